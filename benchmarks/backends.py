@@ -1,8 +1,8 @@
-"""The simulations against the same raw calls of dartpy and pinocchio, written out by hand.
+"""The simulations against hand-written loops of the same dartpy and pinocchio calls.
 
 One unit of work is a control period: torques set once, ten physics steps, positions and velocities
-read once. The raw loops simulate the same world: the world of a simulation is taken apart for them.
-Times are those of the processor: nothing here waits.
+read once. The raw loops simulate the same world, taken from a simulation of physx. Times are
+processor times: nothing here waits.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ Work = Callable[[], Iterator[int]]
 
 
 def worlds(folder: Path) -> dict[str, tuple[World, np.ndarray]]:
-    """Return the worlds that are simulated, and the torques that are held in each."""
+    """Return the simulated worlds, and the torques that are held in each."""
     path = folder / "cartpole.urdf"
     path.write_text(CARTPOLE, encoding="utf-8")
     a1 = Robot(example_robot("a1_description/urdf/a1.urdf"), "a1", fixed_base=False)
@@ -59,7 +59,7 @@ def worlds(folder: Path) -> dict[str, tuple[World, np.ndarray]]:
 
 
 def begin(simulation: Any, title: str) -> None:
-    """Put a world into the state that each round begins with."""
+    """Set a world to the state in which each round starts."""
     q, v = simulation.positions(), simulation.velocities()
     if title == "cartpole":
         q[:] = 0.0, 0.3
@@ -77,7 +77,7 @@ def torques_of(title: str, held: np.ndarray, q: np.ndarray, v: np.ndarray) -> np
 
 
 def through_physx(engine: str, title: str, world: World, held: np.ndarray) -> Work:
-    """Return control periods through the interface."""
+    """Return work that makes control periods through the interface of physx."""
 
     def physx() -> Iterator[int]:
         with plugins.resolve("backend", engine).build(world) as simulation:
@@ -94,7 +94,7 @@ def through_physx(engine: str, title: str, world: World, held: np.ndarray) -> Wo
 
 
 def raw_dart(title: str, world: World, held: np.ndarray) -> Work:
-    """Return control periods by dartpy's own calls."""
+    """Return work that makes control periods with dartpy's own calls."""
 
     def dartpy_calls() -> Iterator[int]:
         with plugins.resolve("backend", "dart").build(world) as simulation:
@@ -116,7 +116,7 @@ def raw_dart(title: str, world: World, held: np.ndarray) -> Work:
 
 
 def raw_pinocchio(title: str, world: World, held: np.ndarray) -> Work:
-    """Return control periods by pinocchio's own calls."""
+    """Return work that makes control periods with pinocchio's own calls."""
 
     def pinocchio_calls() -> Iterator[int]:
         with plugins.resolve("backend", "pinocchio").build(world) as simulation:
@@ -160,7 +160,7 @@ def stepping(folder: Path) -> list[bool]:
 
 
 def loading() -> bool:
-    """Compare the load of A1 with dartpy's own loader, which also loads what is only drawn."""
+    """Compare loading A1 with dartpy's own loader, which also loads visual shapes."""
     path = example_robot("a1_description/urdf/a1.urdf")
     world = World([Robot(path, "a1", fixed_base=False)], ground=Ground())
     backend = plugins.resolve("backend", "dart")
@@ -202,7 +202,7 @@ print((resident() - before) / 50)
 
 
 def memory() -> bool:
-    """Measure what each further world of A1 takes."""
+    """Measure the memory of each additional world with A1."""
     path = str(example_robot("a1_description/urdf/a1.urdf"))
     command = [sys.executable, "-c", _MEMORY, path]
     done = subprocess.run(command, check=True, capture_output=True, text=True)

@@ -1,12 +1,13 @@
-"""A checkpoint's save against writing the same bytes to files and waiting for the disk.
+"""Saving a checkpoint against writing the same bytes to files and waiting for the disk.
 
-A numbered checkpoint has 10 MB: a network's parameters and the state of its optimizer. The best one
-has 10 MB of parameters and replaces the one before. What they are compared with writes the same
-files, each with one `os.write` and one `os.fsync`, and removes those before where the best one is
-replaced; it makes no name of a folder durable. Both run in turn, on the same disk.
+A numbered checkpoint has 10 MB: a network's parameters and the state of its optimizer. The best
+checkpoint has 10 MB of parameters and replaces the previous one. The baseline writes the same
+files, each with one `os.write` and one `os.fsync`, and removes the previous ones where the best
+checkpoint is replaced; it does not make the names of folders durable. Both run alternately, on the
+same disk.
 
     python benchmarks/checkpoint.py
-    python benchmarks/checkpoint.py --check     # ends with status 1 where a target is missed
+    python benchmarks/checkpoint.py --check     # ends with status 1 if a target is missed
 """
 
 from __future__ import annotations
@@ -35,7 +36,7 @@ PROGRESS = checkpoint.Progress(epoch=1, batch=0, batches_read=1, seed=0)
 
 
 def trained(layers: list[int]) -> Learner:
-    """Return a network with an optimizer that has done a step."""
+    """Return a network whose optimizer has made a step."""
     config = NetworkConfig(
         "torch/fc",
         {"layers": layers, "net_fields": "x", "opt_fields": "y"},
@@ -60,8 +61,8 @@ def plain_writes(
     """Return work that writes files to new folders and waits for the disk.
 
     Args:
-        root: Folder of the folders.
-        written: The files.
+        root: Parent of these folders.
+        written: Contents of the files, by name.
         best: Whether each folder is removed when the next one is written.
     """
     numbers = itertools.count(1)
@@ -88,7 +89,7 @@ def plain_writes(
 
 
 def saves(root: Path, learner: Learner, *, best: bool) -> Callable[[], Iterator[int]]:
-    """Return work that saves checkpoints, numbered ones or the best one again and again."""
+    """Return work that saves checkpoints: numbered ones, or the best one again and again."""
     folder = root / "network"
 
     def run() -> Iterator[int]:

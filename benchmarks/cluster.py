@@ -1,8 +1,8 @@
-"""Clients on two nodes of Ray against clients of this machine: what the launcher costs.
+"""Clients on two nodes of Ray against clients on this machine: the overhead of the launcher.
 
     python benchmarks/cluster.py --check
 
-Ray is started here with two nodes of one processor each, and this process is connected to it before
+Ray is started here with two nodes of one processor each, and this process connects to it before
 anything is timed. The last claim, about sweeps that are killed, is that of cluster_sweep.py.
 """
 
@@ -41,7 +41,7 @@ _NAMES = itertools.count()
 
 @contextlib.contextmanager
 def two_nodes() -> Iterator[None]:
-    """Run Ray with two nodes, to which this process is connected."""
+    """Run Ray with two nodes, and connect this process to them."""
     folder = os.environ["RAY_TMPDIR"] = tempfile.mkdtemp(prefix="ray", dir="/tmp")
     options: dict[str, Any] = {"num_cpus": 1, "include_dashboard": False}
     cluster = Cluster(initialize_head=True, head_node_args=options)
@@ -56,7 +56,7 @@ def two_nodes() -> Iterator[None]:
 
 
 def on_ray(clients: int) -> dict[str, Any]:
-    """Return the options of so many clients that share two processors."""
+    """Return the options for clients that share two processors."""
     share = min(1.0, 2 / clients)
     return {"launcher": "cluster/ray", "launcher_kwargs": {"num_cpus": share}}
 
@@ -64,7 +64,7 @@ def on_ray(clients: int) -> dict[str, Any]:
 def generation(
     root: Path, environment: type[Any], arguments: dict[str, Any], rows: int, **options: Any
 ) -> Iterator[int]:
-    """Make and store so many rows with clients that are started before the time is taken."""
+    """Generate and store rows with clients that are started before the timing begins."""
     clients = options["num_clients"]
     pipeline = DataGeneration(
         EnvironmentConfig(environment, env_kwargs=arguments, seed=0, **options),
@@ -106,8 +106,8 @@ def starting(root: Path, environment: str, target: float | None) -> bool:
     """Compare the start of 8 clients on two nodes with that on this machine.
 
     Args:
-        root: Folder for what is written.
-        environment: What they run.
+        root: Folder for output.
+        environment: The environment of the clients.
         target: How many times as long it may take; None: it is only printed.
     """
 
@@ -140,7 +140,7 @@ def starting(root: Path, environment: str, target: float | None) -> bool:
 
 @ray.remote(num_cpus=0)
 class Nothing:
-    """An actor without anything in it."""
+    """An empty actor."""
 
     def answer(self) -> None:
         """Do nothing."""

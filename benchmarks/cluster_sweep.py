@@ -1,10 +1,10 @@
-"""A sweep whose trials are killed: what it comes to, and what the kills cost.
+"""A sweep whose trials are killed: its result, and the cost of the kills.
 
     python benchmarks/cluster_sweep.py --check
 
-Eight trials, each killed (SIGKILL) at three random moments. The table and all final parameters are
-those of an undisturbed sweep, to the last bit. What is trained twice is what no checkpoint held
-when a process was killed: less than an epoch for each kill. Batches are counted, not seconds.
+Eight trials are each killed (SIGKILL) at three random moments. The table and all final parameters
+are bit-identical to those of an undisturbed sweep. Only what no checkpoint held when a process was
+killed is trained twice: less than an epoch per kill. Batches are counted, not seconds.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TRIALS = len(RATES) * len(SEEDS)
 
 
 def survives_kills() -> list[bool]:
-    """Print and return what the sweep comes to."""
+    """Run the sweep with kills; print the claims and return whether they are met."""
     with tempfile.TemporaryDirectory(prefix="physx-sweep-") as name:
         folder = Path(name)
         file = write_study(folder)
@@ -57,7 +57,7 @@ def survives_kills() -> list[bool]:
 
 
 def write_study(folder: Path) -> Path:
-    """Generate a dataset and write the file of a study of it."""
+    """Generate a dataset, and write the file of a study that uses it."""
     spring = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, seed=1)
     options = {"session_dir": str(folder), "session_name": "data", "quiet": True}
     DataGeneration(spring, batch_nb=5, batch_size=20, **options).execute()

@@ -1,10 +1,10 @@
-"""The benchmarks of two checkouts, run in turn: ``compare.py BEFORE [AFTER] [--only NAME ...]``.
+"""Compares the benchmarks of two checkouts: ``compare.py BEFORE [AFTER] [--only NAME ...]``.
 
-BEFORE and AFTER are checkouts, each with its own ``.venv`` (``make .venv/packages``); AFTER is this
-one if left out. Each benchmark runs in BEFORE and in AFTER, ``--rounds`` times in turn, so that a
-drifting machine treats both alike. Printed are the medians of every ratio to a baseline and of
-every claim that both print (the inverse of a claim "at most"), and the change. Claim: the geometric
-mean of the changes is at least 0.95 in each benchmark.
+BEFORE and AFTER are checkouts, each with its own ``.venv`` (``make .venv/packages``); AFTER
+defaults to this one. Each benchmark runs alternately in BEFORE and in AFTER, ``--rounds`` times
+each, so a machine whose speed drifts affects both equally. Printed are the medians of every ratio
+to a baseline and of every claim that both print (the inverse of a claim "at most"), and the change.
+Claim: the geometric mean of the changes is at least 0.95 in each benchmark.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ Figures = dict[str, float]
 
 
 def figures_of(checkout: Path, name: str) -> Figures:
-    """Run a benchmark and return the ratios and claims that it prints, larger being better."""
+    """Run a benchmark and return the ratios and claims that it prints; larger is better."""
     command = [checkout / ".venv/bin/python", f"benchmarks/{name}.py"]
     done = subprocess.run(
         list(map(str, command)), cwd=checkout, capture_output=True, text=True, check=False

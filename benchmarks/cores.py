@@ -1,4 +1,4 @@
-"""Processor cores of their own for processes that answer each other."""
+"""Separate processor cores for processes that answer each other."""
 
 from __future__ import annotations
 
@@ -8,14 +8,14 @@ from collections.abc import Iterator
 
 
 def two_cores() -> list[int]:
-    """Return two processor cores; none where there are fewer, or the system lets nobody choose."""
+    """Return two processor cores, or none if there are fewer or the system allows no choice."""
     cores = sorted(os.sched_getaffinity(0))[:2] if hasattr(os, "sched_getaffinity") else []
     return cores if len(cores) > 1 else []
 
 
 @contextlib.contextmanager
 def on_core(core: int | None) -> Iterator[None]:
-    """Have this process use one processor core only; None: any."""
+    """Restrict this process to one processor core; None: any."""
     if core is None:
         yield
         return

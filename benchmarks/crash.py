@@ -1,15 +1,15 @@
-"""Power cuts: every legal state of the disk is opened, and nothing wrong is ever read back.
+"""Power cuts: opens every legal state of the disk and checks that nothing wrong is ever read back.
 
-Histories of calls are drawn by chance, and everything that they do to the disk is recorded. The
-states that a cut may leave at each moment are built in memory (`tests/core/crash/powercut/disk.py`
-says which they are), opened as after the next start of the machine, and compared with what had been
-promised at that moment. Some are also verified, opened for writing, repaired and rebuilt.
+Random histories of calls are generated, and everything that they do to the disk is recorded. The
+states that a cut may leave at each moment (defined in `tests/core/crash/powercut/disk.py`) are
+built in memory, opened as after a reboot, and compared with what had been promised at that moment.
+Some are also verified, opened for writing, repaired and rebuilt.
 
     python benchmarks/crash.py                # one minute; ends with status 1 if something is wrong
     python benchmarks/crash.py --check        # 15 minutes; ends with status 1 if a target is missed
     python benchmarks/crash.py --check --small
     python benchmarks/crash.py --seconds 100 --first 5000
-    python benchmarks/crash.py --replay 36/0/110/5    # what a problem says: one state, or one seed
+    python benchmarks/crash.py --replay 36/0/110/5    # as printed with a problem: a state or seed
 """
 
 from __future__ import annotations
@@ -42,7 +42,7 @@ def folder() -> Path:
 
 
 def work(first: int, seconds: float) -> Result:
-    """Examine every `PROCESSES`-th history from one on."""
+    """Examine every `PROCESSES`-th history, starting at `first`."""
     root = folder()
     try:
         return campaign(itertools.count(first, PROCESSES), root, seconds)
@@ -69,7 +69,7 @@ def show(problems: list[Problem]) -> None:
 
 
 def run_replay(place: str) -> None:
-    """Examine one history again, and tell everything about one of its states."""
+    """Examine one history again, and print everything about one of its states."""
     root = folder()
     try:
         problems = replay(place, root)
@@ -107,6 +107,6 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if os.environ.get("PYTHONHASHSEED") != "0":  # what sets are iterated in must be replayed, too
+    if os.environ.get("PYTHONHASHSEED") != "0":  # a replay needs the same iteration order of sets
         os.execve(sys.executable, [sys.executable, *sys.argv], os.environ | {"PYTHONHASHSEED": "0"})
     main()

@@ -1,7 +1,7 @@
-"""The dataset against the disk, tensors in RAM and h5py: every claim of its speed and size.
+"""The dataset against the disk, tensors in RAM and h5py: all claims about its speed and size.
 
-Rows of 48 B hold 6 numbers, rows of 48 kB hold 6000, of float64 in two fields. Each candidate runs
-in turn with its baseline; torch has one thread.
+Rows of 48 B hold 6 numbers, rows of 48 kB hold 6000, as float64 in two fields. Each candidate runs
+alternately with its baseline; torch has one thread.
 """
 
 from __future__ import annotations
@@ -43,13 +43,13 @@ def nbytes(rows: Rows) -> int:
 
 
 def file_size(rows: Rows, partitions: int) -> float:
-    """Return the size in GB of files that hold rows in so many partitions."""
+    """Return the size in GB of files that hold rows in a number of partitions."""
     count = -(-len(rows["x"]) // partitions)
     return 1e-9 * (max(values[:count].nbytes for values in rows.values()) + 2**14 + 1)
 
 
 def in_new_folder(root: Path, work: Callable[[Path], Iterator[int]]) -> Work:
-    """Return work that gets a folder of its own, which is removed after it."""
+    """Return work that gets its own folder, which is removed afterwards."""
     numbers = itertools.count()
 
     def run() -> Iterator[int]:
@@ -65,7 +65,7 @@ def in_new_folder(root: Path, work: Callable[[Path], Iterator[int]]) -> Work:
 
 
 def appending_blocks(root: Path, title: str, target: float) -> bool:
-    """Compare blocks of 2 MB, committed each, with `os.write` to as many files."""
+    """Compare appending blocks of 2 MB, each committed, with `os.write` to as many files."""
     shapes, blocks = KINDS[title], 48
     rows = random_rows(shapes, 2**21 // nbytes(random_rows(shapes, 1)))
 
@@ -95,7 +95,7 @@ def appending_blocks(root: Path, title: str, target: float) -> bool:
 
 
 def appending_samples(root: Path, title: str, target: float) -> bool:
-    """Compare single samples with h5py's resize and assign."""
+    """Compare appending single samples with h5py's resize and assign."""
     shapes = KINDS[title]
     few, many = (200, 20_000) if title == "48 B" else (100, 1000)
     sample = {name: values[0] for name, values in random_rows(shapes, 1).items()}
@@ -132,7 +132,7 @@ def appending_samples(root: Path, title: str, target: float) -> bool:
 
 
 def in_ram(tensors: dict[str, torch.Tensor], size: int, batches: int) -> Work:
-    """Return shuffled batches of tensors in RAM."""
+    """Return work that takes shuffled batches from tensors in RAM."""
 
     def index_select() -> int:
         given = 0
@@ -149,7 +149,7 @@ def in_ram(tensors: dict[str, torch.Tensor], size: int, batches: int) -> Work:
 
 
 def from_dataset(dataset: Dataset, size: int, batches: int) -> Work:
-    """Return shuffled batches of a dataset as tensors."""
+    """Return work that reads shuffled batches from a dataset as tensors."""
 
     def read() -> int:
         found = dataset.batches(MODE, size, shuffle=True, seed=0, epochs=None, reuse=True)
@@ -218,7 +218,7 @@ def disk_usage(folder: Path) -> int:
 
 
 def opening_and_size(root: Path) -> list[bool]:
-    """Open 64 partitions of 10 million rows, and compare their size with the raw bytes."""
+    """Open 64 partitions with 10 million rows, and compare their size with the raw bytes."""
     folder, count, met = root / "many", 10_000_000, []
     block = random_rows(SMALL, count // 64)
     row_nbytes = nbytes(block) // len(block["x"])

@@ -1,10 +1,10 @@
-"""The differentiable forward dynamics against a loop of Pinocchio's own calls.
+"""Differentiable forward dynamics against a loop of Pinocchio's own calls.
 
-One unit of work is one state whose accelerations are computed, and through which a gradient goes
-back to its positions, velocities and torques. The loop is written out by hand: `pin.aba` going
-forward, the derivatives going back. Its gradients by the positions are those by small motions; the
-function of physx goes one step further, to those by the quaternion of the base. Time is that on the
-wall; the claim is about two processes, for which two processor cores must be free.
+One unit of work is one state: its accelerations are computed, and a gradient is propagated back to
+its positions, velocities and torques. The loop is written by hand: `pin.aba` forward, the
+derivatives backward. Its gradients with respect to the positions are those of the tangent space;
+physx goes one step further, to those with respect to the quaternion of the base. Times are wall
+times; the claim is about two processes, which need two free processor cores.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ SHARED = "physx, 2 processes"
 
 
 class Loop(torch.autograd.Function):
-    """Forward dynamics of each state in turn; with gradients in the tangent space."""
+    """Forward dynamics state by state, with gradients in the tangent space."""
 
     @staticmethod
     def forward(ctx: Any, model: Any, *rows: torch.Tensor) -> torch.Tensor:
@@ -53,7 +53,7 @@ class Loop(torch.autograd.Function):
 
 
 def gradients(found: torch.Tensor, given: torch.Tensor) -> tuple[torch.Tensor | None, ...]:
-    """Return gradients from derivatives, those by the positions as wide as the positions."""
+    """Return gradients from derivatives; those of the positions are as wide as the positions."""
     by_q, by_v, by_tau = (given[:, None] @ matrices for matrices in found)
     by_q = torch.cat([by_q[:, 0], torch.zeros(len(given), 1)], dim=1)
     return None, by_q, by_v[:, 0], by_tau[:, 0]

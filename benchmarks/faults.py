@@ -1,12 +1,12 @@
-"""How soon the error is there when a client breaks, and how soon clients leave a killed server.
+"""How fast a broken client is reported, and how fast clients leave a killed server.
 
-Each fault happens several times, in real processes; right before it, the time is noted. What counts
-of a client that breaks is the time until the error names it and says how it broke; where it only
-falls silent, without the time for which clients may be silent. What counts of a server that is
-killed is the time until all its clients are gone.
+Each fault happens several times, in real processes; the time is noted right before it. For a client
+that breaks, what counts is the time until the error names it and says how it broke; if it only
+falls silent, the allowed silence is subtracted. For a server that is killed, what counts is the
+time until all its clients are gone.
 
     python benchmarks/faults.py
-    python benchmarks/faults.py --check     # ends with status 1 where a target is missed
+    python benchmarks/faults.py --check     # ends with status 1 if a target is missed
 """
 
 from __future__ import annotations
@@ -63,14 +63,14 @@ LEFT_BEHIND = {
 
 
 class Breaking(Environment):
-    """Breaks in the second of its instances, after some rows; it notes the time right before."""
+    """Breaks in its second instance after some rows; it notes the time right before."""
 
     def __init__(self, *, fault: str, folder: str, **kwargs: Any) -> None:
         super().__init__(**kwargs)
         self.fault, self.folder = fault, Path(folder)
 
     def create(self) -> None:
-        """Hold the pipe whose end tells that every client is gone."""
+        """Hold the pipe whose closing shows that every client is gone."""
         self.life = os.open(self.folder / LIFE, os.O_WRONLY)
         os.write(self.life, b"x")
 
@@ -79,7 +79,7 @@ class Breaking(Environment):
         self.define_training_fields(Field("x", ()))
 
     def step(self) -> None:
-        """Give a number a millisecond later, or break."""
+        """Set a number after a millisecond, or break."""
         time.sleep(1e-3)
         if self.instance_id == 2 and self.step_index == ROWS_BEFORE:
             print("last words", file=sys.stderr, flush=True)
@@ -97,33 +97,33 @@ class Breaking(Environment):
         raise RuntimeError("no more beans")
 
     def leave(self) -> None:
-        """End the process at once."""
+        """End the process immediately."""
         os._exit(3)
 
     def kill(self) -> None:
-        """Be killed."""
+        """Kill this process."""
         os.kill(os.getpid(), signal.SIGKILL)
 
     def stop(self) -> None:
-        """Be stopped."""
+        """Stop this process."""
         os.kill(os.getpid(), signal.SIGSTOP)
 
     def spin(self) -> None:
-        """Compute for ever."""
+        """Compute forever."""
         while True:
             pass
 
     def hold(self) -> None:
-        """Wait for ever, without letting other threads of Python run."""
+        """Wait forever, without letting other Python threads run."""
         ctypes.PyDLL(None).pause()
 
     def send_garbage(self) -> None:
-        """Send bytes that are no message, and wait."""
+        """Send bytes that are not a message, and wait."""
         connection_of_this_client().sendall(bytes(range(1, 256)) * 20)
         time.sleep(LONGEST)
 
     def disconnect(self) -> None:
-        """End the connection, but not the process."""
+        """Close the connection, but keep the process."""
         connection_of_this_client().shutdown(socket.SHUT_RDWR)
         time.sleep(LONGEST)
 
@@ -149,7 +149,7 @@ def connection_of_this_client() -> socket.socket:
 
 @contextlib.contextmanager
 def life_of_clients(folder: Path) -> Iterator[int]:
-    """Make the pipe that clients hold for as long as they live; yield the end to read."""
+    """Create the pipe that clients hold as long as they live; yield the end to read."""
     os.mkfifo(folder / LIFE)
     pipe = os.open(folder / LIFE, os.O_RDONLY | os.O_NONBLOCK)
     try:
@@ -168,7 +168,7 @@ def when_all_are_gone(pipe: int) -> float:
 
 
 def clients(fault: str, folder: Path) -> ClientSource:
-    """Return clients of which one breaks."""
+    """Return clients, one of which breaks."""
     config = EnvironmentConfig(
         Breaking,
         env_kwargs={"fault": fault, "folder": str(folder)},
@@ -180,17 +180,17 @@ def clients(fault: str, folder: Path) -> ClientSource:
 
 
 def produce(source: ClientSource) -> NoReturn:
-    """Have clients make rows for ever."""
+    """Have clients generate rows forever."""
     while True:
         source.batch(20)
 
 
 def broken_client(fault: str, pattern: str, folder: Path) -> tuple[float, float]:
-    """Return how many seconds after a client broke the error is there, and all clients are gone.
+    """Return the s from a client's failure to its error, and until all clients are gone.
 
     Args:
         fault: What the client does.
-        pattern: What the error says.
+        pattern: A pattern that the error matches.
         folder: An empty folder.
     """
     with life_of_clients(folder) as pipe:
@@ -208,7 +208,7 @@ def broken_client(fault: str, pattern: str, folder: Path) -> tuple[float, float]
 
 
 def killed_server(fault: str, folder: Path) -> float:
-    """Return how many seconds after a server was killed with -9 all its clients are gone.
+    """Return the s from killing a server with -9 until all its clients are gone.
 
     Args:
         fault: What a client does before that.
@@ -228,7 +228,7 @@ def killed_server(fault: str, folder: Path) -> float:
 
 
 def measure() -> tuple[dict[str, list[float]], dict[str, list[float]]]:
-    """Return how many seconds each error took, and how many until all clients were gone."""
+    """Return the s until each error, and the s until all clients were gone."""
     named: dict[str, list[float]] = {name: [] for name in BROKEN}
     gone: dict[str, list[float]] = {name: [] for name in (*BROKEN, *LEFT_BEHIND)}
     for _ in range(ROUNDS):
@@ -244,7 +244,7 @@ def measure() -> tuple[dict[str, list[float]], dict[str, list[float]]]:
 
 
 def in_words(seconds: list[float]) -> str:
-    """Return median and maximum in words."""
+    """Return median and maximum as text."""
     return f"{statistics.median(seconds):.3f} s, at most {max(seconds):.3f} s"
 
 
@@ -265,7 +265,7 @@ def main() -> None:
 
 
 if __name__ == "__main__":
-    if len(sys.argv) == 3:  # the server that is to be killed
+    if len(sys.argv) == 3:  # the server to be killed
         with clients(sys.argv[1], Path(sys.argv[2])) as source:
             produce(source)
     main()

@@ -1,7 +1,7 @@
 """Data generation against a bare loop over the same environment.
 
 The bare loop steps the 5-float toy environment, fills a NumPy array and writes each block with one
-`os.write`. Claim: in one process, physx makes at least 0.6 times as many samples a second.
+`os.write`. Claim: in one process, physx generates at least 0.6 times as many samples per second.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ NAMES = itertools.count()
 
 
 def bare_loop(folder: Path) -> int:
-    """Make the samples without physx's sources and dataset."""
+    """Generate the samples without physx's sources and dataset."""
     environment = Spring(seed=0)
     environment.create()
     block = np.empty((BLOCK, 5))
@@ -40,7 +40,7 @@ def bare_loop(folder: Path) -> int:
 
 
 def pipeline(folder: Path, clients: int) -> DataGeneration:
-    """Return a generation of all the rounds' samples; 0 clients: in this process."""
+    """Return a data generation of the samples of all rounds; 0 clients: in this process."""
     config = EnvironmentConfig(
         "toy/spring", as_tcp_ip_client=clients > 0, num_clients=max(1, clients), seed=0
     )
@@ -54,7 +54,7 @@ def pipeline(folder: Path, clients: int) -> DataGeneration:
 
 
 def produce(generation: DataGeneration) -> int:
-    """Make one round's samples with an open pipeline."""
+    """Generate one round's samples with an open pipeline."""
     for _ in range(SAMPLES // BLOCK):
         generation.batch_begin()
         generation.batch_produce()

@@ -1,21 +1,21 @@
-"""Environments: what a step costs beside the physics, and how they compare with gym_jiminy's.
+"""Environments: the cost of a step on top of the physics, and a comparison with gym_jiminy's.
 
     python benchmarks/gym.py
     python benchmarks/gym.py --jiminy PYTHON    # an interpreter that has gym_jiminy
 
-Without `--jiminy`, gym_jiminy is taken from the virtual environment .venv/jiminy where there is
-one. It needs an older NumPy than physx:
+Without `--jiminy`, gym_jiminy is taken from the virtual environment .venv/jiminy, if there is one.
+It needs an older NumPy than physx:
 
     python3.11 -m venv .venv/jiminy
     .venv/jiminy/bin/pip install -r benchmarks/requirements-jiminy.txt
 
-The bare loop is what a user of the engine would write: torques set, `step(n)`, positions and
-velocities read into arrays that are there; under the same torques from the same state, so the
-physics is the same. Its costs and those of `step` are the least of several runs for each step of an
-episode: what the machine's other work adds is not counted. The unit is one step of Gymnasium's own
-CartPole-v1, run after each step of the bare loop: physics empties the processor's caches, so that
-any Python after it takes up to three times as long as in a loop of its own. The time in such a loop
-is printed too.
+The bare loop is what a user of the engine would write: it sets torques, calls `step(n)`, and reads
+positions and velocities into existing arrays, with the same torques from the same state, so the
+physics is the same. Its costs and those of `step` are the minimum of several runs for each step of
+an episode, so other load on the machine does not count. The unit is one step of Gymnasium's own
+CartPole-v1, run after each step of the bare loop: physics empties the processor's caches, so any
+Python code after it takes up to three times as long as in its own loop. The time in its own loop is
+printed, too.
 """
 
 from __future__ import annotations
@@ -57,7 +57,7 @@ def registered(name: str, **options: Any) -> Any:
 
 
 def three_blocks() -> Any:
-    """Return a quadruped with a PD controller, a Mahony filter and a safety limit, once a step."""
+    """Return a quadruped with PD controller, Mahony filter and safety limit, each once per step."""
     kwargs = {"urdf": "a1/a1", "fixed_base": False, "period": 2.5e-3}
     simulator = {"cls": "physx_gym:Simulator.build", "kwargs": kwargs}
     pd = {"kp": 80.0, "kd": 0.02, "joint_velocity_limit": 12.0, "joint_acceleration_limit": 400.0}
@@ -70,14 +70,14 @@ def three_blocks() -> Any:
     return build_pipeline({"cls": "RobotEnv", "kwargs": options}, layers)()
 
 
-# What a step costs beside the physics -----------------------------------------------------------
+# Cost of a step on top of the physics -----------------------------------------------------------
 
 
 class Overhead:
-    """Times steps of an environment, and the bare loop that does the same to the engine."""
+    """Times an environment's steps, and a bare loop that makes the same calls to the engine."""
 
     def __init__(self, env: Any, steps: int, action: Any) -> None:
-        """Note what the motors do in an episode of some steps under an action."""
+        """Record what the motors do in an episode of some steps with an action."""
         self._env, self._base, self._steps, self._action = env, env.unwrapped, steps, action
         env.reset(seed=0)
         simulator = self._base.simulator
@@ -101,7 +101,7 @@ class Overhead:
         self.per_step = len(self._ticks) // steps
 
     def whole(self) -> np.ndarray:
-        """Return times of the environment's steps, in s."""
+        """Return the times of the environment's steps, in s."""
         env, action, times = self._env, self._action, np.empty(self._steps)
         env.reset(seed=0)
         for number in range(self._steps):
@@ -186,7 +186,7 @@ def overheads() -> list[bool]:
 
 
 class Zoo:
-    """gym_jiminy's environments in a process of another interpreter."""
+    """gym_jiminy's environments in a process with another interpreter."""
 
     def __init__(self, python: str) -> None:
         command = [python, "-P", str(HERE / "jiminy_zoo.py")]
@@ -211,7 +211,7 @@ class Zoo:
 
 
 def engine_alone(env: Any, actions: list[Any]) -> float:
-    """Return how many steps per second there were if only dartpy's ``World.step`` took time."""
+    """Return the steps per second if only dartpy's ``World.step`` took time."""
     simulation, steps, spent = env.simulator.simulation, 1000, 0.0
     step = simulation._step_world
 
@@ -231,10 +231,10 @@ def engine_alone(env: Any, actions: list[Any]) -> float:
 
 
 def against_jiminy(python: str) -> list[bool]:
-    """Compare steps per second with gym_jiminy, at physx's own physics period and at its.
+    """Compare steps per second with gym_jiminy, at physx's own physics period and at gym_jiminy's.
 
-    The rate of DART's steps alone, with the same solver and detector, is printed too: no
-    environment around that engine can be faster.
+    The rate of DART's steps alone, with the same solver and detector, is printed, too: no
+    environment on top of that engine can be faster.
     """
     zoo, met = Zoo(python), []
     for name, target in (("Cartpole", 1.6), ("Acrobot", 5.0), ("Ant", 1.3)):
@@ -255,7 +255,7 @@ def against_jiminy(python: str) -> list[bool]:
             alone = [(engine_alone(env, actions),) * 2 for env in envs]
             found = zoo.measure(name.lower(), 0.25)
             rounds.append([*row, *alone, (found["rate"], found["rate_of_step"])])
-        # Rounds, candidates, with and without resets.
+        # Axes: rounds, candidates, with and without resets.
         measured = np.array(rounds)
         middle = np.median(measured, axis=0)
         ratios = np.median(measured[:, :-1] / measured[:, -1:], axis=0)
@@ -278,7 +278,7 @@ def against_jiminy(python: str) -> list[bool]:
 
 
 def telemetry() -> list[bool]:
-    """Compare steps in evaluation, where all is recorded, with those in training."""
+    """Compare steps in evaluation, where everything is recorded, with those in training."""
     met = []
     cases = {
         "cartpole": (registered("Cartpole"), 1, 30),
@@ -316,11 +316,11 @@ gymnasium.make("physx/Cartpole-v0").reset(seed=0)
 
 
 def start_up() -> bool:
-    """Compare import and first reset with the import of what they stand on."""
+    """Compare import and first reset with importing only the libraries underneath."""
     times: dict[str, list[float]] = {_IMPORTS: [], _FIRST_RESET: []}
     with tempfile.TemporaryDirectory() as folder:
         plain = {k: v for k, v in os.environ.items() if k != "PYTHONDONTWRITEBYTECODE"}
-        environment = {**plain, "PYTHONPYCACHEPREFIX": folder}  # everything is compiled once
+        environment = {**plain, "PYTHONPYCACHEPREFIX": folder}  # bytecode is compiled once
         for number in range(2 * ROUNDS + 2):
             for program, spent in times.items():
                 process = subprocess.Popen([sys.executable, "-c", program], env=environment)
@@ -372,7 +372,7 @@ print((resident() - before) / 40)
 
 
 def memory() -> list[bool]:
-    """Measure what each further environment takes, and what Bullet's part of it alone takes."""
+    """Measure the memory of each additional environment, and of Bullet's part of it alone."""
     met = []
     for name, path, most in (
         ("cartpole", "physx/Cartpole-v0", 2.0),
@@ -395,9 +395,9 @@ def memory() -> list[bool]:
 def vectors() -> list[bool]:
     """Compare two processes of ants with one, and cartpoles with Gymnasium's vector environments.
 
-    All take turns in short slices, since the machine's other work comes and goes. A vector
-    environment over bare shared memory, which does nothing but what a step needs, shows how far two
-    processes that wait for each other in each step get on this machine.
+    All run alternately in short slices, because other load on the machine varies. A vector
+    environment over bare shared memory, which only does what a step needs, shows how far two
+    processes that wait for each other in each step can get on this machine.
     """
     name, count = "physx/Ant-v0", 8
     ants: dict[str, Any] = {}
@@ -455,7 +455,7 @@ def draw(env: Any) -> list[np.ndarray]:
 
 
 def turn(env: Any, actions: list[np.ndarray]) -> int:
-    """Step a vector environment for a moment; return how many steps its environments made."""
+    """Step a vector environment for one slice; return how many steps its environments made."""
     done, begin = 0, clock()
     if getattr(env, "batch_size", None) in (None, getattr(env, "num_envs", None)):
         while clock() - begin < SLICE:

@@ -1,12 +1,12 @@
-"""What the idle threads of a network's library take from environments in other processes.
+"""How much idle threads of a network's library slow down environments in other processes.
 
     python benchmarks/idle_threads.py
 
-A policy's network, so wide that its library uses several threads, and a vector environment in two
-processes take turns, as in reinforcement learning: with the time for which GNU's OpenMP lets
-threads spin that have nothing to do, with the shorter one that physx asks for, and with one thread,
-which leaves none idle. And a training on stored samples, whose pieces of work follow each other at
-once, with the first two.
+A policy's network, wide enough that its library uses several threads, and a vector environment in
+two processes alternate, as in reinforcement learning. Three settings are compared: the time for
+which GNU's OpenMP lets idle threads spin, the shorter time that physx requests, and one thread,
+which leaves none idle. A training on stored samples, whose pieces of work follow each other
+immediately, runs with the first two.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ import gymnasium
 import numpy as np
 from measure import claim, finish
 
-import physx_gym  # noqa: F401 - it tells OpenMP to rest soon
+import physx_gym  # noqa: F401 - shortens the spin time of OpenMP
 from physx_core import Dataset, DatasetConfig, NetworkConfig, Training
 
 ROUNDS, SLICE = 9, 0.5
@@ -33,7 +33,7 @@ SPINS = {OWN: {"GOMP_SPINCOUNT": "300000"}, PHYSX: {}, ONE: {"OMP_NUM_THREADS": 
 
 
 def act() -> None:
-    """Step ants with a policy; for each line that is read print the steps per second."""
+    """Step ants with a policy; print the steps per second for each line that is read."""
     import torch
 
     sizes = [27, 512, 512, 8]
@@ -53,7 +53,7 @@ def act() -> None:
 
 
 def learn() -> None:
-    """Train on stored samples; for each line that is read print the samples per second."""
+    """Train on stored samples; print the samples per second for each line that is read."""
     rng, count = np.random.default_rng(0), 8192
     with tempfile.TemporaryDirectory() as name:
         with Dataset.create(Path(name) / "data") as data:
@@ -77,7 +77,7 @@ def learn() -> None:
 
 
 def compare(what: str, *kinds: str) -> dict[str, list[float]]:
-    """Return rates of each kind of process in each round, interleaved."""
+    """Return the rates of each kind of process in interleaved rounds."""
     chosen = {"GOMP_SPINCOUNT", "OMP_WAIT_POLICY", "OMP_NUM_THREADS"}
     plain = {name: value for name, value in os.environ.items() if name not in chosen}
     processes = {

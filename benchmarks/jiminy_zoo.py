@@ -1,10 +1,10 @@
 """Steps gym_jiminy's environments for `benchmarks/gym.py`, which starts it with another Python.
 
-A line on standard input is an environment's name and a time in s; the answer is a line of JSON:
-steps per second, with and without the time of resets, the time of a step, and that between two
-steps of the integrator.
+A line on standard input holds an environment's name and a time in s; the answer is a line of JSON:
+steps per second, with and without the time of resets, the time that a step simulates, and the time
+between two steps of the integrator.
 
-    pip install -r benchmarks/requirements-jiminy.txt      # in an environment of its own
+    pip install -r benchmarks/requirements-jiminy.txt      # in a separate environment
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ def made(name: str) -> tuple[Any, list[Any]]:
 
 
 def steps_per_second(env: Any, actions: list[Any], seconds: float) -> tuple[float, float]:
-    """Return steps per second: with the resets at the ends of episodes, and of time in `step`."""
+    """Return steps per second: including resets at the ends of episodes, and in `step` alone."""
     clock, stepping, resetting, steps = time.perf_counter, 0.0, 0.0, 0
     env.reset()
     while stepping + resetting < seconds:
@@ -46,7 +46,7 @@ def steps_per_second(env: Any, actions: list[Any], seconds: float) -> tuple[floa
 
 
 def integrations(env: Any, actions: list[Any]) -> float:
-    """Return the mean time between two steps of the integrator, in s."""
+    """Return the mean simulated time between two steps of the integrator, in s."""
     env.reset()
     env.step(actions[0])
     before = env.stepper_state.iter

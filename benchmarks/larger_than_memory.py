@@ -1,11 +1,11 @@
-"""Training on a dataset of twice the memory that the process may take.
+"""Training on a dataset twice as large as the memory that the process may use.
 
-The training runs in a process of its own whose control group limits its memory, file cache
-included, to half of the dataset's size. Where no control group can be made, the limit is only that
-the file cache is emptied before each round, and how rows are read is asked for by name.
+The training runs in its own process, whose control group limits its memory, including the file
+cache, to half of the dataset's size. If no control group can be created, the only limit is that the
+file cache is emptied before each round, and the read strategy is requested by name.
 
-Claim: batches come, and a small network trains on them, at 0.2 or more of the speed at which the
-same files are read in sequence under the same limit, and the process does not grow.
+Claim: batches are read, and a small network trains on them, at 0.2 or more of the speed at which
+the same files are read sequentially under the same limit, and the process does not grow.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ CASES = {
 
 
 def store(folder: Path, shapes: dict[str, tuple[int, ...]], size: int) -> None:
-    """Write a dataset of random numbers, `size` bytes of rows."""
+    """Write a dataset of random numbers with `size` bytes of rows."""
     rng = np.random.default_rng(0)
     row_nbytes = sum(8 * int(np.prod(shape)) for shape in shapes.values())
     count = 2**24 // row_nbytes
@@ -59,7 +59,7 @@ def forget(folder: Path) -> None:
 
 
 def sequential(folder: Path) -> Callable[[], int]:
-    """Return a round of reading all files from their beginning to their end."""
+    """Return a round that reads all files from beginning to end."""
     buffer = memoryview(bytearray(2**23))
 
     def read() -> int:
@@ -94,7 +94,7 @@ def shuffled(
 
 
 def trainer(x_shape: tuple[int, ...], y_shape: tuple[int, ...]) -> Callable[..., None]:
-    """Return one optimization step of a linear network of few parameters."""
+    """Return a function that makes one optimization step of a small linear network."""
     size = min(64, int(np.prod(x_shape)))
     layer = torch.nn.Linear(size, y_shape[-1], dtype=torch.float64)
     optimizer = torch.optim.SGD(layer.parameters(), lr=1e-3)
@@ -111,12 +111,12 @@ def trainer(x_shape: tuple[int, ...], y_shape: tuple[int, ...]) -> Callable[...,
 
 
 def resident() -> int:
-    """Return the bytes of memory that this process has taken."""
+    """Return the resident memory of this process in bytes."""
     return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGESIZE")
 
 
 def measure(root: Path, limited: bool) -> None:
-    """Measure and print; this is the process under the limit."""
+    """Measure and print, in the process with the limit."""
     torch.set_num_threads(1)
     met = []
     for number, (title, (shapes, batch_size, expected)) in enumerate(CASES.items()):
@@ -153,7 +153,7 @@ def measure(root: Path, limited: bool) -> None:
 
 @contextlib.contextmanager
 def control_group(limit: int) -> Iterator[Path | None]:
-    """Make a control group within that of this process; give None where that is not allowed."""
+    """Create a control group within that of this process; yield None if that is not allowed."""
     for line in Path("/proc/self/cgroup").read_text().splitlines():
         _, controllers, path = line.split(":", 2)
         if controllers not in ("", "memory"):

@@ -1,16 +1,16 @@
-"""Learning: what PPO reaches in the registered environments, over several seeds.
+"""Reinforcement learning: what PPO achieves in the registered environments, over several seeds.
 
     python benchmarks/learning.py                                   # all of them: hours
     python benchmarks/learning.py --env physx/Ant-v0 --seeds 0 1 2
     python benchmarks/learning.py --env physx/Quadruped-v0 --check --film quadruped.webp
     python benchmarks/learning.py --env physx/Ant-v0 --folder policies --steps 300000
 
-Trains with `examples/12_reinforcement_learning.py` once for each seed, `--jobs` at a time, with the
-settings of `examples/ppo.toml`; then runs deterministic episodes on the engine that it was trained
-on and on the other one. Prints a line for each seed and engine, with the wall time of the training,
-and the range over the seeds. With `--check`, exits with 1 if any seed misses the target on its own
-engine. `--film FILE` shows the first seconds of episodes under the policy of the first seed.
-Options that are not its own are passed on to the example. Needs stable-baselines3.
+Trains with `examples/12_reinforcement_learning.py` once per seed, `--jobs` at a time, with the
+settings in `examples/ppo.toml`; then runs deterministic episodes on the engine used for training
+and on the other one. Prints a line per seed and engine, with the wall time of the training, and the
+range over the seeds. With `--check`, exits with 1 if any seed misses the target on the engine used
+for training. `--film FILE` shows the first seconds of episodes with the policy of the first seed.
+Other options are passed on to the example. Needs stable-baselines3.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ TARGETS = {
     "physx/Quadruped-v0": ("speed", 0.5, 5),
     "physx/PushBox-v0": ("success", 0.9, 20),
 }
-"""Figure of `evaluate` whose mean must reach a value, for every seed, and number of episodes."""
+"""Figure of `evaluate`, the value that its mean must reach for every seed, number of episodes."""
 FIRST_SEED = 30_000
 FILM_TIME, FILM_SIZE, FRAME_RATE = 6.0, (320, 240), 15.0
 NAMES = ("reward", "length", "speed", "success")
@@ -56,7 +56,7 @@ def train(env: str, backend: str, more: list[str], place: Path, seed: int) -> tu
     words = ["--env", name, "--backend", backend, "--seeds", str(seed), "--session-dir", str(place)]
     begin = time.perf_counter()
     command = [sys.executable, str(TRAIN), *words, *more]
-    done = subprocess.run(command, stdout=sys.stderr, check=False)  # 1: it lost
+    done = subprocess.run(command, stdout=sys.stderr, check=False)  # 1: it lost to a rival
     if not (folder / "network").is_dir():
         sys.exit(f"The training with seed {seed} failed with status {done.returncode}.")
     return folder, time.perf_counter() - begin

@@ -1,7 +1,7 @@
-"""Many clients in one process, for what a server spends on each: they simulate nothing.
+"""Many clients in one process that simulate nothing, to measure what a server spends on each.
 
-many_clients.py HOST:PORT CLIENTS VALUES ROWS: each sends as many rows of so many numbers as it is
-allowed to, ROWS in a frame.
+many_clients.py HOST:PORT CLIENTS VALUES ROWS: each client sends as many rows of VALUES numbers as
+it may, ROWS in a frame.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from physx_core.rows import ROW_FIELDS
 
 
 class Client:
-    """One connection, and how many rows it may send and has sent."""
+    """A connection, with the number of rows that it may send and has sent."""
 
     def __init__(self, address: str, number: int, fields: list[Field]) -> None:
         self.number, self.fields, self.sent, self.allowed = number, fields, 0, 0
@@ -48,7 +48,7 @@ class Client:
         self.socket.sendall(pack(kind, encode([field.to_dict() for field in fields])))
 
     def next(self) -> Kind:
-        """Wait for a message."""
+        """Wait for a message, and return its kind."""
         frame = self.reader.read(self.socket)
         assert frame is not None
         if frame.kind is Kind.CREDIT:
@@ -56,7 +56,7 @@ class Client:
         return frame.kind
 
     def send_rows(self, count: int) -> None:
-        """Send a frame of rows; its numbers have as many columns as it takes."""
+        """Send a frame of rows, including the columns that number them."""
         columns = [np.zeros((count, *(field.shape or ()))) for field in self.fields]
         steps = np.arange(self.sent, self.sent + count)
         numbers = {"env_id": np.full(count, self.number), "episode": np.zeros(count), "step": steps}
@@ -68,7 +68,7 @@ class Client:
 
 
 def connect(address: str, number: int, fields: list[Field]) -> Client:
-    """Connect, as soon as the server listens."""
+    """Connect as soon as the server listens."""
     until = time.monotonic() + 60
     while True:
         try:

@@ -1,4 +1,4 @@
-"""Interleaved timing: the candidates run in turn, so that a drifting machine treats all alike."""
+"""Interleaved timing: candidates run alternately, so a drifting machine affects all equally."""
 
 from __future__ import annotations
 
@@ -18,9 +18,9 @@ def rates(
     Args:
         candidates: Name to a function that does some units of work and returns how many. A
             generator function prepares the work until its first ``yield``, does it until the
-            second one, which yields the units, and cleans up after that.
-        rounds: How many times each runs; one more round before is not counted.
-        clock: What tells the time; `time.process_time` where all work is this process's own.
+            second one, which yields the units, and cleans up afterwards.
+        rounds: Number of rounds; one more round before them is not counted.
+        clock: Tells the time; `time.process_time` if all work is done by this process.
     """
     measured: dict[str, list[float]] = {name: [] for name in candidates}
     for count in range(rounds + 1):
@@ -62,7 +62,7 @@ def report(
         unit: What was counted.
         measured: What `rates` returned.
         baseline: Name of the candidate that the others are compared with.
-        target: Least ratio of the candidates `of`.
+        target: Minimum ratio of the candidates `of`.
         of: Names of the candidates that the claim is about.
     """
     print(title)
@@ -85,7 +85,7 @@ def report(
 def claim(
     what: str, value: float, *, at_least: float | None = None, at_most: float | None = None
 ) -> bool:
-    """Print whether a value meets its target, and return it."""
+    """Print and return whether a value meets its target."""
     if at_least is not None:
         met, target = value >= at_least, f"at least {at_least:g}"
     else:

@@ -3,14 +3,14 @@
     python benchmarks/online.py --check
     python benchmarks/online.py --only overlap waits        # timings: these need a quiet machine
 
-overlap: one client simulates, with about the cost of a batch that its learner has. The training
-makes at least 0.92 times as many batches a second as the slower of the two makes alone.
-waits: neither waits for the other for more than 2 % of the time beyond what counts demand.
-memory: it does not grow while ten times as many rows come as a reservoir holds.
-repeated: with clients of any speed and one busy core a training ends with the same network, bit for
-bit, and so does one whose sampler learns.
-learned: a reservoir learns more from as many simulations than a stream, and as much as a training
-on stored samples, shuffled.
+overlap: one client simulates, at about the same cost per batch as the learner. The training makes
+at least 0.92 times as many batches per second as the slower of the two makes alone.
+waits: neither waits for the other for more than 2 % of the time beyond what the counts require.
+memory: it does not grow while ten times as many rows arrive as a reservoir holds.
+repeated: with clients of any speed and one busy core, trainings end with bit-identical networks,
+including those whose sampler learns.
+learned: from the same number of simulations, a reservoir learns more than a stream, and as much as
+a training on stored samples, shuffled.
 chosen: simulations where the loss is high make the largest errors smaller than random ones do.
 """
 
@@ -94,7 +94,7 @@ def common(folder: str) -> dict[str, Any]:
 
 
 def batches_per_second(pipeline: Pipeline) -> float:
-    """Return the batches per second of a pipeline, from when all is open."""
+    """Return the batches per second of a pipeline, timed once everything is open."""
     with pipeline:
         begin = time.perf_counter()
         pipeline.execute()
@@ -148,16 +148,16 @@ def waits() -> list[bool]:
 
 
 class Watched(Training):
-    """A training that notes how much memory this process has after each batch.
+    """A training that records the memory of this process after each batch.
 
-    It lets the clients run ahead as far as they may, so that as many rows wait for it each time.
-    The C library gives back what is freed, so that this is the memory in use.
+    It lets the clients run ahead as far as they may, so the same number of rows waits for it each
+    time. The C library returns what is freed, so this is the memory in use.
     """
 
     resident: list[float]
 
     def batch_end(self) -> None:
-        """Wait until the clients are ahead, and note the memory, in MiB."""
+        """Wait until the clients are ahead, and record the memory, in MiB."""
         super().batch_end()
         dataset, deadline = self.data.dataset, time.monotonic() + 10
         rows = min(self.batch_id + RUN_AHEAD, self.batch_nb or 0) * BATCH
@@ -168,11 +168,11 @@ class Watched(Training):
 
 
 CAPACITY, TIMES, RUN_AHEAD = 500, 10, 60
-MMAP_THRESHOLD, SMALL = -3, 2**16  # from which size on memory is mapped, and unmapped when freed
+MMAP_THRESHOLD, SMALL = -3, 2**16  # memory from this size on is mapped, and unmapped when freed
 
 
 def memory() -> list[bool]:
-    """Measure how the memory grows from when a reservoir is full until ten times as many rows."""
+    """Measure the growth of memory from a full reservoir until ten times as many rows."""
     ctypes.CDLL(None).mallopt(MMAP_THRESHOLD, SMALL)
     size = 2**13
     config = EnvironmentConfig(
@@ -241,10 +241,10 @@ def stored(problem: Problem, folder: str, name: str, seed: int, simulations: int
 
 
 class Examined(Training):
-    """A training that notes its losses for data that it has not seen, near its end.
+    """A training that records its losses on unseen data near its end.
 
-    With a constant learning rate the loss of a single network varies by a quarter from batch to
-    batch, so what a training has learned is the mean over the last tenth of its batches.
+    With a constant learning rate, the loss of a single network varies by a quarter from batch to
+    batch, so the result of a training is the mean over the last tenth of its batches.
     """
 
     unseen: Mapping[str, np.ndarray]
@@ -253,7 +253,7 @@ class Examined(Training):
     found: list[float]
 
     def batch_end(self) -> None:
-        """Note the mean squared error, ten times in all."""
+        """Record the mean squared error, ten times in all."""
         super().batch_end()
         self.batches -= 1
         every = max(1, self.total // 100)
@@ -263,7 +263,7 @@ class Examined(Training):
             self.found.append(float(np.mean((predicted - self.unseen[field]) ** 2)))
 
     def learn(self, unseen: Mapping[str, np.ndarray], batches: int) -> float:
-        """Train for so many batches, and return the mean of the losses."""
+        """Train for `batches` batches, and return the mean of the losses."""
         self.unseen, self.found = unseen, []
         self.total = self.batches = batches
         self.execute()
@@ -272,7 +272,7 @@ class Examined(Training):
 
 
 def losses(problem: Problem, folder: str, seed: int) -> list[float]:
-    """Return the losses of stream, reservoir, and offline training after as many simulations."""
+    """Return the losses of stream, reservoir and offline training with as many simulations."""
     seen = EnvironmentConfig(problem.environment, num_clients=2, seed=seed)
     with Dataset.open(stored(problem, folder, "validation", 10_000, 100)) as dataset:
         data = {name: view[:] for name, view in dataset["training"].items()}
@@ -349,7 +349,7 @@ def tail(sampler: str | None, folder: str, seed: int, data: Mapping[str, np.ndar
 
 
 def chosen() -> list[bool]:
-    """Compare simulations that the loss chooses with random ones."""
+    """Compare simulations chosen by the loss with random ones."""
     found = []
     for seed in SEEDS:
         with tempfile.TemporaryDirectory() as folder:
@@ -369,7 +369,7 @@ def chosen() -> list[bool]:
 
 @contextlib.contextmanager
 def busy_core() -> Iterator[None]:
-    """Have a process keep a processor core busy."""
+    """Keep a processor core busy with another process."""
     process = subprocess.Popen([sys.executable, "-c", "while True: pass"])
     try:
         yield
@@ -379,7 +379,7 @@ def busy_core() -> Iterator[None]:
 
 
 def parameters(sampler: str | None, *, is_late: bool, seed: int = 0) -> np.ndarray:
-    """Return the bytes of the parameters that a training ends with."""
+    """Return the bytes of a training's final parameters."""
     name = "Late" if is_late else "Resonance"
     with tempfile.TemporaryDirectory() as folder:
         training = resonance(f"online_problems:{name}", sampler, folder, seed, views=8)
@@ -390,7 +390,7 @@ def parameters(sampler: str | None, *, is_late: bool, seed: int = 0) -> np.ndarr
 
 
 def repeated() -> list[bool]:
-    """Count the bits in which the networks of equal trainings differ."""
+    """Count the bits in which the networks of identical trainings differ."""
     met = []
     for sampler in ("physx/uniform", "physx/active"):
         expected = parameters(sampler, is_late=False)

@@ -14,10 +14,10 @@ Vector = np.ndarray
 
 
 class Costly(Environment):
-    """A simulation whose step takes a given time of a processor."""
+    """A simulation whose step takes a given processor time."""
 
     def __init__(self, *, cost: float, **kwargs: Any) -> None:
-        """Note the cost of a step, in s."""
+        """Set the cost of a step, in s."""
         super().__init__(**kwargs)
         self._cost = cost
 
@@ -25,11 +25,11 @@ class Costly(Environment):
         """Create nothing."""
 
     def init_database(self) -> None:
-        """Define a field to read and one to predict."""
+        """Define an input and an output field."""
         self.define_training_fields([Field("input", shape=(8,)), Field("output", shape=(1,))])
 
     def step(self) -> None:
-        """Work."""
+        """Keep the processor busy, then set a sample."""
         until = time.perf_counter() + self._cost
         while time.perf_counter() < until:
             pass
@@ -38,10 +38,10 @@ class Costly(Environment):
 
 
 class Large(Environment):
-    """Samples of many numbers."""
+    """Samples with many numbers."""
 
     def __init__(self, *, size: int, **kwargs: Any) -> None:
-        """Note how many."""
+        """Set how many."""
         super().__init__(**kwargs)
         self._size = size
 
@@ -49,7 +49,7 @@ class Large(Environment):
         """Create nothing."""
 
     def init_database(self) -> None:
-        """Define a field to read and one to predict."""
+        """Define an input and an output field."""
         fields = [Field("input", (self._size,), "float32"), Field("output", (1,), "float32")]
         self.define_training_fields(fields)
 
@@ -60,13 +60,13 @@ class Large(Environment):
 
 
 class Lorenz(Environment):
-    """Trajectories of E. N. Lorenz's system, with random coefficients and beginnings.
+    """Trajectories of the Lorenz system, with random coefficients and initial states.
 
     A sample is a state with the coefficients, and the change of the state in 20 ms.
     """
 
     def create(self) -> None:
-        """Define coefficients and beginnings."""
+        """Define coefficients and initial states."""
         self.define_parameters(
             [
                 Parameter("coefficients", [8.0, 20.0, 2.0], [12.0, 35.0, 3.0], shape=(3,)),
@@ -75,15 +75,15 @@ class Lorenz(Environment):
         )
 
     def init_database(self) -> None:
-        """Define a field to read and one to predict."""
+        """Define an input and an output field."""
         self.define_training_fields([Field("input", shape=(6,)), Field("output", shape=(3,))])
 
     def reset_parameters(self, coefficients: Vector, begin: Vector) -> None:
-        """Begin a trajectory."""
+        """Start a trajectory."""
         self._coefficients, self._state, self._made = coefficients, begin, 0
 
     def step(self) -> None:
-        """Make a step of the classic Runge-Kutta method; after the last one begin another."""
+        """Make a step of the classic Runge-Kutta method; after the last one, start another."""
         if self._made == POINTS:
             self.new_episode()
         state, half = self._state, PERIOD / 2
@@ -101,27 +101,27 @@ class Lorenz(Environment):
 
 
 class Resonance(Environment):
-    """The response of a damped oscillator to a periodic force, one sample for each simulation.
+    """The response of a damped oscillator to a periodic force, one sample per simulation.
 
-    Around the resonance with little damping it is large and changes quickly: a small part of the
+    Near the resonance and with little damping, it is large and changes quickly: a small part of the
     range of parameters.
     """
 
     def create(self) -> None:
-        """Define frequency, in natural frequencies, and damping, of the critical one."""
+        """Define frequency, in natural frequencies, and damping, relative to critical damping."""
         self.define_parameters([Parameter("frequency", 0.2, 3.0), Parameter("damping", 0.03, 0.4)])
         self._is_new = True
 
     def init_database(self) -> None:
-        """Define a field to read and one to predict."""
+        """Define an input and an output field."""
         self.define_training_fields([Field("input", shape=(2,)), Field("output", shape=(2,))])
 
     def reset_parameters(self, frequency: float, damping: float) -> None:
-        """Note the parameters."""
+        """Store the parameters."""
         self._frequency, self._damping = frequency, damping
 
     def step(self) -> None:
-        """Compute the parts of the response in phase with the force, and a quarter behind."""
+        """Compute the parts of the response in phase with the force and a quarter period behind."""
         if not self._is_new:
             self.new_episode()
         self._is_new = False
@@ -131,15 +131,15 @@ class Resonance(Environment):
 
 
 class Late(Resonance):
-    """The same from simulations that take different times in every run."""
+    """The same problem, with simulations whose duration varies from run to run."""
 
     def create(self) -> None:
-        """Define the same parameters; nothing determines the times."""
+        """Define the same parameters, and unseeded delays."""
         super().create()
         self._delays = np.random.default_rng()
 
     def step(self) -> None:
-        """Dawdle now and then, then compute."""
+        """Wait now and then, then compute."""
         if self._delays.random() < 0.2:
             time.sleep(self._delays.exponential(0.01))
         super().step()

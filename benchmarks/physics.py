@@ -1,11 +1,11 @@
-"""Contacts and free motion of both engines against theory, and what a step of each solver takes.
+"""Contacts and free motion of both engines against theory, and the time of a step with each solver.
 
     python benchmarks/physics.py             # the figures of docs/contacts.md
     python benchmarks/physics.py --check     # exits with 1 if a default misses a target
 
-Errors are relative to Coulomb's law with the true normal force, in steps of 1 ms; those of
-thresholds are the middle of the interval in which they were found. Times are CPU times of a physics
-step, medians of runs in turn.
+Errors are relative to Coulomb's law with the true normal force, in steps of 1 ms; for thresholds,
+the middle of the bracketing interval counts. Times are CPU times of a physics step, medians of
+interleaved runs.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ GRAVITY = 9.81
 PAIRS = [(engine, solver) for engine, solvers in SOLVERS.items() for solver in solvers]
 ANGLES = (0, 15, 30, 45)
 FRICTION = 0.3
-"""Of the feet of the pushed A1."""
+"""Friction of the feet of the pushed A1."""
 STAND = np.tile([0.0, 0.8, -1.6], 4)
 
 _ROD = (
@@ -58,7 +58,7 @@ def build(engine: str, solver: str | None, *robots: Robot, **options: object) ->
 
 
 def slide(engine: str, solver: str | None, degrees: float) -> float:
-    """Return the relative error of the distance that a cube slides, started at 2 m/s."""
+    """Return the relative error of the distance that a cube slides from a speed of 2 m/s."""
     friction, speed = 0.5, 2.0
     cube = Box(name="cube", size=(0.2, 0.2, 0.2), position=(0, 0, 0.1), friction=friction)
     with build(engine, solver, objects=[cube]) as simulation:
@@ -95,13 +95,13 @@ def a_frame_stands(engine: str, solver: str | None, friction: float, degrees: fl
 
 
 def a_frame_theory(degrees: float = 50) -> float:
-    """Return the friction that an A-frame needs: from the moments about the hinge."""
+    """Return the friction that an A-frame needs, from the moments about the hinge."""
     angle = math.radians(degrees)
     return 0.5 * math.sin(angle) / (math.cos(angle) + FOOT)
 
 
 def a1_holds(engine: str, solver: str | None, ratio: float) -> bool:
-    """Return whether a standing A1 holds against a diagonal push by a ratio of its weight.
+    """Return whether a standing A1 withstands a diagonal push of `ratio` times its weight.
 
     The push grows for two seconds; then the robot has time to come to rest.
     """
@@ -143,7 +143,7 @@ def tumbling(engine: str, integrator: str) -> float:
 
 
 def threshold(holds: Callable[[float], bool], theory: float) -> float:
-    """Return the relative error of the value at which something begins or ceases to hold."""
+    """Return the relative error of the value at which something starts or ceases to hold."""
     low, high = 0.85, 1.15
     below = holds(theory * low)
     if holds(theory * high) == below:
@@ -160,7 +160,7 @@ def threshold(holds: Callable[[float], bool], theory: float) -> float:
 def ant(
     engine: str, solver: str | None, driven: bool, iterations: int | None = None
 ) -> tuple[Simulation, Callable[[], int]]:
-    """Return an ant, at rest or driven by random torques, and what steps it."""
+    """Return an ant, at rest or driven by random torques, and a function that steps it."""
     options = {"period": 6.25e-3, "iterations": iterations}
     simulation = build(engine, solver, Robot("ant", fixed_base=False), **options)
     q = simulation.positions()
@@ -178,7 +178,7 @@ def ant(
 
 
 def standing(engine: str, solver: str | None) -> tuple[Simulation, Callable[[], int]]:
-    """Return a standing A1, and what steps it."""
+    """Return a standing A1, and a function that steps it."""
     robot = Robot("a1/a1", "a1", fixed_base=False, position=(0, 0, 0.29))
     simulation = build(engine, solver, robot)
     q = simulation.positions()
@@ -194,7 +194,7 @@ def standing(engine: str, solver: str | None) -> tuple[Simulation, Callable[[], 
 
 
 def stack(engine: str, solver: str | None) -> tuple[Simulation, Callable[[], int]]:
-    """Return five boxes on each other, and what steps them."""
+    """Return a stack of five boxes, and a function that steps it."""
     boxes = [
         Box(name=f"box{i}", size=(0.2, 0.2, 0.2), position=(0, 0, 0.1 + 0.2 * i)) for i in range(5)
     ]
@@ -217,7 +217,7 @@ SCENES: dict[str, Callable[[str, str | None], tuple[Simulation, Callable[[], int
 
 
 def times() -> None:
-    """Print the CPU time of a step of each solver in each scene, in µs."""
+    """Print the CPU time of a step with each solver in each scene, in µs."""
     print(f"{'µs a step':22}" + "".join(f"{engine[:4] + ' ' + s:>16}" for engine, s in PAIRS))
     for name, scene in SCENES.items():
         made = {f"{engine} {solver}": scene(engine, solver) for engine, solver in PAIRS}
@@ -230,7 +230,7 @@ def times() -> None:
 
 
 def environments() -> float:
-    """Print the steps a second of Ant-v0 on both engines; return the ratio."""
+    """Print the steps per second of Ant-v0 on both engines; return the ratio."""
     candidates = {engine: _episodes(engine) for engine in SOLVERS}
     measured = rates(candidates, 5, time.process_time)
     report("physx/Ant-v0, random actions", "steps", measured, "dart", 0.0)
@@ -239,7 +239,7 @@ def environments() -> float:
 
 
 def _episodes(engine: str) -> Callable[[], int]:
-    """Return what makes some steps of an ant."""
+    """Return a function that makes some steps of an ant."""
     env = gymnasium.make("physx/Ant-v0", backend=engine, disable_env_checker=True).unwrapped
     random = np.random.default_rng(0)
 
@@ -263,7 +263,7 @@ def accuracy(engine: str, solver: str) -> dict[str, float]:
 
 
 def main() -> None:
-    """Print everything; with ``--check`` the defaults must meet their targets."""
+    """Print everything; with ``--check``, the defaults must meet their targets."""
     met = []
     errors = {pair: accuracy(*pair) for pair in PAIRS}
     print(f"{'relative error':22}" + "".join(f"{e[:4] + ' ' + s:>16}" for e, s in PAIRS))

@@ -1,9 +1,10 @@
 """A prediction in a running simulation against the network alone, in one process, one thread.
 
-The baseline turns one sample into a tensor, asks the network without a gradient tape, and turns
-its answer into an array. physx does a whole step of `Prediction` beside it: the environment's step
-with the checks of its sample, the prediction in physical units, and giving it to the environment;
-and `Environment.get_prediction`, which a step may call. The environment itself does nothing.
+The baseline turns one sample into a tensor, runs the network without gradients, and turns its
+output into an array. physx also does the rest of a step of `Prediction`: the environment's step
+with the checks of its sample, the prediction in physical units, and passing it to the environment.
+`Environment.get_prediction`, which a step may call, is measured as well. The environment itself
+does nothing.
 
 Claims: at most twice as long, at most 50 µs more.
 """
@@ -40,7 +41,7 @@ CASES = {
 
 
 class Still(Environment):
-    """Gives the same sample in each step, and does nothing with what is predicted."""
+    """Sets the same sample in each step, and ignores predictions."""
 
     latest: ClassVar[Still]
 
@@ -61,12 +62,12 @@ class Still(Environment):
         )
 
     def step(self) -> None:
-        """Give the sample."""
+        """Set the sample."""
         self.set_training_data(input=self.x, ground_truth=self.y)
 
 
 def durations(candidates: dict[str, Callable[[], object]]) -> dict[str, list[float]]:
-    """Return the median time of a call in µs, in each of some interleaved rounds."""
+    """Return the median time of a call in µs for each of several interleaved rounds."""
     measured: dict[str, list[float]] = {name: [] for name in candidates}
     for number in range(ROUNDS + 1):
         for name, call in candidates.items():
@@ -99,7 +100,7 @@ def report(title: str, measured: dict[str, list[float]], baseline: str) -> list[
 
 
 def trained(root: Path, layers: list[int], ins: tuple[int, ...], outs: tuple[int, ...]) -> None:
-    """Train a network for a moment, in the session ``training``."""
+    """Train a network briefly, in the session ``training``."""
     rng = np.random.default_rng(0)
     with Dataset.create(root / "data") as dataset:
         rows = {"input": rng.random((16, *ins)), "ground_truth": rng.random((16, *outs))}

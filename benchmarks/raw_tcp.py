@@ -1,4 +1,4 @@
-"""Raw TCP between two processes: what transport.py compares clients with."""
+"""Raw TCP between two processes: the baseline for the clients in transport.py."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ while connection.recv_into(number) == 8:
 
 @contextlib.contextmanager
 def raw_client(size: int, what: str, core: int | None = None) -> Iterator[socket.socket]:
-    """Return the connection to a process that sends so many messages as it is told.
+    """Yield the connection to a process that sends as many messages as it is told to.
 
     Args:
         size: Length of each message in bytes.
@@ -45,7 +45,7 @@ def raw_client(size: int, what: str, core: int | None = None) -> Iterator[socket
 
 
 def raw_answers(connection: socket.socket, size: int, count: int) -> int:
-    """Answer so many messages."""
+    """Answer `count` messages."""
     message, buffer = bytes(size), memoryview(bytearray(size))
     connection.sendall(count.to_bytes(8, "little"))
     for _ in range(count):
@@ -57,14 +57,14 @@ def raw_answers(connection: socket.socket, size: int, count: int) -> int:
 
 
 def raw_stream(connection: socket.socket, size: int, count: int) -> int:
-    """Read so many messages in blocks of 256 kB."""
+    """Read `count` messages in blocks of 256 kB."""
     for _ in raw_blocks(connection, size, count):
         pass
     return count
 
 
 def raw_blocks(connection: socket.socket, size: int, count: int) -> Iterator[memoryview]:
-    """Read so many messages; yield each block of at most 256 kB, valid until the next one."""
+    """Read `count` messages; yield each block of at most 256 kB, valid until the next one."""
     buffer, missing = memoryview(bytearray(1 << 18)), size * count
     connection.sendall(count.to_bytes(8, "little"))
     while missing:

@@ -1,7 +1,7 @@
-"""A vector environment over bare shared memory: what gym.py compares `gymnasium.make_vec` with.
+"""A vector environment over bare shared memory: gym.py's baseline for `gymnasium.make_vec`.
 
-It does what a step needs and nothing else: no checks, no infos, no faults, Box spaces alone, and
-whoever waits looks at a number again and again.
+It only does what a step needs: no checks, no infos, no handling of faults, Box spaces alone, and
+busy waiting.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ class Memory:
     Attributes:
         actions: Shape (environments, width of an action).
         results: Observation, reward, terminated and truncated of each environment.
-        counters: For this process and each other one, how many steps it has begun or done.
+        counters: For this process and each other one, the number of steps begun or done.
     """
 
     def __init__(self, block: SharedMemory, count: int, width: int, others: int) -> None:
@@ -37,7 +37,7 @@ class Memory:
 
 
 class RawVectorEnv:
-    """Environments that are stepped in processes."""
+    """Environments that are stepped in other processes."""
 
     def __init__(self, name: str, num_envs: int, processes: int) -> None:
         """Start the processes."""
@@ -78,7 +78,7 @@ class RawVectorEnv:
 
 
 def serve(name: str, block: SharedMemory, sizes: tuple[int, int, int], number: int) -> None:
-    """Step some environments until the end; an episode that is over begins again."""
+    """Step some environments until the end; an episode that is over is reset."""
     import physx_gym  # noqa: F401 - registers the environments
 
     memory = Memory(block, *sizes)

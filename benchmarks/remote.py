@@ -1,9 +1,9 @@
 """Environments in another process against raw sockets, and many worlds against single requests.
 
-Whatever is compared runs in turn, in one run. Starting processes does not count.
+Candidates run alternately, in one run. Starting processes is not timed.
 
     python benchmarks/remote.py
-    python benchmarks/remote.py --check     # ends with status 1 where a target is missed
+    python benchmarks/remote.py --check     # ends with status 1 if a target is missed
 """
 
 from __future__ import annotations
@@ -71,7 +71,7 @@ def place_of(line: str) -> tuple[str, int]:
 
 
 def raw_round_trip(port: int, request: bytes, answer: int) -> Callable[[], object]:
-    """Return what sends and receives the same bytes as godot-gym, and does nothing with them."""
+    """Return a function that exchanges the same bytes as godot-gym and ignores their content."""
     connection = socket.create_connection(("127.0.0.1", port))
     connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
 
@@ -85,9 +85,9 @@ def raw_round_trip(port: int, request: bytes, answer: int) -> Callable[[], objec
 
 
 def latency(ask: Callable[[], object]) -> float:
-    """Return how long one of many requests takes, in s: the median, whatever else the machine does.
+    """Return the median time of a request, in s.
 
-    A mean would tell as much about the programs that run beside this one.
+    A mean would also reflect the other programs on this machine.
     """
     moments = [time.perf_counter()]
     for _ in range(REQUESTS):
@@ -139,7 +139,7 @@ def godot_gym(steps: int, cores: list[int]) -> float:
 
 
 def _answer_size(client: GodotGymClient) -> int:
-    """Return how many bytes the server answers."""
+    """Return the size of the server's answer in bytes."""
     told = client.step(ACTION, WANTED)
     agent = told["agent"] or {}
     message = messages().Message(
@@ -150,11 +150,12 @@ def _answer_size(client: GodotGymClient) -> int:
 
 
 def all_godot_gym() -> bool:
-    """Measure godot-gym; the claim is about physics steps of 1 ms, and a core for each process.
+    """Measure godot-gym; the claim is about physics steps of 1 ms and one core per process.
 
-    Client and server work in turn. Where nothing else runs the kernel puts raw sockets on one core:
-    there a round trip takes 16 us, about as long as Python takes to read one request of JSON, fill
-    one message and read it. With few physics steps a frame that is most of what is measured.
+    Client and server work alternately. If nothing else runs, the kernel puts raw sockets on one
+    core: there, a round trip takes 16 us, about as long as Python takes to read one JSON request,
+    fill one message and read it. With few physics steps per frame, that is most of what is
+    measured.
     """
     cores = two_cores()
     for steps, where in ((FEW_STEPS, cores), (STEPS_OF_1_MS, [])):

@@ -1,4 +1,4 @@
-"""Servers for remote.py: a small scene on DART, and raw sockets that make the same physics."""
+"""Servers for remote.py: a small scene on DART, and raw sockets that run the same physics."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ def build(frame_steps: int) -> Simulation:
     """Return the robot of examples/13_remote_world.py on the ground, on DART.
 
     Args:
-        frame_steps: How many physics steps a frame of 1/60 s has.
+        frame_steps: Number of physics steps in a frame of 1/60 s.
     """
     joints = dict.fromkeys(WHEELS, JointSettings(mode="servo"))
     robot = Robot("wheeled_base", fixed_base=False, position=(0.0, 0.0, 0.15), joints=joints)
@@ -33,7 +33,7 @@ def build(frame_steps: int) -> Simulation:
 
 
 class Wheels(RLAgent):
-    """A robot on wheels; it tells its position and velocity, and some numbers more."""
+    """A robot on wheels that reports its position and velocity, padded with zeros."""
 
     def __init__(self, simulation: Simulation) -> None:
         self.simulation = simulation
@@ -48,7 +48,7 @@ class Wheels(RLAgent):
         self.simulation.set_commands(self.commands)
 
     def get_data(self, request: Any, storage: Any) -> None:
-        """Tell what there is, 16 + 16 numbers."""
+        """Report the state, 16 + 16 numbers."""
         layout = self.simulation.layout
         self.simulation.positions(self.positions[: layout.nq])
         self.simulation.velocities(self.velocities[: layout.nv])
@@ -56,10 +56,10 @@ class Wheels(RLAgent):
 
 
 class Room(RLEnvWorld):
-    """Tells that it is not over."""
+    """Reports that it is not over."""
 
     def get_data(self, request: Any, storage: Any) -> None:
-        """Tell that it is not over."""
+        """Report that it is not over."""
         fill(storage, done=False)
 
 
@@ -88,7 +88,7 @@ def messages() -> Messages:
 
 
 def main() -> None:
-    """Answer each request of so many bytes with so many bytes, after one frame of physics."""
+    """Answer each request of a given size with an answer of a given size, after a physics frame."""
     request, answer, steps = (int(word) for word in sys.argv[1:])
     simulation, reply = build(steps or 1), bytes(answer)
     Wheels(simulation).set_action(ACTION)

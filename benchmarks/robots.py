@@ -1,6 +1,6 @@
-"""Write the table docs/robots.md: every named robot, loaded, stepped and compared on all engines.
+"""Writes the table docs/robots.md: every named robot, loaded, stepped and compared on all engines.
 
-Each robot has a process of its own, so that a crash or an endless loop would be seen.
+Each robot runs in its own process, so a crash or an endless loop would be noticed.
 
     pip install ./examples/mujoco_engine
     python benchmarks/robots.py
@@ -47,7 +47,7 @@ With meshes as *collisions*, `Robot(collisions="boxes")` or `"capsules"` is many
 
 
 def measure(name: str) -> dict[str, object]:
-    """Return what the engines do with a robot; it floats if its root link has a mass."""
+    """Measure a robot on all engines; it floats if its root link has a mass."""
     model = read_robot(Robot(name))
     mass = ElementTree.fromstring(model.text).find("link/inertial/mass")
     floats = mass is not None and float(mass.get("value", "0")) > NEGLIGIBLE
@@ -87,7 +87,7 @@ def _steps(simulation: Simulation) -> str:
 
 
 def row(info: RobotInfo) -> str:
-    """Return a robot's line of the table, measured in a process of its own."""
+    """Return a robot's line of the table, measured in its own process."""
     command = [sys.executable, __file__, info.name]
     try:
         done = subprocess.run(command, capture_output=True, text=True, timeout=TIMEOUT)
@@ -119,7 +119,7 @@ def main() -> None:
         print(json.dumps(found))
         return
     for engine in ENGINES:
-        plugins.resolve("backend", engine)  # else the page would say of every robot that it fails
+        plugins.resolve("backend", engine)  # else the page would report every robot as failing
     rows = []
     with ThreadPoolExecutor(2) as pool:
         for line in pool.map(row, plugins.resolve("backend", "pinocchio").robots()):

@@ -1,9 +1,9 @@
 """Training against the same network in a plain torch loop over tensors in RAM, one thread.
 
 Claim: physx, which reads its batches from the stored dataset, normalization aside, trains at least
-0.9 times as many batches a second; and with statistics to CSV and TensorBoard at least 0.9 times as
-many as without any. What the plain loop does not do, and physx does before each step, is to look
-whether the gradients are finite; `on_nan="continue"` leaves it out, and is printed beside.
+0.9 times as many batches per second; and with statistics to CSV and TensorBoard, at least 0.9 times
+as many as without. Before each step, physx also checks that the gradients are finite, which the
+plain loop does not; a run without this check (`on_nan="continue"`) is printed for comparison.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def plain_loop(layers: list[int], x: np.ndarray, y: np.ndarray, batches: int) ->
 
 
 def epochs(training: Training) -> Callable[[], int]:
-    """Return a round of training with physx: an epoch of a pipeline that is open."""
+    """Return a round of training with physx: an epoch of an open pipeline."""
 
     def epoch() -> int:
         training.epoch_begin()
@@ -72,7 +72,7 @@ def epochs(training: Training) -> Callable[[], int]:
 
 
 def with_and_without_statistics(title: str, training: Callable[..., Training]) -> bool:
-    """Measure what it costs to write all numbers to CSV and TensorBoard; return if it is little."""
+    """Measure the cost of writing all numbers to CSV and TensorBoard; return if it is small."""
     with training() as silent, training(statistics="torch/tensorboard") as told:
         silent.observers.close()
         silent.observers = Observers([ProgressBar()])

@@ -1,11 +1,11 @@
-"""Clients over TCP against raw sockets, bare loops and interpreters: every claim of their speed.
+"""Clients over TCP against raw sockets, bare loops and interpreters: all claims about their speed.
 
-Samples of 48 B hold 6 numbers, samples of 48 kB hold 6000, of float64 in two fields. What runs in
-turn with its baseline does as much in each round; clients are started anew for each round wherever
-they run ahead, so that none of their work is done in another's time. Starting them does not count
-but in the line that is about it.
+Samples of 48 B hold 6 numbers, samples of 48 kB hold 6000, as float64 in two fields. Candidates run
+alternately with their baseline and do the same amount of work in each round; clients that run ahead
+are restarted for each round, so none of their work is done in another candidate's time. Starting
+them is timed only in the line about it.
 
-``--costs [PAGE]`` prints what clients and rows cost, and nothing else: the table of docs/scale.md.
+``--costs [PAGE]`` prints only what clients and rows cost: the table in docs/scale.md.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ Work = Callable[[], int | Iterator[int]]
 
 
 def times_as_long(measured: dict[str, list[float]], name: str, baseline: str) -> float:
-    """Print how long each candidate takes; return how many times as long as another one does."""
+    """Print each candidate's time; return how many times as long `name` takes as `baseline`."""
     for candidate, each in measured.items():
         print(f"  {candidate:28} {1e6 / statistics.median(each):12,.1f} µs")
     pairs = zip(measured[name], measured[baseline], strict=True)
@@ -65,7 +65,7 @@ def times_as_long(measured: dict[str, list[float]], name: str, baseline: str) ->
 
 
 def unchanged(batch: Batch) -> Batch:
-    """Return what a network that does nothing predicts."""
+    """Return the prediction of a network that does nothing."""
     return batch
 
 
@@ -73,7 +73,7 @@ def predictions_over_tcp(root: Path, title: str, cores: list[int]) -> float:
     """Compare `get_prediction` of a client with a raw ping-pong of the same bytes.
 
     Args:
-        root: Folder for what is written.
+        root: Folder for output.
         title: Size of a sample.
         cores: Processor cores of this process and of the clients, one each; empty: any.
 
@@ -106,10 +106,10 @@ def predictions_over_tcp(root: Path, title: str, cores: list[int]) -> float:
 
 
 def all_predictions_over_tcp(root: Path) -> list[bool]:
-    """Compare both sizes of samples; on cores of their own, where the claim is about.
+    """Compare both sizes of samples; the claim is about processes on separate cores.
 
-    In a run server and clients work at the same time and so on different cores. Where nothing else
-    runs the kernel puts both ends of a ping-pong on one core instead: there a message takes just
+    In a run, server and clients work at the same time, and so on different cores. If nothing else
+    runs, the kernel instead puts both ends of a ping-pong on one core: there, a message takes only
     8 µs, about as long as Python takes to call its functions a hundred times.
     """
     met = []
@@ -169,7 +169,7 @@ def generation(
     clients: int,
     dataset: DatasetConfig | None = None,
 ) -> Iterator[int]:
-    """Make and store so many rows with clients that are started before the time is taken."""
+    """Generate and store rows with clients that are started before the timing begins."""
     pipeline = DataGeneration(
         EnvironmentConfig(environment, env_kwargs=arguments, num_clients=clients, seed=0),
         dataset,
@@ -221,12 +221,12 @@ def generation_small(root: Path) -> bool:
 
 
 def generation_large(root: Path) -> bool:
-    """Compare streaming of large samples to disk with a raw stream that nobody keeps.
+    """Compare streaming large samples to disk with a raw stream that is discarded.
 
-    What the raw stream reaches when it is written to a plain file as it arrives is printed beside
-    the claim. It depends on where the memory of the system's cache comes from: writing to memory
-    that was in use a moment ago is twice as fast as the raw stream, but a virtual machine may have
-    to ask its host for each page, and then it is ten times as slow.
+    The rate of the raw stream when it is written to a plain file as it arrives is printed with the
+    claim. It depends on where the memory of the system's cache comes from: writing to memory that
+    was in use a moment ago is twice as fast as the raw stream, but a virtual machine may have to
+    ask its host for each page, and then it is ten times as slow.
     """
     values, rows = SIZES["48 kB"], 2000
     small = DatasetConfig(max_file_size=0.05)
@@ -264,7 +264,7 @@ def generation_large(root: Path) -> bool:
 
 
 def stream_to_file(connection: socket.socket, path: Path, size: int, count: int) -> Iterator[int]:
-    """Write so many messages to a file as they arrive, in a space that was reserved before."""
+    """Write `count` messages to a file as they arrive, into preallocated space."""
     descriptor = os.open(path, os.O_RDWR | os.O_CREAT)
     yield 0
     os.posix_fallocate(descriptor, 0, size * count)
@@ -277,10 +277,10 @@ def stream_to_file(connection: socket.socket, path: Path, size: int, count: int)
 
 
 def generation_working(root: Path, milliseconds: float, target: float) -> bool:
-    """Compare a client whose steps compute for a while with the computing alone.
+    """Compare a client whose steps compute for a while with the computation alone.
 
-    Both take turns in the client, every 20 ms: other work on the machine changes how fast it
-    computes by more than what is measured here, so they must not be far apart.
+    Both alternate in the client, every 20 ms: other load on the machine changes its speed by more
+    than what is measured here, so they must be close in time.
     """
     units, seconds = 20_000, []
     for _ in range(9):
@@ -314,8 +314,8 @@ def generation_working(root: Path, milliseconds: float, target: float) -> bool:
 def generation_by_clients(root: Path) -> bool:
     """Compare large samples that pass through the server with those that clients write themselves.
 
-    On one machine both end on the same disk; what the server spends on a sample is what bounds how
-    many clients it can have.
+    On one machine, both end up on the same disk; the server's time per sample limits how many
+    clients it can have.
     """
     values, rows = 60_000, 480
 
@@ -352,10 +352,10 @@ def generation_sleeping(root: Path) -> bool:
 
 
 def setting_up(root: Path) -> bool:
-    """Compare 8 clients until their first samples with 8 interpreters that import NumPy."""
+    """Compare 8 clients, up to their first samples, with 8 interpreters that import NumPy."""
 
     def interpreters() -> int:
-        # In sessions of their own, as clients are: the kernel shares processors among sessions.
+        # In separate sessions, like clients: the kernel shares processors among sessions.
         command = [sys.executable, "-c", "import numpy"]
         started = [subprocess.Popen(command, start_new_session=True) for _ in range(8)]
         for process in started:
@@ -377,7 +377,7 @@ def setting_up(root: Path) -> bool:
 
 
 def server_time(root: Path) -> None:
-    """Print the processor time that the server takes for each sample."""
+    """Print the processor time of the server per sample."""
     rows = 200_000
 
     def of(clients: int) -> Work:

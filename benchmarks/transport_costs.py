@@ -1,9 +1,9 @@
-"""What clients and rows cost a run: the table of docs/scale.md, by `transport.py --costs`.
+"""The cost of clients and rows for a run: the table in docs/scale.md, by `transport.py --costs`.
 
 A server is measured with clients that simulate nothing, all in one other process
-(`many_clients.py`). What counts is the processor time of the server's process; costs for each
-client and each frame are differences between two runs, so that what is spent once cancels.
-Encrypted connections use an address of this machine that is not a loopback one.
+(`many_clients.py`). The measure is the processor time of the server's process; costs per client and
+per frame are differences between two runs, so one-time costs cancel. Encrypted connections use an
+address of this machine that is not a loopback one.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Row = tuple[str, str, str]
 
 
 def outside_address() -> str | None:
-    """Return an address of this machine that is not a loopback one, if it has any."""
+    """Return an address of this machine that is not a loopback one, if there is one."""
     with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as probe:
         try:
             probe.connect(("192.0.2.200", 9))  # sends nothing
@@ -55,7 +55,7 @@ def memory() -> float:
 
 
 def _kilobytes(process: int | str) -> float:
-    """Return the memory of a process in kB, its part of what it shares."""
+    """Return the memory of a process in kB, with its part of shared memory."""
     text = Path(f"/proc/{process}/smaps_rollup").read_text(encoding="ascii")
     return float(text.partition("\nPss:")[2].split()[0])
 
@@ -64,7 +64,7 @@ def _kilobytes(process: int | str) -> float:
 def served(
     root: Path, address: str, clients: int, values: int, rows: int, total: int | None = None
 ) -> Iterator[ClientSource]:
-    """Return the source of so many clients, which is not open yet, and of so many rows in all."""
+    """Yield the source of some clients, not open yet, which send `total` rows in all."""
     with socket.create_server((address, 0)) as free:
         port = free.getsockname()[1]
     config = EnvironmentConfig(
@@ -80,12 +80,12 @@ def served(
     finally:
         process.kill()
         process.wait()
-        with contextlib.suppress(Exception):  # its clients do not say goodbye
+        with contextlib.suppress(Exception):  # its clients do not sign off
             source.close()
 
 
 def joining(root: Path, address: str, clients: int) -> tuple[float, float, float]:
-    """Return processor time in s and memory in kB of so many clients, and the time of a look."""
+    """Return processor time in s and memory in kB of joining clients, and the s of a poll."""
     with served(root, address, clients, SMALL, 1) as source:
         before, began = memory(), time.process_time()
         source.open()
@@ -98,7 +98,7 @@ def joining(root: Path, address: str, clients: int) -> tuple[float, float, float
 
 
 def joining_alone(address: str, clients: int) -> list[float]:
-    """Return what `joining` does, in a new process, whose memory holds nothing else."""
+    """Run `joining` in a new process, whose memory holds nothing else."""
     words = [sys.executable, str(Path(__file__)), address, str(clients)]
     done = subprocess.run(words, stdout=subprocess.PIPE, check=True)
     found: list[float] = json.loads(done.stdout)
@@ -108,7 +108,7 @@ def joining_alone(address: str, clients: int) -> list[float]:
 def receiving(
     root: Path, address: str, clients: int, values: int, rows: int, total: int
 ) -> tuple[float, float]:
-    """Return the processor time in s of receiving each row, and of storing it."""
+    """Return the processor time in s of receiving a row, and of storing it."""
     size = min(total // 5, 10_000)
     receive = store = 0.0
     with (
@@ -129,7 +129,7 @@ def receiving(
 
 
 def asking(root: Path, address: str) -> float:
-    """Return how long a prediction takes in s, in the quickest of several rounds."""
+    """Return the time of a prediction in s, in the fastest of several rounds."""
     count = 300
     services = RunServices(root, Observers([]), lambda batch: batch)
     arguments = {"values": SMALL, "asks": count}
@@ -158,9 +158,9 @@ def processes(root: Path) -> tuple[float, float]:
 
 
 def partitions(root: Path) -> tuple[float, list[tuple[int, float]]]:
-    """Return the bytes of a partition in the manifest, and how long a new one takes in s.
+    """Return a partition's bytes in the manifest, and the time of a new one in s.
 
-    The latter for two numbers of partitions that there are already.
+    The latter for two numbers of existing partitions.
     """
     folder, block = root / "partitions", {"x": np.zeros((680, 5)), "y": np.zeros((680, 1))}
     seen: list[tuple[int, int, float]] = [(0, 0, 0.0)]
@@ -181,7 +181,7 @@ def partitions(root: Path) -> tuple[float, list[tuple[int, float]]]:
 
 
 def costs(root: Path) -> list[Row]:
-    """Measure everything; return what, plain and encrypted."""
+    """Measure everything; return names with plain and encrypted costs."""
     os.environ.setdefault("PHYSX_TOKEN", secrets.token_hex(32))
     _be_quiet()
     outside = outside_address()
@@ -194,19 +194,17 @@ def costs(root: Path) -> list[Row]:
     rows = [(name, columns[0][name], columns[1][name]) for name in columns[0]]
     started, used = processes(root)
     entry, grown = partitions(root)
-    rows.append(
-        ("client process: processor time from start to end", f"{started:.2f} s", "the same")
-    )
+    rows.append(("client process: CPU time from start to end", f"{started:.2f} s", "the same"))
     rows.append(("client process: memory", f"{used:.0f} MB", "the same"))
-    rows.append(("manifest: bytes a partition of 2 fields", f"{entry:.0f} B", "the same"))
+    rows.append(("manifest: size per partition of 2 fields", f"{entry:.0f} B", "the same"))
     for count, seconds in grown:
-        name = f"writer: processor time of a new partition after {count} others"
+        name = f"writer: CPU time of a new partition after {count} others"
         rows.append((name, f"{1e3 * seconds:.1f} ms", "the same"))
     return rows
 
 
 def _be_quiet() -> None:
-    """Have runs not say that they wait for clients."""
+    """Suppress the message that a run waits for clients."""
     logging.getLogger("physx").setLevel(logging.ERROR)
 
 
@@ -219,23 +217,23 @@ def _column(root: Path, address: str) -> dict[str, str]:
     large, stored = receiving(root, address, 2, LARGE, 2, 2000)
     megabytes = 8e-6 * LARGE
     return {
-        "server: processor time of a client that joins": f"{1e3 * join:.2f} ms",
+        "server: CPU time of a client that joins": f"{1e3 * join:.2f} ms",
         "server: memory of an idle client": f"{kept:.0f} kB",
-        "server: processor time of a look for events, more for each idle client": (
+        "server: CPU time of polling for events, added by each idle client": (
             f"{1e6 * max(look, 0):.2f} µs"
         ),
         "server: a frame of one row of 48 B, 8 clients": f"{1e6 * single:.0f} µs",
         f"server: a frame of one row of 48 B, {MANY} clients": f"{1e6 * crowd:.0f} µs",
         "server: a row of 48 B, 1000 in a frame": f"{1e6 * block:.2f} µs",
         "server: storing a row of 48 B": f"{1e6 * store:.2f} µs",
-        "server: receiving rows of 48 kB, a MB": f"{1e3 * large / megabytes:.2f} ms",
-        "server: storing rows of 48 kB, a MB": f"{1e3 * stored / megabytes:.2f} ms",
-        "a prediction of one client, there and back": f"{1e6 * asking(root, address):.0f} µs",
+        "server: receiving rows of 48 kB, per MB": f"{1e3 * large / megabytes:.2f} ms",
+        "server: storing rows of 48 kB, per MB": f"{1e3 * stored / megabytes:.2f} ms",
+        "a prediction for one client, round trip": f"{1e6 * asking(root, address):.0f} µs",
     }
 
 
 def print_costs(root: Path, page: Path | None) -> None:
-    """Print the table, and put it into a page."""
+    """Print the table, and write it into a page if one is given."""
     lines = ["| | plain | encrypted |", "|---|---|---|"]
     lines += [f"| {what} | {plain} | {encrypted} |" for what, plain, encrypted in costs(root)]
     print("\n".join(lines))

@@ -1,4 +1,4 @@
-"""The environments of transport.py, in a file of their own that clients import quickly."""
+"""The environments of transport.py, in a separate file that clients import quickly."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from physx_core import Environment, Field
 
 
 class Rows(Environment):
-    """Gives the same two arrays in each step: as fast as samples can be."""
+    """Sets the same two arrays in each step: the fastest possible samples."""
 
     def __init__(self, *, values: int, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -27,12 +27,12 @@ class Rows(Environment):
         self.define_training_fields([Field("x", self.x.shape), Field("y", self.y.shape)])
 
     def step(self) -> None:
-        """Give the arrays."""
+        """Set the arrays."""
         self.set_training_data(x=self.x, y=self.y)
 
 
 class Asking(Rows):
-    """Asks for many predictions in each step, on a processor core of its own if it gets one."""
+    """Asks for many predictions in each step, on its own processor core if it gets one."""
 
     def __init__(self, *, asks: int, core: int | None = None, **kwargs: Any) -> None:
         super().__init__(**kwargs)
@@ -41,7 +41,7 @@ class Asking(Rows):
             os.sched_setaffinity(0, {core})
 
     def step(self) -> None:
-        """Ask, and then give the arrays."""
+        """Ask, and then set the arrays."""
         for _ in range(self.asks):
             self.get_prediction(x=self.x, y=self.y)
         super().step()
@@ -50,7 +50,7 @@ class Asking(Rows):
 class Working(Rows):
     """Computes for a while in each step, and now and then for as long as many steps take.
 
-    The arrays begin with when a step began to compute, and when it ended, in s.
+    The arrays start with the times, in s, when a step began to compute and when it ended.
     """
 
     def __init__(self, *, work: int, block: int, **kwargs: Any) -> None:
@@ -58,7 +58,7 @@ class Working(Rows):
         self.work, self.block, self.steps = work, block, 0
 
     def step(self) -> None:
-        """Compute, in the first step and after each `block` further ones for `block` steps."""
+        """Compute; in the first step and after every `block` further ones, for `block` steps."""
         count = 1 if self.steps % (self.block + 1) else self.block
         self.steps += 1
         self.x[0] = time.perf_counter()
@@ -76,13 +76,13 @@ class Sleeping(Rows):
         self.seconds = seconds
 
     def step(self) -> None:
-        """Sleep, and then give the arrays."""
+        """Sleep, and then set the arrays."""
         time.sleep(self.seconds)
         super().step()
 
 
 def compute(work: int) -> float:
-    """Do so many units of work that need nothing but the processor."""
+    """Do some units of work that need nothing but the processor."""
     value = 0.5
     for _ in range(work):
         value = math.cos(value)

@@ -1,10 +1,10 @@
-"""What it costs to see: drawing in every step, into a file and to a viewer that hangs.
+"""The cost of visualization: drawing in every step, to a file and to a viewer that hangs.
 
 An empty environment moves 20 boxes and sets 10 scalars in every step, as a data generation in this
-process does. The time of its loop without a factory is subtracted. A frozen viewer is a real one,
+process does. The time of its loop without a factory is subtracted. The frozen viewer is a real one,
 stopped before the first row arrives. The recording's size is compared with that of its numbers: 7
-of 32 bits for each body and 64 bits for each scalar. The bodies slide and turn on a plane; for
-comparison, the size is printed for bodies whose numbers are all random, too.
+numbers of 32 bits per body and 64 bits per scalar. The bodies slide and turn on a plane; for
+comparison, the size is also printed for bodies whose numbers are all random.
 """
 
 from __future__ import annotations
@@ -28,8 +28,8 @@ from physx_rerun.visualizer import RerunVisualizer
 
 BODIES, SCALARS = 20, 10
 STEPS, ROUNDS = 2000, 9
-SIZED = 20_000  # steps of the recording whose size counts
-RAW = BODIES * 7 * 4 + SCALARS * 8  # bytes of a step
+SIZED = 20_000  # steps of the recording whose size is measured
+RAW = BODIES * 7 * 4 + SCALARS * 8  # bytes per step
 
 NAMES = [f"box {number}" for number in range(BODIES)]
 
@@ -87,7 +87,7 @@ class Scene:
         self.step = 0
 
     def run(self, draw: Callable[..., None], steps: int) -> float:
-        """Draw steps, and return the time that each added in ms."""
+        """Draw steps, and return the time that each adds, in ms."""
         begin = time.perf_counter()
         for _ in range(steps):
             draw(self.factory, *self.moves[self.step % len(self.moves)])
@@ -101,7 +101,7 @@ class Scene:
 
 
 def to_a_file(folder: Path) -> list[bool]:
-    """Measure drawing into a file."""
+    """Measure drawing to a file."""
     scene = Scene(folder)
     times: dict[str, list[float]] = {"one by one": [], "update_many": []}
     for number in range(ROUNDS + 1):
@@ -123,7 +123,7 @@ def to_a_file(folder: Path) -> list[bool]:
 
 
 def with_a_frozen_viewer(folder: Path) -> list[bool]:
-    """Measure drawing into a file and to a viewer that hangs all the time."""
+    """Measure drawing to a file and to a viewer that hangs all the time."""
     viewer = Viewer(0, ("--save", str(folder / "received.rrd")))
     viewer.wait_until_ready()
     scene = Scene(folder, mode="connect", address=viewer.address)

@@ -1,9 +1,10 @@
-"""A part of `viewer.py`: pictures of a robot without a graphics card, and replays of samples.
+"""Part of `viewer.py`: pictures of a robot without a graphics card, and replays of samples.
 
-Pictures of the quadruped, 640 x 480, are rendered with its meshes without small details, and as
-they are, in turn, each frame after a step. The driver's own time is that of a picture of a scene in
-which nothing changed. The replay is a command of its own, start-up included; in turn with it runs a
-bare program that reads the same points with h5py and logs them one by one with Rerun.
+Pictures of the quadruped, 640 x 480, are rendered alternately with simplified meshes, which lack
+small details, and with the original ones, each frame after a step. The driver's own time is that of
+a picture of a scene in which nothing changed. The replay is a separate command, startup included;
+it alternates with a bare program that reads the same points with h5py and logs them one by one with
+Rerun.
 """
 
 from __future__ import annotations
@@ -46,7 +47,7 @@ class Cloud(Environment):
         """Nothing is simulated."""
 
     def init_database(self) -> None:
-        """Store the points."""
+        """Define the points."""
         self.define_training_fields([("points", np.ndarray)])
 
     def init_visualization(self) -> None:
@@ -83,7 +84,7 @@ class Film:
         return FRAMES / (time.perf_counter() - begin)
 
     def driver(self) -> float:
-        """Return the time of a picture of what is drawn already, in s."""
+        """Return the time of a picture of an unchanged scene, in s."""
         offscreen = self.env._own_renderer._viewer._offscreen
         scene = offscreen._camera.wait_for_position("picture", 0)
         begin = time.perf_counter()

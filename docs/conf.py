@@ -1,4 +1,4 @@
-"""Settings of the site that ``make docs`` builds, offline, from the pages of the repository."""
+"""Sphinx settings for the site that ``make docs`` builds, offline, from the repository's pages."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ include_patterns = [
 exclude_patterns = ["docs/_build", ".venv", "sessions", "tests", "physx_*/src"]
 myst_heading_anchors = 4
 default_role = "code"
-nitpicky = False  # annotations name types of libraries whose pages are not here
+nitpicky = False  # annotations name types of libraries whose pages are not included
 
 html_theme = "furo"
 html_title = "physx"
@@ -42,7 +42,7 @@ napoleon_use_ivar = True
 
 
 class FaceDirective(SphinxDirective):
-    """``.. face:: MODULE``: what a module is for, and the names that it is the first to offer."""
+    """``.. face:: MODULE``: a module's purpose, and the names that it is the first to offer."""
 
     required_arguments = 1
 
@@ -55,7 +55,7 @@ class FaceDirective(SphinxDirective):
 def escape(
     app: Sphinx, what: str, name: str, obj: object, options: object, lines: list[str]
 ) -> None:
-    """Prepare the lines of a docstring."""
+    """Escape the lines of a docstring."""
     lines[:] = map(public_names.escaped, lines)
 
 

@@ -1,12 +1,12 @@
 """Runs examples in full, keeps their output and pictures, and shows them in docs/gallery.md.
 
 python docs/gallery.py NAME ...    # runs examples/NAME, such as 02_train: minutes
-python docs/gallery.py             # writes the page from what is kept in docs/examples/
+python docs/gallery.py             # writes the page from the output kept in docs/examples/
 
-A page's section is made of the beginning of the example: the docstring of a script, the comment of
-a TOML file, the README of a folder as far as its first table. A script draws the picture
-(``--picture``), a film if its docstring says ``--picture NAME.webp``; other examples leave it where
-their commands are run.
+An example's section is built from its beginning: the docstring of a script, the comment of a TOML
+file, or the README of a folder up to its first table. A script draws the picture (``--picture``),
+as a film if its docstring says ``--picture NAME.webp``; other examples leave it where their
+commands are run.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from PIL import Image
 
 HERE = Path(__file__).resolve().parent
 EXAMPLES = HERE.parent / "examples"
-GREATEST = 150_000  # size of a picture in bytes with as many colors as it likes
+GREATEST = 150_000  # bytes; larger pictures are reduced to 256 colors
 TEST = "<!-- tested by tests/examples/test_all.py -->"
 
 
@@ -34,14 +34,14 @@ def path_of(name: str) -> Path:
 
 
 def names() -> list[str]:
-    """Return the names of all examples: the numbered ones in their order, then the others."""
+    """Return the names of all examples: the numbered ones in order, then the others."""
     numbered = {path.stem for path in EXAMPLES.glob("[0-9][0-9]_*")}
     others = {path.parent.name for path in EXAMPLES.glob("*/README.md")}
     return sorted(numbered) + sorted(others - numbered)
 
 
 def beginning(name: str) -> str:
-    """Return what an example says of itself: its title, text and commands, as in a docstring."""
+    """Return an example's introduction: its title, text and commands, as in a docstring."""
     path = path_of(name)
     if path.is_dir():
         told = (path / "README.md").read_text(encoding="utf-8").partition("\n|")[0]
@@ -54,7 +54,7 @@ def beginning(name: str) -> str:
 
 
 def commands(name: str) -> str:
-    """Return the commands that an example says of itself, for a shell."""
+    """Return the shell commands in an example's introduction."""
     told = beginning(name)
     if path_of(name).is_dir():
         return "\n".join(re.findall(r"^```sh\n(.*?)^```", told, re.MULTILINE | re.DOTALL))
@@ -96,7 +96,7 @@ def draw(name: str, drawn: Path) -> int:
 
 
 def section(name: str) -> str:
-    """Return what the page says of an example."""
+    """Return an example's section of the page."""
     title, _, told = beginning(name).partition("\n")
     path, drawn = path_of(name), picture(name)
     place = f"../examples/{path.name}" + ("/README.md" if path.is_dir() else "")

@@ -1,4 +1,4 @@
-"""What the pages of figures and examples share: runs whose output is kept, and shown on a page."""
+"""Shared code of the pages of figures and examples: runs whose output is kept and shown."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from pathlib import Path
 
 
 def markdown(told: str, fence: str) -> str:
-    """Return a docstring as Markdown: what begins a block of its indented parts is given."""
+    """Return a docstring as Markdown, its indented parts as blocks that begin with `fence`."""
     parts = told.split("\n\n")
     for place, part in enumerate(parts):
         if part.startswith("    "):
@@ -25,14 +25,14 @@ def markdown(told: str, fence: str) -> str:
 
 @dataclass(frozen=True)
 class Page:
-    """A page whose end shows programs, and what each printed when it was last run.
+    """A page that ends with programs and the output of their last runs.
 
     Attributes:
-        path: The page. What stands before its mark is written by hand.
-        kept: Folder of the output, one text file for each program.
+        path: The page. Everything before its mark is written by hand.
+        kept: Folder of the output, one text file per program.
         names: Returns the names of all programs.
-        run: Runs a program and returns its exit status; what it prints goes through `keep`.
-        section: Returns what the page says of a program.
+        run: Runs a program and returns its exit status; its output goes through `keep`.
+        section: Returns a program's section of the page.
     """
 
     path: Path
@@ -43,11 +43,11 @@ class Page:
 
     @property
     def mark(self) -> str:
-        """The line before what is not written by hand."""
+        """The line after which nothing is written by hand."""
         return f"<!-- What follows is written by {self.path.stem}.py. -->"
 
     def text(self) -> str:
-        """Return what the page has to be, its written part as it is."""
+        """Return the page as it should be, with its hand-written part unchanged."""
         written = self.path.read_text(encoding="utf-8").partition(self.mark)[0]
         return "\n".join([f"{written}{self.mark}\n", *map(self.section, self.names())])
 
@@ -66,7 +66,7 @@ class Page:
         return done.returncode
 
     def printed(self, name: str) -> str:
-        """Return a block of what is kept of a program."""
+        """Return a block with a program's kept output."""
         kept = self.kept / f"{name}.txt"
         told = kept.read_text(encoding="utf-8") if kept.is_file() else "No run is kept.\n"
         return f"```text\n{told}```\n"

@@ -1,6 +1,6 @@
-"""Draws the pictures of the documentation that show environments and examples.
+"""Draws the documentation's pictures of environments and examples.
 
-python docs/pictures.py    # writes environments.png, replay.png, examples.png beside this file
+python docs/pictures.py    # writes environments.png, replay.png, examples.png next to this file
 python docs/pictures.py --demo PICTURE    # compares a picture of the demo with its kept film
 """
 
@@ -33,7 +33,7 @@ FEET = ("FR_foot", "FL_foot", "RR_foot", "RL_foot")
 
 
 def moved(name: str, steps: int, **options: Any) -> Any:
-    """Return an environment in evaluation mode after some steps of a swinging action."""
+    """Return an environment in evaluation mode after some steps of an oscillating action."""
     env: Any = gymnasium.make(f"physx/{name}-v0", **options).unwrapped
     env.eval()
     env.reset(seed=3)
@@ -68,7 +68,7 @@ def environments(path: Path, size: tuple[int, int] = (320, 240)) -> None:
 
 
 def replay(path: Path, size: tuple[int, int] = (1500, 800)) -> None:
-    """Draw the replay of a quadruped: its signals, contacts, a foot's way, and another motion."""
+    """Draw the replay of a quadruped: its signals, contacts, a foot's path, and another motion."""
     with tempfile.TemporaryDirectory() as folder:
         logs = []
         for steps in (40, 25):
@@ -82,7 +82,7 @@ def replay(path: Path, size: tuple[int, int] = (1500, 800)) -> None:
 
 
 def load(name: str) -> Any:
-    """Return a script of the examples as a module."""
+    """Load an example script as a module."""
     path = EXAMPLES / name
     spec = importlib.util.spec_from_file_location(f"example_{path.stem}", path)
     assert spec is not None and spec.loader is not None
@@ -93,14 +93,14 @@ def load(name: str) -> Any:
 
 
 def play(environment: Any, number: int, steps: int) -> Iterator[list[Event]]:
-    """Step the environment of an example, and yield what it draws in each step.
+    """Step an example's environment, and yield what it draws in each step.
 
-    In a network's place, what was true in the step before is predicted.
+    In place of a network's prediction, it gets the truth of the previous step.
 
     Args:
         environment: Class of the environment.
         number: Number of the instance, counted from 1.
-        steps: How many steps.
+        steps: Number of steps.
     """
 
     class Alone(environment):  # type: ignore[misc]
@@ -142,7 +142,7 @@ def show_environments(folder: Path, *visualizers: Visualizer) -> None:
 
 
 def show_robots(path: Path) -> None:
-    """Write a recording of the pushed box and the walking quadruped of the examples."""
+    """Write a recording of the pushed box and the walking quadruped from the examples."""
     pushing, walking = load("11_pushing.py"), load("10_quadruped.py")
     box: Any = gymnasium.make("physx/PushBox-v0").unwrapped
     robot: Any = physx_gym.load_pipeline(walking.ROBOT)()
@@ -161,11 +161,11 @@ def show_robots(path: Path) -> None:
 
 
 def examples() -> dict[str, np.ndarray]:
-    """Return pictures of what the examples show, by the viewer that draws them.
+    """Return pictures of the examples' scenes, by name.
 
     Returns:
-        Pictures of the width 1000: the scenes of the environments and those of the robots in
-        Rerun's viewer, and the former in that of ``examples/05_own_plugin``.
+        Pictures 1000 pixels wide: the environments and the robots in Rerun's viewer, and the
+        environments in the viewer of ``examples/05_own_plugin``.
     """
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -182,13 +182,13 @@ def examples() -> dict[str, np.ndarray]:
 
 
 def sheet(drawn: dict[str, np.ndarray]) -> Image.Image:
-    """Return the pictures of `examples` below each other, with few colors."""
+    """Return the pictures of `examples` stacked vertically, with few colors."""
     rows = [drawn[name] for name in ("environments", "robots", "matplotlib")]
     return Image.fromarray(np.vstack(rows)).quantize(256)
 
 
 def shares(picture: np.ndarray) -> dict[str, float]:
-    """Return the shares of the pixels of a picture that are of these colors."""
+    """Return the share of a picture's pixels that have each of these colors."""
     red, green, blue = np.moveaxis(picture.astype(int), 2, 0)
     colors = {
         "light": np.minimum(np.minimum(red, green), blue) > 150,
@@ -202,7 +202,7 @@ def shares(picture: np.ndarray) -> dict[str, float]:
 
 
 def check_demo(path: Path) -> None:
-    """Check that a picture of the demo shows what its kept film does, maybe at another time."""
+    """Check that a picture of the demo shows what its kept film shows, maybe at another time."""
     for file in (path, DEMO):
         with Image.open(file) as image:
             image.seek(getattr(image, "n_frames", 1) // 2)  # of a film
@@ -211,7 +211,7 @@ def check_demo(path: Path) -> None:
         row = drawn[height // 30 : height * 52 // 90]  # the windows without their titles
         arms = [shares(each) for each in np.array_split(row, 3, axis=1)]
         assert all(arm["light"] > 0.015 for arm in arms), (file, "the arms", arms)
-        lags = [arm["green"] for arm in arms]  # what is seen of the reference
+        lags = [arm["green"] for arm in arms]  # the visible part of the reference
         assert lags[0] > max(0.005, 1.5 * lags[1], 1.5 * lags[2]), (file, "the reference", lags)
         curves = shares(drawn[height * 56 // 90 : height * 85 // 90, : width * 52 // 90])
         assert curves["blue"] > 5e-4 and curves["orange"] > 5e-4, (file, "the plot", curves)

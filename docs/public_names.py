@@ -1,4 +1,4 @@
-"""The public names of all packages, and whether each is documented: what the reference shows."""
+"""The public names of all packages, for the reference, and whether each is documented."""
 
 from __future__ import annotations
 
@@ -16,7 +16,9 @@ from typing import Any
 
 from sphinx.pycode import ModuleAnalyzer
 
-# The faces, in the reference's order: a name is described where it comes first.
+from physx_core.errors import PhysxError
+
+# The faces, in the reference's order: a name is described in the first face that offers it.
 FACES = {
     "physx_core": (
         "",
@@ -54,7 +56,7 @@ class Name:
     Attributes:
         module: The face that offers it.
         name: The name.
-        value: What it is.
+        value: The object itself.
         home: The module that defines it.
     """
 
@@ -65,7 +67,7 @@ class Name:
 
     @property
     def kind(self) -> str:
-        """The directive of autodoc that describes it."""
+        """The autodoc directive that describes it."""
         if inspect.isclass(self.value):
             return "exception" if issubclass(self.value, BaseException) else "class"
         if isinstance(self.value, FunctionType):
@@ -74,7 +76,7 @@ class Name:
 
     @property
     def text(self) -> str:
-        """What is written about a constant or a type below its definition."""
+        """The text below the definition of a constant or a type."""
         found: dict[tuple[str, str], list[str]] = ModuleAnalyzer.for_module(
             self.home
         ).find_attr_docs()
@@ -100,7 +102,7 @@ def names_of(module: str) -> tuple[Name, ...]:
 
 
 def home(module: str, name: str, value: Any) -> str:
-    """Return the name of the module that defines what a face offers."""
+    """Return the name of the module that defines an object offered by a face."""
     if inspect.isclass(value) or isinstance(value, FunctionType):
         return str(value.__module__)
     face = importlib.import_module(module)
@@ -118,7 +120,7 @@ def home(module: str, name: str, value: Any) -> str:
 
 
 def described() -> Iterator[Name]:
-    """Return all public names, each where it is described: in the first face that offers it."""
+    """Return all public names, each from the first face that offers it, where it is described."""
     seen: set[tuple[str, str]] = set()
     for module in MODULES:
         for each in names_of(module):
@@ -128,7 +130,7 @@ def described() -> Iterator[Name]:
 
 
 def reference(module: str) -> str:
-    """Return the description of a face as reStructuredText with autodoc's directives."""
+    """Return the description of a face as reStructuredText with autodoc directives."""
     here = [each for each in described() if each.module == module]
     others = sorted({each.name for each in names_of(module)} - {each.name for each in here})
     lines = [f".. automodule:: {module}", "   :no-members:", ""]
@@ -147,14 +149,14 @@ def reference(module: str) -> str:
 
 
 def escaped(line: str) -> str:
-    """Return a line of a docstring in which (samples, *shape) and np.bool_ mean themselves."""
+    """Escape a docstring's line so that (samples, *shape) and np.bool_ appear literally."""
     if line.startswith(":vartype"):
         return line.replace("_]", r"\_]")
     return re.sub(r"(?<![*`\w])\*(?=\w)(?![^*]*[\w.]\*(?!\w))", r"\*", line)
 
 
 def undocumented() -> list[str]:
-    """Return what has no text: modules, names, methods, properties, fields of dataclasses."""
+    """Return everything without text: modules, names, methods, properties, dataclass fields."""
     missing = [name for name in MODULES if not inspect.getdoc(importlib.import_module(name))]
     for each in described():
         name = f"{each.home}.{each.name}"
@@ -184,3 +186,46 @@ def _silent_members(kind: type, module: str) -> Iterator[str]:
             told = (kind.__qualname__, name) in below
             if not (told or name.startswith("_") or re.search(rf"^\s+{name}:", text, re.MULTILINE)):
                 yield name
+
+
+def unnamed_errors() -> list[str]:
+    """Return each error that a function or method itself raises but its docstring does not name.
+
+    To name a base class is enough. The docstring of a class counts for its special methods.
+    """
+    return [
+        f"{name}: {error.__name__}"
+        for each in described()
+        for name, node, text in _functions(each)
+        for error in _raised(node, each.home)
+        if set(re.findall(r"\w+Error", text)).isdisjoint(base.__name__ for base in error.__mro__)
+    ]
+
+
+def _functions(each: Name) -> Iterator[tuple[str, ast.AST, str]]:
+    """Yield the name, source and text of a function, or of the methods that a class defines."""
+    tree = _definitions(each.home).get(each.name)
+    name, text = f"{each.home}.{each.name}", inspect.getdoc(each.value) or ""
+    if each.kind == "function" and tree is not None:
+        yield name, tree, text
+    elif isinstance(tree, ast.ClassDef):
+        for node in tree.body:
+            if isinstance(node, ast.FunctionDef) and not re.match("_(?!_)", node.name):
+                own = inspect.getdoc(getattr(each.value, node.name)) or ""
+                told = own + text if node.name.startswith("__") else own
+                yield f"{name}.{node.name}", node, told
+
+
+@cache
+def _definitions(module: str) -> dict[str, ast.AST]:
+    """Return the functions and classes of a module by name."""
+    tree = ast.parse(inspect.getsource(importlib.import_module(module)))
+    return {node.name: node for node in tree.body if hasattr(node, "name")}
+
+
+def _raised(function: ast.AST, module: str) -> set[type[PhysxError]]:
+    """Return the errors that a function of a module creates and raises."""
+    names = vars(importlib.import_module(module))
+    found = (each.exc for each in ast.walk(function) if isinstance(each, ast.Raise))
+    kinds = (names.get(ast.unparse(each.func)) for each in found if isinstance(each, ast.Call))
+    return {kind for kind in kinds if inspect.isclass(kind) and issubclass(kind, PhysxError)}

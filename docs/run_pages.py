@@ -1,29 +1,29 @@
-"""Runs the code of all README.md and of the pages in docs/, each in a folder of its own.
+"""Runs the code in all README.md files and the pages in docs/, each in its own folder.
 
-python docs/run_pages.py [PAGE ...]    # all pages, or some; says which block failed, and how
+python docs/run_pages.py [PAGE ...]    # all pages, or some; reports which block failed, and how
 
-The language of a block says what happens to it:
+The language of a block determines what happens to it:
 
 =============  ====================================================================================
-python         a part of the page's program, which runs when commands follow, or the page ends
-sh             commands, which must succeed
-console        commands after ``$``, and what they print: ``...`` stands for anything
+python         part of the page's program, which runs when commands follow or the page ends
+sh             commands that must succeed
+console        commands after ``$``, and their output: ``...`` matches anything
 text, none     not code
 =============  ====================================================================================
 
-So does a comment on the line before the block:
+A comment on the line before the block changes that:
 
 =================================  ================================================================
-``<!-- file: NAME -->``            the block is written to that file, or added to it if the page
-                                   has written it before; a command or program after it must name
-                                   it, and so should the text: readers do not see the comment
+``<!-- file: NAME -->``            the block is written to that file, or appended if the page has
+                                   written it before; a later command or program must name it, and
+                                   so should the text, because readers do not see the comment
 ``<!-- fails -->``                 the last command must fail
-``<!-- tested by PATH::TEST -->``  the block is shown only: that test, or script, runs it
-``<!-- not run: REASON -->``       it is shown only: it is another project's code
+``<!-- tested by PATH::TEST -->``  the block is only shown; that test or script runs it
+``<!-- not run: REASON -->``       the block is only shown: it is another project's code
 =================================  ================================================================
 
-The pages in docs/learn build on each other, so they share a folder. ``examples`` is the folder of
-the repository. There is no display.
+The pages in docs/learn build on each other, so they share a folder. ``examples`` is the
+repository's folder. There is no display.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ BOOKS = [LEARN, *([page] for page in PAGES if page not in LEARN)]
 COMMENT = re.compile(r"<!-- (file|tested by|not run|fails):? ?(.*?) ?-->\n?")
 COMMAND = re.compile(r"\$? ?(physx|python|pip|make|torchrun|apt|rerun)[ -]")
 SAME = doctest.ELLIPSIS | doctest.NORMALIZE_WHITESPACE
-TIMEOUT = 300  # seconds of a command
+TIMEOUT = 300  # seconds per command
 
 
 class PageError(Exception):
@@ -66,11 +66,11 @@ class Block:
     Attributes:
         page: Path of the page.
         line: Line of the page, counted from 1.
-        language: What stands behind the three backticks.
+        language: The text after the three backticks.
         text: The code.
         file: Name of the file that it is written to, or an empty string.
         tested_by: What runs it instead, or an empty string.
-        not_run: Why nothing can run it, or an empty string.
+        not_run: Why it is not run, or an empty string.
         fails: Whether the last command must fail.
     """
 
@@ -94,7 +94,7 @@ class Block:
 
 
 def read(page: Path) -> list[Block]:
-    """Return the blocks of a page, without those that are directives of the site."""
+    """Return the blocks of a page, without the site's directives."""
     found, told = [], {}
     for token in MarkdownIt("commonmark").parse(page.read_text(encoding="utf-8")):
         if token.type == "html_block" and (match := COMMENT.fullmatch(token.content)):
@@ -109,10 +109,10 @@ def read(page: Path) -> list[Block]:
 
 
 def check(blocks: list[Block]) -> None:
-    """Check that each block of a page runs, or says what runs it.
+    """Check that each block of a page runs, or names what runs it.
 
     Raises:
-        PageError: One does not.
+        PageError: If a block does neither.
     """
     for number, block in enumerate(blocks):
         if block.tested_by:
@@ -139,7 +139,7 @@ def _check_test(block: Block) -> None:
 
 
 def commands(block: Block) -> Iterator[tuple[str, str]]:
-    """Return the commands of a block, each with what it prints; an empty text means anything."""
+    """Return the commands of a block, each with its output; an empty text matches anything."""
     if block.language == "sh":
         yield block.text, ""
         return
@@ -170,7 +170,7 @@ class Runner:
         }
 
     def run(self, block: Block) -> None:
-        """Run a block, or keep it for the program that it is a part of."""
+        """Run a block, or keep it for the program that it belongs to."""
         if block.is_shown_only:
             return
         if block.file:
@@ -184,7 +184,7 @@ class Runner:
                 self._execute(block, ["/bin/sh", "-e", "-c", command], printed)
 
     def finish(self) -> None:
-        """Run the program that is not run yet."""
+        """Run the pending program."""
         if not self._program:
             return
         first, text = self._program[0], "\n".join(block.text for block in self._program)
@@ -215,10 +215,10 @@ def run(pages: list[Path], folder: Path) -> int:
     """Run the blocks of pages that build on each other, in an empty folder.
 
     Returns:
-        How many blocks ran.
+        Number of blocks that ran.
 
     Raises:
-        PageError: A block failed, printed something else, or says nothing of what runs it.
+        PageError: If a block failed, printed something else, or does not name what runs it.
     """
     runner, ran = Runner(folder), 0
     blocks = [block for page in pages for block in read(page)]

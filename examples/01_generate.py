@@ -1,10 +1,10 @@
-"""Samples from one environment, and from several that take turns.
+"""Data generation with one environment, or with several in parallel.
 
-An environment is a class whose step sets one sample; here, a random cloud of points and its spread.
-One in this process fills a dataset that knows fields, units and statistics. Then one and four
-clients do, processes of their own, with steps that take 5 ms: four make about four times as many.
-Each row tells which instance made it: row r of n instances is that of instance r modulo n, however
-fast each is, so the same seed makes the same rows.
+An environment is a class whose step sets one sample: here, a random cloud of points and its spread.
+First, one environment in this process fills a dataset with fields, units and statistics. Then one
+and four clients, each in its own process, do the same with steps that take 5 ms: four clients are
+about four times as fast. Each row records which instance generated it. With n instances, row r
+comes from instance r modulo n, however fast each of them is, so the same seed gives the same rows.
 
     python examples/01_generate.py
 """
@@ -21,7 +21,7 @@ from physx_core import DataGeneration, Dataset, EnvironmentConfig
 
 
 class Timed(DataGeneration):
-    """Measures the time from the first batch to the last; starting the clients does not count."""
+    """Measures the time from the first batch to the last; starting the clients is not timed."""
 
     def data_generation_begin(self) -> None:
         super().data_generation_begin()

@@ -1,9 +1,9 @@
-"""A network learns from stored samples, is interrupted, and goes on.
+"""Training on stored samples, interrupted and resumed.
 
 Fully connected layers learn the spread of a cloud from the coordinates of its points. The training
-ends after a third of its epochs, as after Ctrl-C, and is resumed: the network is the same, bit for
-bit, as one trained in one go. Then networks of three seeds stand against what is cheaper: the mean
-of all samples, a linear map, and a linear map of all products of two coordinates.
+stops after a third of its epochs, as after Ctrl-C, and is resumed: the network is bit-identical to
+one trained without interruption. Then networks from three seeds are compared with cheaper rivals:
+the mean of all samples, a linear map, and a linear map of all products of two coordinates.
 
     python examples/02_train.py
     physx stats sessions/train

@@ -1,9 +1,9 @@
-"""A network takes part in the running environment: while it learns, and when it has.
+"""A network's predictions inside a running environment.
 
-First an environment looks on while the network learns: it asks for a prediction in its own step,
-as often as it likes. Then a network that has learned from stored samples guesses the spread of
-clouds that it has never seen. The environment draws its guess over the truth, the viewer records
-the scene, and the dataset what was predicted.
+First, an environment watches the network learn: it asks for predictions in its own step, as often
+as it likes. Then a network trained on stored samples predicts the spread of clouds that it has
+never seen. The environment draws the prediction over the truth, the viewer records the scene, and
+the dataset records the predictions.
 
     python examples/03_predict.py
     physx view sessions/predict
@@ -28,7 +28,7 @@ from physx_rerun import render_picture
 
 
 class Watched(Cloud):
-    """A cloud that stays the same, and asks the network, as it is now, for its spread."""
+    """A constant cloud that asks the network for its spread while the network learns."""
 
     def step(self) -> None:
         super().step()

@@ -1,9 +1,9 @@
-"""A network of your own, which knows what the problem is like.
+"""Your own network, with the problem's symmetries built in.
 
-The spread of a cloud depends neither on the order of its points nor on where it is. A deep set, a
-plain PyTorch class named by its module, cannot but respect that. Beside it stand fully connected
-layers of three widths, which have to learn it: one with as many parameters, one with more. All
-learn from the same samples.
+The spread of a cloud depends neither on the order of its points nor on its position. A deep set, a
+plain PyTorch class named by its module, has these symmetries built in. Its rivals are fully
+connected layers of three widths, which have to learn them: one has as many parameters, one has
+more. All learn from the same samples.
 
     python examples/04_own_network.py
 """
@@ -32,7 +32,7 @@ OWN = NetworkConfig(
 
 
 def draw(path, right, guesses) -> None:
-    """Draw guesses over what is right, a diagram for each network."""
+    """Plot guesses over the truth, one diagram per network."""
     figure = Figure(figsize=(9, 3.4), layout="constrained")
     for axes, (name, guess) in zip(figure.subplots(1, 3), guesses.items(), strict=True):
         axes.plot(right, guess, ".", ms=2)

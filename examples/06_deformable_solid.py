@@ -1,10 +1,10 @@
-"""A soft beam bends: a network learns what linear elasticity gets wrong.
+"""A soft beam: a network that corrects linear elasticity.
 
-Two clients push a clamped rubber beam at random places and find its equilibrium, its end moved by
-up to most of its length, with felupe's hyperelastic finite elements. Linear elasticity, its
-stiffness factorized once, needs no samples and almost no time, but is wrong where a beam bends far.
-A small network that corrects it beats larger ones that learn the whole displacement. Then it takes
-part in the running environment: orange, over the solver's gray beam and linear elasticity's blue.
+Two clients push a clamped rubber beam at random places and find its equilibrium with felupe's
+hyperelastic finite elements; its end moves by up to most of its length. Linear elasticity, its
+stiffness factorized once, needs no samples and almost no time, but is wrong for large deflections.
+A small network that corrects it beats larger ones that learn the whole displacement. That network
+then runs in the environment: orange, over the solver's gray beam and linear elasticity's blue one.
 
     python examples/06_deformable_solid.py --picture beam.png
     physx view sessions/beam/beam.rrd
@@ -27,7 +27,7 @@ GRID |= {"border_mode": "same", "two_sublayers": False, "positions": True}  # on
 
 
 def networks(epochs):
-    """Yield the name of each network, its kind, target, epochs and arguments."""
+    """Yield each network's name, kind, target, epochs and arguments."""
     for name, width in (("FC 128", 128), ("FC 512", 512), (OWN, 256)):
         wanted = "correction" if name == OWN else "displacement"
         yield name, "torch/fc", wanted, epochs, {"layers": [768, width, width, 768]}
@@ -35,7 +35,7 @@ def networks(epochs):
 
 
 class Timed(Prediction):
-    """Keeps how far each push bends, and the CPU's s for solver, linear elasticity, network."""
+    """Records each push's deflection and the CPU s of solver, linear elasticity and network."""
 
     found = ()
 

@@ -1,9 +1,9 @@
-"""Turbulence on a grid, learned by a Fourier neural operator and by a UNet.
+"""Turbulence on a grid: a Fourier neural operator and a UNet.
 
-Vortices stir each other: what will the flow look like in a second? The equation is not linear: a
+Vortices stir each other: what will the flow look like in one second? The equation is nonlinear: a
 linear map and fully connected networks get half of it wrong. The UNet that comes with physx does
-better, and far better an FNO of neuraloperator, which knows waves around the joined sides of the
-square. That one is a plain PyTorch class, as any of yours may be.
+better, and neuraloperator's FNO, which works with waves on the periodic square, does far better.
+The FNO is a plain PyTorch class, as any of yours may be.
 
     python examples/07_field_on_a_grid.py
 """
@@ -28,7 +28,7 @@ class FNO(neuralop.models.FNO):
 
 
 def draw(picture: Path, fields: dict[str, np.ndarray]) -> None:
-    """Draw fields of the same samples beside each other, one sample in a row."""
+    """Draw fields of the same samples side by side, one sample per row."""
     rows = len(fields["exact"])
     figure = Figure(figsize=(12, 2.05 * rows + 0.25), layout="constrained")
     places = figure.subplots(rows, len(fields))
@@ -40,7 +40,7 @@ def draw(picture: Path, fields: dict[str, np.ndarray]) -> None:
 
 
 def main() -> int:
-    """Compare the networks; the exit status says whether the FNO beats everything else."""
+    """Compare the networks; the exit status tells whether the FNO beats all others."""
     asked = options(__doc__).parse_args()
     count, epochs = (100, 2) if asked.small else (1000, 15)
     session = generate(Vortices, count, asked.session_dir, as_tcp_ip_client=False)

@@ -1,10 +1,10 @@
-"""Heat in a mesh of triangles, learned by a graph network of torch-geometric.
+"""Heat in a triangle mesh: a graph network from torch-geometric.
 
-A plate with a hole conducts heat well in some places and badly in others; how warm is each node a
-while later? A graph network knows which nodes are neighbors, and has to learn only what happens
-along an edge. A linear map and fully connected networks learn each node by itself, and do worse.
+A plate with a hole conducts heat well in some places and badly in others: how warm is each node a
+little later? A graph network knows which nodes are neighbors and only has to learn what happens
+along an edge. A linear map and fully connected networks learn each node separately and do worse.
 
-The network is a plain PyTorch class and knows nothing of physx: networks/heat.py.
+The network is a plain PyTorch class that knows nothing about physx: networks/heat.py.
 
     python examples/08_mesh_with_a_graph_network.py
 """
@@ -20,7 +20,7 @@ from matplotlib.figure import Figure
 
 
 def draw(picture: Path, fields: dict[str, np.ndarray]) -> None:
-    """Draw fields of the same samples beside each other, one sample in a row."""
+    """Draw fields of the same samples side by side, one sample per row."""
     nodes, triangles = mesh()
     rows = len(fields["exact"])
     figure = Figure(figsize=(12, 2 * rows + 0.25), layout="constrained")
@@ -37,7 +37,7 @@ def draw(picture: Path, fields: dict[str, np.ndarray]) -> None:
 
 
 def main() -> int:
-    """Compare the networks; the exit status says whether the graph network beats all others."""
+    """Compare the networks; the exit status tells whether the graph network beats all others."""
     asked = options(__doc__).parse_args()
     count, epochs = (100, 2) if asked.small else (1000, 20)
     session = generate(Plate, count, asked.session_dir, as_tcp_ip_client=False)

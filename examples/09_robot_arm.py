@@ -1,11 +1,11 @@
-"""A robot arm that learned its own dynamics.
+"""A robot arm that learns its own dynamics.
 
 Two clients move a Franka Panda at random and store 40 000 samples (q, v, a) -> torque. A network
-learns them, and its torque helps a weak joint controller (PD) along trajectories that it has never
-seen. Its rivals do without a network, or with a narrower one; the exact model is the reference.
+learns them, and its torque assists a weak joint controller (PD) along trajectories that it has
+never seen. Its rivals use no network, or a narrower one; the exact model is the reference.
 
-    python examples/09_robot_arm.py             # some minutes on 2 cores
-    python examples/09_robot_arm.py --small     # some seconds, to see that it works
+    python examples/09_robot_arm.py             # a few minutes on 2 cores
+    python examples/09_robot_arm.py --small     # a few seconds, to see that it works
     python examples/09_robot_arm.py --picture arm.webp     # a film; arm.png: a picture
 """
 
@@ -33,7 +33,7 @@ NETWORK, EXACT = "PD + network, width 256", "PD + exact model"
 
 
 def show(session: Path, name: str, steps: int) -> Path:
-    """Let three arms follow a trajectory, one with a trained network; return the recording."""
+    """Run three arms along a trajectory, one with a trained network; return the recording."""
     recording, nets = session / "tracking.rrd", str(session / "networks")
     arms = EnvironmentConfig(
         ComparedArm,
@@ -47,7 +47,7 @@ def show(session: Path, name: str, steps: int) -> Path:
 
 
 def main() -> int:
-    """Do the job; the exit status says whether the network is better than its best rival."""
+    """Compare the controllers; the exit status tells whether the network beats its best rival."""
     chosen = options(__doc__).parse_args()
     rows, epochs, steps = (4000, 8, 100) if chosen.small else (40_000, 30, 800)
     seeds = SEEDS[:1] if chosen.small else SEEDS

@@ -1,10 +1,10 @@
-"""A quadruped gets up from its knees and trots: a controller above a pipeline of blocks.
+"""A quadruped that stands up and trots: a gait on top of a pipeline of blocks.
 
 `environments/quadruped.toml` describes the environment: a Unitree A1 whose joints are driven by a
-PD controller above a limit of torques, 200 times a second, and an attitude filter that sees the
-inertial sensor alone. This script only says, 50 times a second, where the joints shall be: legs
-swing in pairs, and lean against the tilt that the filter estimates. The gait was found on DART;
-beside it stand a robot that only stands, and Pinocchio, on which it was never tried before.
+PD controller with a torque limit, 200 times a second, and an attitude filter that sees only the
+inertial sensor. This script only sets joint targets, 50 times a second: legs swing in pairs and
+lean against the tilt that the filter estimates. The gait was found on DART. It is compared with a
+robot that only stands, and runs on Pinocchio, too, where it was never tried before.
 
     python examples/10_quadruped.py --picture quadruped.webp
 """
@@ -26,13 +26,13 @@ SIDES = np.array([1.0, -1.0, 1.0, -1.0])  # left and right
 
 
 def targets(t, first, attitude, trots):
-    """Return where the joints shall be at a time, shape (12,), in rad.
+    """Return the joint targets at a time, shape (12,), in rad.
 
-    `first` is where they were, and `attitude` the estimated roll, pitch and yaw, in rad.
+    `first` holds the initial joint positions, `attitude` the estimated roll, pitch and yaw, in rad.
     """
-    share = min(1.0, 2.0 * t / READY)  # got up, it has as long to settle
+    share = min(1.0, 2.0 * t / READY)  # once up, it has as long again to settle
     legs = (1.0 - share) * first.reshape(4, 3) + share * STAND
-    if trots and t > READY:  # each leg swings for one stride, and pushes for the next one
+    if trots and t > READY:  # each leg swings for one stride and pushes for the next
         effort, phase = min(1.0, t - READY), math.pi * ((t - READY) / STRIDE + PAIRS)
         legs += effort * np.fmax(np.sin(phase), 0.0)[:, None] * LIFT
         legs[:, 1] += effort * SWEEP * np.cos(phase) * (1.0 + SIDES * attitude[2])
@@ -41,7 +41,7 @@ def targets(t, first, attitude, trots):
 
 
 def walk(env, seconds, trots=True):
-    """Let the robot get up and walk; return x, y, z in m and the tilt in degrees of each step."""
+    """Have the robot get up and walk; return x, y, z in m and the tilt in degrees of each step."""
     observation, _ = env.reset(seed=0)
     first, clock = observation["states"]["agent"]["q"][7:].copy(), env.stepper_state
     seen, over = [], False
@@ -68,7 +68,7 @@ def main():
             forward[name, backend] = x[-1] if z.min() > 0.18 else -np.inf  # it fell
     if chosen.picture:
         env = load_pipeline(ROBOT)()
-        env.eval()  # what happens is recorded
+        env.eval()  # records the episode
         walk(env, 2.0)
         env.replay(record_video_path=chosen.picture, frame_rate=12.5, picture_size=(360, 220))
         env.close()

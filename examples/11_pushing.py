@@ -1,9 +1,9 @@
-"""A stick pushes a box into a circle: a task of contacts, solved by a rule of ten lines.
+"""Pushing a box into a circle: a contact task solved by a rule of ten lines.
 
-`physx/PushBox-v0` tells where the stick, the box and the circle are, and wants to know how the
-stick is to accelerate. Pushing straight at the box loses it: the rule goes around the box first,
-and stays in the middle of its back. Beside it stand doing nothing, chance, and a stick that just
-runs at the box; all of them on both engines.
+`physx/PushBox-v0` observes where the stick, the box and the circle are, and takes the acceleration
+of the stick as its action. Pushing straight at the box loses it: the rule first goes around the box
+and then stays in the middle of its back. It competes with doing nothing, random actions, and a
+stick that runs straight at the box, all of them on both engines.
 
     python examples/11_pushing.py --picture push.webp
 """
@@ -17,20 +17,20 @@ from common import options
 import physx_gym  # noqa: F401 - registers the environments
 from physx_gym.cli.evaluate import evaluate, summary
 
-AWAY = 0.3  # m, from the middle of the box, at which the stick goes around it
+AWAY = 0.3  # m, distance from the box's center at which the stick goes around it
 
 
 def drive(observation, target):
-    """Return the action that leads the stick to a place."""
+    """Return the action that moves the stick toward a target."""
     action = 6.0 * (target - observation[0:2]) - observation[2:4]
     return np.clip(action, -1.0, 1.0).astype(np.float32)
 
 
 def push(observation):
-    """Go around the box, behind it, then push it towards the circle.
+    """Go around the box to its back, then push it toward the circle.
 
     Args:
-        observation: Of the environment, shape (15,).
+        observation: The environment's observation, shape (15,).
     """
     stick, box, way = (observation[i : i + 2] for i in (0, 4, 13))
     way = way / max(np.linalg.norm(way), 1e-9)

@@ -1,9 +1,9 @@
-"""A policy learns from rewards: PPO of stable-baselines3 on a robot's Gymnasium environment.
+"""Reinforcement learning: PPO on a robot's Gymnasium environment.
 
-physx steps the environments in processes of their own, stable-baselines3 learns, and the policy is
-saved as a session, which `physx evaluate` runs and films on either engine. Beside it stand doing
-nothing, chance, and a rule of one line where there is one. For the cartpole that is "push to where
-the pole leans and falls", which is hard to beat; PPO does it, knowing no mechanics.
+physx steps the environments in separate processes, stable-baselines3 learns, and the policy is
+saved as a session, which `physx evaluate` runs and films on either engine. It competes with doing
+nothing, random actions and, where there is one, a rule of one line. For the cartpole, that is "push
+to where the pole leans and falls", which is hard to beat; PPO beats it without knowing mechanics.
 
     python examples/12_reinforcement_learning.py --picture rewards.png
     python examples/12_reinforcement_learning.py --env Ant --seeds 0  # Acrobot, Quadruped, PushBox
@@ -23,7 +23,7 @@ from physx_gym.cli.evaluate import evaluate, summary
 
 RULES = {  # of the three actions, 0 and 2 push or turn to either side
     "Cartpole": lambda seen: int(1 + np.sign(seen[1] + seen[3])),  # where the pole will be
-    "Acrobot": lambda seen: int(1 + np.sign(seen[5])),  # on, as the elbow turns already
+    "Acrobot": lambda seen: int(1 + np.sign(seen[5])),  # the way the elbow already turns
 }
 
 

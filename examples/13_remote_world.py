@@ -1,8 +1,8 @@
-"""A room in another process, driven as a Godot application would be: find the apples.
+"""A room in another process, driven like a Godot application: find the apples.
 
-`physx serve` runs the room on DART; this process connects and gets a Gymnasium environment: what
-it observes and takes, the room tells. A policy of a few lines drives to the apples that the robot
-sees, through gaps that are wide enough. Its rival is the same policy, blind to apples.
+`physx serve` runs the room on DART; this process connects and gets a Gymnasium environment whose
+observations and actions the room defines. A policy of a few lines drives to the apples that the
+robot sees, through gaps that are wide enough. Its rival is the same policy, blind to apples.
 
     python examples/13_remote_world.py --picture room.webp
 """
@@ -19,17 +19,17 @@ from environments.room_film import Film
 
 from physx_remote import connect
 
-FAR = 6.0  # what rays tell that meet nothing, in m
+FAR = 6.0  # reading of rays that hit nothing, in m
 
 
 def policy(seen: dict[str, np.ndarray], rng: np.random.Generator) -> np.ndarray:
-    """Return the speeds of both wheels: to the nearest apple, or to where there is room."""
+    """Return the speeds of both wheels: toward the nearest apple, or toward free space."""
     obstacles, apples = seen["obstacles"], seen["apples"]
     rays, goal = len(obstacles), int(apples.argmin())
     if obstacles[[0, 1, -1]].min() < 0.55 and apples[goal] > 0.6:  # back off, and turn away from it
         turn = -0.3 if obstacles[1:4].min() < obstacles[-3:].min() else 0.3
         return np.array([-0.4 - turn, -0.4 + turn], np.float32)
-    turns = (np.arange(rays) + rays // 2) % rays - rays // 2  # from ahead to each ray, in rays
+    turns = (np.arange(rays) + rays // 2) % rays - rays // 2  # of each ray, in rays from ahead
     room = np.min([np.roll(obstacles, shift) for shift in (-1, 0, 1)], axis=0)
     if apples[goal] < FAR:
         away = np.abs((turns - turns[goal] + rays // 2) % rays - rays // 2)
@@ -43,7 +43,7 @@ def policy(seen: dict[str, np.ndarray], rng: np.random.Generator) -> np.ndarray:
 
 
 def drive(address: str, steps: int, seed: int, sees_apples: bool) -> list[dict]:
-    """Drive until no apple is left, or for so many steps; return the info of all steps."""
+    """Drive until no apple is left, for at most `steps` steps; return the info of each step."""
     with connect(address, "godot-gym", repeat_action=6) as room:
         seen, info = room.reset(seed=seed)
         rng, scenes, over = np.random.default_rng(seed), [info], False

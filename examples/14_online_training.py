@@ -1,10 +1,10 @@
-"""Learning the heat equation while two clients simulate it, where the network is still wrong.
+"""Online training: learn the heat equation while simulating it where the network is wrong.
 
-Heat spreads from a spot; narrow spots that stay sharp are few, and the hard part. A reservoir mixes
-the samples of many simulations, and the network learns from each while the next are made;
-`physx/active` simulates more where the loss is high. Compared are the largest errors on unseen
-simulations: with parameters drawn at random, after simulations that were all stored first, and of
-other widths, each with as many simulations and batches.
+Heat spreads from a spot; narrow spots that stay sharp are rare, and they are the hard part. Two
+clients simulate; a reservoir mixes the samples of many simulations, and the network learns while
+the next ones run. `physx/active` simulates more where the loss is high. Its largest errors on
+unseen simulations are compared with those for random parameters, and for simulations that are all
+stored first, with networks of two widths; each gets as many simulations and batches.
 
     python examples/14_online_training.py --picture online.png
 """
@@ -31,7 +31,7 @@ def network(width: int) -> NetworkConfig:
 
 
 def online(sampler, rows, seed, folder, given):
-    """Learn while simulating; return the session's parameters, and predictions."""
+    """Train while simulating; return the session's parameters, and predictions."""
     environment = EnvironmentConfig(Heat, num_clients=2, seed=seed, sampler=sampler)
     buffer = {"capacity": rows // 2, "watermark": rows // 10, "views": VIEWS}
     how = {"online": "physx/reservoir", "online_kwargs": buffer, "quiet": True}
@@ -46,7 +46,7 @@ def online(sampler, rows, seed, folder, given):
 
 
 def main() -> int:
-    """Learn in all ways; return whether choosing the simulations was no better."""
+    """Train in all ways; return whether choosing the simulations was no better."""
     chosen = options(__doc__).parse_args()
     simulations, seeds = (32, SEEDS[:1]) if chosen.small else (1024, SEEDS)
     rows, folder, errors, found = simulations * FRAMES, chosen.session_dir, {}, []

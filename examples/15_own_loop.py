@@ -1,10 +1,10 @@
-"""Samples from a loop of your own, without an environment.
+"""Samples from your own loop, without an environment.
 
-A pendulum swings far, in a few lines of NumPy that know nothing of physx. Each block of samples
-goes into a dataset as soon as it is there, and is safe from then on, whatever happens to the
-program. From there on everything is as with any other dataset. A network learns where the pendulum
-is a second later, and stands against what is cheaper: the theory of small swings, a linear map,
-narrower networks.
+A few lines of NumPy that know nothing about physx simulate a pendulum with large swings. Each block
+of samples goes into a dataset as soon as it is computed, and is safe from then on, whatever happens
+to the program. Everything else works as with any other dataset. A network learns where the pendulum
+is one second later, and is compared with cheaper rivals: the theory of small swings, a linear map,
+and narrower networks.
 
     python examples/15_own_loop.py
     physx info sessions/pendulum
@@ -21,11 +21,11 @@ from rivals import linear_map, relative_error, verdict
 
 from physx_core import Dataset
 
-FREQUENCY, STEPS = np.sqrt(9.81), 200  # of small swings of 1 m, in rad/s; steps of a second
+FREQUENCY, STEPS = np.sqrt(9.81), 200  # small swings at 1 m, in rad/s; steps per second
 
 
 def swing(state: np.ndarray) -> np.ndarray:
-    """Return angles and angular velocities a second later, shape (pendulums, 2), in rad, rad/s."""
+    """Return angle and angular velocity one second later, shape (pendulums, 2), in rad, rad/s."""
     angle, velocity = state.T.copy()
     for _ in range(STEPS):  # leapfrog
         velocity -= 0.5 / STEPS * FREQUENCY**2 * np.sin(angle)
@@ -35,7 +35,7 @@ def swing(state: np.ndarray) -> np.ndarray:
 
 
 def draw(path, state, later) -> None:
-    """Draw the angle after a second over the state before, as different models say."""
+    """Draw the angle after one second over the initial state, as each model predicts it."""
     figure = Figure(figsize=(9, 3.2), layout="constrained")
     for axes, (name, found) in zip(figure.subplots(1, len(later)), later.items(), strict=True):
         dots = axes.scatter(*state.T, c=found[:, 0], s=3, cmap="twilight", vmin=-3, vmax=3)

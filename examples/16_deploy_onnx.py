@@ -1,8 +1,8 @@
-"""A trained network as one file that runs without physx and without PyTorch.
+"""A trained network as one file that runs without physx or PyTorch.
 
-The file has the normalization inside, so it takes and returns physical units under the names of the
+The file includes the normalization, so it takes and returns physical units under the names of the
 fields. A program that imports only NumPy and onnxruntime predicts with it, as one in C++ or on a
-robot would: what it says is what physx says, but for rounding, and single samples are faster.
+robot would: its predictions equal those of physx up to rounding, and single samples are faster.
 
     python examples/16_deploy_onnx.py
     physx export-network sessions/cloud/networks/training --to onnx

@@ -1,9 +1,9 @@
 """Clients on another machine, started by hand.
 
-The run waits until clients connect. Each is one command on any machine that has physx: `physx
-client`, with the address and a file that holds the run's secret token. Between machines the
-connection is encrypted, and the clients prove that they know the token before anything else is
-said. The rows are those of a run in one process, bit for bit. Here the command runs in two other
+The run waits until clients connect. Each client is one command on any machine with physx: `physx
+client`, with the address and a file that holds the run's secret token. Connections between machines
+are encrypted, and clients prove that they know the token before anything else is exchanged. The
+rows are bit-identical to those of a run in one process. Here, the command runs in two other
 processes; with --elsewhere it is printed, for you to run where you like.
 
     python examples/17_two_machines.py

@@ -1,12 +1,12 @@
 """Equations of motion inside the loss.
 
-A double pendulum has friction in its joints; the model of it has none. From 500 samples
-(q, v, torque) -> acceleration a network learns the torques that the model lacks, though nobody
-measured them: gradients go through the equations of motion. Its rivals are networks without the
-model, one that corrects the model's accelerations, a linear map, and a linear law of friction.
+A double pendulum has friction in its joints; its model has none. From 500 samples (q, v, torque) ->
+acceleration, a network learns the torques that the model lacks, although nobody measured them:
+gradients flow through the equations of motion. Its rivals are networks without the model, one that
+corrects the model's accelerations, a linear map, and a linear friction law.
 
     python examples/18_physics_informed.py             # a minute
-    python examples/18_physics_informed.py --small     # some seconds, to see that it works
+    python examples/18_physics_informed.py --small     # a few seconds, to see that it works
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ KINDS = {
 
 
 def train(way, inputs, width, model, known, epochs, seed):
-    """Return accelerations by a network that is fitted to all samples at once."""
+    """Fit a network to all samples at once; return a function that computes accelerations."""
     torch.manual_seed(seed)
     first, second, third = map(torch.nn.Linear, (inputs, width, width), (width, width, 2))
     network = torch.nn.Sequential(first, torch.nn.Tanh(), second, torch.nn.Tanh(), third).double()
@@ -59,7 +59,7 @@ def train(way, inputs, width, model, known, epochs, seed):
 
 
 def main() -> int:
-    """Compare; the exit status says whether the network in the model is better than its rivals."""
+    """Compare; the exit status tells whether the network in the model beats its rivals."""
     chosen = options(__doc__).parse_args()
     rows, epochs, seeds = (200, 150, SEEDS[:1]) if chosen.small else (500, 1000, SEEDS)
     with pendulum("dart", friction=True) as real, pendulum("pinocchio", friction=False) as simple:

@@ -1,8 +1,8 @@
-"""A policy learns with environments on the nodes of a Ray cluster, and is the same to the last bit.
+"""A policy trained on a Ray cluster, bit-identical to one trained locally.
 
-A launcher is all that a vector environment needs to have its processes elsewhere: here two nodes of
-one core, started for this run, or any cluster that runs. PPO of stable-baselines3 learns on the
-cluster and with processes of this machine: every parameter of both policies is equal.
+A launcher is all that a vector environment needs to run its processes elsewhere: here on two
+single-core nodes started for this run, or on any running cluster. PPO from stable-baselines3 learns
+on the cluster and with local processes: every parameter of the two policies is equal.
 
     python examples/20_policy_on_a_cluster.py --picture cluster.png
     python examples/20_policy_on_a_cluster.py --address HOST:PORT      # of a cluster's head node
@@ -27,7 +27,7 @@ CARTPOLE = "physx/Cartpole-v0"
 
 
 def learn(steps, **launch):
-    """Return a policy's parameters, and the steps made and the reward at each episode's end."""
+    """Train a policy; return its parameters, and steps and reward at the end of each episode."""
     options = {"num_processes": 2, "autoreset_mode": "SameStep", **launch}
     envs = VecMonitor(GymnasiumVecEnv(gymnasium.make_vec(CARTPOLE, 8, **options)))
     ppo = {"n_steps": 64, "batch_size": 256, "n_epochs": 20, "gamma": 0.98, "seed": 0}

@@ -1,4 +1,4 @@
-"""What the examples share: their options, samples to learn from, and networks that learned them."""
+"""Shared code of the examples: options, training samples, and trained networks."""
 
 from __future__ import annotations
 
@@ -22,17 +22,17 @@ SEEDS = (0, 1, 2)
 
 
 def options(doc: str) -> argparse.ArgumentParser:
-    """Return the options that all examples have; more can be added."""
+    """Return a parser with the options of all examples; an example can add more."""
     parser = argparse.ArgumentParser(description=doc.partition("\n")[0])
-    parser.add_argument("--small", action="store_true", help="some seconds, to see that it works")
+    parser.add_argument("--small", action="store_true", help="a quick run of some seconds")
     parser.add_argument("--session-dir", type=Path, default=Path("sessions"))
     parser.add_argument("--picture", type=Path, help="where to draw the picture")
-    torch.set_num_threads(1)  # enough for small networks, and no waiting on a busy machine
+    torch.set_num_threads(1)  # enough for small networks; avoids waits on a busy machine
     return parser
 
 
 def generate(environment: type, samples: int, folder: Path, **config: Any) -> Path:
-    """Make samples to learn from, and a fifth as many to test with; return the session's path."""
+    """Generate training samples, and a fifth as many for validation; return the session's path."""
     options = {"session_name": environment.__name__.lower(), "session_dir": str(folder)}
     for mode, rows in (("training", samples), ("validation", samples // 5)):
         made = EnvironmentConfig(environment, seed=0, **config)
@@ -52,7 +52,7 @@ def samples(session: Path, mode: str, *fields: str) -> list[np.ndarray]:
 def config(
     network: str | type, given: str, wanted: str, epochs: int, lr: float, **arguments: Any
 ) -> NetworkConfig:
-    """Return what trains a network by Adam, its learning rate falling to 0 in so many epochs."""
+    """Return a network's configuration: Adam, its learning rate falling to 0 over `epochs`."""
     return NetworkConfig(
         network,
         network_kwargs={**arguments, "net_fields": given, "opt_fields": wanted},
@@ -67,7 +67,7 @@ def config(
 def trained(
     session: Path, network: NetworkConfig, epochs: int, seed: int, **options: Any
 ) -> Training:
-    """Train a network with a session's samples; return what trained it, its `learner` ready."""
+    """Train a network on a session's samples; return the training, with its `learner` ready."""
     training = Training(
         network,
         DatasetConfig(existing_dir=str(session), normalize=True),
@@ -86,7 +86,7 @@ def trained(
 def learned(
     session: Path, network: NetworkConfig, given: str, epochs: int, seed: int, **options: Any
 ) -> np.ndarray:
-    """Train a network with a session's samples; return its predictions for those of validation."""
+    """Train a network on a session's samples; return its predictions for the validation samples."""
     learner = trained(session, network, epochs, seed, **options).learner
     (tested,) = samples(session, "validation", given)
     (guess,) = learner.predict_in_training({given: tested}).values()

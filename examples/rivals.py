@@ -1,7 +1,7 @@
-"""What the examples compare networks with: cheap maps, and a verdict over several seeds.
+"""The rivals that the examples compare networks with: cheap maps, and a verdict over several seeds.
 
-An error is relative: the norm of the difference by the norm of what is right, its mean over the
-samples. The worst network of all seeds has to beat the best rival.
+Errors are relative: the norm of the difference divided by the norm of the exact value, averaged
+over the samples. The network with the worst seed must beat the best rival.
 """
 
 from __future__ import annotations
@@ -12,7 +12,7 @@ import numpy as np
 
 
 def linear_map(inputs: np.ndarray, outputs: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
-    """Return the linear map of ridge regression, its penalty chosen with a fifth of the samples."""
+    """Fit a linear map by ridge regression; a held-out fifth of the samples sets the penalty."""
     flat, wanted = inputs.reshape(len(inputs), -1), outputs.reshape(len(outputs), -1)
     center, mean, known = flat.mean(0), wanted.mean(0), len(flat) * 4 // 5
 
@@ -39,7 +39,7 @@ def relative_error(guess: np.ndarray, exact: np.ndarray) -> float:
 def table(
     errors: Mapping[str, Sequence[float]], what: str = "relative error", form: str = ".2%"
 ) -> None:
-    """Print mean and worst of all errors."""
+    """Print the mean and the worst of each candidate's errors."""
     print(f"\n{what:28}{'mean':>10}{'worst':>10}")
     for name, found in errors.items():
         print(f"{name:28}{np.mean(found):>10{form}}{max(found):>10{form}}")
@@ -53,9 +53,9 @@ def verdict(
     form: str = ".2%",
     references: Sequence[str] = (),
 ) -> int:
-    """Print mean and worst of all errors; return 0 if the network's worst beats the best rival.
+    """Print mean and worst errors; return 0 if the network's worst error beats the best rival.
 
-    References are printed, but are no rivals.
+    References are printed but are not rivals.
     """
     table(errors, what, form)
     others = errors.keys() - {network, *references}

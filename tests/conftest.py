@@ -10,6 +10,7 @@ import subprocess
 import sys
 import time
 import uuid
+from multiprocessing import resource_tracker
 from pathlib import Path
 
 import pytest
@@ -127,6 +128,7 @@ def another_machine():
 @pytest.fixture
 def nothing_stays_behind(monkeypatch):
     """Every process that the test starts, directly or not, is gone when it ends."""
+    resource_tracker.ensure_running()  # which lives as long as this process
     mark, before = uuid.uuid4().hex, running_children()
     monkeypatch.setenv("PHYSX_TEST_MARK", mark)
     yield

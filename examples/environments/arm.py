@@ -1,4 +1,4 @@
-"""The Franka Panda tracks trajectories: a weak joint controller, and a torque fed forward."""
+"""The Franka Panda tracks trajectories with a weak joint controller and a feedforward torque."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ Torque = str | Callable[[np.ndarray], np.ndarray]
 
 
 class ComparedArm(DartArm):
-    """Arms side by side on the same trajectory; each gets another torque in addition."""
+    """Arms side by side on the same trajectory, each with a different feedforward torque."""
 
     def __init__(self, **kwargs: Any) -> None:
         super().__init__(task="track", **kwargs)
@@ -33,15 +33,15 @@ class ComparedArm(DartArm):
 
 
 def predicted(learner: Learner) -> Torque:
-    """Return the torque that a network feeds forward."""
+    """Return a function that predicts the feedforward torque with a network."""
     return lambda state: learner.predict({"state": state})["torque"]
 
 
 def tracking_error(torque: Torque, trajectory: int, steps: int) -> float:
-    """Let an arm follow a trajectory and return the mean error of its seven joints, in mrad.
+    """Run an arm along a trajectory and return the mean error of its seven joints, in mrad.
 
-    The torque that is fed forward is one that `DartArm` knows ("none", "gravity", "model"), or a
-    function of the reference (q, v, a), shape (1, 27), that returns torques, shape (1, 9).
+    The feedforward torque is one that `DartArm` knows ("none", "gravity", "model"), or a function
+    that maps the reference (q, v, a), shape (1, 27), to torques, shape (1, 9).
     """
     feedforward = torque if isinstance(torque, str) else "network"
     with closing(DartArm(task="track", trajectory=trajectory, feedforward=feedforward)) as arm:
@@ -58,7 +58,7 @@ def tracking_error(torque: Torque, trajectory: int, steps: int) -> float:
 
 
 def draw(recording: Path, picture: Path | None, steps: int) -> None:
-    """Draw a recording: as a film (.webp), or the middle of it; by default beside it, if it can."""
+    """Draw a recording as a film (.webp), or its middle as a picture; next to it by default."""
     drawn = picture or recording.with_suffix(".png")
     try:
         if drawn.suffix == ".webp":

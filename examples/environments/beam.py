@@ -1,4 +1,4 @@
-"""A beam that is pushed: it makes samples, and shows what a network makes of them."""
+"""A beam that is pushed: it generates samples, and shows a network's predictions."""
 
 import time
 
@@ -7,16 +7,16 @@ from environments.beam_solver import GRID, ElasticBeam, NoEquilibriumError
 
 from physx_core import Environment, Field
 
-GREATEST_FORCE = 100.0  # N; some such pushes move its end by most of its length
+GREATEST_FORCE = 100.0  # N; some pushes this strong move its end by most of its length
 COLORS = {"linear elasticity": "dodgerblue", "network": "orange"}
 PATCH = 0.12  # m, the standard deviation of the forces around the center of a push
 
 
 class Beam(Environment):
-    """In each step a random push on the surface bends the beam, and the solver finds how far.
+    """In each step, a random push on the surface bends the beam, and the solver computes how far.
 
-    The displacement is that of linear elasticity and a correction. The network's prediction of the
-    latter gives a beam that is drawn over the solver's, beside that of linear elasticity.
+    The displacement is that of linear elasticity plus a correction. The beam with the network's
+    prediction of the correction is drawn over the solver's, along with that of linear elasticity.
     """
 
     def create(self) -> None:

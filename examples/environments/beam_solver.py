@@ -5,7 +5,7 @@ import numpy as np
 from scipy.sparse.linalg import SuperLU, splu
 
 NODES = (16, 4, 4)
-GRID = (4, 4, 16, 3)  # what is known at the nodes: along z, y, x as felupe counts, components
+GRID = (4, 4, 16, 3)  # values at the nodes: along z, y, x in felupe's order, components
 SIZE = (1.0, 0.25, 0.25)  # m
 YOUNG, POISSON = 1e5, 0.3  # Pa, 1: soft rubber
 
@@ -19,7 +19,7 @@ class ElasticBeam:
 
     Attributes:
         rest: Positions of the nodes at rest, shape GRID, in m.
-        skin: Triangles of the surface, numbers of nodes, shape (m, 3).
+        skin: Triangles of the surface as node numbers, shape (m, 3).
     """
 
     def __init__(self) -> None:
@@ -36,16 +36,16 @@ class ElasticBeam:
         self.skin = np.vstack([quads[:, [0, 2, 1]], quads[:, [0, 3, 2]]])
 
     def linear(self, forces: np.ndarray) -> np.ndarray:
-        """Return the displacements by linear elasticity; its stiffness is factorized once."""
+        """Return the displacements of linear elasticity, whose stiffness is factorized once."""
         return self._on_grid(self._at_rest.solve(forces.ravel()[self._free]))
 
     def solve(self, forces: np.ndarray, tolerance: float = 1e-6, most: int = 30) -> np.ndarray:
         """Return the displacements in equilibrium with forces, both of shape GRID, in m and N.
 
-        Newton's method begins at rest. Steps that would triple what is not balanced are shortened.
+        Newton's method starts at rest. Steps that would triple the residual are shortened.
 
         Raises:
-            NoEquilibriumError: More than `tolerance` of the forces is left after the most steps.
+            NoEquilibriumError: If more than `tolerance` of the forces is left after `most` steps.
         """
         error = wanted = forces.ravel()[self._free]
         values, factors = np.zeros(wanted.size), self._at_rest
@@ -65,7 +65,7 @@ class ElasticBeam:
 
     def _inner_forces(self, values: np.ndarray) -> np.ndarray:
         self._field[0].values[:] = self._on_grid(values).reshape(-1, 3)
-        with np.errstate(all="ignore"):  # a cell turned inside out
+        with np.errstate(all="ignore"):  # a cell may be inverted
             return self._solid.assemble.vector(self._field).toarray()[self._free, 0]
 
     def _on_grid(self, values: np.ndarray) -> np.ndarray:

@@ -1,7 +1,8 @@
-"""A cloud of points, and its spread: the root mean square of the points along its principal axes.
+"""A cloud of points and its spread: the root mean square of the points along its principal axes.
 
-A singular value decomposition gives it exactly, so it is easy to see what a network makes of it. It
-is no linear function of the points: the best linear map does no better than the mean of all clouds.
+A singular value decomposition computes the spread exactly, so a network's predictions are easy to
+check. It is not a linear function of the points: the best linear map does no better than the mean
+of all clouds.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ POINTS = 10
 
 
 class Cloud(Environment):
-    """Each step draws a cloud, unless it is to stay the same; a network shall guess its spread."""
+    """Each step draws a cloud, unless it is constant; a network has to predict its spread."""
 
     def __init__(self, *, constant: bool = False, delay: float = 0.0, **kwargs) -> None:
         super().__init__(**kwargs)
@@ -26,7 +27,7 @@ class Cloud(Environment):
         self.draw()
 
     def draw(self) -> None:
-        """Draw points that form a cloud in any direction, more or less long or flat."""
+        """Draw a cloud with a random orientation, more or less elongated or flat."""
         directions = np.linalg.qr(self.rng.normal(size=(3, 3)))[0]
         around = self.rng.normal(size=(POINTS, 3)) * self.rng.uniform(0.1, 1, 3)
         self.points = around @ directions
@@ -46,7 +47,7 @@ class Cloud(Environment):
         self.set_training_data(input=self.points, ground_truth=self.spread)
 
     def lines(self, spread: np.ndarray) -> np.ndarray:
-        """Return lines along the principal axes, shape (3, 2, 3): ends in m."""
+        """Return lines along the principal axes, shape (3, 2, 3): their ends in m."""
         ways = spread[:, None] * self.axes
         return np.stack([self.middle - ways, self.middle + ways], axis=1)
 
@@ -66,7 +67,7 @@ class Cloud(Environment):
 
 
 def network(width: int = 128) -> NetworkConfig:
-    """Return fully connected layers that guess the spread from the coordinates of all points."""
+    """Return fully connected layers that predict the spread from the coordinates of all points."""
     return NetworkConfig(
         "torch/fc",
         network_kwargs={"layers": [3 * POINTS, width, width, 3]},

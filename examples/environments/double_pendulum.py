@@ -1,4 +1,4 @@
-"""A double pendulum with viscous and dry friction in its joints, and a model of it without."""
+"""A double pendulum with viscous and dry friction in its joints, and a model without friction."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def pendulum(engine: str, *, friction: bool) -> Simulation:
 
 
 def as_torch(function: Callable[..., np.ndarray]) -> Function:
-    """Return a function of arrays as one of tensors, without gradients."""
+    """Wrap a function of arrays as a function of tensors, without gradients."""
     return lambda *given: torch.from_numpy(function(*(each.detach().numpy() for each in given)))
 
 
@@ -38,19 +38,19 @@ def measure(simulation: Simulation, samples: int, seed: int) -> list[torch.Tenso
 
 
 def missing(model: Simulation, samples: list[torch.Tensor]) -> torch.Tensor:
-    """Return the torques that a model lacks in samples, shape (n, 2), by its inverse dynamics."""
+    """Return the torques that a model lacks in samples, shape (n, 2), from its inverse dynamics."""
     q, v, torque, acceleration = (each.numpy() for each in samples)
     found = np.array(list(map(model.inverse_dynamics, q, v, acceleration)))
     return torch.from_numpy(torque - found)
 
 
 def linear(given: list[torch.Tensor], wanted: torch.Tensor) -> Function:
-    """Return the linear map from several tensors to one."""
+    """Fit the linear map from several tensors to one."""
     fitted = as_torch(linear_map(torch.hstack(given).numpy(), wanted.numpy()))
     return lambda *values: fitted(torch.hstack(values))
 
 
 def error(acceleration: Function, samples: list[torch.Tensor]) -> float:
-    """Return the relative error of accelerations in samples."""
+    """Return the relative error of computed accelerations for samples."""
     *given, exact = samples
     return relative_error(acceleration(*given).detach().numpy(), exact.numpy())

@@ -1,4 +1,4 @@
-"""A picture of the friction that was learned, and of how the pendulum swings with it."""
+"""A picture of the learned friction, and of how the pendulum swings with it."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ def friction(v: torch.Tensor) -> torch.Tensor:
 
 
 def swing(acceleration: Function) -> np.ndarray:
-    """Let a pendulum go and return its angles after each period, shape (STEPS, 2)."""
+    """Release the pendulum and return its angles after each period, shape (STEPS, 2)."""
     q, v = torch.tensor([[1.2, 0.4]]).double(), torch.zeros(1, 2).double()
     angles = []
     for _ in range(STEPS):
@@ -33,7 +33,7 @@ def swing(acceleration: Function) -> np.ndarray:
 
 
 def plot(axis: Any, x: Any, curves: dict[str, Any]) -> None:
-    """Plot curves over x, with their names."""
+    """Plot curves over x, with a legend."""
     for (name, y), style in zip(curves.items(), STYLES, strict=True):
         axis.plot(x, y, label=name, **style)
     axis.legend(fontsize=8)
@@ -42,9 +42,9 @@ def plot(axis: Any, x: Any, curves: dict[str, Any]) -> None:
 def draw(
     path: Path, real: Simulation, model: Function, law: Function, name: str, learned: Any
 ) -> None:
-    """Draw laws of friction over the speed, and how the elbow swings after letting go.
+    """Draw friction laws over speed, and how the elbow swings after its release.
 
-    What was learned is a `functools.partial` of accelerations, whose first argument is the law.
+    `learned` is a `functools.partial` that computes accelerations; its first argument is the law.
     """
     figure = Figure((11, 3.4), layout="constrained")
     axes: Any = figure.subplots(1, 3)

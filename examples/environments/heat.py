@@ -1,4 +1,4 @@
-"""Heat that spreads in a plate from a hot spot: a simulation for each set of parameters."""
+"""Heat spreading in a plate from a hot spot: one simulation per set of parameters."""
 
 from __future__ import annotations
 
@@ -6,15 +6,15 @@ import numpy as np
 
 from physx_core import Environment, Field, Parameter
 
-CELLS, FRAMES, DURATION = 24, 10, 0.02  # along an edge of 1 m; of a simulation; in s
+CELLS, FRAMES, DURATION = 24, 10, 0.02  # per edge of 1 m; per simulation; in s
 
 
 class Heat(Environment):
     """The heat equation on the unit square with insulated edges, by explicit finite differences.
 
     An episode is a simulation of `FRAMES` samples: parameters and time, scaled to -1..1, and the
-    temperature of all cells. All spots have the same heat: narrow ones are hot and sharp, and where
-    heat spreads slowly they stay so. This small part of the parameters is the hard one to learn.
+    temperature of all cells. All spots hold the same heat: narrow ones are hot and sharp, and stay
+    so where heat spreads slowly. This small part of the parameter range is the hard one to learn.
     """
 
     PARAMETERS = (
@@ -30,13 +30,13 @@ class Heat(Environment):
         self._centers = (np.arange(CELLS) + 0.5) / CELLS
 
     def init_database(self):
-        """Define what the network reads and predicts."""
+        """Define the network's input and output."""
         self.define_training_fields(
             [Field("input", shape=(5,)), Field("temperature", shape=(CELLS, CELLS), unit="K")]
         )
 
     def reset_parameters(self, x, y, width, diffusivity):
-        """Begin with a hot spot."""
+        """Start with a hot spot."""
         across, along = self._centers[:, None] - x, self._centers[None, :] - y
         spot = np.exp(-(across**2 + along**2) / (2 * width**2))
         self._temperature = (0.1 / width) ** 2 * spot
@@ -45,12 +45,12 @@ class Heat(Environment):
         high = np.array([each.high[0] for each in self.PARAMETERS])
         given = np.array([x, y, width, diffusivity])
         self._scaled = 2 * (given - low) / (high - low) - 1
-        share = diffusivity * DURATION / FRAMES * CELLS**2  # of stable steps of 0.2
+        share = diffusivity * DURATION / FRAMES * CELLS**2  # stable steps are at most 0.2
         self._steps = int(np.ceil(share / 0.2))
         self._rate = share / self._steps
 
     def step(self):
-        """Simulate until the next frame; after the last one, begin the next simulation."""
+        """Simulate until the next frame; after the last one, start the next simulation."""
         if self._frame == FRAMES:
             self.new_episode()
         for _ in range(self._steps):

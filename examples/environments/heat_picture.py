@@ -1,4 +1,4 @@
-"""Where simulations were made, and where the errors are."""
+"""A picture of where simulations were made and where the errors are."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ def draw(
 
     Args:
         path: The picture.
-        found: For each sampler its name, widths and diffusivities of the simulations, and errors.
-        given: What the errors belong to, shape (rows, 5), scaled to -1..1.
+        found: For each sampler: its name, widths and diffusivities of the simulations, and errors.
+        given: The inputs that the errors belong to, shape (rows, 5), scaled to -1..1.
     """
     low, high = np.array([[each.low[0], each.high[0]] for each in Heat.PARAMETERS[2:]]).T
     places = (low + (given[:, 2:4] + 1) / 2 * (high - low)).T

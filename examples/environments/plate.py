@@ -1,4 +1,4 @@
-"""A plate with a hole, of triangles: heat spreads in it, faster where it conducts well."""
+"""A triangulated plate with a hole: heat spreads in it, faster where it conducts well."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ SIDE, RADIUS, SPACE = 1.0, 0.2, 0.1  # side, radius of the hole, space between n
 
 
 def mesh() -> tuple[np.ndarray, np.ndarray]:
-    """Return the nodes (n, 2) in m and the triangles (m, 3) of the plate, an irregular mesh."""
+    """Return the irregular mesh of the plate: nodes (n, 2) in m, and triangles (m, 3)."""
     axis = np.linspace(0, SIDE, round(SIDE / SPACE) + 1)
     nodes = np.stack(np.meshgrid(axis, axis), axis=-1)
     inner = nodes[1:-1, 1:-1]
@@ -28,13 +28,13 @@ def mesh() -> tuple[np.ndarray, np.ndarray]:
 
 
 class Plate(Environment):
-    """Temperature and conductivity on the nodes of a mesh -> temperature a while later.
+    """Temperature and conductivity at the nodes of a mesh -> temperature a little later.
 
-    The heat equation in linear finite elements with lumped masses, by implicit Euler steps. No heat
+    The heat equation, with linear finite elements, lumped masses and implicit Euler steps. No heat
     leaves the plate.
     """
 
-    STEPS, PERIOD = 10, 1e-3  # implicit steps, and the length of one in s
+    STEPS, PERIOD = 10, 1e-3  # implicit steps, and the length of each in s
     LENGTH = 0.15  # over which temperature and conductivity vary, in m
 
     def create(self) -> None:

@@ -1,4 +1,4 @@
-"""A walled room with apples, which another process may drive a robot through."""
+"""A walled room with apples through which another process can drive a robot."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ SHOWN = Field("places", (APPLES, 2)), Field("eaten", (APPLES,), bool), Field("po
 
 
 class Apples(RLEnvWorld):
-    """The apples, what became of the last action, and for pictures where the robot's bodies are."""
+    """The apples, the result of the last action, and the robot's body poses for pictures."""
 
     FIELDS = (("reward", float), ("terminated", bool), *SHOWN)
 
@@ -35,7 +35,7 @@ class Apples(RLEnvWorld):
         self.simulation, self.reward = simulation, 0.0
 
     def scatter(self, rng):
-        """Return a free place for the robot, after apples were put at others."""
+        """Scatter the apples, and return a free place for the robot."""
         places = []
         while len(places) <= APPLES:
             place = rng.uniform(0.6 - SIZE / 2, SIZE / 2 - 0.6, 2)
@@ -54,7 +54,7 @@ class Apples(RLEnvWorld):
 
 
 class AppleSeeker(RLEnvironment):
-    """Find all apples. Action: the speed of both wheels, in [-1, 1]."""
+    """Find all apples. Action: the speeds of both wheels, in [-1, 1]."""
 
     def _ready(self):
         world = World([Seeker.ROBOT], objects=WALLS, ground=Ground(), period=1 / 240)

@@ -1,4 +1,4 @@
-"""What a client was told of the room becomes a film."""
+"""Turns what a client knows about the room into a film."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Film:
         self.factory.add_lines("way", np.zeros((2, 3)), color="#ffd34d", size=0.015)
 
     def place(self, scene: dict[str, np.ndarray], way: np.ndarray) -> None:
-        """Show the room as it was told, and the way so far, shape (n, 3) in m."""
+        """Show the room as reported in a scene, and the path so far, shape (n, 3) in m."""
         self.factory.update_robot("robot", poses=scene["poses"])
         self.factory.update_lines("way", positions=way * [1, 1, 0] + [0, 0, 0.02])
         for number, (place, eaten) in enumerate(zip(scene["places"], scene["eaten"], strict=True)):
@@ -46,7 +46,7 @@ class Film:
             self.factory.update_sphere(f"apple {number}", **look)
 
     def save(self, path: Path, every: int = 8) -> None:
-        """Write every so many scenes and the last one as a film, .webp; else the last one alone."""
+        """Write every `every`-th scene and the last one as a film (.webp), or only the last one."""
         last, pictures = len(self.scenes) - 1, []
         steps = [*range(0, last, every), last] if path.suffix == ".webp" else [last]
         way = np.array([scene["poses"][0, :3] for scene in self.scenes])

@@ -1,4 +1,4 @@
-"""A robot on two wheels that sees by rays: obstacles, and apples that nothing hides."""
+"""A two-wheeled robot that senses obstacles, and apples that nothing hides, with rays."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from physx_core.simulation import JointSettings, Robot
 from physx_remote import RLAgent, fill
 
 RAYS = 16
-NEAR, FAR = 0.4, 6.0  # where rays begin and end, in m from the robot's middle
+NEAR, FAR = 0.4, 6.0  # where rays start and end, in m from the robot's center
 EYE = 0.2  # height of the rays, in m
 SPEED = 12.0  # of a wheel, in rad/s
 WHEELS = ("left_wheel_joint", "right_wheel_joint")
@@ -19,7 +19,7 @@ SEEN = spaces.Box(0.0, FAR, (RAYS,), np.float32)
 
 
 class Seeker(RLAgent):
-    """Drives with its wheels, and tells how far away obstacles and apples are in each direction."""
+    """Drives with its wheels; reports the distances to obstacles and apples in each direction."""
 
     ROBOT = Robot(
         "wheeled_base",

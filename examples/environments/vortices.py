@@ -1,4 +1,4 @@
-"""Vortices in a square of water whose opposite sides are joined."""
+"""Vortices in a periodic square of water."""
 
 from __future__ import annotations
 
@@ -7,17 +7,17 @@ import numpy as np
 from physx_core import Environment, Field
 
 POINTS = 24  # along each side of the square
-SIZE = 2  # vortices along each side, roughly
+SIZE = 2  # approximate number of vortices along each side
 
 
 class Vortices(Environment):
-    """Vorticity of a plane flow -> vorticity a second later.
+    """Vorticity of a plane flow -> vorticity one second later.
 
     The Navier-Stokes equation w_t + u.grad(w) = nu lap(w) with u = (psi_y, -psi_x), lap(psi) = -w,
-    in a periodic square of 1 m: Fourier modes, the upper third left out, and Runge-Kutta steps.
+    in a periodic square of 1 m, with Fourier modes, the upper third dropped, and Runge-Kutta steps.
     """
 
-    STEPS, PERIOD = 10, 0.1  # steps of a sample, and the length of one in s
+    STEPS, PERIOD = 10, 0.1  # steps per sample, and the length of each in s
     VISCOSITY = 5e-4  # m2/s
 
     def create(self) -> None:
@@ -33,7 +33,7 @@ class Vortices(Environment):
         self.define_training_fields(fields)
 
     def change(self, modes: np.ndarray) -> np.ndarray:
-        """Return how fast the modes of the vorticity change, shape (POINTS, POINTS) each."""
+        """Return how fast the modes of the vorticity change, shape (POINTS, POINTS)."""
         flow_y, flow_x = self.slope * self.inverse * modes
         speed = np.fft.ifft2(np.stack([flow_x, -flow_y])).real
         carried = np.fft.fft2((speed * np.fft.ifft2(self.slope * modes).real).sum(0))

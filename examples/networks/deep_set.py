@@ -1,13 +1,13 @@
-"""A network for sets of points (Zaheer et al. 2017), which knows nothing of physx."""
+"""A network for sets of points (Zaheer et al. 2017) that knows nothing about physx."""
 
 import torch
 
 
 class DeepSet(torch.nn.Module):
-    """What it says of a cloud depends neither on the order of the points nor on their place.
+    """A network whose output depends neither on the order of the points nor on their position.
 
-    The same layers see each point, relative to the mean of all; the greatest value and the mean
-    of what they find go through further layers.
+    The same layers process each point, relative to the mean of all points; the maximum and the mean
+    of their outputs go through further layers.
     """
 
     def __init__(self, width: int, outputs: int) -> None:
@@ -21,6 +21,6 @@ class DeepSet(torch.nn.Module):
         )
 
     def forward(self, points: torch.Tensor) -> torch.Tensor:
-        """Return what is guessed of clouds, shape (batch, points, 3), as (batch, outputs)."""
+        """Return the outputs, shape (batch, outputs), for clouds of shape (batch, points, 3)."""
         found = self.each(points - points.mean(dim=1, keepdim=True))
         return self.all(torch.cat([found.amax(dim=1), found.mean(dim=1)], dim=1))

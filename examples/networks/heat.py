@@ -1,4 +1,4 @@
-"""A graph network that learns how heat spreads along the edges of a mesh; it knows no physx."""
+"""A graph network that learns how heat spreads along the edges of a mesh, without using physx."""
 
 from __future__ import annotations
 
@@ -9,15 +9,15 @@ from torch_geometric.utils import add_self_loops, softmax, to_undirected
 
 
 class HeatNetwork(MessagePassing):
-    """Each node becomes as warm as the mean of its neighbors and itself, some times in a row.
+    """Repeatedly sets the temperature of each node to a weighted mean of its neighbors and itself.
 
-    What is learned are the weights of these means, one for each edge and each time: they follow
-    from what both nodes know, which are their own conductivity and place, and by an edge
-    convolution those of their neighbors. The same layers see every edge.
+    It learns the weights of these means, one per edge and repetition, from what both nodes know:
+    their own conductivity and position and, through an edge convolution, those of their neighbors.
+    The same layers process every edge.
     """
 
     def __init__(self, channels: int, steps: int) -> None:
-        super().__init__(aggr="add", node_dim=1)  # the axes are samples, nodes, channels
+        super().__init__(aggr="add", node_dim=1)  # axes: samples, nodes, channels
         nodes, triangles = (torch.as_tensor(array) for array in mesh())
         sides = torch.cat([triangles[:, [0, 1]], triangles[:, [1, 2]], triangles[:, [2, 0]]]).long()
         length = (nodes[sides[:, 0]] - nodes[sides[:, 1]]).norm(dim=1).mean()
@@ -32,7 +32,7 @@ class HeatNetwork(MessagePassing):
         torch.nn.init.eye_(self.last.weight)
 
     def forward(self, values: torch.Tensor) -> torch.Tensor:
-        """Return (samples, nodes, 1) from temperature and conductivity, (samples, nodes, 2)."""
+        """Map temperature, conductivity (samples, nodes, 2) to temperature (samples, nodes, 1)."""
         temperature, conductivity = values.split(1, dim=-1)
         known = torch.cat([conductivity, self.places.expand(len(values), -1, -1)], dim=-1)
         known = torch.cat([known, self.look(known, self.edges)], dim=-1)
@@ -44,5 +44,5 @@ class HeatNetwork(MessagePassing):
         return self.last(temperature)
 
     def message(self, x_j: torch.Tensor, weight: torch.Tensor) -> torch.Tensor:
-        """Return what a neighbor adds to a node's mean."""
+        """Return a neighbor's contribution to a node's mean."""
         return weight * x_j

@@ -15,7 +15,7 @@ def test_every_file_on_the_ways_exists(root):
 
 def test_the_tree_shows_every_room(root):
     text = (root / "docs/architecture.md").read_text()
-    tree = re.search(r"## The rooms\n\n```\n(.*?)```", text, re.S)[1]
+    tree = re.search(r"## Source tree\n\n```\n(.*?)```", text, re.S)[1]
     for package in PACKAGES:
         part = tree.split(f"physx_{package}/\n")[1].split("\n\n")[0]
         folders = {path for path in source(root, package).rglob("*/") if any(path.glob("*.py"))}

@@ -256,7 +256,7 @@ def forgets_to_return_from_check_sample():
     with_data(lambda data, step: data, check_sample=lambda self: None)
 
 
-@mistake(e.UsageError, "get_prediction() needs a network, and this run has none")
+@mistake(e.UsageError, "get_prediction() needs a network, but this run has none")
 def asks_for_a_prediction_in_a_generation():
     with_step(lambda self: self.get_prediction(state=self.x))
 
@@ -322,7 +322,7 @@ def misspells_an_option_without_kwargs():
     generate(type("Changed", (Good,), {"__init__": init}), env_kwargs={"lenght": 2})
 
 
-@mistake(e.UsageError, "must hand instance_id, instance_nb and seed to super().__init__()")
+@mistake(e.UsageError, "must pass instance_id, instance_nb and seed to super().__init__()")
 def does_not_hand_on_its_arguments():
     with_data(None, __init__=lambda self, **kwargs: Good.__init__(self))
 
@@ -347,7 +347,7 @@ def calls_a_method_by_its_british_name():
     with_step(lambda self: self.update_visualisation())
 
 
-@mistake(e.EnvironmentFailedError, "sample_training", "In its place: sample.")
+@mistake(e.EnvironmentFailedError, "sample_training", "Use sample instead.")
 def reads_the_sample_by_its_former_name():
     with_step(lambda self: self.sample_training)
 
@@ -424,7 +424,7 @@ def leaves_out_the_plugin():
     generate("spring")
 
 
-@mistake(e.PluginNotFoundError, '"vedo"', "of the kind visualizer: ", "rerun")
+@mistake(e.PluginNotFoundError, '"vedo"', "of kind visualizer: ", "rerun")
 def wants_a_viewer_that_nobody_has():
     generate(visualizer="vedo")
 
@@ -786,7 +786,7 @@ def predicts_with_a_session_that_trained_nothing():
     Prediction(NetworkConfig(), EnvironmentConfig(Good), session_name="kept").execute()
 
 
-@mistake(e.CheckpointError, '"network_7"', "There are: network_0")
+@mistake(e.CheckpointError, '"network_7"', "Available: network_0")
 def wants_a_checkpoint_that_does_not_exist():
     predict(network=NetworkConfig(which_network=7))
 
@@ -846,7 +846,7 @@ def asks_a_network_that_answers_nan():
     predict(type("Changed", (Good,), {"step": step}), network=of(Broken))
 
 
-@mistake(e.UsageError, "get_prediction() before the first batch", "training and additional data")
+@mistake(e.UsageError, "Before the first batch, get_prediction()", "training and additional data")
 def asks_in_a_training_before_anything_is_known():
     train_online(type("Changed", (Good,), {"step": lambda self: self.get_prediction(state=self.x)}))
 

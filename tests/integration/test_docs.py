@@ -99,7 +99,7 @@ def test_a_new_user_starts_the_program_three_times(root, run, tmp_path):
     script.write_text(code.replace("state=before", "states=before"))
     failed = run(script, ok=False).stderr
     assert 'Did you mean "state"?' in failed
-    assert "session: sessions/pendulum is removed, as the run kept nothing in it" in failed
+    assert "session: sessions/pendulum was removed: the run stored nothing in it" in failed
     assert list(sessions.iterdir()) == []
 
     script.write_text(code)
@@ -119,6 +119,10 @@ def test_a_new_user_starts_the_program_three_times(root, run, tmp_path):
 
 def test_every_public_name_is_documented():
     assert public_names.undocumented() == []
+
+
+def test_every_error_is_named_where_it_is_raised():
+    assert public_names.unnamed_errors() == []
 
 
 def test_the_reference_shows_every_face(root):
@@ -150,5 +154,5 @@ def test_every_error_has_a_cause_and_a_cure(root):
 
 def test_the_page_of_figures_is_what_the_benchmarks_say():
     assert figures.PAGE.path.read_text() == figures.PAGE.text()
-    for page, table in zip((figures.README, figures.PAGE.path), figures.tables(), strict=True):
+    for page, table in figures.tables().items():
         assert page.read_text() == figures.with_table(page, table)

@@ -370,7 +370,7 @@ def has_a_manifest_of_many_lists(place):
     return ["info", "sessions/net"]
 
 
-@hostile("partition", "do not have the checksum")
+@hostile("partition", "do not match their stored checksum")
 def has_its_values_elsewhere(place):
     place.copy("sessions")
     file = next(place.here.glob("sessions/net/dataset/*_state_0.h5"))
@@ -527,17 +527,17 @@ def database(place, value=None, schema="CREATE TABLE training (id INTEGER PRIMAR
     return DATABASE
 
 
-@hostile("DeepPhysX", "no array of numbers")
+@hostile("DeepPhysX", "not an array of numbers")
 def pickles_a_call(place):
     return database(place, pickle.dumps(Call(os.mkdir, "executed")))
 
 
-@hostile("DeepPhysX", "no array of numbers")
+@hostile("DeepPhysX", "not an array of numbers")
 def has_a_memo_of_gigabytes(place):
     return database(place, b"\x80\x02)r" + struct.pack("<I", 2**27) + b".")
 
 
-@hostile("DeepPhysX", "no array of numbers")
+@hostile("DeepPhysX", "not an array of numbers")
 def has_a_pickle_nested_without_end(place):
     return database(place, b"\x80\x02}" + b")" + b"\x85" * 10**6 + b"Ns.")
 
@@ -784,7 +784,7 @@ def is_larger_than_the_memory(place):
     return words
 
 
-@hostile("checkpoint", r"checkpoint\.toml describes no .*layers")
+@hostile("checkpoint", r"checkpoint\.toml describes a .*cannot be created.*layers")
 def has_arguments_that_fit_no_network(place):
     return describe(
         place, lambda text: re.sub(r"layers = \[[^\]]*\]", 'layers = "x"', text), "torch"

@@ -104,12 +104,12 @@ def test_new_plugins_import_faces_only(call, tmp_path):
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (("plugin", "torch"), 'There is a plugin "torch" already'),
+        (("plugin", "torch"), 'There is already a plugin "torch"'),
         (("plugin", "core"), "is the name of physx-core"),
-        (("plugin", "Wave Tank"), "lower-case letters"),
-        (("plugin", "../x"), "lower-case letters"),
+        (("plugin", "Wave Tank"), "lowercase letters"),
+        (("plugin", "../x"), "lowercase letters"),
         (("network", "x", "--folder", "file"), "cannot be written"),
-        (("plugin", "made"), "exists already"),
+        (("plugin", "made"), "already exists"),
     ],
 )
 def test_mistakes_are_named(call, tmp_path, words, message):

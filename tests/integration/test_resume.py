@@ -151,7 +151,7 @@ def test_what_cannot_be_resumed(training):
     options = {"epoch_nb": 1, "batch_nb": 1, "batch_size": 5, "session_name": "online"}
     Training(NetworkConfig("toy/linear"), None, spring, **options).execute()
     for changed, others, name in (
-        ({"num_clients": 2}, {}, "num_clients was 1 and is 2"),
+        ({"num_clients": 2}, {}, "num_clients was 1 and is now 2"),
         ({"env_kwargs": {"mass": 2.0}}, {}, "env_kwargs was {}"),
         ({"seed": 3}, {}, "seed was"),
         ({}, {"batch_size": 6}, "batch_size was 5 and is 6"),

@@ -113,7 +113,7 @@ def test_nobody_listens(opened):
     (line,) = visualizer.announcements()
     assert f"127.0.0.1:{port}" in line and line.endswith(f"rerun --bind 127.0.0.1 --port {port}")
     ball(visualizer)
-    with pytest.warns(UserWarning, match=f"127.0.0.1:{port} was never there"):
+    with pytest.warns(UserWarning, match=f"127.0.0.1:{port} was never reachable"):
         visualizer.close()
     assert visualizer.file.is_file()
 

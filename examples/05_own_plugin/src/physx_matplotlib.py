@@ -1,4 +1,4 @@
-"""A visualizer as a plugin: `matplotlib/matplotlib` keeps a picture of what each instance drew."""
+"""A visualizer as a plugin: `matplotlib/matplotlib` saves a picture of what each instance drew."""
 
 import numpy as np
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -27,7 +27,7 @@ class MatplotlibVisualizer(Visualizer):
                 scene.pop(event.name)
             elif event.action == "add":
                 scene[event.name] = (event.kind, dict(event.values))
-            elif event.name in scene:  # which the simulated time is not
+            elif event.name in scene:  # the simulated time is not
                 scene[event.name][1].update(event.values)
 
     def figure(self):

@@ -1,6 +1,6 @@
-"""The physx plugin ``cluster``: clients of a run on Ray and on Slurm.
+"""The physx plugin ``cluster``: a run's clients on Ray and on Slurm.
 
-The public names are imported on first use, so that discovering the plugin imports no cluster.
+The public names are imported on first use, so discovering the plugin imports no cluster library.
 """
 
 from __future__ import annotations

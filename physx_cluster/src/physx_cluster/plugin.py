@@ -1,4 +1,4 @@
-"""The hooks of the plugin ``cluster``; components are references, imported on use."""
+"""Hooks of the plugin ``cluster``; components are references, imported on use."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
 """physx connects C++ physics engines with deep learning.
 
 The names for users: pipelines, configurations, datasets, world descriptions, and the base classes
-of components. They are imported on first use, so that ``import physx_core`` is quick.
+of components. They are imported on first use to keep ``import physx_core`` fast.
 """
 
 from __future__ import annotations

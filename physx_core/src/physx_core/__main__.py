@@ -1,4 +1,4 @@
-"""``python -m physx_core`` is the command ``physx``."""
+"""Runs the command ``physx`` for ``python -m physx_core``."""
 
 from physx_core.cli import main
 

@@ -1,4 +1,4 @@
-"""Validation of the options of a description; each error names the option."""
+"""Validates the options of a description; each error names the option."""
 
 from __future__ import annotations
 
@@ -83,7 +83,8 @@ def unit_quaternion(option: str, values: Sequence[float]) -> tuple[float, ...]:
     """Return a quaternion x, y, z, w, scaled to length 1.
 
     Raises:
-        ConfigError: If it does not have four finite numbers, or its length is not 1 within 0.001.
+        ConfigError: If it does not consist of four finite numbers, or its length differs from 1 by
+            more than 0.001.
     """
     quaternion = vector(option, values, 4)
     length = math.sqrt(sum(part * part for part in quaternion))
@@ -98,7 +99,7 @@ def name(kind: str, value: Any) -> str:
     """Return a name: a nonempty string without ``/``, which separates names in a state.
 
     Raises:
-        ConfigError: If it is not such a string.
+        ConfigError: If the value is not such a string.
     """
     if not isinstance(value, str) or not value or "/" in value:
         raise ConfigError(

@@ -8,7 +8,7 @@ from typing import Self
 
 
 class Closeable(ABC):
-    """A context manager that calls `close` at the end of its with statement."""
+    """A context manager that calls `close` on exit."""
 
     @abstractmethod
     def close(self) -> None:

@@ -1,6 +1,6 @@
-"""Configurations: frozen, validated dataclasses that are loaded from and saved to one TOML file.
+"""Configurations: frozen, validated dataclasses, loaded from and saved to one TOML file.
 
-Plugins use `options` and `at_least` to validate the options of their components in the same way.
+Plugins use `options` and `at_least` to validate their components' options in the same way.
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ T = TypeVar("T")
 
 @dataclass_transform(field_specifiers=(field,), frozen_default=True)
 def configuration(cls: type[T]) -> type[T]:
-    """Create a frozen dataclass whose constructor validates its arguments.
+    """Make a class a frozen dataclass whose constructor validates its arguments.
 
     Field metadata may contain ``minimum`` and ``maximum`` (numbers), ``choices`` (the allowed
-    values), and ``recorded`` (False: the option is not part of the configuration as plain data).
-    Attribute docstrings become the help texts of the command line.
+    values), and ``recorded`` (False: `to_plain` omits the option). Attribute docstrings become the
+    help texts of the command line.
     """
     return options(dataclass(frozen=True)(cls))
 
@@ -77,7 +77,7 @@ def _hints(cls: Any) -> dict[str, Any]:
 
 @functools.cache
 def _typeguard() -> Any:
-    """Import typeguard without its plugins, for which it would read all packages' metadata."""
+    """Import typeguard without its plugins: to find them it would read all package metadata."""
     switch = "TYPEGUARD_DISABLE_PLUGIN_AUTOLOAD"
     before = os.environ.get(switch)
     os.environ[switch] = before or "1"
@@ -107,7 +107,7 @@ def _validate(instance: Any, cls: Any) -> None:
 
 
 def _misfit(where: str, value: Any, hint: Any, error: Exception) -> str:
-    """Return why an option cannot have a value."""
+    """Return why a value is not valid for an option."""
     name = type(value).__name__
     if dataclasses.is_dataclass(value):
         wanted = _configuration_in(hint)
@@ -115,7 +115,7 @@ def _misfit(where: str, value: Any, hint: Any, error: Exception) -> str:
     accepts_class = any(typing.get_origin(part) is type for part in typing.get_args(hint))
     if accepts_class and type(value).__module__ != "builtins":
         return f"{where} is an instance of {name}: give the class, {name}, not an instance."
-    return f"{where} is {value!r}, of the wrong type: {error}."
+    return f"{where} is {value!r}, which has the wrong type: {error}."
 
 
 def _check_range(where: str, value: Any, metadata: Mapping[Any, Any]) -> None:
@@ -140,7 +140,7 @@ MODES = ("training", "validation", "prediction")
 WRONG = "wrong"
 """Mode of the samples that `check_sample` rejected."""
 SETS = "parameters"
-"""Mode of the parameters that were chosen, one row for each set."""
+"""Mode of the chosen parameters, one row for each set."""
 
 
 @configuration
@@ -148,56 +148,58 @@ class EnvironmentConfig:
     """The environment that generates the samples, and how its instances run."""
 
     environment: str | type[Any]
-    """Reference "plugin/name", "package.module:Class", "script.py:Class", or the class itself."""
+    """Reference "plugin/name", "package.module:Class" or "script.py:Class", or the class itself."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the environment's constructor."""
     as_tcp_ip_client: bool = True
-    """Run each instance in a process of its own; otherwise all in this process."""
+    """Run each instance in a separate process; otherwise run all in this process."""
     num_clients: int = at_least(1, 1)
-    """Number of instances. The same seed and number generate the same samples, in any process."""
+    """Number of instances. The same seed and the same number of instances give the same samples,
+    regardless of the processes."""
     min_clients: int | None = at_least(1, None)
-    """Makes the run elastic: clients may join and leave while it runs, and each runs several
-    instances if there are fewer of them. It begins with this many and waits when there are fewer.
-    None: 1 if `max_clients` is set; otherwise each instance has a client of its own."""
+    """Makes the run elastic: clients may join and leave at any time, and a client runs several
+    instances if there are fewer clients than instances. The run starts with this many clients, and
+    pauses while there are fewer. None: 1 if `max_clients` is set; otherwise one client for each
+    instance."""
     max_clients: int | None = at_least(1, None)
-    """Makes the run elastic: at most this many clients run it. None: as many as `num_clients`, or
-    `min_clients` if that is more."""
+    """Makes the run elastic, with at most this many clients. None: `num_clients`, or `min_clients`
+    if that is larger."""
     ip_address: str = "127.0.0.1"
     """Address of the server."""
     port: int = field(default=0, metadata={"minimum": 0, "maximum": 65535})
     """Port of the server; 0: any free one."""
     simulations_per_step: int = at_least(1, 1)
-    """Calls of `step` per sample; `compute_training_data` is False in all but the last."""
+    """Calls of `step` per sample; `compute_training_data` is False in all but the last call."""
     max_wrong_samples_per_step: int = at_least(0, 10)
     """Number of consecutive samples that `check_sample` may reject before the run fails."""
     record_wrong_samples: bool = False
-    """Store the samples that `check_sample` rejects too, in the mode "wrong", except invalid ones,
-    for example with NaN. In a prediction, only if it records."""
+    """Also store the samples that `check_sample` rejects, in the mode "wrong", unless they are
+    invalid, for example because of NaN. A prediction does so only if it records."""
     load_samples: bool = False
-    """Send stored samples of `DatasetConfig.existing_dir`, or else of the session, through the
-    environments, available as `Environment.sample`. In a training, the results are trained on and
-    replace the samples in the session's own copy of the dataset. In a prediction the samples are
-    only read, in the order of writing, repeatedly."""
+    """Send stored samples through the environments, available as `Environment.sample`: those of
+    `DatasetConfig.existing_dir` if set, otherwise the session's own. Training uses the results and
+    replaces the samples with them in the session's own copy of the dataset. Prediction only reads
+    the samples, in the order of writing, repeatedly."""
     only_first_epoch: bool = True
-    """With `load_samples`, in a training: send the samples in the first epoch only, and read the
-    results in later ones; otherwise send the last epoch's results again in every epoch."""
+    """For training with `load_samples`: replay the samples in the first epoch only, and read the
+    results in later epochs; otherwise replay the last epoch's results in every epoch."""
     always_produce: bool = False
-    """Generate new samples in every epoch of a training, not only in the first; excludes
-    `load_samples`."""
+    """Generate new samples in every epoch of a training, not only in the first; cannot be combined
+    with `load_samples`."""
     visualizer: str | type[Any] | None = None
     """Visualizer, for example "rerun"; None: the environment has no factory."""
     visualizer_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the visualizer."""
     sampler: str | type[Any] | None = None
-    """Sampler of the environment's parameters, for example "physx/sobol"; None: they are drawn from
+    """Sampler of the environment's parameters, for example "physx/sobol"; None: draw them from
     their distributions."""
     sampler_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the sampler."""
     redraw: int = at_least(0, 0)
-    """Number of times that each instance continues with its next parameters after some with which
-    the simulation failed; those are recorded."""
+    """Number of times that each instance may continue with its next parameters after a simulation
+    failed; the parameters that failed are recorded."""
     seed: int | None = None
-    """Seed of all instances' random streams; None: a random one, recorded in the session."""
+    """Seed of all instances' random streams; None: a random seed, recorded in the session."""
     timeout: float = at_least(0.1, 60.0)
     """Longest time in s that a client may be silent while the server waits for it."""
     restarts: int = at_least(0, 0)
@@ -205,12 +207,12 @@ class EnvironmentConfig:
     without the failure."""
     launcher: str | type[Any] = "physx/subprocess"
     """Launcher of the clients: "physx/subprocess" on this machine; "physx/manual" if you start them
-    with ``physx client``; or that of a plugin."""
+    with ``physx client``; or a plugin's launcher."""
     launcher_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the launcher."""
     token_file: str | None = None
-    """File with the secret token of the clients, readable by its owner only; None: the environment
-    variable PHYSX_TOKEN, or else a random token for clients that are started here."""
+    """File with the clients' secret token, readable only by its owner; None: the environment
+    variable PHYSX_TOKEN if set, otherwise a random token for clients started here."""
 
     @property
     def is_elastic(self) -> bool:
@@ -226,24 +228,25 @@ class DatasetConfig:
     """Folder of an existing session or dataset to read; it is never modified."""
     mode: str = field(default="training", metadata={"choices": (*MODES, WRONG)})
     """Mode to write or read: "training", "validation" or "prediction"; "wrong", with the samples
-    that `check_sample` rejected, is only read."""
+    that `check_sample` rejected, can only be read."""
     max_file_size: float = at_least(1e-6, 0.25)
     """Size of a partition in GB."""
     writers: str = field(default="server", metadata={"choices": ("server", "clients")})
-    """Who writes the rows of a data generation: the run's own process, "server", or each client
-    those that it makes, "clients", to partitions of its own in the dataset's folder, which all must
-    share: for rates that the run's connection cannot carry."""
+    """Who writes the rows in data generation: "server", the run's own process, or "clients", each
+    client its own rows to its own partitions. The clients must then share the dataset's folder. Use
+    this for data rates that the run's connection cannot carry."""
     shuffle: bool = True
     """Read each epoch in a new random order; otherwise in the order of writing."""
     validation_split: float = field(default=0.0, metadata={"minimum": 0.0, "maximum": 0.99})
-    """Share of the samples that a training holds back for validation, if the dataset has no mode
-    "validation"; the same samples in every training. The others define the normalization."""
+    """Fraction of the samples held back from training for validation, if the dataset has no mode
+    "validation"; the same samples every time. The others define the normalization."""
     split_by: str = field(default="row", metadata={"choices": ("row", "episode")})
-    """Hold back single samples, or whole trajectories: "row" or "episode"."""
+    """Hold back single samples or whole trajectories: "row" or "episode"."""
     normalize: bool = False
     """Normalize each component to mean 0 and standard deviation 1 for networks."""
     recompute_normalization: bool = False
-    """Compute mean and standard deviation from the stored rows instead of the stored values."""
+    """Recompute mean and standard deviation from the stored rows instead of using the stored
+    values."""
 
 
 @configuration
@@ -251,7 +254,7 @@ class NetworkConfig:
     """The network to train or to predict with, and its optimization."""
 
     network: str | type[Any] | None = None
-    """Reference of the network; None: that of the checkpoint (prediction only)."""
+    """Reference of the network; None: the checkpoint's network (prediction only)."""
     network_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the network's constructor."""
     optimization: str | type[Any] | None = None
@@ -263,41 +266,41 @@ class NetworkConfig:
     transformation_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the transformation's constructor."""
     loss: str | type[Any] | None = None
-    """Loss function, a class or the name of one of the network's library."""
+    """Loss function: a class, or the name of one in the network's library."""
     optimizer: str | type[Any] | None = None
-    """Optimizer, a class or the name of one of the network's library."""
+    """Optimizer: a class, or the name of one in the network's library."""
     optimizer_kwargs: dict[str, Any] = field(default_factory=dict)
     """Further keyword arguments of the optimizer."""
     lr: float | None = None
     """Learning rate; None: the optimizer's default."""
     scheduler: str | type[Any] | None = None
-    """Scheduler of the learning rate, a class or the name of one of the network's library; None:
-    the rate is constant."""
+    """Learning-rate scheduler: a class, or the name of one in the network's library; None: a
+    constant rate."""
     scheduler_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the scheduler."""
     network_dir: str | Path | None = None
-    """Session or network folder with the parameters that a training starts from."""
+    """Session or network folder with the initial parameters of the training."""
     network_name: str | None = None
-    """Name of the checkpoints in the session; None: "network" for those that are written, and for
-    one that is read the only name there."""
+    """Name of the checkpoints in the session; None: "network" when writing; when reading, the only
+    name that exists there."""
     which_network: int | Literal["best"] = -1
     """Number of the checkpoint to load; -1: the last; "best": the one with the smallest loss."""
     save_each_epoch: bool = False
     """Write a checkpoint after every epoch, not only at the end."""
     save_best: bool | None = None
-    """Write the network of the epoch with the smallest validation loss, or training loss if nothing
-    is validated, as checkpoint "best". None: if something is validated or `Training.patience` is
-    set, as the training loss is usually smallest at the end."""
+    """Save the network with the smallest validation loss, or training loss without validation, as
+    checkpoint "best". None: only with validation or `Training.patience`, because the training loss
+    is usually smallest at the end."""
     data_type: str = field(default="float32", metadata={"choices": ("float32", "float64")})
-    """Floating type that the network computes in."""
+    """Floating-point type of the network's computations."""
     device: str = "auto"
     """Device of the network: "cpu", "cuda", "cuda:1" ... or "auto"."""
     require_training_stuff: bool = True
-    """Whether a training needs `loss` and `optimizer`; False if the optimization has its own."""
+    """Whether training needs `loss` and `optimizer`; False if the optimization has its own."""
 
 
 def to_plain(config: Any) -> dict[str, Any]:
-    """Return a configuration as TOML-compatible data, without options that are None."""
+    """Return a configuration as TOML-compatible data, omitting options that are None."""
     return {
         name: _plain_value(f"{type(config).__name__}.{name}", getattr(config, name))
         for name in (f.name for f in dataclasses.fields(config) if _is_recorded(f))
@@ -337,7 +340,7 @@ def read_toml(path: str | Path) -> dict[str, Any]:
     """Return the content of a TOML file.
 
     Raises:
-        ConfigFileError: If the file is missing, cannot be read, or is not TOML.
+        ConfigFileError: If the file is missing, unreadable, or not valid TOML.
     """
     try:
         return parse_toml(Path(path).read_bytes())
@@ -357,7 +360,7 @@ def write_toml(path: str | Path, plain: Mapping[str, Any]) -> None:
 
 
 def from_plain(make: Callable[..., T], plain: Mapping[str, Any]) -> T:
-    """Create a configuration from plain data, in which tables are nested configurations.
+    """Create a configuration from plain data; tables become nested configurations.
 
     Args:
         make: A configuration, or another dataclass decorated with `options`.
@@ -383,14 +386,14 @@ def _configuration_in(hint: Any) -> type[Any] | None:
 
 
 SCRIPT_PREFIX = "_physx_script_"
-"""Prefix of the module names of imported scripts."""
+"""Prefix of the module names under which scripts are imported."""
 
 
 def reference_of(component: Any) -> str:
-    """Return the reference by which another process finds a component.
+    """Return the reference by which another process can find a component.
 
     Args:
-        component: A reference, which is returned unchanged, or a class.
+        component: A class; or a reference, which is returned unchanged.
 
     Raises:
         UsageError: If the class was defined in a function or in an interactive session, where other

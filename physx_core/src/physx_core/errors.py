@@ -1,6 +1,6 @@
 """The errors of physx, one class for each kind of problem that a user can fix.
 
-Plugins raise these errors too: the command line reports them without a traceback.
+Plugins raise these errors too. The command line reports them without a traceback.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ def listed(names: Iterable[str]) -> str:
 
 
 def _listed_near(name: str, known: Sequence[str]) -> str:
-    """Return the known names, or if there are many, those closest to `name` and how many more."""
+    """Return the known names; if there are many, the closest ones and the number of others."""
     import difflib
 
     if len(known) <= 20:
@@ -35,9 +35,9 @@ def _listed_near(name: str, known: Sequence[str]) -> str:
 
 
 def printable(text: object) -> str:
-    """Return text that cannot control a terminal: other characters than these are escaped.
+    """Escape everything in a text that could control a terminal; keep line breaks and tabs.
 
-    Names in files and in packages' metadata come from strangers. Lines and tabs are kept.
+    Names in files and in package metadata are not trusted.
     """
     return "".join(
         each if each.isprintable() or each in "\n\t" else ascii(each)[1:-1] for each in str(text)
@@ -45,7 +45,7 @@ def printable(text: object) -> str:
 
 
 class PhysxError(Exception):
-    """Base of all errors of physx."""
+    """Base class of all physx errors."""
 
 
 # Configuration ------------------------------------------------------------------------------
@@ -56,10 +56,10 @@ class ConfigError(PhysxError):
 
 
 class UnknownOptionError(ConfigError):
-    """A configuration does not have an option of this name.
+    """A configuration has no option of this name.
 
     Attributes:
-        owner: Name of the configuration, for example ``EnvironmentConfig``.
+        owner: The configuration, for example ``EnvironmentConfig``.
         unknown: The unknown option names.
         known: The valid option names.
     """
@@ -74,20 +74,20 @@ class UnknownOptionError(ConfigError):
 
 
 class UnknownArgumentError(UnknownOptionError, TypeError):
-    """A constructor does not have an argument of this name.
+    """A constructor has no argument of this name.
 
-    It is a `TypeError` too, in Python's words: Gymnasium and TorchRL offer an environment arguments
-    that it may lack, and look for these words to go on without them.
+    Also a `TypeError` with Python's wording: Gymnasium and TorchRL pass arguments that an
+    environment may not accept, and recognize this wording to retry without them.
     """
 
     def __init__(self, owner: str, unknown: Iterable[str] = (), known: Iterable[str] = ()) -> None:
         """Describe the error.
 
         Args:
-            owner: Name of the class; or, without unknown arguments, the whole message, as Gymnasium
-                raises an error again with its text extended.
+            owner: Name of the class. Without unknown arguments: the whole message, because
+                Gymnasium re-raises an error with an extended text.
             unknown: Names of the unknown arguments.
-            known: Names of its arguments.
+            known: Names of the arguments that the class accepts.
         """
         self.owner, self.unknown, self.known = owner, sorted(unknown), sorted(known)
         message = owner
@@ -105,7 +105,7 @@ class ConfigFileError(ConfigError):
 
 
 class UsageError(PhysxError):
-    """An invalid call, for example of a method outside of its phase."""
+    """A call is invalid, for example a method is called outside its phase."""
 
 
 # Plugins ------------------------------------------------------------------------------------
@@ -140,12 +140,12 @@ class PluginNotFoundError(PhysxError):
 
 
 class ComponentNotFoundError(PhysxError):
-    """The plugin, module or script exists, but does not have the requested component.
+    """The plugin, module, or script exists but does not have the requested component.
 
     Attributes:
         kind: Kind of the component, for example ``environment``.
         name: The requested name.
-        known: Names of the existing components.
+        known: Names of the components that it has.
     """
 
     def __init__(
@@ -157,15 +157,15 @@ class ComponentNotFoundError(PhysxError):
 
 
 class ContractError(PhysxError):
-    """A component does not do what physx and its users expect of one of its kind."""
+    """A component does not fulfill the contract of its kind."""
 
 
 class ReferenceFormError(PhysxError):
-    """The reference to a component has an invalid form, or names what is no such component."""
+    """A reference is malformed, or does not name a component of the right kind."""
 
 
 class UntrustedReferenceError(PhysxError):
-    """A file that was read names code that is no component of an installed plugin."""
+    """A file names code that is not a component of an installed plugin."""
 
 
 # Samples ------------------------------------------------------------------------------------
@@ -175,9 +175,9 @@ class SampleError(PhysxError):
     """An environment set data that cannot be stored.
 
     Attributes:
-        field: Name of the field, or an empty string if the error is not about a field.
-        instance_id: Number of the environment instance, from 1; 0 if it is not about an instance.
-        step: The instance's step that set the data, from 0; -1 if it is not about a step.
+        field: Name of the field; empty if the error does not concern a single field.
+        instance_id: Number of the environment instance, from 1; 0 if unknown.
+        step: The instance's step that set the data, from 0; -1 if unknown.
     """
 
     def __init__(
@@ -191,14 +191,14 @@ class SampleError(PhysxError):
         super().__init__(message)
 
     def at(self, instance_id: int, step: int) -> SampleError:
-        """Return this error with the instance and the step that it is about."""
+        """Return this error with its instance and step added."""
         text = str(self)
         text = text[:1].lower() + text[1:]
         return type(self)(text, field=self.field, instance_id=instance_id, step=step)
 
 
 class MissingFieldError(SampleError):
-    """A defined field is missing in the sample."""
+    """A defined field is missing from the sample."""
 
 
 class UnknownFieldError(SampleError):
@@ -225,13 +225,13 @@ class WrongSamplesError(SampleError):
 
 
 class EnvironmentFailedError(PhysxError):
-    """User code of an environment raised an exception.
+    """An environment's own code raised an exception.
 
     Attributes:
         instance_id: Number of the environment instance, from 1.
         method: Name of the method that raised, for example ``step``.
         step: The instance's step at which it raised, from 0; -1 before the first.
-        remote_traceback: Traceback in the environment's process, as text.
+        remote_traceback: Traceback from the environment's process, as text.
     """
 
     def __init__(
@@ -244,13 +244,14 @@ class EnvironmentFailedError(PhysxError):
 
 
 class ClientError(PhysxError):
-    """A client process ended, hung or could not be reached.
+    """A client process exited, hung, or could not be reached.
 
     Attributes:
         instance_id: Number of the client's environment instance, from 1.
         exit_status: Exit status of the process, negative for a signal, None while it runs.
         stderr: Last lines of its standard error.
-        client: In an elastic run, the client that ran the instance and its machine, in words.
+        client: In an elastic run, a description of the client that ran the instance, and of its
+            machine.
     """
 
     def __init__(
@@ -277,8 +278,8 @@ class TooFewClientsError(PhysxError):
     """An elastic run has had fewer clients than it needs for too long.
 
     Attributes:
-        clients: How many there are.
-        needed: How many there must be.
+        clients: Number of clients.
+        needed: Number of clients that the run needs.
     """
 
     def __init__(self, clients: int, needed: int, message: str) -> None:
@@ -287,7 +288,7 @@ class TooFewClientsError(PhysxError):
 
 
 class ProgramError(PhysxError):
-    """A program that makes the samples of an environment failed, hung or broke the protocol.
+    """A program that generates an environment's samples failed, hung, or violated the protocol.
 
     Attributes:
         program: The program and its arguments, as in a shell.
@@ -304,7 +305,7 @@ class ProgramError(PhysxError):
 
 
 class ConnectionRefusedByPeerError(PhysxError):
-    """The other side of a connection failed to authenticate, or violated the protocol."""
+    """The other side of a connection failed to authenticate or violated the protocol."""
 
 
 class UnansweredError(ConnectionRefusedByPeerError):
@@ -312,7 +313,7 @@ class UnansweredError(ConnectionRefusedByPeerError):
 
 
 class SilentPeerError(UnansweredError):
-    """What listens at an address did not respond in time."""
+    """The process that listens at an address did not respond in time."""
 
 
 # Sessions, datasets, checkpoints ------------------------------------------------------------
@@ -323,7 +324,7 @@ class SessionError(PhysxError):
 
 
 class StudyError(PhysxError):
-    """A study cannot be begun, continued or shown, or trials of it ended without a result."""
+    """A study cannot be started, continued, or shown, or some of its trials have no result."""
 
 
 class DatasetError(PhysxError):
@@ -339,7 +340,7 @@ class DatasetLockedError(DatasetError):
 
 
 class ExchangeError(DatasetError):
-    """Rows cannot be exported to, or imported from, a file of another format."""
+    """Rows cannot be exported to or imported from a file of another format."""
 
 
 class MissingLibraryError(PhysxError):
@@ -347,7 +348,7 @@ class MissingLibraryError(PhysxError):
 
     Attributes:
         library: Name of the package.
-        extra: Extra of a distribution that installs it.
+        extra: Name of the extra that installs it.
     """
 
     def __init__(
@@ -361,7 +362,7 @@ class MissingLibraryError(PhysxError):
 
 
 class FieldsMismatchError(DatasetError):
-    """Fields that must agree differ.
+    """Fields that must match differ.
 
     Attributes:
         differences: One line of text for each difference, by field name.
@@ -374,15 +375,15 @@ class FieldsMismatchError(DatasetError):
 
 
 class CheckpointError(PhysxError):
-    """A checkpoint is missing, damaged, or of another network."""
+    """A checkpoint is missing, damaged, or belongs to another network."""
 
 
 class DivergedError(PhysxError):
-    """A training met a loss, gradient or parameter that is not finite.
+    """A loss, gradient, or parameter became NaN or infinite during training.
 
     Attributes:
-        epoch: The epoch, counted from 1; 0 if it is not about an epoch.
-        batch: The batch in the epoch, counted from 1; 0 if it is not about a batch.
+        epoch: The epoch, counted from 1; 0 if it does not apply.
+        batch: The batch in the epoch, counted from 1; 0 if it does not apply.
     """
 
     def __init__(self, message: str, *, epoch: int = 0, batch: int = 0) -> None:
@@ -404,10 +405,10 @@ class ModelError(PhysxError):
 
 
 class MissingMeshesError(ModelError):
-    """Mesh files that a robot description names do not exist.
+    """A robot description names mesh files that do not exist.
 
     Attributes:
-        missing: Every missing file, as named in the description.
+        missing: All missing files, as named in the description.
     """
 
     def __init__(self, model: str, missing: Sequence[str]) -> None:
@@ -420,7 +421,7 @@ class MissingMeshesError(ModelError):
 
 
 class SimulationError(PhysxError):
-    """The simulation cannot perform a call, or its state is no longer finite."""
+    """A simulation cannot perform a call, or its state is no longer finite."""
 
 
 class FeatureNotSupportedError(SimulationError):
@@ -443,14 +444,14 @@ class FeatureNotSupportedError(SimulationError):
 
 
 class EpisodeError(PhysxError):
-    """A call at the wrong time in an episode, for example a step before the first reset."""
+    """A call came at the wrong time in an episode, for example a step before the first reset."""
 
 
 class ActionError(PhysxError):
     """An action is not in the action space and cannot be converted.
 
     Attributes:
-        entry: Invalid entry of the action, for example ``[2]`` or ``["arm"][0]``; empty if the
+        entry: The invalid entry of the action, for example ``[2]`` or ``["arm"][0]``; empty if the
             whole action is invalid.
     """
 
@@ -460,7 +461,7 @@ class ActionError(PhysxError):
 
 
 class LogError(PhysxError):
-    """The log of an episode is missing, damaged, or lacks the requested data."""
+    """An episode's log is missing, damaged, or lacks the requested data."""
 
 
 class VisualizerError(PhysxError):
@@ -475,7 +476,7 @@ class RemoteError(PhysxError):
 
 
 class RemoteClosedError(RemoteError):
-    """The connection was closed, by the other side or here."""
+    """The connection was closed by either side."""
 
 
 class RemoteTimeoutError(RemoteError):
@@ -487,4 +488,4 @@ class RemoteProtocolError(RemoteError):
 
 
 class RequestError(RemoteError):
-    """An environment cannot perform a request; it keeps running."""
+    """An environment cannot perform a request. It keeps running."""

@@ -1,4 +1,4 @@
-"""Fields: the names, shapes, types and units of a sample's values, and which values fit them."""
+"""Fields: names, shapes, types, and units of a sample's values, and the values that fit them."""
 
 from __future__ import annotations
 
@@ -20,13 +20,13 @@ RESERVED = ("env_id", "episode", "step")
 """Fields that physx adds to each row: number of the instance, its trajectory, and its step."""
 
 NUMBERS = "biufc"
-"""Kinds of NumPy types that fields may have: boolean, integers, floating, complex."""
+"""Kinds of NumPy types that fields may have: boolean, integer, floating-point, complex."""
 
 _FITTING = {"b": "b", "i": "biu", "u": "biu", "f": "biuf", "c": NUMBERS}
 """Kind of a field's type to the kinds of values that fit it."""
 
 NO_ARRAY = (ValueError, TypeError, OverflowError, RuntimeError)
-"""What `np.asarray` raises for values that are ragged or otherwise not convertible to an array."""
+"""Exceptions of `np.asarray` for values that are ragged or cannot be converted to an array."""
 
 _SMALL = 8192  # elements
 
@@ -38,9 +38,9 @@ class Field:
     Attributes:
         name: Name, a Python identifier.
         shape: Shape of one sample's value. None: taken from the first sample.
-        dtype: NumPy type, any plain boolean, integer, floating or complex one.
-        unit: Unit of the values, for example ``"N m"``; empty for numbers without one.
-        role: ``training`` for what networks read, ``additional`` for what is kept beside it.
+        dtype: NumPy type: any plain boolean, integer, floating-point, or complex type.
+        unit: Unit of the values, for example ``"N m"``; empty for dimensionless numbers.
+        role: ``training`` for data that networks read, ``additional`` for everything else.
     """
 
     name: str
@@ -53,8 +53,8 @@ class Field:
         """Check the name, and normalize shape and type.
 
         Raises:
-            ConfigError: If the name is not an identifier, the shape is negative, or the type is
-                not a plain one.
+            ConfigError: If the name is not an identifier, the shape is invalid, or the type is not
+                a plain one.
         """
         if not isinstance(self.name, str) or not self.name.isidentifier():
             raise ConfigError(f"A field's name must be a Python identifier, not {self.name!r}.")
@@ -77,39 +77,40 @@ class Field:
 
     @cached_property
     def numpy_dtype(self) -> np.dtype[Any]:
-        """The type as an object of NumPy."""
+        """The type as a NumPy object."""
         return np.dtype(self.dtype)
 
     @cached_property
     def nbytes(self) -> int:
-        """Bytes of one sample's value; 0 while the shape is unknown."""
+        """Size of one sample's value in bytes; 0 while the shape is unknown."""
         count = math.prod(self.shape) if self.shape is not None else 0
         return count * self.numpy_dtype.itemsize
 
     def convert(self, values: Any, *, axes: int = 0, instance_id: int = 0, step: int = -1) -> Array:
         """Return values as an array of the field's shape and type.
 
-        This is the one rule of which values fit a field, whatever way they come into a dataset:
+        These rules decide which values fit a field, however they get into a dataset:
 
-        - Booleans, integers, floating-point and complex numbers fit fields of their own kind and of
-          the kinds after it in this list; a number never becomes a boolean, a complex number never
-          a real one.
-        - An integer field holds each integer exactly: one that is out of its range does not fit.
-        - Floating-point and complex fields round to the nearest value of their type, integers too
-          (float64 holds all of them up to 2**53). A number that is too large for the type becomes
-          infinite, and infinite numbers are rejected where rows are checked: see `is_finite`.
-        - Byte order and memory layout do not matter. Texts, objects and dates do not fit any field.
+        - Booleans, integers, floating-point numbers, and complex numbers fit fields of their own
+          kind and of the kinds after it in this list. A number never becomes a boolean, and a
+          complex number never becomes real.
+        - An integer field stores integers exactly: one that is out of range does not fit.
+        - Floating-point and complex fields round to the nearest value of their type, also integers
+          (float64 represents all of them up to 2**53). A number that is too large for the type
+          becomes infinite, and infinite numbers are rejected when rows are checked: see
+          `is_finite`.
+        - Byte order and memory layout do not matter. Strings, objects, and dates fit no field.
         - An empty list or tuple fits a field of any type.
 
         Args:
-            values: One value, or an array of them; numbers, sequences and arrays.
-            axes: How many axes come before the field's own.
-            instance_id: Instance that made the values, for the error; 0: unknown.
-            step: The instance's step that made them, for the error.
+            values: One value or an array of values: numbers, sequences, or arrays.
+            axes: Number of axes before the field's own.
+            instance_id: Instance that set the values, for the error; 0: unknown.
+            step: The instance's step that set them, for the error.
 
         Returns:
-            An array of shape (*first axes, *field shape). It shares the memory of `values` if that
-            is an array of the field's type.
+            An array of shape (*first axes, *field shape). It shares memory with `values` if that is
+            an array of the field's type.
 
         Raises:
             FieldShapeError: If the values are ragged or have another shape.
@@ -143,9 +144,9 @@ class Field:
         """Return the error for a value that is NaN or infinite.
 
         Args:
-            instance_id: Instance that made the value; 0: unknown.
-            step: The instance's step that made it.
-            where: Further description of the place, with a leading space.
+            instance_id: Instance that set the value; 0: unknown.
+            step: The instance's step that set it.
+            where: Further description of the location, with a leading space.
         """
         return NotFiniteError(
             f'field "{self.name}" holds NaN or an infinite number as {self.numpy_dtype}{where}.',
@@ -177,17 +178,17 @@ class Field:
 
 
 FieldLike: TypeAlias = Field | tuple[str, Any] | str
-"""A field, its name, or ``(name, type)``; `type`: NumPy type, `float`, `int`, `bool`, `ndarray`."""
+"""A field, its name, or ``(name, type)``; type: a NumPy type, `float`, `int`, `bool`, `ndarray`."""
 
 
 def as_fields(given: FieldLike | Iterable[FieldLike], role: Role) -> list[Field]:
-    """Return a user's description of fields as fields of one role.
+    """Convert a user's field descriptions to fields of one role.
 
     Args:
         given: One field or several: a `Field`, a name, or a pair (name, type). The type
-            `np.ndarray` stands for an array of float64 with the shape of the first sample;
-            `float`, `int` and `bool` stand for one number.
-        role: Role that all the fields get.
+            `np.ndarray` means an array of float64 with the shape of the first sample; `float`,
+            `int`, and `bool` mean one number.
+        role: Role of all the fields.
 
     Raises:
         ConfigError: If a name is not an identifier or is reserved, or a type is not a plain one.
@@ -199,7 +200,7 @@ def as_fields(given: FieldLike | Iterable[FieldLike], role: Role) -> list[Field]
     fields = [_as_field(item, role) for item in items]
     for field in fields:
         if field.name in RESERVED:
-            raise ConfigError(f'The field name "{field.name}" is reserved: physx fills it itself.')
+            raise ConfigError(f'The field name "{field.name}" is reserved: physx sets this field.')
     return fields
 
 
@@ -219,11 +220,11 @@ def _as_field(item: Any, role: Role) -> Field:
 
 
 def is_finite(array: Array) -> bool:
-    """Return whether an array holds neither NaN nor an infinite number."""
+    """Return whether an array contains neither NaN nor infinity."""
     if array.dtype.kind not in "fc":
         return True
-    # A sum tells it in one fast pass, unless it overflows. Small arrays take the quicker dot
-    # product; for large ones it would start threads, which costs more than it saves.
+    # The sum shows it in one fast pass, unless it overflows. For small arrays the dot product is
+    # faster; for large ones it would start threads, which costs more than it saves.
     if array.size <= _SMALL:
         total = np.vdot(array, array).real
     else:
@@ -233,7 +234,7 @@ def is_finite(array: Array) -> bool:
 
 
 def first_not_finite(rows: Array) -> int | None:
-    """Return the number of the first row that holds NaN or an infinite number; None: no row."""
+    """Return the index of the first row that contains NaN or infinity; None: no row does."""
     if is_finite(rows):
         return None
     finite = np.isfinite(rows).reshape(len(rows), -1).all(axis=1)
@@ -255,7 +256,7 @@ def _misfit(array: Array, dtype: np.dtype[Any]) -> str:
 
 
 def _cast(array: Array, dtype: np.dtype[Any]) -> Array:
-    """Return an array in a type that can hold it; what is too large for it becomes infinite."""
+    """Convert an array to a type that can hold it; numbers too large for it become infinite."""
     size, given = _real_size(dtype), _real_size(array.dtype)
     if dtype.kind in "fc" and (size < given or size == 2):
         with np.errstate(over="ignore"):
@@ -264,5 +265,5 @@ def _cast(array: Array, dtype: np.dtype[Any]) -> Array:
 
 
 def _real_size(dtype: np.dtype[Any]) -> int:
-    """Return the bytes of a number of a type, or of each part of a complex one."""
+    """Return the size in bytes of a number of this type, or of each part of a complex number."""
     return dtype.itemsize // 2 if dtype.kind == "c" else dtype.itemsize

@@ -1,8 +1,8 @@
-"""File operations: everything that datasets and checkpoints do to the disk goes through here.
+"""File operations: all disk access of datasets and checkpoints goes through this module.
 
-Each function does one thing completely or raises; what survives a power cut is said by those that
-wait for the disk. No link is ever followed, and only regular files are opened: a dataset may come
-from an untrusted source.
+Each function does one thing completely or raises. Functions that wait for the disk state what
+survives a power failure. Links are never followed, and only regular files are opened, because a
+dataset may come from an untrusted source.
 """
 
 from __future__ import annotations
@@ -19,18 +19,18 @@ from physx_core.errors import DatasetError, PhysxError
 from physx_core.typing import Array
 
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
-"""Error numbers of a disk that is full, a quota or a file size that is reached."""
+"""Error numbers for a full disk, an exhausted quota, and the maximum file size."""
 
 _SAFELY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
 @contextlib.contextmanager
 def storing(what: str) -> Iterator[None]:
-    """Translate the system's errors into a `DatasetError` that says what could not be stored."""
+    """Convert system errors to a `DatasetError` that names what could not be stored."""
     try:
         yield
     except OSError as error:
-        raise storage_error(what, error, "All rows committed before") from error
+        raise storage_error(what, error, "All previously committed rows") from error
 
 
 def storage_error(
@@ -43,17 +43,17 @@ def storage_error(
     """Return the error for something that could not be stored.
 
     Args:
-        what: What was to be stored.
+        what: What could not be stored.
         error: The system's error.
-        safe: What is intact nevertheless.
+        safe: What is still intact.
         kind: Class of the returned error.
-        advice: What to do after having freed some space, if the disk is full.
+        advice: What to do after freeing some space, if the disk is full.
     """
     if isinstance(error, SyncError) and kind is DatasetError:
         return DatasetError(
             f"{what} cannot be stored: the disk has failed ({error.strerror}), and rows of the "
-            "last seconds may be lost. Close the dataset and open it again: it then has all rows "
-            "that are intact."
+            "last few seconds may be lost. Close the dataset and open it again to get all intact "
+            "rows."
         )
     if isinstance(error, RemovedError):
         return DatasetError(
@@ -72,7 +72,7 @@ def open_regular(path: Path | str, flags: int = os.O_RDONLY) -> int:
     """Open a file and return its descriptor.
 
     Raises:
-        OSError: If it cannot be opened, or is a link, a folder, a pipe or a device.
+        OSError: If it cannot be opened, or is a link, folder, pipe, or device.
     """
     try:
         descriptor = os.open(path, flags | _SAFELY, 0o666)
@@ -87,13 +87,13 @@ def open_regular(path: Path | str, flags: int = os.O_RDONLY) -> int:
 
 
 def create_new(path: Path) -> int:
-    """Create an empty file, replacing any of that name, and return its descriptor."""
+    """Create an empty file, replacing an existing one, and return its descriptor."""
     remove(path)
     return open_regular(path, os.O_RDWR | os.O_CREAT | os.O_EXCL)
 
 
 def duplicate(descriptor: int) -> int:
-    """Return another descriptor of an open file."""
+    """Return another descriptor for an open file."""
     return os.dup(descriptor)
 
 
@@ -103,14 +103,14 @@ def close(descriptor: int) -> None:
 
 
 def size(descriptor: int) -> int:
-    """Return how many bytes an open file has."""
+    """Return the size of an open file in bytes."""
     return os.fstat(descriptor).st_size
 
 
 def try_lock(path: Path) -> int | None:
-    """Lock a file, which is made if there is none; return its descriptor, or None if it is locked.
+    """Lock a file, creating it if needed; return its descriptor, or None if it is already locked.
 
-    Closing the descriptor unlocks it, and so does the end of the process, however it ends.
+    Closing the descriptor unlocks the file, as does the end of the process, however it ends.
 
     Raises:
         OSError: If it cannot be opened or locked.
@@ -128,7 +128,7 @@ def try_lock(path: Path) -> int | None:
 
 
 def is_removed(descriptor: int) -> bool:
-    """Return whether an open file has no name any more: somebody has removed it."""
+    """Return whether an open file has been removed and no longer has a name."""
     return os.fstat(descriptor).st_nlink == 0
 
 
@@ -146,7 +146,7 @@ def read_content(path: Path, limit: int) -> bytes:
 
 
 def read_blocks(path: Path, nbytes: int = 2**18) -> Iterator[memoryview]:
-    """Yield the bytes of a file in blocks; each is valid until the next one.
+    """Yield the contents of a file in blocks; each is valid until the next one.
 
     Raises:
         OSError: If it cannot be read.
@@ -161,12 +161,12 @@ def read_blocks(path: Path, nbytes: int = 2**18) -> Iterator[memoryview]:
 
 
 def read_head(descriptor: int, limit: int) -> bytes:
-    """Return the first bytes of an open file, at most `limit`."""
+    """Return at most the first `limit` bytes of an open file."""
     return os.pread(descriptor, limit, 0)
 
 
 def write_at(descriptor: int, content: bytes | memoryview, offset: int) -> None:
-    """Write all of the content at an offset of an open file."""
+    """Write the whole content at an offset of an open file."""
     view = memoryview(content)
     while view:
         written = os.pwrite(descriptor, view, offset)
@@ -184,9 +184,9 @@ def read_at(descriptor: int, view: memoryview, offset: int) -> bool:
 
 
 def copy_range(origin: int, place: int, target: int, target_place: int, count: int) -> bool:
-    """Let the system copy bytes from one open file to another; return whether it could.
+    """Have the system copy bytes from one open file to another; return whether it could.
 
-    File systems such as Btrfs and XFS let the files share the bytes on the disk.
+    On file systems such as Btrfs and XFS, the files then share the bytes on the disk.
 
     Raises:
         OSError: If the disk is full.
@@ -208,29 +208,29 @@ def copy_range(origin: int, place: int, target: int, target_place: int, count: i
 
 
 def as_bytes(array: Array) -> memoryview:
-    """Return the memory of a contiguous array as bytes."""
+    """Return a contiguous array's memory as bytes."""
     return array.reshape(-1).view("u1").data
 
 
 def resize(descriptor: int, size: int) -> None:
-    """Set the size of an open file; what is added reads as zeros and takes no space yet."""
+    """Set the size of an open file; added bytes read as zeros and take no space yet."""
     os.ftruncate(descriptor, size)
 
 
 def reserve(descriptor: int, start: int, stop: int) -> None:
-    """Take the disk space of some bytes of an open file, so that writing them cannot lack it."""
+    """Allocate disk space for a range of an open file, so that writing to it cannot run out."""
     os.posix_fallocate(descriptor, start, stop - start)
 
 
 class SyncError(OSError):
-    """A sync has failed: what of the writes before it is on the disk, nobody knows.
+    """A sync has failed: which of the earlier writes are on the disk is unknown.
 
-    Another sync may succeed nevertheless, because the system has dropped what it could not write.
+    A later sync may still succeed, because the system has dropped what it could not write.
     """
 
 
 class RemovedError(OSError):
-    """A file that is being written has no name any more, because somebody removed it."""
+    """A file was removed while it was being written."""
 
 
 def sync(descriptor: int) -> None:
@@ -246,7 +246,7 @@ def sync(descriptor: int) -> None:
 
 
 def start_sync(path: Path) -> None:
-    """Have the content of a file written to the disk, without waiting for it."""
+    """Start writing the content of a file to the disk, without waiting for it."""
     descriptor = open_regular(path)
     try:
         os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
@@ -269,7 +269,7 @@ def sync_file(path: Path) -> None:
 
 
 def sync_folder(folder: Path) -> None:
-    """Wait until the names in a folder are on the disk: of new, renamed and removed files.
+    """Wait until a folder's entries are on the disk: new, renamed, and removed files.
 
     Raises:
         SyncError: If the disk fails.
@@ -285,7 +285,7 @@ def sync_folder(folder: Path) -> None:
 
 
 def make_folder(folder: Path) -> None:
-    """Create a folder, with those around it, so that it is there after a power cut."""
+    """Create a folder and its missing parents durably: they survive a power failure."""
     missing = []
     while not folder.is_dir():
         missing.append(folder)
@@ -301,10 +301,10 @@ def create_folder(folder: Path, *, sync: bool = True) -> None:
 
     Args:
         folder: The folder.
-        sync: Whether to wait for the disk, so that it is there after a power cut.
+        sync: Whether to wait for the disk, so that the folder survives a power failure.
 
     Raises:
-        FileExistsError: If there is something of that name.
+        FileExistsError: If something of that name exists.
     """
     os.mkdir(folder)
     if sync:
@@ -312,12 +312,12 @@ def create_folder(folder: Path, *, sync: bool = True) -> None:
 
 
 def rename(path: Path, target: Path) -> None:
-    """Rename a file or folder; a file of the new name is replaced."""
+    """Rename a file or folder; an existing file of the new name is replaced."""
     os.replace(path, target)
 
 
 def link(path: Path, target: Path) -> None:
-    """Give a file a second name, or where that is not possible, copy it."""
+    """Create a hard link to a file, or copy the file if that is not possible."""
     try:
         os.link(path, target)
     except OSError:
@@ -325,13 +325,13 @@ def link(path: Path, target: Path) -> None:
 
 
 def remove(path: Path) -> None:
-    """Remove a file, if there is one of that name."""
+    """Remove a file, if it exists."""
     with contextlib.suppress(FileNotFoundError):
         os.unlink(path)
 
 
 def remove_folder(folder: Path) -> None:
-    """Remove a folder with everything in it, if there is one of that name."""
+    """Remove a folder with everything in it, if it exists."""
     for root, folders, names in os.walk(folder, topdown=False):
         for name in names:
             os.unlink(os.path.join(root, name))
@@ -343,17 +343,17 @@ def remove_folder(folder: Path) -> None:
 
 
 def temporary_path(path: Path) -> Path:
-    """Return the path that a file is written to before it replaces `path`."""
+    """Return the path that a file is written to before it is renamed to `path`."""
     return path.with_name(path.name + ".tmp")
 
 
 def replace(path: Path, content: bytes, *, wait: bool = True) -> None:
-    """Replace a file atomically: if the process dies, either the old or the new one is there.
+    """Replace a file atomically: if the process dies, either the old or the new file exists.
 
     Args:
         path: The file.
         content: Its new content.
-        wait: Whether to wait for the disk, so that this holds after a power cut, too.
+        wait: Whether to wait for the disk, so that this also holds after a power failure.
     """
     draft = temporary_path(path)
     try:

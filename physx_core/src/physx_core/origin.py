@@ -1,8 +1,8 @@
-"""Tells how to install a package of physx: from the place that physx itself came from.
+"""Suggests how to install a physx package: from where physx itself was installed.
 
-The packages of physx are on no index that anybody guards: the name of one in a hint to install may
-be that of a stranger's package. PEP 610 records the place of every package that did not come from
-an index.
+The names of the physx packages are not reserved on any package index, so a hint that gives only a
+name could lead to somebody else's package. PEP 610 records the origin of every package that did not
+come from an index.
 """
 
 from __future__ import annotations
@@ -17,12 +17,12 @@ _CORE = "physx-core"
 
 
 def install_hint(distribution: str, extra: str = "", *, update: bool = False) -> str:
-    """Return a sentence that says how to install a package of physx.
+    """Return a sentence on how to install a physx package.
 
     Args:
         distribution: Name of the package, for example ``physx-torch``.
         extra: Extra of the package to install with it.
-        update: Whether it is installed already, and too old.
+        update: Whether it is already installed, but too old.
     """
     named = f"{distribution}[{extra}]" if extra else distribution
     try:
@@ -38,7 +38,7 @@ def install_hint(distribution: str, extra: str = "", *, update: bool = False) ->
 
 
 def _recorded() -> dict[str, Any] | None:
-    """Return what PEP 610 recorded of the core; None: it came from an index."""
+    """Return the PEP 610 record of the core; None: it came from an index."""
     from importlib.metadata import distribution
 
     text = distribution(_CORE).read_text("direct_url.json")
@@ -46,12 +46,12 @@ def _recorded() -> dict[str, Any] | None:
         return None
     found = json.loads(text)
     if not isinstance(found, dict):
-        raise ValueError("direct_url.json is no table")
+        raise ValueError("direct_url.json is not a table")
     return found
 
 
 def _place(where: dict[str, Any], distribution: str, named: str) -> str | None:
-    """Return what pip takes for a package beside the core; None: nothing is known to be there."""
+    """Return pip's argument for a package next to the core; None: no package is known there."""
     url, folder = _without_login(where["url"]), distribution.replace("-", "_")
     extra = named.removeprefix(distribution)
     if "dir_info" in where:

@@ -1,4 +1,4 @@
-"""Parses text that may come from a stranger: JSON and TOML within limits of size and depth."""
+"""Parses untrusted JSON and TOML within limits of size and depth."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _LONG_KEY = re.compile(rb"(?:\A|[\n=\[\]{},])(?:[^\n=\[\]{},.]*+\.){%d}" % (_MOS
 
 
 def parse_json(text: str | bytes) -> Any:
-    """Return what a JSON text stands for.
+    """Return the value of a JSON text.
 
     Raises:
-        ValueError: If it is not JSON, or is nested too deeply or has so many parts that they would
+        ValueError: If it is not JSON, is nested too deeply, or has so many parts that they would
             take far more memory than the text.
     """
     content = text.encode() if isinstance(text, str) else text
@@ -38,8 +38,8 @@ def parse_toml(content: bytes) -> dict[str, Any]:
     """
     import tomllib
 
-    if _LONG_KEY.search(content.translate(None, b" \t")):  # takes time that grows with its square
-        raise ValueError(f"a key has more than {_MOST_PARTS} parts, or a text as many dots")
+    if _LONG_KEY.search(content.translate(None, b" \t")):  # parsing it takes quadratic time
+        raise ValueError(f"a key has more than {_MOST_PARTS} parts, or a string as many dots")
     try:
         return tomllib.loads(content.decode())
     except RecursionError:

@@ -1,8 +1,8 @@
 """Rotations: quaternions, rotation vectors, matrices, and roll, pitch, and yaw.
 
 A quaternion is x, y, z, w, of length 1; angles are in rad. Most functions exist twice: for one
-rotation in plain numbers, which for a few of them is many times faster than arrays, and, with names
-that end in ``_rows``, for arrays whose last axis holds the quaternion or vector.
+rotation as plain numbers, which for a few rotations is many times faster than arrays, and with the
+suffix ``_rows`` for arrays whose last axis holds the quaternion or vector.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ def cross(a: float, b: float, c: float, x: float, y: float, z: float) -> Triple:
 
 
 def cross_rows(first: Vector, second: Vector) -> Vector:
-    """Return the cross products of vectors (..., 3); for a few of them much faster than NumPy's."""
+    """Return the cross products of vectors (..., 3); much faster than NumPy's for a few vectors."""
     products = first * second.take(_NEXT, -1) - first.take(_NEXT, -1) * second
     return products.take(_NEXT, -1)
 
@@ -87,7 +87,7 @@ def rotate_rows(quaternions: Vector, vectors: Vector) -> Vector:
 def rotate_back(quaternion: Sequence[float], a: float, b: float, c: float) -> Triple:
     """Return the vector (a, b, c) rotated by the inverse of a quaternion.
 
-    That is a vector given along the world's axes, along those of a body with this orientation.
+    This converts a vector from the world frame to the frame of a body with this orientation.
     """
     x, y, z, w = quaternion
     s, t, u = 2 * (b * z - c * y), 2 * (c * x - a * z), 2 * (a * y - b * x)
@@ -109,7 +109,7 @@ def from_axis_angle(axis: Sequence[float], angle: float) -> Quaternion:
 
 
 def from_rotation_vector(x: float, y: float, z: float) -> Quaternion:
-    """Return the quaternion, with w not negative, of a rotation vector."""
+    """Return the quaternion of a rotation vector; w is not negative."""
     angle = math.sqrt(x * x + y * y + z * z)
     half = 0.5 * angle
     scale, w = math.sin(half) / angle if angle > 1e-8 else 0.5, math.cos(half)
@@ -125,7 +125,7 @@ def from_rotation_vector_rows(vectors: Vector) -> Vector:
 
 
 def to_rotation_vector(quaternion: Vector) -> Vector:
-    """Return the rotation vector, shape (3,), at most pi long, of a quaternion."""
+    """Return the rotation vector of a quaternion, shape (3,), at most pi long."""
     w = float(quaternion[3])
     xyz = quaternion[:3] if w >= 0 else -quaternion[:3]
     sine = math.sqrt(xyz[0] ** 2 + xyz[1] ** 2 + xyz[2] ** 2)
@@ -134,7 +134,7 @@ def to_rotation_vector(quaternion: Vector) -> Vector:
 
 
 def to_rotation_vector_rows(quaternions: Vector) -> Vector:
-    """Return the rotation vectors (..., 3), at most pi long, of quaternions (..., 4)."""
+    """Return the rotation vectors of quaternions (..., 4), shape (..., 3), at most pi long."""
     signed = np.where(quaternions[..., 3:] < 0, -quaternions, quaternions)
     axis, length = signed[..., :3], np.linalg.norm(signed[..., :3], axis=-1, keepdims=True)
     angle = 2 * np.arctan2(length, signed[..., 3:])
@@ -155,7 +155,7 @@ def from_roll_pitch_yaw(roll: float, pitch: float, yaw: float) -> Quaternion:
 
 
 def to_roll_pitch_yaw(quaternion: Sequence[float]) -> Triple:
-    """Return roll, pitch, and yaw of a quaternion."""
+    """Return the roll, pitch, and yaw of a quaternion."""
     x, y, z, w = quaternion
     roll = math.atan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = math.asin(max(-1.0, min(1.0, 2 * (w * y - z * x))))
@@ -164,7 +164,7 @@ def to_roll_pitch_yaw(quaternion: Sequence[float]) -> Triple:
 
 
 def to_roll_pitch_yaw_rows(quaternions: Vector) -> Vector:
-    """Return roll, pitch, and yaw, shape (..., 3), of quaternions (..., 4)."""
+    """Return the roll, pitch, and yaw of quaternions (..., 4), shape (..., 3)."""
     x, y, z, w = np.moveaxis(quaternions, -1, 0)
     roll = np.arctan2(2 * (w * x + y * z), 1 - 2 * (x * x + y * y))
     pitch = np.arcsin(np.clip(2 * (w * y - z * x), -1.0, 1.0))
@@ -176,13 +176,13 @@ def to_roll_pitch_yaw_rows(quaternions: Vector) -> Vector:
 
 
 def to_matrix(quaternion: Vector | Sequence[float]) -> Vector:
-    """Return the rotation matrix, shape (3, 3), of a quaternion."""
+    """Return the rotation matrix of a quaternion, shape (3, 3)."""
     x, y, z, w = map(float, quaternion)
     return np.array(_matrix(x, y, z, w))
 
 
 def to_matrix_rows(quaternions: Vector) -> Vector:
-    """Return the rotation matrices, shape (..., 3, 3), of quaternions (..., 4)."""
+    """Return the rotation matrices of quaternions (..., 4), shape (..., 3, 3)."""
     x, y, z, w = np.moveaxis(quaternions, -1, 0)
     return np.moveaxis(np.array(_matrix(x, y, z, w)), (0, 1), (-2, -1))
 
@@ -196,8 +196,8 @@ def _matrix(x: Any, y: Any, z: Any, w: Any) -> list[list[Any]]:
 
 
 def from_matrix_rows(matrices: Vector) -> Vector:
-    """Return the quaternions (n, 4), with w not negative, of rotation matrices (n, 3, 3)."""
-    # Each row is the quaternion times 4 times one of its parts; the largest is divided by.
+    """Return the quaternions (n, 4) of rotation matrices (n, 3, 3); w is not negative."""
+    # Each row is the quaternion times 4 times one of its components; use the largest one.
     m = matrices
     xx, yy, zz = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
     xy, xz, yz = m[:, 0, 1] + m[:, 1, 0], m[:, 0, 2] + m[:, 2, 0], m[:, 1, 2] + m[:, 2, 1]
@@ -221,7 +221,7 @@ def from_matrix_rows(matrices: Vector) -> Vector:
 
 
 def interpolate_rows(first: Vector, second: Vector, share: Vector) -> Vector:
-    """Return the rotations at a share, shape (n, 1), of the way from `first` to `second`."""
+    """Return the rotations at a fraction `share`, shape (n, 1), of the way from first to second."""
     near = np.where(np.sum(first * second, axis=-1, keepdims=True) < 0, -second, second)
     mixed = first + share * (near - first)
     scaled: Vector = mixed / np.linalg.norm(mixed, axis=-1, keepdims=True)
@@ -229,10 +229,10 @@ def interpolate_rows(first: Vector, second: Vector, share: Vector) -> Vector:
 
 
 def mean(quaternions: Vector) -> Vector:
-    """Return the mean rotation, shape (4,), of quaternions (n, 4).
+    """Return the mean rotation of quaternions (n, 4), shape (4,).
 
-    That is the eigenvector of the largest eigenvalue of the sum of their outer products (Markley
-    et al., "Averaging Quaternions", 2007).
+    It is the eigenvector of the largest eigenvalue of the sum of their outer products (Markley et
+    al., "Averaging Quaternions", 2007).
     """
     _, vectors = np.linalg.eigh(quaternions.T @ quaternions)
     found: Vector = vectors[:, -1]

@@ -1,4 +1,4 @@
-"""Rows of samples: buffers that check each row as it is put in, and rejected samples."""
+"""Rows of samples: buffers that check each row when it is added, and rejected samples."""
 
 from __future__ import annotations
 
@@ -24,8 +24,8 @@ ROW_FIELDS = (
     Field("episode", shape=(), dtype="int64", role="additional"),
     Field("step", shape=(), dtype="int64", role="additional"),
 )
-"""Fields that physx adds to each row: the instance that made it, the instance's trajectory and
-step."""
+"""Fields that physx adds to each row: the instance that generated it, and the instance's trajectory
+and step."""
 
 _BLOCK_NBYTES = 2**20
 _BLOCK_ROWS = 4096
@@ -34,13 +34,13 @@ _BLOCK_ROWS = 4096
 class RowBuffer:
     """Rows of samples, one preallocated array for each field; each row is checked once.
 
-    Names, shapes and types are checked when a row is put in. Whether its values are finite is
-    checked then, too, or by `take` for all rows together, which is faster.
+    Names, shapes, and types are checked when a row is added. Whether its values are finite is
+    checked then as well, or by `take` for all rows together, which is faster.
 
     Attributes:
-        fields: Fields of the rows, those that physx adds at the end.
-        capacity: How many rows fit in.
-        count: How many rows there are.
+        fields: Fields of the rows; those that physx adds come last.
+        capacity: Maximum number of rows.
+        count: Number of rows.
     """
 
     def __init__(
@@ -50,8 +50,8 @@ class RowBuffer:
 
         Args:
             fields: Fields of the samples; one with an open shape takes single numbers.
-            capacity: How many rows fit in; None: as many as 1 MiB holds, 4096 at most.
-            numbered: Whether rows get the `ROW_FIELDS` beside those of the samples.
+            capacity: Maximum number of rows; None: as many as fit in 1 MiB, at most 4096.
+            numbered: Whether rows get the `ROW_FIELDS` in addition to the samples' fields.
         """
         self.fields = [*fields, *ROW_FIELDS] if numbered else list(fields)
         if capacity is None:
@@ -59,7 +59,7 @@ class RowBuffer:
             capacity = max(1, min(_BLOCK_ROWS, _BLOCK_NBYTES // max(1, row_nbytes)))
         self.capacity = capacity
         self.count = 0
-        self._finite = 0  # how many of the rows are known to be finite
+        self._finite = 0  # number of rows known to be finite
         self._arrays: Batch = {
             field.name: np.empty((capacity, *(field.shape or ())), field.dtype)
             for field in self.fields
@@ -77,7 +77,7 @@ class RowBuffer:
 
     @property
     def full(self) -> bool:
-        """Whether no further row fits in."""
+        """Whether there is no space for another row."""
         return self.count == self.capacity
 
     def put(
@@ -89,21 +89,21 @@ class RowBuffer:
         *,
         finite: bool = False,
     ) -> None:
-        """Copy a sample into the next row; after an error the buffer is as it was.
+        """Copy a sample into the next row; after an error the buffer is unchanged.
 
         Args:
-            sample: Field name to value, exactly the fields that the buffer was made with.
-            instance_id: Instance that made the sample; 0: unknown.
+            sample: Field name to value, for exactly the fields that the buffer was created with.
+            instance_id: Instance that generated the sample; 0: unknown.
             episode: The instance's trajectory that the sample belongs to.
-            step: The instance's step that made it.
-            finite: Whether to check now that all values are finite; if not, `take` does so.
+            step: The instance's step that generated it.
+            finite: Whether to check now that all values are finite; otherwise `take` does.
 
         Raises:
             MissingFieldError: If a field is missing.
             UnknownFieldError: If a field was not defined.
-            FieldShapeError: If a value has another shape than its field.
+            FieldShapeError: If a value's shape differs from that of its field.
             FieldTypeError: If the field's type cannot hold a value: see `Field.convert`.
-            NotFiniteError: If `finite` is set and a value is NaN, infinite or too large for its
+            NotFiniteError: If `finite` is set and a value is NaN, infinite, or too large for its
                 field's type.
         """
         row = self.count
@@ -133,8 +133,8 @@ class RowBuffer:
         """Return the rows as views, valid until the next `put`, and empty the buffer.
 
         Raises:
-            NotFiniteError: If a row holds NaN or an infinite number; names the first such row. The
-                rows before it can be taken then.
+            NotFiniteError: If a row contains NaN or infinity; it names the first such row. The rows
+                before it can then still be taken.
         """
         count, wrong = self.count, None
         if self._finite < count:
@@ -152,15 +152,15 @@ class RowBuffer:
         return {name: array[:count] for name, array in self._arrays.items()}
 
     def clear(self) -> None:
-        """Forget all rows."""
+        """Discard all rows."""
         self.count = self._finite = 0
 
 
 class RejectedSamples:
     """Samples that `check_sample` rejected, in the order of their steps.
 
-    Nothing invalid is ever stored: a sample that does not fit the fields, or that holds NaN or an
-    infinite number, is left out.
+    Nothing invalid is ever stored: a sample that does not fit the fields, or that contains NaN or
+    infinity, is left out.
     """
 
     def __init__(self) -> None:
@@ -172,29 +172,29 @@ class RejectedSamples:
         Args:
             sample: Field name to value.
             episode: The instance's trajectory that it belongs to.
-            step: The instance's step that made it.
+            step: The instance's step that generated it.
         """
         with contextlib.suppress(*NO_ARRAY):
             copies = {name: np.array(value) for name, value in sample.items()}
             self._waiting.append((copies, episode, step))
 
     def forget(self, count: int) -> None:
-        """Forget the first samples."""
+        """Discard the first samples."""
         del self._waiting[:count]
 
     def infer_shapes(self, fields: Sequence[Field]) -> list[Field]:
-        """Return fields with open shapes taken from the first sample that has all the fields."""
+        """Fill in open shapes of fields from the first sample that has all the fields."""
         for sample, _, _ in self._waiting:
             if all(field.name in sample for field in fields):
                 return infer_shapes(fields, sample)
         return list(fields)
 
     def take(self, fields: Sequence[Field], instance_id: int) -> Batch:
-        """Return the samples as rows, with the fields that physx adds, and forget them.
+        """Return the samples as rows, with the fields that physx adds, and discard them.
 
         Args:
             fields: The environment's fields; no sample fits while a shape is open.
-            instance_id: Instance that made the samples.
+            instance_id: Instance that generated the samples.
         """
         waiting, self._waiting = self._waiting, []
         if any(field.shape is None for field in fields):
@@ -213,9 +213,9 @@ def check_names(
 
     Args:
         expected: Names of the defined fields.
-        given: Names of the fields that there are values for.
-        instance_id: Instance that made the values, for the error; 0: unknown.
-        step: The instance's step that made them, for the error.
+        given: Names of the fields that have values.
+        instance_id: Instance that set the values, for the error; 0: unknown.
+        step: The instance's step that set them, for the error.
 
     Raises:
         UnknownFieldError: If a field was not defined.
@@ -241,12 +241,12 @@ def check_names(
 
 
 def infer_shapes(fields: Iterable[Field], values: Mapping[str, Any], axes: int = 0) -> list[Field]:
-    """Return the fields with their shapes, open ones taken from values.
+    """Return the fields with open shapes filled in from values.
 
     Args:
         fields: The fields.
         values: Field name to value.
-        axes: How many axes of the values come before the field's own: 1 for rows.
+        axes: Number of axes of the values before the field's own: 1 for rows.
     """
     known = []
     for field in fields:
@@ -263,7 +263,7 @@ def copy_row(batch: Batch, row: int) -> Sample:
 
 
 def concatenate(blocks: Sequence[Batch]) -> Batch:
-    """Return blocks of rows of the same fields as one block; empty if there are no rows."""
+    """Join blocks of rows with the same fields; empty if there are no rows."""
     blocks = [block for block in blocks if len(next(iter(block.values()), ()))]
     if not blocks:
         return {}

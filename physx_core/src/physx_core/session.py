@@ -1,4 +1,4 @@
-"""Session: the folder of a run, with its dataset, networks, statistics and configuration."""
+"""Session: the folder of a run, with its dataset, networks, statistics, and configuration."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ class Session:
     """A session's folder.
 
     Attributes:
-        path: The folder: ``<session_dir>/<session_name>``, with ``_1``, ``_2`` ... for later ones.
+        path: The folder: ``<session_dir>/<session_name>``, later ones with ``_1``, ``_2``, ...
         is_new: Whether the folder was created for the current run.
     """
 
@@ -61,14 +61,14 @@ class Session:
         Args:
             session_dir: Folder of the sessions, relative to the working directory.
             session_name: Name of the session.
-            new_session: Whether to number the new session if one of that name exists; otherwise the
-                existing one is used, with a warning if there is a later one.
+            new_session: Whether to create a numbered session if the name is taken; otherwise the
+                existing one is used, with a warning if there is a newer one.
 
         Raises:
             SessionError: If the name is not a valid folder name, or the folder cannot be created.
         """
         if session_name in ("", "..") or Path(session_name).name != session_name:
-            raise SessionError(f'"{session_name}" is not a valid name of a session.')
+            raise SessionError(f'"{session_name}" is not a valid session name.')
         root = Path(session_dir)
         path = root / session_name
         try:
@@ -77,7 +77,7 @@ class Session:
                 return cls.existing(root, session_name)
             if not new_session and _numbered(path):
                 others = listed(other.name for other in _numbered(path))
-                _warn(f'There is no session "{session_name}": a new one is used, not {others}.')
+                _warn(f'There is no session "{session_name}": using a new one, not {others}.')
             while True:
                 try:
                     files.create_folder(path)
@@ -89,12 +89,12 @@ class Session:
 
     @classmethod
     def existing(cls, session_dir: str | Path, session_name: str) -> Session:
-        """Return an existing session, and warn if one that was numbered after it is newer.
+        """Return an existing session, and warn if a numbered one of the same name is newer.
 
-        A script whose first run made the session "run" writes to "run_1" when it is started again.
+        A script whose first run created the session "run" writes to "run_1" when started again.
 
         Raises:
-            SessionError: If there is no such session; the message lists the existing ones.
+            SessionError: If the session does not exist; the message lists the existing ones.
         """
         path = Path(session_dir) / session_name
         if not path.is_dir():
@@ -102,12 +102,12 @@ class Session:
             names = [p.name for p in root.iterdir() if p.is_dir()] if root.is_dir() else []
             raise SessionError(
                 f'There is no session "{session_name}" in {root}.'
-                f"{nearest(session_name, names)} There are: {listed(names)}."
+                f"{nearest(session_name, names)} Available: {listed(names)}."
             )
         later = [other for other in _numbered(path) if _last_used(other) > _last_used(path)]
         if later:
             newest = max(later, key=_last_used)
-            _warn(f'The session "{session_name}" is used, but "{newest.name}" is newer.')
+            _warn(f'Using the session "{session_name}", but "{newest.name}" is newer.')
         return cls(path)
 
     def record(self, pipeline: str, plain: Mapping[str, Any], seed: int) -> None:
@@ -141,35 +141,35 @@ class Session:
         self.note(f"{lines}\n{tomli_w.dumps(plain)}")
 
     def note(self, text: str) -> None:
-        """Append a paragraph to ``info.txt``, where the user may write notes too."""
+        """Append a paragraph to ``info.txt``, where users may also write notes."""
         with (self.path / "info.txt").open("a", encoding="utf-8") as stream:
             stream.write(f"{text.rstrip()}\n\n")
 
 
 def _warn(text: str) -> None:
     advice = (
-        "If another one is meant, name it; in a script, pass on what the run before has made: "
+        "If you mean another one, name it; in a script, pass on what the previous run created: "
         "DatasetConfig(existing_dir=generation.session.path), session_name=training.session.name."
     )
     warnings.warn(f"{text} {advice}", stacklevel=2)
 
 
 def related_sessions(path: Path) -> list[Path]:
-    """Return the folders beside a session that have its name but for the number, by number."""
+    """Return the sibling folders whose names differ from a session's only by number, sorted."""
     name = re.sub(r"_\d+$", "", path.name)
     base = path.with_name(name)
     return [other for other in (base, *_numbered(base)) if other.is_dir() and other != path]
 
 
 def _numbered(path: Path) -> list[Path]:
-    """Return ``<path>_1``, ``<path>_2``, ... as far as there are such, by number."""
+    """Return the folders ``<path>_1``, ``<path>_2``, ... that exist, sorted by number."""
     found = (re.fullmatch(re.escape(path.name) + r"_(\d+)", p.name) for p in path.parent.iterdir())
     names = sorted((int(match[1]), match[0]) for match in found if match)
     return [path.with_name(name) for _, name in names]
 
 
 def _last_used(path: Path) -> float:
-    """Return when a run last wrote its configuration into a session; 0 if none did."""
+    """Return the time at which a run last wrote its configuration to a session; 0: never."""
     file = path / "config.toml"
     return file.stat().st_mtime if file.is_file() else 0.0
 
@@ -183,7 +183,7 @@ def installed_versions() -> dict[str, str]:
     """Return the versions of Python, the platform, the physx distributions, and their libraries."""
     versions = {"python": platform.python_version(), "platform": sys.platform}
     for distribution in distributions():
-        # From the folder's name, as importlib.metadata does it; reading all names takes long.
+        # From the folder's name, like importlib.metadata; reading all metadata is slow.
         name = getattr(distribution, "_normalized_name", None) or distribution.metadata["Name"]
         name = (name or "").replace("_", "-")
         if name.startswith("physx-") or name in ("numpy", "h5py", "torch", "dartpy", "pin"):

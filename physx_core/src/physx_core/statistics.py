@@ -1,4 +1,4 @@
-"""Running mean, standard deviation, minimum and maximum of each component of a field."""
+"""Running mean, standard deviation, minimum, and maximum of each component of a field."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ _QUIET = np.errstate(over="ignore", invalid="ignore")
 
 @dataclass(frozen=True)
 class Normalization:
-    """Statistics of each component of a field; mean and deviation normalize it.
+    """Statistics of each component of a field; mean and standard deviation normalize it.
 
     Attributes:
         mean: Mean, of the field's shape, float64, in the field's unit.
         std: Standard deviation, of the field's shape, float64, in the field's unit; 1 for a
-            constant component, so that normalizing only shifts it to 0.
+            constant component, so that normalization only shifts it to 0.
         minimum: Smallest value, of the field's shape, float64, in the field's unit; None if
             unknown, as in checkpoints of the first version.
         maximum: Largest value, like `minimum`.
@@ -49,13 +49,13 @@ class Normalization:
 
 
 class RunningStatistics:
-    """Mean, standard deviation, minimum and maximum of all rows so far, in float64.
+    """Mean, standard deviation, minimum, and maximum of all rows so far, in float64.
 
     Blocks are combined by the update of Chan, Golub and LeVeque (1979), "Updating formulae and a
-    pairwise algorithm for computing sample variances". Values are relative to the first row, so
-    that a large offset costs no precision and a constant component has a deviation of exactly 0.
-    Where squares overflow, beyond 1e150 or so, the mean is taken for the middle of minimum and
-    maximum, and the deviation for half of their distance, which it cannot exceed.
+    pairwise algorithm for computing sample variances". Values are relative to the first row, so a
+    large offset costs no precision, and the deviation of a constant component is exactly 0. Where
+    squares overflow, beyond about 1e150, the midpoint of minimum and maximum replaces the mean, and
+    half their distance, an upper bound, replaces the deviation.
 
     Attributes:
         count: Number of rows so far.
@@ -66,7 +66,7 @@ class RunningStatistics:
         self._origin: Doubles = np.zeros(())
         self._mean: Doubles = np.zeros(())  # relative to the origin
         self._squares: Doubles = np.zeros(())  # sum of squared deviations from the mean
-        self._std: Doubles | None = None  # as it was read, which its square would not give back
+        self._std: Doubles | None = None  # as read, because its square would lose precision
         self._minimum: Doubles = np.zeros(())
         self._maximum: Doubles = np.zeros(())
 
@@ -78,7 +78,7 @@ class RunningStatistics:
 
     @property
     def std(self) -> Doubles:
-        """Standard deviation (of the population) of each component, in the field's unit."""
+        """Population standard deviation of each component, in the field's unit."""
         if self._std is not None:
             return self._std
         std = np.sqrt(self._squares / max(self.count, 1))
@@ -126,7 +126,7 @@ class RunningStatistics:
         self._combine(other.count, np.asarray(mean), other._squares)
 
     def normalization(self) -> Normalization:
-        """Return the normalization; deviation 1 where values differ by rounding errors only."""
+        """Return the normalization; the deviation is 1 where values differ only by rounding."""
         mean, std = self.mean, self.std
         resolution = 4 * np.finfo(np.float64).eps * np.abs(mean)
         std = np.where(std > resolution, std, 1.0)
@@ -147,8 +147,8 @@ class RunningStatistics:
     def from_dict(cls, plain: Mapping[str, Any]) -> Self:
         """Return the statistics that `to_dict` described.
 
-        Without minimum and maximum, as in early versions, they are empty: the rows are read again
-        when statistics are needed.
+        They are empty if minimum and maximum are missing, as in early versions: the rows are then
+        read again when statistics are needed.
         """
         statistics = cls()
         if "minimum" not in plain or "maximum" not in plain:
@@ -179,7 +179,7 @@ class RunningStatistics:
 
 
 def _over_rows(function: np.ufunc, rows: Array) -> Array:
-    """Reduce an array along its rows, several narrow rows at once, which is faster."""
+    """Reduce an array over its rows, several narrow rows at a time for speed."""
     count, shape = len(rows), rows.shape[1:]
     width = math.prod(shape)
     fold = max(1, min(_WIDTH // max(width, 1), count))

@@ -29,10 +29,11 @@ _UNREADABLE = (
 
 
 class Spring(Environment):
-    """A damped mass on a spring under a random force; semi-implicit Euler steps.
+    """A damped mass on a spring under a random force, integrated with semi-implicit Euler steps.
 
-    Each sample holds the ``state`` (position in m, velocity in m/s) and ``force`` before the step
-    and the ``next_state`` after it. A stored sample is replayed from its state with its force.
+    Each sample contains the ``state`` (position in m, velocity in m/s) and ``force`` before the
+    step and the ``next_state`` after it. Replaying a stored sample starts from its state and
+    applies its force.
     """
 
     def __init__(
@@ -50,7 +51,7 @@ class Spring(Environment):
             mass: Mass in kg.
             stiffness: Stiffness of the spring in N/m.
             damping: Damping in N s/m.
-            period: Length of a step in s.
+            period: Duration of a step in s.
             kwargs: See `Environment`.
         """
         super().__init__(**kwargs)
@@ -96,7 +97,7 @@ class Spring(Environment):
             self._draw(following[0])
 
     def apply_prediction(self, prediction: Batch) -> None:
-        """Draw the predicted mass, translucent, with the next step."""
+        """Draw the predicted mass, translucent, at the next step."""
         if self.factory:
             if self.predicted is None:
                 self.factory.add_sphere("prediction", 0.2, color="blue", alpha=0.4)
@@ -111,7 +112,7 @@ class Spring(Environment):
 
 
 class Linear(Network):
-    """Predicts a field as a linear function of others; arrays are its tensors."""
+    """Predicts a field as a linear function of others; its tensors are NumPy arrays."""
 
     default_optimization = "toy/least-squares"
     default_transformation = "toy/identity"
@@ -154,7 +155,7 @@ class Linear(Network):
         return np.concatenate([*parts, np.ones((len(parts[0]), 1))], axis=1)
 
     def predict(self, data: Tensors) -> Tensors:
-        """Return the linear function of the inputs by field."""
+        """Return the linear function of the inputs, by field."""
         return {self.pred_fields[0]: self.forward(*(data[name] for name in self.net_fields))}
 
     def forward(self, *inputs: Array) -> Array:
@@ -190,19 +191,19 @@ class Linear(Network):
 
 
 class LeastSquares(Optimization):
-    """Solves for the weights that fit all batches so far; the loss is the mean square."""
+    """Solves for the weights that fit all batches so far; the loss is the mean squared error."""
 
     state_file = "normal_equations.npz"
 
     def set_loss(self, loss: str | type[Any] | None) -> None:
-        """Accept the mean square only."""
+        """Accept only the mean square."""
         if loss is not None:
             raise ConfigError("toy/least-squares uses the mean square as its loss: leave out loss.")
 
     def set_optimizer(
         self, optimizer: str | type[Any] | None, network: Network, **kwargs: Any
     ) -> None:
-        """Set the network whose weights to solve for."""
+        """Set the network whose weights are solved for."""
         if optimizer is not None or kwargs or not isinstance(network, Linear):
             raise ConfigError("toy/least-squares solves for toy/linear and takes no optimizer.")
         self._network = network
@@ -210,14 +211,14 @@ class LeastSquares(Optimization):
         self._right: Array | None = None
 
     def compute_loss(self, prediction: Tensors, targets: Tensors, data: Tensors) -> Any:
-        """Return the mean square of the difference and keep the batch for `optimize`."""
+        """Return the mean squared difference and keep the batch for `optimize`."""
         self._rows = self._network.rows(data)
         target = targets[self._network.opt_fields[0]]
         self._targets = target.reshape(len(target), -1)
         return float(np.mean((prediction[self._network.pred_fields[0]] - target) ** 2))
 
     def compute_row_losses(self, prediction: Tensors, targets: Tensors, data: Tensors) -> Any:
-        """Return the mean square of each row's difference."""
+        """Return the mean squared difference of each row."""
         error = prediction[self._network.pred_fields[0]] - targets[self._network.opt_fields[0]]
         return np.mean((error**2).reshape(len(error), -1), axis=1)
 

@@ -1,7 +1,6 @@
-"""physx plugins `dart` and `pinocchio`: simulations of robots, and environments with them.
+"""physx plugins `dart` and `pinocchio`: robot simulations, and environments with them.
 
-The public names are imported when they are first used, so that finding the plugins does not import
-an engine.
+The public names are imported on first use, so discovering the plugins does not import an engine.
 """
 
 from __future__ import annotations

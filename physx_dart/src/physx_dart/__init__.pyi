@@ -1,4 +1,4 @@
-"""physx plugins `dart` and `pinocchio`: simulations of robots, and environments with them."""
+"""physx plugins `dart` and `pinocchio`: robot simulations, and environments with them."""
 
 from .dart.simulation import DartBackend as DartBackend
 from .environments.arm import DartArm as DartArm

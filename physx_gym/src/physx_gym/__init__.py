@@ -1,9 +1,9 @@
 """Robots as Gymnasium environments, on any engine.
 
-The public names are imported when they are first used. Importing the package registers its
-environments with Gymnasium, ``physx/Cartpole-v0`` and others, and limits the time for which
-OpenMP's threads spin, so that a policy's network leaves the processors to the environments: import
-it before the network's library.
+Public names are imported on first use. Importing the package registers its environments with
+Gymnasium (``physx/Cartpole-v0`` and others) and limits how long OpenMP threads spin, so that a
+policy's network leaves the processors to the environments. Import the package before the network's
+library.
 """
 
 from __future__ import annotations

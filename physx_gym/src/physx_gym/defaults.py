@@ -1,4 +1,4 @@
-"""The plugins that are used unless others are named."""
+"""Default plugins."""
 
 BACKEND = "dart"
 """Reference of the physics engine."""

@@ -1,4 +1,4 @@
-"""The plugin ``gym``: every environment that is registered with Gymnasium, by its id."""
+"""The plugin ``gym``: every environment registered with Gymnasium, by its id."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from physx_gym.bridge.gym_environment import GymEnvironment
 
 @hookimpl
 def physx_environments() -> Components:
-    """Return all environments that are registered with Gymnasium."""
+    """Return all environments registered with Gymnasium."""
     return {
         id: functools.partial(GymEnvironment, id=id)
         for id in gymnasium.registry

@@ -1,4 +1,4 @@
-"""Registers the environments of physx with Gymnasium."""
+"""Registers physx environments with Gymnasium."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ _REWARD_THRESHOLDS = {"Cartpole": 475.0, "Acrobot": -100.0}
 
 
 def register() -> None:
-    """Register ``physx/<Name>-v0`` for each environment; none is imported before it is made.
+    """Register ``physx/<Name>-v0`` for each environment, without importing any.
 
-    ``import physx_gym`` calls it, and so does ``gymnasium.make("physx_gym:physx/Cartpole-v0")``,
-    which imports the package itself.
+    Called by ``import physx_gym``, and so by ``gymnasium.make("physx_gym:physx/Cartpole-v0")``,
+    which imports the package.
     """
     for name, place in _ENTRY_POINTS.items():
         id = f"physx/{name}-v0"
@@ -45,14 +45,14 @@ _VECTOR_OPTIONS = (
 
 
 def make_vector(id: str, num_envs: int, **options: Any) -> Any:
-    """Return a vector environment whose environments run in processes of their own.
+    """Return a vector environment whose environments run in separate processes.
 
     Args:
         id: Id of the environment.
         num_envs: Number of environments.
         options: ``num_processes``, ``batch_size``, ``autoreset_mode``, ``copy``, ``timeout``,
             ``launcher``, ``launcher_kwargs``, ``ip_address`` and ``restarts`` of
-            `ParallelVectorEnv`; all others are for each environment.
+            `ParallelVectorEnv`; all others go to each environment.
     """
     from physx_gym.vector.vector_env import ParallelVectorEnv
 

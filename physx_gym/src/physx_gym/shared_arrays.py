@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 
 class Window:
-    """A view of an array, pickled with the array, so that it is a view again afterwards."""
+    """A view of an array, pickled with that array so that it is still a view when unpickled."""
 
     def __init__(self, whole: NDArray[Any], part: NDArray[Any]) -> None:
         self.whole = whole
@@ -23,7 +23,7 @@ class Window:
 
 
 class SharedArrays:
-    """An object that is pickled so that views of its arrays, also in containers, stay views."""
+    """An object whose views of its arrays, even in containers, stay views through pickling."""
 
     _left_out: ClassVar[frozenset[str]] = frozenset()
     """Attributes that are not pickled; they become None."""
@@ -56,7 +56,7 @@ def _open(value: Any) -> Any:
 
 
 def _map(function: Callable[[Any], Any], value: Any) -> Any:
-    """Apply a function to the values of a container; return itself if none changes."""
+    """Apply a function to a container's values; return the container itself if none changes."""
     if type(value) is dict:
         changed = {key: function(each) for key, each in value.items()}
         same = all(changed[key] is each for key, each in value.items())

@@ -1,7 +1,7 @@
-"""Trees of spaces and of their values, and the fields that stand for their leaves.
+"""Trees of spaces and of their values, and the fields that represent their leaves.
 
 A tree is a `Dict` or `Tuple` space, or the dictionaries, lists and tuples that are its elements;
-anything else in it is a leaf. A path is the keys that lead to a leaf.
+anything else in it is a leaf. A path is the sequence of keys that leads to a leaf.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ def leaves(tree: Any, path: Path = ()) -> Iterator[tuple[Path, Any]]:
 
 
 def map_leaves(function: Callable[[Path, Any], Any], tree: Any, path: Path = ()) -> Any:
-    """Return dictionaries, lists and tuples like those of a tree, with other leaves.
+    """Return a tree of dictionaries, lists and tuples of the same structure, with new leaves.
 
     Args:
-        function: Takes the path of a leaf and the leaf, and returns what replaces it.
+        function: Takes the path of a leaf and the leaf, and returns the replacement.
         tree: The tree; a `Tuple` space becomes a tuple.
-        path: Where the tree is.
+        path: Path of the tree itself.
     """
     if isinstance(tree, Mapping):
         return {key: map_leaves(function, each, (*path, key)) for key, each in tree.items()}
@@ -52,14 +52,14 @@ def map_leaves(function: Callable[[Path, Any], Any], tree: Any, path: Path = ())
 
 
 def value_at(tree: Any, path: Iterable[Any]) -> Any:
-    """Return the part of a tree that a path leads to."""
+    """Return the part of a tree at a path."""
     for key in path:
         tree = tree[key]
     return tree
 
 
 def format_path(path: Path) -> str:
-    """Return a path as it is written in Python, for example ``["states"][0]``."""
+    """Return a path in Python syntax, for example ``["states"][0]``."""
     return "".join(f'["{key}"]' if isinstance(key, str) else f"[{key}]" for key in path)
 
 
@@ -67,7 +67,7 @@ def format_path(path: Path) -> str:
 
 
 def neutral(space: gymnasium.Space[Any]) -> Any:
-    """Return a new buffer for elements of a space: zeros, or the values nearest to them."""
+    """Return a new buffer for elements of a space: zeros, or the nearest valid values."""
     return map_leaves(_neutral, space)
 
 
@@ -97,7 +97,7 @@ def copy_tree(tree: Any) -> Any:
 
 
 def copier(space: gymnasium.Space[Any]) -> Callable[[Any], Any]:
-    """Return a function that copies buffers to elements of a space: its choices become numbers."""
+    """Return a function that copies buffers to elements of a space; choices become numbers."""
     has_choices = any(isinstance(leaf, spaces.Discrete) for _, leaf in leaves(space))
     return partial(_copy_element, space) if has_choices else copy_tree
 
@@ -116,6 +116,9 @@ def fill(tree: Any, values: Any) -> Any:
 
     Returns:
         The tree; or the values, if the tree is a leaf that is not an array.
+
+    Raises:
+        SimulationError: If the values do not have the form of the tree.
     """
     try:
         if isinstance(tree, np.ndarray):
@@ -139,7 +142,7 @@ def fill(tree: Any, values: Any) -> Any:
 class SpaceFields:
     """The leaves of a space as fields: arrays of a fixed shape and type.
 
-    The name of a field is the prefix and the leaf's path, joined by ``_``.
+    A field's name is the prefix and the leaf's path, joined by ``_``.
 
     Attributes:
         space: The space.
@@ -152,7 +155,10 @@ class SpaceFields:
 
         Args:
             space: The space.
-            prefix: First part of the fields' names.
+            prefix: Prefix of the fields' names.
+
+        Raises:
+            ConfigError: If values of the space do not have a fixed shape.
         """
         self.space = space
         self.fields: list[Field] = []
@@ -172,17 +178,17 @@ class SpaceFields:
             self.leaves.append(leaf)
             self.fields.append(Field(name, tuple(leaf.shape or ()), np.dtype(leaf.dtype)))
         self._names = {path: name for name, (path, _) in self._places.items()}
-        self._only = self._names.get(())  # of a space that is a leaf itself
+        self._only = self._names.get(())  # if the space is itself a leaf
 
     def arrays(self, value: Any) -> dict[str, Array]:
-        """Return an element of the space, or a batch of them, as an array for each field."""
+        """Return an element of the space, or a batch of them, as one array per field."""
         found = {}
         for name, (path, dtype) in self._places.items():
             found[name] = np.asarray(value_at(value, path), dtype)
         return found
 
     def value(self, arrays: Mapping[str, Any]) -> Any:
-        """Return the element of the space that the arrays of its fields stand for."""
+        """Return the element of the space represented by arrays of its fields."""
 
         def take(path: Path, leaf: Any) -> Any:
             array = arrays[self._names[path]]
@@ -191,7 +197,7 @@ class SpaceFields:
         return map_leaves(take, self.space)
 
     def put(self, arrays: Mapping[str, Array], place: int, value: Any) -> None:
-        """Write an element of the space to a place of arrays with a leading axis."""
+        """Write an element of the space to an index of arrays with a leading axis."""
         if self._only is not None:
             arrays[self._only][place] = value
             return
@@ -199,13 +205,13 @@ class SpaceFields:
             arrays[name][place] = array
 
     def copy(self, arrays: Mapping[str, Array], place: int) -> Any:
-        """Return the element that stands at a place of arrays with a leading axis."""
+        """Return a copy of the element at an index of arrays with a leading axis."""
         if self._only is not None:
             return arrays[self._only][place].copy()
         return self.value({name: array[place].copy() for name, array in arrays.items()})
 
     def batch(self, arrays: Mapping[str, Any]) -> Any:
-        """Return the batch of elements that arrays with a leading axis stand for."""
+        """Return the batch of elements represented by arrays with a leading axis."""
         if self._only is not None:
             return arrays[self._only]
         return map_leaves(lambda path, _: arrays[self._names[path]], self.space)

@@ -1,6 +1,6 @@
-"""Adapters for stable-baselines3: vector environments to train in, policies saved as sessions.
+"""Adapters for stable-baselines3: train in vector environments, save policies as sessions.
 
-Needs the extra ``physx-gym[stable-baselines3]``; to save policies, `physx_torch`, too.
+Requires the extra ``physx-gym[stable-baselines3]``; saving policies also requires `physx_torch`.
 """
 
 from __future__ import annotations
@@ -37,39 +37,39 @@ _LOG = logging.getLogger("physx")
 
 
 class GymnasiumVecEnv(VecEnv, Closeable):
-    """A vector environment of Gymnasium, for the algorithms of stable-baselines3.
+    """A Gymnasium vector environment for stable-baselines3 algorithms.
 
     ::
 
         vector = gymnasium.make_vec("physx/Ant-v0", 8, autoreset_mode="SameStep")
         model = PPO("MlpPolicy", VecMonitor(GymnasiumVecEnv(vector)))
 
-    Steps, infos and seeds are those of `stable_baselines3.common.vec_env.DummyVecEnv` with the same
-    environments. Wrappers of the single environments are not seen: `env_is_wrapped` is False.
+    Steps, infos and seeds match `stable_baselines3.common.vec_env.DummyVecEnv` with the same
+    environments. Wrappers of individual environments are not visible: `env_is_wrapped` is False.
 
     Attributes:
         vector: The vector environment.
     """
 
     def __init__(self, vector: VectorEnv[Any, Any, Any]) -> None:
-        """Take over a vector environment; `close` closes it.
+        """Wrap a vector environment; `close` closes it.
 
         Args:
-            vector: The vector environment. A new episode begins in the step in which the last one
-                ends, as its ``autoreset_mode`` says.
+            vector: The vector environment. Its ``autoreset_mode`` must start a new episode in the
+                step in which the last one ends.
 
         Raises:
-            ConfigError: If it begins episodes otherwise.
+            ConfigError: If it has another ``autoreset_mode``.
         """
         mode = vector.metadata.get("autoreset_mode")
         if mode is not AutoresetMode.SAME_STEP:
             raise ConfigError(
-                f"stable-baselines3 begins episodes in the step in which the last one ends, but "
-                f"autoreset_mode is {getattr(mode, 'value', mode)!r}: make the vector environment "
-                'with autoreset_mode="SameStep", or, if it is one of Gymnasium itself, '
+                f"stable-baselines3 starts an episode in the step in which the last one ends, but "
+                f"autoreset_mode is {getattr(mode, 'value', mode)!r}: create the vector "
+                'environment with autoreset_mode="SameStep", or, if Gymnasium provides it, with '
                 'vector_kwargs={"autoreset_mode": gymnasium.vector.AutoresetMode.SAME_STEP}.'
             )
-        self.vector: Any = vector  # wrappers of Gymnasium know fewer methods than it has
+        self.vector: Any = vector  # Gymnasium's wrappers declare fewer methods than it has
         self._listed = DictInfoToList(vector)
         self._actions: Any = None
         super().__init__(
@@ -77,14 +77,16 @@ class GymnasiumVecEnv(VecEnv, Closeable):
         )
 
     def reset(self) -> Any:
-        """Begin new episodes, with the seeds and options that were set; return the observations.
+        """Start new episodes with the seeds and options that were set; return the observations.
 
         Raises:
-            UsageError: If the options of the environments differ.
+            UsageError: If the environments' options differ.
         """
         options = self._options[0]
         if any(each != options for each in self._options):
-            raise UsageError("A vector environment is reset with the same options for all.")
+            raise UsageError(
+                "The environments of a vector environment must be reset with the same options."
+            )
         seeds: Any = None if self._seeds == [None] * self.num_envs else list(self._seeds)
         seen, self.reset_infos = self._listed.reset(seed=seeds, options=options or None)
         self._reset_seeds()
@@ -96,9 +98,9 @@ class GymnasiumVecEnv(VecEnv, Closeable):
         self._actions = actions
 
     def step_wait(self) -> Any:
-        """Make the step; return observations, rewards, ends and infos.
+        """Execute the step; return observations, rewards, ends and infos.
 
-        Where an episode ends, the observation is the first one of the next episode, and the info
+        Where an episode ends, the observation is the first one of the next episode, and the info is
         that of the last step, with ``"terminal_observation"``.
         """
         seen, rewards, terminated, truncated, infos = self._listed.step(self._actions)
@@ -117,19 +119,19 @@ class GymnasiumVecEnv(VecEnv, Closeable):
         self.vector.close()
 
     def get_attr(self, attr_name: str, indices: Any = None) -> list[Any]:
-        """Return an attribute of environments.
+        """Return an attribute of the chosen environments.
 
         Raises:
             AttributeError: If they do not have it.
         """
         try:
             found = self.vector.get_attr(attr_name)
-        except PhysxError as error:  # its process had the error
+        except PhysxError as error:  # raised in the environment's process
             raise AttributeError(str(error)) from error
         return [found[number] for number in self._get_indices(indices)]
 
     def set_attr(self, attr_name: str, value: Any, indices: Any = None) -> None:
-        """Set an attribute of environments to a value."""
+        """Set an attribute of the chosen environments."""
         chosen = self._numbers(indices)
         rest = len(chosen) < self.num_envs
         values = self.get_attr(attr_name) if rest else [value] * self.num_envs
@@ -143,26 +145,26 @@ class GymnasiumVecEnv(VecEnv, Closeable):
         """Call a method of all environments; return the results.
 
         Raises:
-            UsageError: If it is to be called in some environments only.
+            UsageError: If only some of the environments are chosen.
         """
         if len(self._numbers(indices)) < self.num_envs:
             raise UsageError(
-                f"{method_name}() would be called in some environments only, but a vector "
-                "environment calls all: leave indices out, or use make_vec_env of "
+                f"{method_name}() was requested for only some environments, but a vector "
+                "environment calls it in all: omit indices, or use make_vec_env of "
                 "stable-baselines3."
             )
         return list(self.vector.call(method_name, *method_args, **method_kwargs))
 
     def env_is_wrapped(self, wrapper_class: Any, indices: Any = None) -> list[bool]:
-        """Return False for each environment, as their wrappers are not seen."""
+        """Return False for each environment, as their wrappers are not visible."""
         return [False for _ in self._get_indices(indices)]
 
     def get_images(self) -> Sequence[Any]:
-        """Return the picture that each environment renders."""
+        """Return each environment's rendered picture."""
         return list(self.vector.render() or ())
 
     def _numbers(self, indices: Iterable[int] | int | None) -> list[int]:
-        """Return the numbers of the chosen environments, each once."""
+        """Return the numbers of the chosen environments, without duplicates."""
         return sorted({range(self.num_envs)[each] for each in self._get_indices(indices)})
 
 
@@ -174,16 +176,16 @@ def _copied(observations: Any) -> Any:
 
 
 def save_policy(model: BaseAlgorithm, folder: str | Path) -> Path:
-    """Write a policy as a session that `Policy`, ``physx evaluate`` and ``physx info`` read.
+    """Write a policy as a session that `Policy`, ``physx evaluate`` and ``physx info`` can read.
 
     It predicts what ``model.predict(observation, deterministic=True)`` returns. If the model was
-    trained with `VecNormalize`, the normalization of the observation is part of it; that the
-    latter clips (``clip_obs``) is not, so a finite bound is a warning.
+    trained with `VecNormalize`, the normalization of observations is saved too, but not their
+    clipping (``clip_obs``): a finite bound logs a warning.
 
     Args:
-        model: PPO, A2C or another algorithm with an ``"MlpPolicy"`` of actor and critic, for an
-            observation that is an array of numbers.
-        folder: Folder of the session. Each call adds a checkpoint, of which the last one is read.
+        model: PPO, A2C or another actor-critic algorithm with an ``"MlpPolicy"``, whose observation
+            is an array of numbers.
+        folder: Folder of the session. Each call adds a checkpoint; the last one is read.
 
     Returns:
         Folder of the checkpoint.
@@ -209,8 +211,8 @@ def save_policy(model: BaseAlgorithm, folder: str | Path) -> Path:
         known["observation"] = Normalization(seen.mean, scale)
         if np.isfinite(normalizer.clip_obs):
             _LOG.warning(
-                "VecNormalize clips observations at %g deviations, which the saved policy does "
-                "not: train with clip_obs=np.inf to have the same.",
+                "VecNormalize clips observations at %g standard deviations, but the saved policy "
+                "does not: train with clip_obs=np.inf to get the same actions.",
                 normalizer.clip_obs,
             )
     config = NetworkConfig(
@@ -229,11 +231,11 @@ def save_policy(model: BaseAlgorithm, folder: str | Path) -> Path:
 
 
 def _layers(model: BaseAlgorithm) -> nn.Sequential:
-    """Return the layers from observation to action, after checking that these are all there is."""
+    """Return the layers from observation to action, after checking that there is nothing else."""
     policy: Any = model.policy
     acted, problem = model.action_space, None
     if not isinstance(policy, ActorCriticPolicy) or policy.squash_output:
-        problem = f"its policy is {type(policy).__name__}, whose actor is not one of layers alone"
+        problem = f"its policy is {type(policy).__name__}, whose actor is not purely layers"
     elif type(policy.mlp_extractor) is not MlpExtractor:
         problem = f"its policy has a {type(policy.mlp_extractor).__name__}"
     elif type(policy.features_extractor) is not FlattenExtractor or not isinstance(
@@ -241,12 +243,12 @@ def _layers(model: BaseAlgorithm) -> nn.Sequential:
     ):
         problem = f"it observes {model.observation_space}, not an array of numbers"
     elif policy.normalize_images and is_image_space(model.observation_space):
-        problem = "it observes pictures"
+        problem = "it observes images"
     elif isinstance(acted, spaces.MultiBinary):
         problem = f"its action space is {acted}"
     if problem is not None:
         raise ConfigError(
-            f"{type(model).__name__} cannot be saved as a policy of physx: {problem}. "
+            f"{type(model).__name__} cannot be saved as a physx policy: {problem}. "
             'PPO and A2C with an "MlpPolicy" can.'
         )
     return nn.Sequential(*policy.mlp_extractor.policy_net, policy.action_net)

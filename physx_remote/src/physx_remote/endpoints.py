@@ -64,17 +64,17 @@ def serve(
     """Return a service of an environment; call its `run`, or its `poll` repeatedly.
 
     Args:
-        environment: An `RLEnvironment`, its class or reference; or whatever
+        environment: An `RLEnvironment`, its class or reference; or anything that
             `physx_remote.open_worlds` takes.
         protocol: Name of the protocol, ``"package.module:Class"``, or the class.
-        address: Where to listen, or what to connect to.
-        port: Port there; 0: any free port, or the protocol's own.
-        num_worlds: How many worlds to serve on one connection.
+        address: Address to listen at, or to connect to.
+        port: Port to listen at or connect to; 0: any free port, or the protocol's default.
+        num_worlds: Number of worlds to serve on one connection.
         env_kwargs: Keyword arguments of each environment.
         options: The protocol's own options.
 
     Raises:
-        PhysxError: If the environment or protocol does not exist, or it cannot listen there.
+        PhysxError: If the environment or protocol does not exist, or the service cannot listen.
     """
     check_address(address, port)
     if env_kwargs is not None and not isinstance(env_kwargs, Mapping):
@@ -116,7 +116,7 @@ def connect(
         options: Options of the protocol's client.
 
     Raises:
-        PhysxError: If nothing answers there, or not as the protocol prescribes.
+        PhysxError: If nothing answers there, or the answer violates the protocol.
     """
     return find_protocol(protocol).connect(*parse_address(address), **options)
 
@@ -143,7 +143,7 @@ def connect_vector(
 
 
 def _find_scene(environment: Any, arguments: Mapping[str, Any]) -> RLEnvironment | None:
-    """Return the `RLEnvironment` that is meant, or None for other kinds of environments."""
+    """Return the `RLEnvironment` to serve, or None for other kinds of environments."""
     from physx_remote.godot_gym.environment import RLEnvironment
 
     if isinstance(environment, str):
@@ -154,8 +154,8 @@ def _find_scene(environment: Any, arguments: Mapping[str, Any]) -> RLEnvironment
         environment = call_with(environment, arguments)
     elif arguments and isinstance(environment, RLEnvironment):
         raise UsageError(
-            f"This {type(environment).__name__} exists already and takes no env_kwargs: give its "
-            "class."
+            f"This {type(environment).__name__} already exists and takes no env_kwargs: pass "
+            "its class."
         )
     if not isinstance(environment, RLEnvironment):
         return None

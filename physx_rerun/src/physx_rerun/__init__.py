@@ -1,6 +1,6 @@
 """The physx plugin ``rerun``: shows environments and training in the Rerun viewer.
 
-The public names are imported on first use, so that discovering the plugin does not import Rerun.
+The public names are imported on first use, so discovering the plugin does not import Rerun.
 """
 
 from __future__ import annotations

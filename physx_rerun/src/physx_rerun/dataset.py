@@ -1,4 +1,4 @@
-"""Draws the rows of a dataset: clouds of points, curves, and arrays."""
+"""Draws the rows of a dataset as point clouds, curves and arrays."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from physx_rerun.drawing import colors
 TIMELINE = "row"
 """Timeline of the recording: the number of the row in its mode."""
 LIMIT_BYTES = 500_000_000
-"""Size of the rows after which the rest of a mode is left out."""
+"""Size of the rows after which the rest of a mode is omitted."""
 _BLOCK_BYTES = 8_000_000
 _MOST_CURVES = 32
-_MOST_ARRAYS = 2000  # Rerun takes them one by one
-_MOST_INSTANCES = 4  # with windows of their own
+_MOST_ARRAYS = 2000  # Rerun accepts them only one by one
+_MOST_INSTANCES = 4  # with separate windows
 _RADIUS = rr.Radius.ui_points(3.0)
 _BOOKKEEPING = ("env_id", "episode", "step")
 
@@ -36,7 +36,7 @@ class _Column:
     Attributes:
         mode: The mode.
         field: The field.
-        shape: Its shape.
+        shape: The field's shape.
     """
 
     mode: str
@@ -44,7 +44,7 @@ class _Column:
     shape: tuple[int, ...]
 
     def entity(self, instance: int) -> str:
-        """Return the path of its entity, for the rows of one instance."""
+        """Return the path of the entity for the rows of one instance."""
         parts = (self.mode, f"env_{instance}", self.field.name)
         return "/".join(map(rr.escape_entity_path_part, parts))
 
@@ -56,15 +56,15 @@ class _Column:
 
     @property
     def is_curve(self) -> bool:
-        """Whether it is a few numbers."""
+        """Whether the field consists of a few numbers."""
         return len(self.shape) < 2 and math.prod(self.shape) <= _MOST_CURVES
 
     def is_cloud(self, dimension: int) -> bool:
-        """Whether it is points of this dimension."""
+        """Whether the field consists of points of this dimension."""
         return len(self.shape) == 2 and self.shape[1] == dimension
 
     def write_look(self, stream: rr.RecordingStream, instance: int) -> None:
-        """Write what is the same in all rows."""
+        """Write what is constant in all rows."""
         entity = self.entity(instance)
         if self.is_curve:
             count = math.prod(self.shape)
@@ -97,11 +97,11 @@ def write_dataset(directory: Path, stream: rr.RecordingStream) -> None:
     """Write the rows of a dataset to a recording, with a layout of windows.
 
     The field ``points`` of the second instance in the mode ``training`` is the entity
-    ``training/env_2/points``. Its shape decides how it is drawn: (n, 3) and (n, 2) as points,
-    few numbers as curves, all else, in the first rows, as an array.
+    ``training/env_2/points``. Fields are drawn according to their shapes: (n, 3) and (n, 2) as
+    points, a few numbers as curves, and the first rows of all others as arrays.
 
     Args:
-        directory: The dataset's folder, or that of its session.
+        directory: The folder of the dataset or its session.
         stream: The recording.
 
     Raises:
@@ -131,7 +131,7 @@ def _columns(dataset: Dataset, mode: str) -> list[_Column]:
 def _write_mode(
     dataset: Dataset, mode: str, columns: Sequence[_Column], stream: rr.RecordingStream
 ) -> list[int]:
-    """Write the rows of a mode and return the numbers of the instances that they are from."""
+    """Write the rows of a mode and return the numbers of their instances."""
     view, count, known = dataset[mode], dataset.num_samples(mode), set[int]()
     sizes = (math.prod(c.shape) * np.dtype(c.field.dtype).itemsize for c in columns)
     row_bytes = max(1, sum(sizes))

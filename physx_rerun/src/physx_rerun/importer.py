@@ -1,6 +1,6 @@
 """``rerun-importer-physx``: lets ``rerun FILE.h5`` open a dataset.
 
-Rerun calls it for each file that it opens, so that it looks at the name before it imports anything.
+Rerun calls it for each file that it opens, so it checks the name before it imports anything.
 """
 
 from __future__ import annotations
@@ -10,14 +10,14 @@ import sys
 from pathlib import Path
 
 FOREIGN = 66
-"""Exit status for files of others, agreed with Rerun."""
+"""Exit status for files that are not datasets, as specified by Rerun."""
 
 
 def find_dataset(path: Path) -> Path | None:
-    """Return the folder of the dataset that a file belongs to, or that a folder is, or holds.
+    """Return the folder of the dataset that a file belongs to, or that a folder is or contains.
 
     Args:
-        path: An HDF5 file or the manifest of a dataset, its folder, or that of its session.
+        path: An HDF5 file or the manifest of a dataset, or the folder of a dataset or its session.
     """
     folders = [path, path / "dataset"]
     if path.suffix == ".h5" or path.name == "dataset.json":

@@ -16,8 +16,8 @@ def show(place: str | Path, *, width: int | None = None, height: int | None = No
     """Show a recording or a dataset below the notebook's cell.
 
     Args:
-        place: A recording; a session's folder, of which the newest recording is taken, or else the
-            dataset; a dataset's folder, or one of its files.
+        place: A recording; a session's folder (its newest recording, else its dataset); a
+            dataset's folder, or one of its files.
         width: Width in pixels.
         height: Height in pixels.
 

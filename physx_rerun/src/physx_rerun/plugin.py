@@ -1,4 +1,4 @@
-"""The hooks of the plugin ``rerun``."""
+"""Hooks of the plugin ``rerun``."""
 
 from __future__ import annotations
 
@@ -7,5 +7,5 @@ from physx_core.plugins import hookimpl
 
 @hookimpl
 def physx_visualizers() -> dict[str, str]:
-    """Return the visualizer as a reference, so that Rerun is imported on first use."""
+    """Return the visualizer as a reference, so Rerun is imported on first use."""
     return {"rerun": "physx_rerun.visualizer:RerunVisualizer"}

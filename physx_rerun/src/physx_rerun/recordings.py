@@ -1,4 +1,4 @@
-"""Finds the recording of a session, and makes one of a dataset."""
+"""Finds the recording of a session, or creates one from a dataset."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ def find(place: str | Path) -> Path:
     """Return the file of a recording or the folder of a dataset.
 
     Args:
-        place: A recording; a session's folder, of which the newest recording is taken, or else the
-            dataset; a dataset's folder, or one of its files.
+        place: A recording; a session's folder (its newest recording, else its dataset); a
+            dataset's folder, or one of its files.
 
     Raises:
         VisualizerError: If there is neither a recording nor a dataset.
@@ -33,15 +33,15 @@ def find(place: str | Path) -> Path:
     found = recordings[-1] if recordings else find_dataset(path)
     if found is None:
         raise VisualizerError(
-            f"{path} is neither a recording (.rrd) nor a dataset, and holds none. Runs with "
-            "--environment.visualizer rerun leave a recording in their session."
+            f"{path} is neither a recording (.rrd) nor a dataset, and contains none. Runs with "
+            "--environment.visualizer rerun save a recording in their session."
         )
     return found
 
 
 @contextlib.contextmanager
 def recording_of(place: str | Path) -> Iterator[Path]:
-    """Provide the file of a recording, a temporary one of a dataset; see `find`.
+    """Provide the file of a recording, for a dataset a temporary one; see `find`.
 
     Raises:
         PhysxError: If there is none, or the dataset cannot be read.

@@ -53,34 +53,34 @@ class RerunVisualizer(Visualizer):
     "web": serve a page for browsers; "headless": write a file, and a picture at the end;
     "offscreen": render pictures for `capture`; "none": neither draw nor write."""
     path: str | Path | None = None
-    """The .rrd file; None: a new file in the session's folder, named like the run."""
+    """The .rrd file; None: a new file in the session's folder, named after the run."""
     save: bool = True
     """Whether to write the file."""
     address: str | Sequence[str] | None = None
-    """Viewers to connect to, each "HOST:PORT"; they can be started later, and again."""
+    """Viewers to connect to, each "HOST:PORT"; they can be started later, and restarted."""
     port: int = at_least(0, 0)
     """Port of the opened viewer; 0: any free one."""
     page_port: int = at_least(0, 0)
     """Port of the page of the mode "web"; 0: any free one."""
     memory_limit: str = "2GB"
-    """Memory of the opened viewer, beyond which it drops the oldest rows."""
+    """Memory limit of the opened viewer, beyond which it drops the oldest rows."""
     picture: str | Path | None = None
-    """Picture of the headless mode; None: beside the file, with the suffix .png."""
+    """Picture of the headless mode; None: next to the file, with the suffix .png."""
     picture_size: tuple[int, int] = (1600, 900)
     """Width and height in pixels of the pictures of the headless and offscreen modes."""
     detail: float = at_least(0, 3.0)
-    """Pixels of the smallest details of meshes in offscreen pictures that a robot fills; 0: all
-    details, which take most of the time without a graphics card."""
+    """Size in pixels of the smallest mesh details drawn in offscreen pictures filled by a robot;
+    0: all details, which take most of the time without a GPU."""
     max_instances: int = at_least(0, 4)
-    """Number of instances to draw completely; of others only numbers and texts are recorded."""
+    """Number of instances to draw completely; for others, only numbers and texts are recorded."""
     every: int = at_least(1, 1)
-    """Number of steps of an environment from one that is recorded to the next."""
+    """Record every n-th step of an environment."""
 
     def __post_init__(self) -> None:
         """Check that the options are consistent, and start with an empty scene.
 
         Raises:
-            ConfigError: If they are not.
+            ConfigError: If options are inconsistent.
         """
         self._check_options()
         self._reset()
@@ -108,7 +108,7 @@ class RerunVisualizer(Visualizer):
     def _check_options(self) -> None:
         addresses = self._given_addresses()
         if self.mode == "connect" and not (addresses and all(map(_is_address, addresses))):
-            raise ConfigError('mode "connect" needs address="HOST:PORT" of a viewer, or several.')
+            raise ConfigError('mode "connect" needs address="HOST:PORT", or a list of addresses.')
         if self.mode != "connect" and self.address is not None:
             raise ConfigError(f'address is for mode "connect", not for "{self.mode}".')
         if self.mode != "headless" and self.picture is not None:
@@ -249,13 +249,13 @@ class RerunVisualizer(Visualizer):
         self._flush_if_due()
 
     def fields(self, fields: Sequence[Field]) -> None:
-        """Take the units of the training's samples; see `Observer.fields`."""
+        """Store the units of the training's samples; see `Observer.fields`."""
         self._dashboard.fields(fields)
 
     def predictions(
         self, predicted: Mapping[str, Array], truth: Mapping[str, Array], step: int, timeline: str
     ) -> None:
-        """Show predicted values over true ones; see `Observer.predictions`."""
+        """Show predicted versus true values; see `Observer.predictions`."""
         if not self._is_open:
             return
         self._dashboard.predictions(predicted, truth, self._times(step, timeline))
@@ -315,14 +315,14 @@ class RerunVisualizer(Visualizer):
                 self._dashboard.describe(path.read_text("utf-8"))
 
     def _times(self, step: int, timeline: str) -> Times:
-        """Return where to put what a training recorded: also where its other timelines are."""
+        """Return the current position on all timelines of the training."""
         self._positions[timeline] = step
         self._layout.add_timeline(timeline)
         return {**self._positions, TIME: self._now()}
 
     @property
     def _resolution(self) -> float | None:
-        """How many of the smallest details a robot has from end to end; None: all."""
+        """Size of a robot divided by that of its smallest details to draw; None: all details."""
         is_drawn_roughly = self.mode == "offscreen" and self.detail > 0
         return max(self.picture_size) / self.detail if is_drawn_roughly else None
 
@@ -352,7 +352,7 @@ class RerunVisualizer(Visualizer):
                 owns_viewer=self.viewer is not None or self._offscreen is not None,
             )
         if self._layout.changed or self._dashboard.changed:
-            # Before the rows, so that a picture of these is of this layout.
+            # Before the rows, so pictures of these rows have this layout.
             self._recording.write_blueprint(self._layout.blueprint(self._dashboard.cells()))
         self._recording.write(chunks)
 

@@ -1,6 +1,6 @@
 """The physx plugin ``torch``: PyTorch networks, optimization and transformation.
 
-The public names are imported on first use, so that discovering the plugin does not import torch.
+The public names are imported on first use, so discovering the plugin does not import torch.
 """
 
 from __future__ import annotations

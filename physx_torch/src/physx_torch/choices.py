@@ -1,4 +1,4 @@
-"""Chooses classes of torch by name, and creates them with a user's arguments."""
+"""Looks up classes by name, and creates objects with the user's arguments."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ def find_classes(module: ModuleType, base: type[Any]) -> dict[str, type[Any]]:
 
 
 def choose(what: str, given: Any, known: Mapping[str, Any]) -> Any:
-    """Return the object of a name; anything but a string is returned unchanged.
+    """Return the object with a name; anything but a string is returned unchanged.
 
     Args:
-        what: Kind of the object for messages, for example ``"loss"``.
+        what: Kind of the object, for error messages, for example ``"loss"``.
         given: A known name, ``"package.module:Name"``, or the object itself.
         known: Objects by name.
     """
@@ -47,21 +47,21 @@ def choose(what: str, given: Any, known: Mapping[str, Any]) -> Any:
             ) from error
     raise ConfigError(
         f'torch has no {what} "{given}".{nearest(given, known)} It has: {listed(known)}. '
-        'Name your own as "package.module:Name".'
+        'Specify your own as "package.module:Name".'
     )
 
 
 def make(
     what: str, base: type[Any], factory: Callable[..., Any], /, *args: Any, **kwargs: Any
 ) -> Any:
-    """Return ``factory(*args, **kwargs)``; a class that is not derived from `base` is not called.
+    """Return ``factory(*args, **kwargs)``, unless the factory is a class not derived from `base`.
 
     Args:
-        what: Kind of the object for messages, for example ``"loss"``.
-        base: Class that its class must be derived from.
+        what: Kind of the object, for error messages, for example ``"loss"``.
+        base: Class that the object's class must be derived from.
         factory: A class, or a function that returns an object.
-        args: Its arguments.
-        kwargs: Its keyword arguments.
+        args: Positional arguments.
+        kwargs: Keyword arguments.
     """
     if isinstance(factory, type) and not issubclass(factory, base):
         wanted = ".".join([*base.__module__.split(".")[:2], base.__name__])
@@ -80,10 +80,10 @@ def make_activation(option: str, given: Any, channels: int) -> torch.nn.Module:
     """Return an activation.
 
     Args:
-        option: Name of the option for messages, for example ``"FC.activation"``.
+        option: Name of the option, for error messages, for example ``"FC.activation"``.
         given: Name of a class in `torch.nn` such as ``"SiLU"``, ``"package.module:Class"``, or a
             class.
-        channels: Number of its channels: `torch.nn.PReLU` learns a slope for each.
+        channels: Number of channels: `torch.nn.PReLU` learns a slope for each.
     """
     known = find_classes(torch.nn.modules.activation, torch.nn.Module)
     chosen = choose("activation", given, {**known, "Identity": torch.nn.Identity})

@@ -18,12 +18,12 @@ def list_devices() -> list[str]:
 
 
 def find_device(name: str) -> torch.device:
-    """Return the device of a name.
+    """Return the device with a name.
 
     Args:
         name: ``"cpu"``, ``"cuda"``, ``"cuda:<index>"``, ``"mps"`` or ``"auto"``: the first CUDA
-            device if there is one, otherwise the processor. If torchrun started several
-            processes, ``"cuda"`` and ``"auto"`` give each its own device.
+            device if there is one, else the CPU. If torchrun started several processes, ``"cuda"``
+            and ``"auto"`` give each its own device.
     """
     existing = list_devices()
     own = int(os.environ.get("LOCAL_RANK", "0")) % max(1, torch.cuda.device_count())

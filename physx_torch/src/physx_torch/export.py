@@ -1,4 +1,4 @@
-"""Export of a network with its transformation as one file that runs without physx."""
+"""Exports a network with its transformation to one file that runs without physx."""
 
 from __future__ import annotations
 
@@ -55,22 +55,22 @@ def export_network(
 ) -> None:
     """Write a network and its transformation as ``"onnx"``, ``"torchscript"`` or ``"pt2"``.
 
-    The first axis of inputs and outputs is that of the samples, of any length. Floating inputs
-    have the network's data type. ONNX names inputs and outputs by the fields; the other two take
-    and return a dictionary of tensors by field. A field that is both an input and predicted is
-    output as ``predicted_<name>``.
+    The first axis of inputs and outputs is the sample axis, of any length. Floating-point inputs
+    have the network's data type. ONNX inputs and outputs are named after the fields; the other two
+    formats take and return a dictionary of tensors by field. A field that is both an input and
+    predicted is output as ``predicted_<name>``.
 
     Args:
         path: The file; an existing one is replaced.
         form: The file's format.
-        network: The network, on the processor.
+        network: The network, on the CPU.
         predict: Prediction in physical units with the network: tensors by field to tensors by
             field.
         fields: The fields that the network was bound to, by name.
     """
     if network.device.type != "cpu":
         raise ConfigError(
-            f'A network is exported from the processor, not from "{network.device}", so that the '
+            f'A network must be on the CPU to be exported, not on "{network.device}", so that the '
             'file runs anywhere: load it with device="cpu", as physx export-network does.'
         )
     samples = {name: _samples(fields[name], network) for name in network.net_fields}
@@ -79,13 +79,13 @@ def export_network(
             FORMS[form](_PhysicalUnits(network, predict).eval(), samples, path)
     except MissingLibraryError:
         raise
-    except Exception as error:  # an exporter may fail in any way on what it does not know
+    except Exception as error:  # an exporter may fail in any way
         name = type(network).__name__
         raise ConfigError(f'{name} cannot be exported as "{form}": {_reason(error)}') from error
 
 
 def _reason(error: BaseException) -> str:
-    """Return the first line of the error that began a chain of errors."""
+    """Return the first line of the error that started a chain of errors."""
     while error.__cause__ is not None:
         error = error.__cause__
     lines = str(error).strip().splitlines()
@@ -94,7 +94,7 @@ def _reason(error: BaseException) -> str:
 
 @contextlib.contextmanager
 def _evaluating(network: TorchNetwork) -> Iterator[None]:
-    """Put a network into evaluation mode, with parameters that need no gradients, for a while."""
+    """Put a network temporarily into evaluation mode, with parameters that need no gradients."""
     was_training = network.training
     trained = [parameter for parameter in network.parameters() if parameter.requires_grad]
     network.set_eval()
@@ -109,7 +109,7 @@ def _evaluating(network: TorchNetwork) -> Iterator[None]:
 
 
 def _samples(field: Field, network: TorchNetwork) -> torch.Tensor:
-    """Return example samples of a field for the exporters to trace the network with."""
+    """Return example samples of a field with which the exporters trace the network."""
     zeros = np.zeros((2, *(field.shape or ())), field.dtype)
     return network.numpy_to_tensor({field.name: zeros})[field.name]
 
@@ -122,7 +122,7 @@ def _torchscript(module: _PhysicalUnits, samples: Tensors, path: Path) -> None:
 
 
 def _axes(samples: Tensors) -> dict[str, Any]:
-    """Mark the sample axis as one of any length, in the form that the exporters take."""
+    """Mark the sample axis as one of any length, in the form that the exporters expect."""
     axis = torch.export.Dim("samples")
     return {"data": {name: {0: axis} for name in samples}}
 
@@ -155,7 +155,7 @@ def _onnx(module: _PhysicalUnits, samples: Tensors, path: Path) -> None:
 
 
 def _replace(path: Path, write_to: Callable[[Path], Any], suffix: str = ".partial") -> None:
-    """Write a file so that it appears under its name only when it is complete."""
+    """Write a file that appears under its name only when it is complete."""
     partial = path.with_name(f".{path.name}.partial").with_suffix(suffix)
     try:
         write_to(partial)

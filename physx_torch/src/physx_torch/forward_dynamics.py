@@ -21,10 +21,11 @@ from physx_core.typing import Vector
 class ForwardDynamics:
     """Accelerations as a function of positions, velocities and torques, with gradients.
 
-    Values are those of `Simulation.forward_dynamics`: with damping, springs and Coulomb friction,
-    without contacts and limits. Gradients are computed from analytic derivatives in double
+    Values are those of `Simulation.forward_dynamics`, with damping, springs and Coulomb friction
+    but without contacts and limits. Gradients are computed from analytic derivatives in double
     precision on the CPU, with constant Coulomb friction. The quaternion of a floating base is
-    normalized, and its gradient is that of the normalized one. There are no second derivatives.
+    normalized, and its gradient is with respect to the normalized one. There are no second
+    derivatives.
 
     Example:
         >>> dynamics = ForwardDynamics(simulation, processes=2)
@@ -51,17 +52,17 @@ class ForwardDynamics:
         self.simulation, self.processes = simulation, processes
 
     def __call__(self, positions: Tensor, velocities: Tensor, torques: Tensor) -> Tensor:
-        """Return the accelerations, shape (..., nv), with the type and device of the input.
+        """Return the accelerations, shape (..., nv), with the dtype and device of the input.
 
         Args:
             positions: Shape (..., nq), in the convention of `physx_core.simulation.layout`.
             velocities: Shape (..., nv).
-            torques: Shape (..., nv), in N m or N; a base's first six are a force and a torque on
-                it, along its own axes. The leading axes of the three are broadcast.
+            torques: Shape (..., nv), in N m or N; a floating base's first six are a force and a
+                torque on it, along its own axes. The leading axes of all three are broadcast.
 
         Raises:
-            SimulationError: If a shape does not fit, a value is not finite, a quaternion is not of
-                length 1 (within 0.001), or one of the processes ended.
+            SimulationError: If a shape does not match, a value is not finite, a quaternion does not
+                have length 1 (within 0.001), or one of the processes has ended.
         """
         given = (positions, velocities, torques)
         self._check(given)
@@ -83,7 +84,7 @@ class ForwardDynamics:
         ):
             if tensor.shape[-1:] != (length,):
                 shape = tuple(tensor.shape)
-                raise SimulationError(f"{name} have the shape {shape} but need (..., {length}).")
+                raise SimulationError(f"{name} have shape {shape} but need (..., {length}).")
 
 
 def _rows(tensor: Tensor, leading: Sequence[int]) -> Tensor:
@@ -100,7 +101,7 @@ def _accelerations(dynamics: ForwardDynamics, rows: Sequence[Tensor]) -> Vector:
 
 
 class _Function(torch.autograd.Function):
-    """Forward dynamics of rows of states."""
+    """Forward dynamics of states given as rows."""
 
     @staticmethod
     def forward(ctx: Any, dynamics: ForwardDynamics, *rows: Tensor) -> Tensor:
@@ -137,13 +138,13 @@ def _to_position_gradients(layout: Layout, positions: Vector, by_motion: Vector)
 def _write_base(found: Vector, quaternion: Vector, by_motion: Vector) -> None:
     """Write gradients by x, y, z and the quaternion x, y, z, w of a base into `found` (n, 7..).
 
-    A change dp of the position is R^T dp in the base's frame, and a change du of the quaternion u
-    is the rotation 2 Im(u* du) / |u|^2 there.
+    In the base's frame, a change dp of the position is R^T dp, and a change du of the quaternion u
+    is the rotation 2 Im(u* du) / |u|^2.
 
     Args:
         found: The first seven columns are written.
-        quaternion: Of the base, x, y, z, w, shape (n, 4).
-        by_motion: Gradients by translations along and rotations about its own axes, (n, 6..).
+        quaternion: Quaternion of the base, x, y, z, w, shape (n, 4).
+        by_motion: Gradients by translations along and rotations about the base's axes, (n, 6..).
     """
     length = np.sqrt((quaternion**2).sum(axis=1, keepdims=True))
     unit = quaternion / length

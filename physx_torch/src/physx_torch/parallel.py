@@ -1,7 +1,7 @@
 """Data-parallel training: several processes of torch.distributed train one network.
 
-``torchrun`` starts the processes. Each computes the gradients of its share of a batch; these are
-averaged before clipping and stepping, so that all processes have the same parameters.
+``torchrun`` starts the processes. Each computes the gradients of its share of a batch; they are
+averaged before clipping and stepping, so all processes have the same parameters.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from physx_core.typing import Batch
 from physx_torch.devices import find_device
 
 _TIMEOUT = datetime.timedelta(days=1)
-"""Longest time for which the others wait for one; its environments may take long for a batch."""
+"""Longest time that the others wait for one, whose environments may take long for a batch."""
 
 
 def join_group(device: str) -> Group:
     """Return the group of this process, which is its only member unless torchrun started it.
 
-    The processes communicate by NCCL if each has a CUDA device of its own, otherwise by Gloo.
+    The processes communicate by NCCL if each has its own CUDA device, otherwise by Gloo.
 
     Args:
         device: The network's device, as in `NetworkConfig.device`.
@@ -37,7 +37,7 @@ def join_group(device: str) -> Group:
     if int(os.environ.get("WORLD_SIZE", "1")) == 1:
         return Group()
     if not distributed.is_available():
-        raise ConfigError("The installed torch has no torch.distributed: leave torchrun out.")
+        raise ConfigError("The installed torch has no torch.distributed: omit torchrun.")
     return TorchGroup(find_device(device))
 
 
@@ -49,7 +49,7 @@ class TorchGroup(Group):
         if not distributed.is_initialized():
             _connect(device)
         self.rank, self.size = distributed.get_rank(), distributed.get_world_size()
-        is_cuda_only = distributed.get_backend() == "nccl"  # a group that the user's code made
+        is_cuda_only = distributed.get_backend() == "nccl"  # a group that the user's code created
         self._device = device if is_cuda_only else torch.device("cpu")
 
     def tell(self, value: Any) -> Any:
@@ -131,8 +131,8 @@ def broadcast_parameters(network: torch.nn.Module) -> None:
 def average_gradients(network: torch.nn.Module) -> None:
     """Replace each gradient by its mean over all processes, and buffers by the leading process's.
 
-    A parameter without gradient in all processes keeps none; if only some have a gradient, it
-    counts as zero in the others.
+    A parameter without a gradient in all processes keeps none; if only some have a gradient, the
+    others count as zero.
     """
     parameters = [parameter for parameter in network.parameters() if parameter.requires_grad]
     size = distributed.get_world_size()
@@ -162,7 +162,7 @@ def _group_alike(tensors: Iterable[torch.Tensor]) -> list[list[torch.Tensor]]:
 
 
 def _real(tensor: torch.Tensor) -> torch.Tensor:
-    """Return a view as real numbers, as not every backend supports complex ones."""
+    """Return a view as real numbers, because not every backend supports complex numbers."""
     return torch.view_as_real(tensor) if tensor.is_complex() else tensor
 
 

@@ -68,7 +68,7 @@ def test_a_preempted_local_job_runs_again_and_the_rows_stay_the_same(runs, local
     status, said = runs.finish(process)
     assert status == 0, said
     assert "Restart 1 of 1" in said
-    assert "and runs it again" in said
+    assert "Slurm interrupted and requeued job" in said
     assert runs.same(runs.stored(), expected)
     eventually(runs.nothing_is_left)
 
@@ -254,7 +254,7 @@ def test_the_queue_is_asked_for_all_jobs_at_once_and_rarely(runs, slurm, tmp_pat
         ({"cluster": "slrum"}, 'cluster is \'slrum\', but must be "slurm" or "local"'),
         ({"nods": 3}, "Parameter 'nods' need to be prefixed"),
         ({"cluster": "local", "tiem": 3}, "tiem"),
-        ({"folder": "/nonexistent"}, "cannot be made in /nonexistent"),
+        ({"folder": "/nonexistent"}, "Cannot create the jobs' folder in /nonexistent"),
     ],
 )
 def test_options_are_checked_before_anything_is_started(

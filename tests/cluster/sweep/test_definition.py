@@ -42,8 +42,8 @@ def plus(table, text, base=LINEAR):
         (plus("study", "batch = 0"), ["[study] batch is 0 but must be at least 1"]),
         (plus("study", "goal = 'minimise'"), ["[study] goal is 'minimise'", "'maximize'"]),
         (plus("study", "seeds = []"), ["[study] seeds is []"]),
-        (plus("study", "seeds = [1, 1]"), ["give different numbers"]),
-        (plus("study", "trials = 3"), ["a grid is tried completely"]),
+        (plus("study", "seeds = [1, 1]"), ["must list distinct numbers"]),
+        (plus("study", "trials = 3"), ["a grid is always complete"]),
         (plus("study", "sampler = 'random'"), ["trials is missing"]),
         (plus("study", "sampler_kwargs = {a = 1}"), ['not for "grid"']),
         (plus("study", "pruner_kwargs = {a = 1}"), ["without a pruner"]),
@@ -85,7 +85,7 @@ def plus(table, text, base=LINEAR):
         ),
         (
             plus("parameters", "training.batch_size.half = [10]"),
-            ["training.batch_size.half", "which is no table"],
+            ["training.batch_size.half", "which is not a table"],
         ),
         (LINEAR.replace("epoch_nb", "epochs"), ["[pipelines.linear]", '"epochs"', "epoch_nb"]),
         (

@@ -72,9 +72,9 @@ def test_the_table_is_the_same_wherever_trials_run(write, slow, same_as_whole, e
     ("executor", "options", "texts"),
     [
         ("local", {"cpus": 2}, ['The executor "local" has no option "cpus"']),
-        ("ray", {"address": "of the tests", "cpus": 2}, ["Ray refuses the options", "cpus"]),
+        ("ray", {"address": "of the tests", "cpus": 2}, ["Ray rejects the options", "cpus"]),
         ("ray", {"address": "127.0.0.1:9"}, ["Ray does not answer at 127.0.0.1:9"]),
-        ("slurm", {"cluster": "local", "tiem": 3}, ["submitit refuses the options", "tiem"]),
+        ("slurm", {"cluster": "local", "tiem": 3}, ["submitit rejects the options", "tiem"]),
         ("slurm", {"cluster": "slrm"}, ["run.options.cluster is 'slrm'"]),
     ],
 )
@@ -163,7 +163,7 @@ def test_a_worker_that_ray_loses_is_replaced(write, slow, same_as_whole, ray_clu
 def test_a_job_that_slurm_cannot_run_ends_the_sweep(write, physx, idle_slurm):
     pytest.importorskip("submitit")
     for options, text in (
-        ({"slurm_partition": "none"}, "Slurm refuses the job of a trial"),
+        ({"slurm_partition": "none"}, "Slurm rejects the job of a trial"),
         ({"timeout_min": 600}, "Slurm"),
     ):
         write(run={"executor": "slurm", "options": options})

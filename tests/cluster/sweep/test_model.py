@@ -164,7 +164,7 @@ class Sweeps(RuleBasedStateMachine):
         except KilledError:
             return
         except StudyError as error:
-            assert "the same command continues" in str(error)
+            assert "the same command resumes" in str(error)
             return
         assert (self.folder / "trials.csv").read_text() == self.undisturbed()
 

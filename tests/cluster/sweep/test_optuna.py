@@ -86,7 +86,7 @@ def test_several_seeds_count_by_their_mean_and_failures_are_told():
         (lambda: search("optuna/tppe"), r'no sampler "optuna/tppe".*Did you mean "optuna/tpe"'),
         (lambda: search("optuna/grid"), 'no sampler "optuna/grid"'),
         (lambda: search(startup=3), 'has no option "startup"'),
-        (lambda: search("optuna/qmc", qmc_type="holton"), "refuses its arguments"),
+        (lambda: search("optuna/qmc", qmc_type="holton"), "rejects its arguments"),
         (lambda: Pruning("optuna/medain", {}, "minimize", []), 'Did you mean "optuna/median"'),
         (lambda: Pruning("optuna/median", {"n": 3}, "minimize", []), 'has no option "n"'),
     ],
@@ -174,7 +174,7 @@ def test_fewer_trials_in_a_batch_than_processes_are_said(write):
     options = {"sampler": "optuna/tpe", "trials": 2, "batch": 1, "run": {"parallel": 2}}
     said = []
     run_study(Definition.read(write(**options)), Path("study"), said.append)
-    assert said[1].startswith("note: no more trials than 1 run at the same time")
+    assert said[1].startswith("note: only 1 of 2 (run.parallel) trials can run at the same time")
 
 
 def test_results_that_were_changed_are_noticed(write):
@@ -188,5 +188,5 @@ def test_results_that_were_changed_are_noticed(write):
         for line in place.read_text().splitlines()
     ]
     place.write_text("\n".join(changed))
-    with pytest.raises(StudyError, match="Its results were changed, or Optuna is of another"):
+    with pytest.raises(StudyError, match="Its results were changed, or Optuna's version"):
         run_study(Definition.read(file), Path("study"), lambda line: None)

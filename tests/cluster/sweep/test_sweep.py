@@ -95,7 +95,7 @@ def test_what_concerns_all_trials_ends_the_sweep_at_once_and_is_no_result(write,
     write()
     said = physx("sweep", "sweep.toml", status=1)
     assert "DatasetNotFoundError: There is no dataset in data" in said
-    assert "the same command continues" in said
+    assert "the same command resumes" in said
     assert table("studies/sweep") == []
     assert not Path("studies/sweep/trial_0002/output.txt").exists()
     status = physx("sweep", "--status", "studies/sweep")

@@ -76,7 +76,7 @@ def test_a_file_gives_options_and_words_replace_them(capsys, tmp_path):
         (["info", "--verify"], "needs a folder"),
         (["predict", "sessions/none", "toy/spring"], "no session"),
         ([*TRAIN, "--epoch-nb", "1", "--batch-size", "1"], "nowhere"),
-        ([*GENERATE, "--environment.env-kwargs", "mass=[1,", "2]"], "quote one"),
+        ([*GENERATE, "--environment.env-kwargs", "mass=[1,", "2]"], "quote it"),
     ],
 )  # fmt: skip
 def test_mistakes_end_with_one_clear_error(words, message, capsys):
@@ -145,7 +145,7 @@ def test_help_shows_the_arguments_without_names_and_examples(verb, arguments, ca
 @pytest.mark.parametrize(
     ("verb", "text"),
     [
-        ("generate", "None: as many as `num_clients`, or `min_clients` if that is more."),
+        ("generate", "None: `num_clients`, or `min_clients` if that is larger."),
         ("train", "if the dataset has a validation mode or `validation_split` holds samples back;"),
     ],
 )

@@ -43,7 +43,7 @@ def test_it_names_interpreter_versions_and_places():
     assert sys.executable in text and __version__ in text
     assert "physx-core" in text and "numpy" in text
     assert "vulkan" in text and "display" in text
-    assert "in each other's way: nothing" in text
+    assert "conflicts: none" in text
     assert "toy  (physx-core" in text and "broken" not in text
     assert "0123secret" not in text and "PHYSX_IMPORT_TIMEOUT 50" in text
 
@@ -53,7 +53,7 @@ def test_a_module_in_another_place_is_named(tmp_path):
     (tmp_path / "zarr").mkdir()
     (tmp_path / "zarr/__init__.py").touch()
     text = info(PYTHONPATH=tmp_path, ROS_DISTRO="humble")
-    assert f"zarr: import zarr takes {tmp_path / 'zarr'}, not " in text
+    assert f"zarr: import zarr loads {tmp_path / 'zarr'}, not " in text
     assert f"PYTHONPATH   {tmp_path}" in text and "ROS_DISTRO   humble" in text
 
 
@@ -67,7 +67,7 @@ def test_a_broken_plugin_and_a_package_without_its_files_are_named(tmp_path):
     package(tmp_path, "bad", "2.0", ["bad/__init__.py"], "[physx]\nbad = bad.plugin\n")
     (tmp_path / "bad/__init__.py").unlink()
     text = info(PYTHONPATH=tmp_path)
-    assert "bad: its files are gone: install it again" in text
+    assert "bad: its files are missing: reinstall it" in text
     assert "bad  (bad 2.0)\n  broken: " in text
 
 
@@ -86,6 +86,6 @@ def test_drivers_are_found_where_a_system_has_them(tmp_path, monkeypatch):
     found = installation.describe_drivers({"DISPLAY": ":1"}, tmp_path)
     assert found["display"] == ":1" and found["vulkan"] == "lvp_icd"
     assert "nvidia0" in found["cards"] and "renderD128" in found["cards"]
-    assert found["cards"].endswith("NVIDIA's driver 570.86.10")
+    assert found["cards"].endswith("NVIDIA driver 570.86.10")
     chosen = {"VK_DRIVER_FILES": str(tmp_path / "none.json")}
     assert "no driver" in installation.describe_drivers(chosen, tmp_path)["vulkan"]

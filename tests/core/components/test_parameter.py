@@ -66,7 +66,7 @@ def test_a_cut_off_normal_distribution_stays_within_its_bounds(share, mean, devi
         ({"low": 0.0, "high": np.inf}, "not finite"),
         ({"low": [0.0, 1.0], "high": 1.0, "shape": (3,)}, "neither a number nor of shape"),
         ({"low": 0.0, "high": 1.0, "shape": (0,)}, "0 elements"),
-        ({"low": 0.0, "high": 1.0, "distribution": "gauss"}, "no distribution 'gauss'"),
+        ({"low": 0.0, "high": 1.0, "distribution": "gauss"}, "unknown distribution 'gauss'"),
     ],
 )
 def test_what_is_no_distribution_is_an_error_that_names_the_parameter(options, message):

@@ -233,7 +233,7 @@ def test_minari_reports_rows_in_no_episode(folder, tmp_path, minari):
     [
         (ExportOptions(observations=["stat"]), 'Did you mean "state"'),
         (ExportOptions(actions=["state"], observations=["state"]), "more than once"),
-        (ExportOptions(rewards="state"), "not one number"),
+        (ExportOptions(rewards="state"), "not a single number"),
         (ExportOptions(actions=["state"]), "No field is left"),
     ],
 )

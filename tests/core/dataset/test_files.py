@@ -281,7 +281,7 @@ def test_a_truncated_partition(folder):
     path = folder / "run_training_x_1.h5"
     size = path.stat().st_size
     os.truncate(path, size - 41)
-    match = f"run_training_x_1.h5 is truncated: it has {size - 41} bytes, {size}.*\\. 338 rows"
+    match = f"run_training_x_1.h5 is truncated: it has {size - 41} bytes, but {size}.*\\. 338 rows"
     assert "338 rows" in fails_to_read(folder, match)
 
 

@@ -82,7 +82,7 @@ def test_too_small_an_address_space(tmp_path):
     words = [sys.executable, "-c", code, str(tmp_path)]
     failed = subprocess.run(words, capture_output=True, text=True, check=False)
     assert failed.returncode == 1
-    assert "100663296 bytes of addresses are needed" in failed.stderr
+    assert "100663296 bytes of address space are needed" in failed.stderr
 
 
 # Damage -----------------------------------------------------------------------------------------

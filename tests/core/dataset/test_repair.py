@@ -120,7 +120,7 @@ def test_sound_rows_get_a_new_header(folder, thousand):
     path.write_bytes(content)
     with Dataset.open(folder) as dataset:
         assert len(dataset.verify()) == 1
-    assert "new header" in Dataset.repair(folder)[0]
+    assert "header has been rewritten" in Dataset.repair(folder)[0]
     thousand.check(folder, thousand.rows)
     with h5py.File(path) as file:
         assert_array_equal(file["data"][:], thousand.rows["x"][340:680])

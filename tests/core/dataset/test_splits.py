@@ -162,7 +162,7 @@ def test_trajectories_of_unequal_length_approximate_the_shares(folder):
 @pytest.mark.parametrize(
     ("shares", "by", "message"),
     [
-        ({"a": 0.9, "b": 0.2}, "row", "add up to 1 at most"),
+        ({"a": 0.9, "b": 0.2}, "row", "add up to at most 1"),
         ({"a": 0.9, "b": 0}, "row", "must be positive"),
         ({"a": -0.1}, "row", "must be positive"),
         ({}, "row", "must be positive"),

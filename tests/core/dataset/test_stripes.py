@@ -537,7 +537,7 @@ def test_a_stripe_has_one_writer_at_a_time(folder, monkeypatch):
         )
         assert process.stdout.readline() == "holds\n"
         os.close(locks.take_over(proof, 0))
-        with pytest.raises(DatasetError, match="still writes the rows of instance 2"):
+        with pytest.raises(DatasetError, match="still writing the rows of instance 2"):
             locks.take_over(proof, 1)
         process.kill()
         process.communicate()
@@ -559,13 +559,13 @@ def test_manifests_with_impossible_stripes_are_refused(folder):
     plain = json.loads(text)
     assert plain["format_version"] == 2
     wrong = [
-        (2, {"stripe": [2, 4]}, "do not follow"),
-        (1, {"stripe": [0, 3], "first_row": 0}, "do not follow"),
+        (2, {"stripe": [2, 4]}, "are inconsistent"),
+        (1, {"stripe": [0, 3], "first_row": 0}, "are inconsistent"),
         (0, {"stripe": [3, 3]}, "place of a stripe"),
         (0, {"stripe": [0, 1]}, "number of stripes"),
         (1, {"stripe": 7}, "a stripe cannot be 7"),
-        (2, {"rows": 0}, "do not fit together"),
-        (0, {"rows": 1}, "do not fit together"),
+        (2, {"rows": 0}, "inconsistent numbers of rows"),
+        (0, {"rows": 1}, "inconsistent numbers of rows"),
         (1, {"sealed": False}, "some stripes"),
     ]
     for place, changes, problem in wrong:
@@ -578,7 +578,7 @@ def test_manifests_with_impossible_stripes_are_refused(folder):
     changed["modes"]["training"]["partitions"][0]["stripe"] = [1, 3]
     path.write_text(json.dumps(changed))
     found = find_problems(folder, manifest_file.load(folder, edited=True))
-    assert all("has another stripe" in problem for problem in found) and len(found) == 3
+    assert all("has a different stripe" in problem for problem in found) and len(found) == 3
     path.write_text(text)
     with Dataset.open(folder) as dataset:
         check(dataset, list(range(6)))

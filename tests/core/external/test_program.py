@@ -150,6 +150,7 @@ def sampled(program, episodes, as_clients, **ranges):
         ]
 
 
+@pytest.mark.faults
 def test_a_sampler_chooses_the_parameters_of_a_program_and_those_that_kill_it_are_redrawn(
     heat, heat_fortran
 ):
@@ -385,17 +386,17 @@ WAYS = {
     "no fields": r"declared no fields in physx_open\(\)",
     "no sample": r"called physx_close\(\) without having sent a sample",
     "status": r"ended with exit status 4 after physx_close\(\)",
-    "stay": r"called physx_close\(\), but still runs 2 s later",
-    "garbage": r"sent 74 68 65 72\.\.\. where a message should begin",
-    "version": r"of protocol 2, but this one speaks 1: compile it",
+    "stay": r"was still running 2 s after physx_close\(\)",
+    "garbage": r"sent 74 68 65 72\.\.\. where a message should start",
+    "version": r"of protocol 2, but this physx uses 1: compile it",
     "kind": r"a message of kind 63 with 0 arrays",
     "huge": r"sent a message of kind 3 with 1 arrays of 9223372036854775807 bytes",
     "half": r"did nothing for 2 s",
     "type": r'gave the array "x" the unknown type 7',
     "rank": r'gave the array "x" the rank 99',
     "shape": r'gave the array "x" the shape \(-1,\)',
-    "name": r"named an array 'a b\\n\\x1b\[31m', which is no identifier",
-    "reserved": r"named an array 'step', .*or a name that physx uses itself",
+    "name": r"named an array 'a b\\n\\x1b\[31m', which is not an identifier",
+    "reserved": r"named an array 'step', .*or is reserved by physx",
     "length": r"described arrays of 4 bytes, but announced 8",
     "twice": r"called physx_open\(\) twice",
     "no inputs": r"called physx_predict\(\) without inputs",
@@ -483,7 +484,7 @@ def test_a_program_that_cannot_be_started_is_named(local):
 @pytest.mark.parametrize("program", [[], "", ["a", 1], {"a": 1}, ["a\0b"]])
 def test_a_program_is_a_list_of_texts(local, program):
     with (
-        pytest.raises(ConfigError, match="must be a list of texts"),
+        pytest.raises(ConfigError, match="must be a list of strings"),
         local("external/program", env_kwargs={"program": program}) as source,
     ):
         source.batch(1)
@@ -517,7 +518,7 @@ def test_a_program_that_declares_other_fields_the_next_time_is_told(local, heat)
     script = f"n=3; [ -e once ] && n=4; touch once; exec {heat} $n 2 1"
     kwargs = {"program": ["/bin/sh", "-c", script], "parameters": {"alpha": 0.1}}
     with (
-        pytest.raises(ProgramError, match="declared other fields when it was started again"),
+        pytest.raises(ProgramError, match="declared different fields when it was started again"),
         local("external/program", env_kwargs=kwargs) as source,
     ):
         source.batch(3)
@@ -527,7 +528,7 @@ def test_a_program_that_runs_by_itself_says_so(build, heat):
     variables = {name: value for name, value in os.environ.items() if name != "PHYSX_SOCKET"}
     done = subprocess.run([heat], capture_output=True, text=True, env=variables)
     assert done.returncode == 1
-    assert "no run of physx has started this program" in done.stderr
+    assert "this program was not started by a physx run" in done.stderr
     missing = subprocess.run(
         [heat], capture_output=True, text=True, env={**variables, "PHYSX_SOCKET": "/nowhere/s"}
     )

@@ -260,10 +260,10 @@ def test_a_listener_finds_every_frame_though_the_system_sees_none_of_it(sizes):
 @pytest.mark.parametrize(
     ("answer", "error", "text"),
     [
-        (b"", UnansweredError, "a version that does not encrypt"),
-        (b"HTTP/1.1 400 Bad Request\r\n\r\n", ConnectionRefusedByPeerError, "does not encrypt as"),
-        (pack(Kind.CHALLENGE, bytes(76)), ConnectionRefusedByPeerError, "does not encrypt as"),
-        (b"\x15\x03\x03\x00\x02\x02\x28", ConnectionRefusedByPeerError, "does not encrypt as"),
+        (b"", UnansweredError, "does not support encryption"),
+        (b"HTTP/1.1 400 Bad Request\r\n\r\n", ConnectionRefusedByPeerError, "does not use physx"),
+        (pack(Kind.CHALLENGE, bytes(76)), ConnectionRefusedByPeerError, "does not use physx"),
+        (b"\x15\x03\x03\x00\x02\x02\x28", ConnectionRefusedByPeerError, "does not use physx"),
         (None, SilentPeerError, "in time"),
     ],
 )

@@ -148,7 +148,7 @@ class Text(str):
     ids=["object", "set", "subclass", "objects", "structured", "masked", "function"],
 )
 def test_what_cannot_travel_is_named(value):
-    with pytest.raises(UsageError, match=r"(?s)options\['deep'\]\[1\] is .*cannot travel"):
+    with pytest.raises(UsageError, match=r"(?s)options\['deep'\]\[1\] is .*cannot be sent"):
         encode({"deep": [0, value]}, "options")
 
 

@@ -84,7 +84,7 @@ def test_a_generation_says_where_it_writes_what_it_left_and_how_to_continue(said
     generate()
     expected = [line.format("spring_1") for line in (*end, info, training)]
     assert said() == ['session: sessions/spring_1 ("spring" exists)', *expected]
-    with pytest.warns(UserWarning, match='"spring" is used, but "spring_1" is newer'):
+    with pytest.warns(UserWarning, match='session "spring", but "spring_1" is newer'):
         generate(new_session=False, mode="validation")
     lines = said()
     assert lines[0] == "session: sessions/spring (continued)"
@@ -187,7 +187,7 @@ def test_a_prediction_without_an_end_says_how_it_ends(said):
             signal.raise_signal(signal.SIGINT)
 
     Interrupted(NetworkConfig(), SPRING).execute()
-    assert said()[1] == "steps until Ctrl-C; step_nb (--step-nb) is their number"
+    assert said()[1] == "runs until Ctrl-C; step_nb (--step-nb) limits the number of steps"
 
 
 def test_a_batch_that_is_larger_than_the_dataset_is_announced(said):
@@ -195,7 +195,7 @@ def test_a_batch_that_is_larger_than_the_dataset_is_announced(said):
     said()
     data = DatasetConfig(existing_dir=made)
     Training(LINEAR, data, epoch_nb=1, batch_size=21).execute()
-    assert said()[2] == "batches of 20 samples, as there are no more than these"
+    assert said()[2] == "batches of 20 samples, because there are no more"
     Training(LINEAR, data, epoch_nb=1, batch_size=20).execute()
     assert not any("no more" in line for line in said())
 
@@ -321,7 +321,7 @@ def test_a_run_that_failed_before_its_first_row_leaves_no_session(options, error
     assert sessions() == []
     assert said() == [
         "session: sessions/spring",
-        "session: sessions/spring is removed, as the run kept nothing in it",
+        "session: sessions/spring was removed: the run stored nothing in it",
     ]
     assert generate().session.name == "spring"
 
@@ -421,7 +421,7 @@ def test_ctrl_c_before_the_first_row_leaves_no_session(tmp_path):
         time.sleep(0.05)
     process.send_signal(signal.SIGINT)
     _, text = process.communicate(timeout=60)
-    assert "session: sessions/data_generation is removed" in text
+    assert "session: sessions/data_generation was removed" in text
     assert sessions() == []
 
 
@@ -434,7 +434,7 @@ def test_a_name_that_was_numbered_since_is_used_with_a_warning():
     train("sessions/spring", session_name="net")
     second = train("sessions/spring_1", session_name="net")
     assert second.session.name == "net_1"
-    with pytest.warns(UserWarning, match='"net" is used, but "net_1" is newer.*session_name='):
+    with pytest.warns(UserWarning, match='session "net", but "net_1" is newer.*session_name='):
         Prediction(NetworkConfig(), SPRING, session_name="net", step_nb=1).execute()
     Prediction(NetworkConfig(), SPRING, session_name="net", step_nb=1).execute()  # now the newest
     Prediction(NetworkConfig(), SPRING, session_name="net_1", step_nb=1).execute()
@@ -451,7 +451,7 @@ def test_commands_warn_on_one_line(tmp_path):
         check=False,
     )
     (line,) = (line for line in done.stderr.splitlines() if "is newer" in line)
-    assert line.startswith('physx: UserWarning: The session "spring" is used, but "spring_1" is')
+    assert line.startswith('physx: UserWarning: Using the session "spring", but "spring_1" is')
     assert ".py" not in done.stderr
 
 
@@ -459,7 +459,7 @@ def test_a_missing_session_is_not_continued_in_silence():
     generate()
     generate()
     Path("sessions/spring").rename("sessions/away")
-    with pytest.warns(UserWarning, match='no session "spring": a new one is used, not spring_1'):
+    with pytest.warns(UserWarning, match='no session "spring": using a new one, not spring_1'):
         generate(new_session=False)
 
 
@@ -507,7 +507,7 @@ def test_resuming_needs_nothing_but_the_session(said):
     assert main(["train", "sessions/training/", "--resume", "--epoch-nb", "4"]) == 0
     assert "4 of 4 epochs in T" in said()
     assert main(["train", "sessions/training", "--resume"]) == 0
-    assert any(line.startswith("nothing was left to train") for line in said())
+    assert any(line.startswith("nothing left to train") for line in said())
     assert sessions() == ["spring", "training"]
 
 
@@ -568,5 +568,5 @@ def test_the_only_name_in_a_session_is_that_of_the_network():
     )
     data = DatasetConfig(existing_dir=made)
     Training(other, data, new_session=False, epoch_nb=1, batch_size=5).execute()
-    with pytest.raises(PhysxError, match="There are: line_0, other_0"):
+    with pytest.raises(PhysxError, match="Available: line_0, other_0"):
         Prediction(NetworkConfig(), SPRING, step_nb=1).execute()

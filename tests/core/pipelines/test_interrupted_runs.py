@@ -187,7 +187,7 @@ LEFT = {
     "online training": [CHECKPOINT, "next: physx train sessions/new --resume"],
     "training with clients": [CHECKPOINT, "next: physx train sessions/new --resume"],
     "prediction": ["next: physx info sessions/trained"],
-    "replay": ["session: sessions/new is removed, as the run kept nothing in it"],
+    "replay": ["session: sessions/new was removed: the run stored nothing in it"],
 }
 
 
@@ -286,7 +286,7 @@ def test_an_environment_that_fails_leaves_a_checkpoint_and_the_error_names_it():
         Training(NETWORK, None, config, batch_nb=3, **OPTIONS).execute()
     place = Path("sessions/training/network/network_0")
     assert str(place) in caught.value.__notes__[-1]
-    assert "from which resume=True" in caught.value.__notes__[-1]
+    assert "resume=True (physx train --resume) continues" in caught.value.__notes__[-1]
     assert progress() == (1, 1)
     Training(NETWORK, batch_nb=3, resume=True, **OPTIONS).execute()
     assert progress(number=1) == (3, 0)
@@ -309,7 +309,7 @@ def test_a_training_that_cannot_be_resumed_says_how_to_go_on(capfd):
     assert "NetworkConfig.network_dir" in caught.value.__notes__[-1]
     last = capfd.readouterr().err.splitlines()[-1]
     assert last == AGAIN.replace("new", "training")
-    with pytest.raises(ConfigError, match=r"depend on the network that learns.*network_dir"):
+    with pytest.raises(ConfigError, match=r"depend on the learning network.*network_dir"):
         Training(NETWORK, None, config, batch_nb=9, resume=True, **OPTIONS).execute()
     words = last.removeprefix("next: physx ").split()
     assert main([*words, "--environment.environment", "toy/spring", "--batch-nb", "1"]) == 0

@@ -364,7 +364,7 @@ def test_a_failing_observer_is_muted_and_the_run_goes_on(monkeypatch):
             super()._open(resources)
             self.observers._observers.append(Fails())
 
-    with pytest.warns(UserWarning, match="Fails failed and is left out.*viewer broke"):
+    with pytest.warns(UserWarning, match="Fails failed and is disabled.*viewer broke"):
         Mine(SPRING, batch_nb=3, batch_size=2).execute()
 
 

@@ -231,7 +231,7 @@ def test_a_record_that_was_cut_or_damaged_ends_there():
     file.write_bytes(content[:place] + b"\xff" + content[place + 1 :])
     assert np.array_equal(read_drawn_rows(path), whole[:10])
     file.write_bytes(b"physx")
-    with pytest.raises(SessionError, match="damaged, or not a file of physx"):
+    with pytest.raises(SessionError, match="damaged, or was not written by physx"):
         read_drawn_rows(path)
 
 

@@ -245,7 +245,7 @@ def test_a_missing_best_network_is_named(data):
     training([1.0], network={"save_best": False}, patience=1, session_name="other").execute()
     assert checkpoints() == checkpoints("other") == ["network_0"]
     best = {"network_dir": "sessions/training", "which_network": "best"}
-    with pytest.raises(CheckpointError, match='"network_best".*There are: network_0'):
+    with pytest.raises(CheckpointError, match='"network_best".*Available: network_0'):
         training([1.0], network=best).execute()
     with pytest.raises(ConfigError, match="which_network"):
         NetworkConfig(which_network="worst")

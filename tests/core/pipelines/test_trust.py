@@ -145,9 +145,9 @@ def test_trust_imports_classes_of_the_right_kind_only(evil, executed):
     for reference, message in {
         "os:system": "standard library",
         "subprocess:Popen": "standard library",
-        f"{evil}:make": "no class",
+        f"{evil}:make": "not a class",
         f"{evil}:Env": "not derived from Network",
-        f"{evil}:pathlib": "standard library|no class",
+        f"{evil}:pathlib": "standard library|not a class",
     }.items():
         with pytest.raises((ReferenceFormError, UntrustedReferenceError), match=message):
             use(reference)

@@ -271,7 +271,7 @@ def test_a_command_of_a_missing_package_names_it(name, package, monkeypatch, cap
 
 
 def test_unknown_plugins_say_what_is_there_and_that_they_are_none_of_physx():
-    with pytest.raises(PluginNotFoundError, match='Did you mean "toy".*none of physx') as caught:
+    with pytest.raises(PluginNotFoundError, match='Did you mean "toy".*not one of physx') as caught:
         plugins.resolve("environment", "tooy/spring")
     assert "toy" in caught.value.installed
 

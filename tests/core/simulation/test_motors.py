@@ -116,7 +116,7 @@ def test_invalid_values_are_rejected():
         Motors(Held(), WORLD, [Motor(joint="a"), Motor(joint="a")])
     with pytest.raises(ConfigError, match='mode "servo"'):
         Motors(Held(("force", "servo", "force")), WORLD, [Motor(joint="b")])
-    with pytest.raises(ConfigError, match="multiple of the physics' period"):
+    with pytest.raises(ConfigError, match="multiple of the physics period"):
         Motors(Held(), WORLD, [Motor(joint="a", period=2.5e-3)])
     with pytest.raises(ConfigError, match="too stiff"):
         Motors(Held(), WORLD, [Motor(joint="a", stiffness=1e6, inertia=0.1)])

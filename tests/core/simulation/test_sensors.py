@@ -197,7 +197,7 @@ def test_invalid_values_are_rejected():
         make(Imu(name="x", body="boddy"))
     with pytest.raises(FeatureNotSupportedError, match="contacts"):
         make(ContactSensor(name="x", body="body"))
-    with pytest.raises(ConfigError, match="multiple of the physics' period"):
+    with pytest.raises(ConfigError, match="multiple of the physics period"):
         make(Encoder(name="x", joint="a", period=1.5e-3))
     with pytest.raises(ConfigError, match='2 sensors "x"'):
         make(Encoder(name="x", joint="a"), Encoder(name="x", joint="b"))

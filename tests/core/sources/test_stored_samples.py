@@ -281,7 +281,7 @@ def test_without_existing_dir_the_sessions_own_samples_are_replayed(source_dir):
     train(None, through(factor=5.0), "own", new_session=False)
     rows = rows_of("sessions/own")
     assert (rows["times"] == 2).all() and np.allclose(rows["y"][:, 0], 5 * rows["x"].sum(axis=1))
-    with pytest.raises(ConfigError, match="already has samples of its own"):
+    with pytest.raises(ConfigError, match="already has its own samples"):
         train(source_dir, through(), "own", new_session=False)
     with pytest.raises(DatasetError, match='no samples of mode "training" to send'):
         train(None, through(), "new")

@@ -6,18 +6,18 @@ from physx_core.errors import UsageError
 from physx_core.testing import check_buffer, check_sampler
 
 SAMPLERS = [
-    ("InOrder", "chooses the same in any order", "otherwise"),
+    ("InOrder", "chooses the same in any order", "differently"),
     ("Unseeded", "chooses the same again", "same seed"),
     ("OutOfBounds", "chooses every parameter within its bounds", "stiffness"),
     ("Incomplete", "chooses every parameter within its bounds", "cells"),
-    ("Cached", "gives away its sets", "changed by its user"),
+    ("Cached", "hands out copies of its sets", "changed by its user"),
     ("LearnsAtOnce", "learns from counted batches", "another is told"),
-    ("ForgetsLosses", "continues from a state", "otherwise"),
-    ("RestoresAnything", "refuses what is no state", "ValueError"),
+    ("ForgetsLosses", "continues from a state", "differently"),
+    ("RestoresAnything", "refuses an invalid state", "ValueError"),
 ]
 BUFFERS = [
     ("Decreases", "needs more rows from batch to batch", "decreases"),
-    ("NeedsByState", "needs rows by its options alone", "after batches were drawn"),
+    ("NeedsByState", "needs rows that depend only on its options", "after batches were drawn"),
     ("Impatient", "draws rows that it keeps", "slot without a row"),
     ("OwnRandom", "draws the same again", "same seed"),
     ("HiddenState", "continues from a state", "restore()"),

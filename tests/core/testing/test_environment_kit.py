@@ -19,7 +19,7 @@ WRONG = [
     ("Swallows", "refuses unknown options", "misspelling"),
     ("FirstForEver", "takes its place among the instances", "instance 1 of 1"),
     ("DrawsRandomly", "draws without an effect on its rows", "with a visualizer"),
-    ("ClosesOnce", "closes at any time, also twice", "before create()"),
+    ("ClosesOnce", "closes at any time, even twice", "before create()"),
     ("Crashes", "gives the same rows with the same seed", "SIGSEGV"),
     ("ReplaysAnything", "replays stored rows", "second replay"),
     ("OtherInClients", "gives the same rows from clients over TCP", '"state"'),
@@ -59,4 +59,4 @@ def test_what_is_the_same_for_all_seeds_is_said_and_not_judged(place):
 def test_what_needs_a_network_is_left_out(place):
     report = check_environment(place("wrong_environments", "Asks"))
     assert report.ok and report.counts()["skipped"] >= 6, str(report)
-    assert "a network, which the kit has not" in str(report)
+    assert "a network, which the kit lacks" in str(report)

@@ -15,7 +15,7 @@ pytestmark = pytest.mark.slow
 WRONG = {
     "Careless": {
         "keeps the token off command lines": "everybody",
-        "tells how a client ended, and its last words": "stderr()",
+        "reports how a client ended, and its last output": "stderr()",
         "starts a client for each instance": "[4, 2, 1]",
         "starts a killed client again": "out of machines",
     },
@@ -23,11 +23,14 @@ WRONG = {
         "kills clients": "as if it had done its work",
         "kills one client alone": "ended another one",
     },
-    "LeavesChildren": {"leaves nothing of clients that hang": "sleep"},
+    "LeavesChildren": {"cleans up after clients that hang": "sleep"},
 }
 
 
-@pytest.mark.parametrize("name", WRONG)
+@pytest.mark.parametrize(
+    "name",
+    ["Careless", *(pytest.param(name, marks=pytest.mark.faults) for name in list(WRONG)[1:])],
+)
 def test_what_is_wrong_is_named(name, place, expect_named, nothing_stays_behind):
     try:
         report = check_launcher(place("wrong_launchers", name))

@@ -9,12 +9,12 @@ FIELDS = (Field("x", (4,)), Field("y", (3,)))
 NETWORKS = [
     ("OtherName", "predicts each of its fields, in the shape of its target", "pred_fields"),
     ("FlatPrediction", "predicts each of its fields, in the shape of its target", "(8, 3)"),
-    ("MixesRows", "predicts a sample alone as among others", "alone"),
+    ("MixesRows", "predicts a sample the same alone and in a batch", "alone"),
     ("DropsInEvaluation", "predicts the same again", "evaluation mode"),
     ("ChangesInputs", "does not change its inputs", "predict() changed"),
     ("IgnoresSeed", "begins with the same parameters for the same seed", "first"),
     ("Pickles", "saves its parameters without code", "pickle"),
-    ("ForgetsOffset", "saves and loads all that it predicts with", "not among them"),
+    ("ForgetsOffset", "saves and loads everything it predicts with", "not among them"),
     ("LoadsAnything", "refuses damaged and missing parameters", "half of a file"),
     ("BindsAnything", "refuses fields that it cannot read", "super().bind"),
     ("Swallows", "refuses unknown options", "misspelling"),
@@ -23,16 +23,16 @@ OPTIMIZATIONS = [
     ("Climbs", "lowers the loss", "linear problem"),
     ("StepsInLoss", "changes parameters in optimize() alone", "validation"),
     ("ForgetsMomentum", "resumes from a checkpoint bit for bit", "state_file"),
-    ("RowLossesStep", "computes losses of rows without an effect", "compute_row_losses"),
+    ("RowLossesStep", "computes row losses without side effects", "compute_row_losses"),
     ("Noisy", "trains the same again", "second training"),
-    ("HidesNaN", "stops at NaN with the parameters of before", "without a word"),
+    ("HidesNaN", "stops at NaN with the previous parameters", "without a word"),
 ]
 TRANSFORMATIONS = [
     ("ForgetsToUndo", "converts normalized predictions back to physical units", "does not undo"),
     ("UndoesAlways", "converts predictions back to physical units", "does not undo"),
     ("KeepsNothing", "keeps its normalization for checkpoints", "super().set_normalization"),
     ("InPlace", "does not change what it transforms", "the targets"),
-    ("OfTheBatch", "transforms a sample alone as among others", "alone"),
+    ("OfTheBatch", "transforms a sample the same alone and in a batch", "alone"),
 ]
 
 

@@ -72,7 +72,7 @@ def test_a_client_more_than_there_are_instances_takes_over(
         rows.take(20)
     rows.check(local(WANDERER, **settings))
     (text,) = said("another client takes over")
-    assert text.endswith("It is not started again: restarts is 0.")
+    assert text.endswith("It is not restarted: restarts is 0.")
 
 
 # Coming and going -------------------------------------------------------------------------------
@@ -87,13 +87,13 @@ def test_a_late_client_takes_over_instances(local, by_hand, join, taking, said, 
         rows = taking(source)
         rows.take(8)
         ours.append(join())
-        rows.take_until(lambda: len(said("goes from client 1")) == 2)
+        rows.take_until(lambda: len(said("moves from client 1")) == 2)
         rows.take(20)
     rows.check(local(WANDERER, **settings))
     texts = [process.communicate(timeout=60)[0] for process in ours]
     assert [process.returncode for process in ours] == [0, 0]
     assert "waits for instances to run" in texts[0]
-    assert len(re.findall(r"instance \d goes elsewhere", texts[0])) == 2
+    assert len(re.findall(r"instance \d moves to another client", texts[0])) == 2
     assert len(re.findall(r"runs instance \d", texts[1])) == 2
     assert "the run has ended" in texts[1]
     assert said()[0].startswith("The run waits for 1 client (at most 2 may join). Start each")
@@ -123,7 +123,7 @@ def test_a_run_with_too_few_clients_waits_and_says_so(
 
     def come_late():
         deadline = time.monotonic() + 60
-        while not said("1 client and waits for others, since [^1]"):
+        while not said("1 client and has been waiting for others for [^1]"):
             assert time.monotonic() < deadline
             time.sleep(0.05)
         ours.append(join())
@@ -137,7 +137,9 @@ def test_a_run_with_too_few_clients_waits_and_says_so(
         rows.take(60)
         late.join()
     rows.check(local(WANDERER, **settings))
-    assert "It needs 2 (min_clients), and waits no longer than 20 s" in said("waits for others")[0]
+    assert (
+        "It needs 2 (min_clients), and waits no longer than 20 s" in said("waiting for others")[0]
+    )
 
 
 def test_a_run_that_too_few_clients_join_ends(by_hand, join, unhurried):
@@ -161,7 +163,7 @@ def test_one_client_too_many_is_told_so(by_hand, join):
             source.batch(2)
             time.sleep(0.01)
     for process in rest:
-        assert "at most 1 may join (max_clients), and 1 are here" in process.stderr.read()
+        assert "at most 1 may join (max_clients), and 1 already joined" in process.stderr.read()
         assert process.returncode == 1
 
 

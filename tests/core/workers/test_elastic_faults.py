@@ -58,7 +58,7 @@ def test_a_killed_client_that_nobody_replaces_ends_the_run_at_once(clients, proc
     with (
         pytest.raises(
             TooFewClientsError,
-            match=r"has 1 client, but needs 2 \(min_clients\), and none can come any more. "
+            match=r"has 1 client, but needs 2 \(min_clients\), and no more can join. "
             rf"Client 1 on {HOST} was killed .* set EnvironmentConfig.restarts",
         ),
         clients(WANDERER, min_clients=2, run_ahead=2, **settings) as source,
@@ -95,7 +95,7 @@ def test_a_client_that_stops_at_the_end_ends_nothing(clients, process_ids, takin
             os.kill(pid, signal.SIGSTOP)
     (text,) = said()
     assert re.match(f"Client 1 on {HOST} was cut off. It has not answered for", text)
-    assert text.endswith("The run was at its end, and all its rows are there.")
+    assert text.endswith("The run was ending, and it has all its rows.")
 
 
 def test_clients_that_cannot_start_end_the_run_at_once(clients, monkeypatch, said):
@@ -103,7 +103,7 @@ def test_clients_that_cannot_start_end_the_run_at_once(clients, monkeypatch, sai
     with (
         pytest.raises(
             TooFewClientsError,
-            match=r"(?s)has 0 clients, but needs 1 .*none can come any more.*before it joined",
+            match=r"(?s)has 0 clients, but needs 1 .*no more can join.*before it joined",
         ),
         clients(WANDERER, num_clients=2, max_clients=2, restarts=1),
     ):
@@ -111,7 +111,7 @@ def test_clients_that_cannot_start_end_the_run_at_once(clients, monkeypatch, sai
     for number in (1, 2):
         how = f"Client {number} ended with exit status 1 before it joined. "
         assert len(said(how + "Restart 1 of 1")) == 1
-        assert len(said(how + "It is not started again")) == 1
+        assert len(said(how + "It is not restarted")) == 1
 
 
 @pytest.mark.parametrize(

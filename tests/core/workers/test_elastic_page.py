@@ -8,6 +8,8 @@ import subprocess
 import sysconfig
 from pathlib import Path
 
+import pytest
+
 from physx_core import Dataset
 
 PAGE = Path(__file__).parents[3] / "docs" / "elastic.md"
@@ -15,6 +17,7 @@ ALONE = """physx generate toy/spring --environment.num-clients 4 --environment.s
 --batch-nb 20 --batch-size 50"""
 
 
+@pytest.mark.faults
 def test_the_commands_of_the_page_make_the_rows_of_a_run_alone(port, nothing_stays_behind):
     commands = re.search(r"```sh\n(.*?)```", PAGE.read_text(), re.S)[1].replace("5000", str(port))
     path = f"{sysconfig.get_path('scripts')}:{os.environ['PATH']}"

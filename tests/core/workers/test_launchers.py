@@ -191,7 +191,7 @@ def test_the_time_of_a_client_begins_when_it_is_not_queued_any_more(clients, cap
         pass
     assert time.monotonic() - began > 6.2  # asked for every 0.1 s
     assert "pending (Resources)" in caplog.text
-    assert "once it is not queued any more" in caplog.text
+    assert "once it has left the queue" in caplog.text
 
 
 def test_a_launcher_that_forgets_its_handles_is_named(clients):

@@ -72,8 +72,8 @@ def test_the_server_says_now_and_then_what_it_waits_for(by_hand, caplog, monkeyp
     ):
         pass
     texts = warnings(caplog)
-    assert "waits for a client to run instance 1, 2, since " in texts[1]
-    assert "waits for a client to run instance 1, 2, since 3 s" in texts[-1]
+    assert "has been waiting for a client to run instance 1, 2 for " in texts[1]
+    assert "has been waiting for a client to run instance 1, 2 for 3 s" in texts[-1]
 
 
 def test_another_client_takes_the_place_of_one_that_leaves(local, by_hand, join, caplog):
@@ -93,7 +93,7 @@ def test_another_client_takes_the_place_of_one_that_leaves(local, by_hand, join,
     assert [row.tobytes() for row in rows] == [row.tobytes() for row in expected["position"]]
     assert leaver.returncode == 130
     said = late.communicate(timeout=60)[0]
-    assert "rows are stored and are made again" in said
+    assert "stored rows are generated again" in said
     (text,) = [text for text in warnings(caplog) if "closed the connection" in text]
     assert "The run waits up to 20 s for another client to take its place" in text
 
@@ -162,7 +162,7 @@ def test_the_token_may_come_from_a_file(clients, join, port, tmp_path, monkeypat
 @pytest.mark.parametrize(
     ("content", "mode", "text"),
     [
-        (TOKEN, 0o640, "Other users may read or write the token file .*chmod 600"),
+        (TOKEN, 0o640, "Other users can read or write the token file .*chmod 600"),
         (TOKEN, 0o604, "Other users"),
         ("short", 0o600, "has 5 characters: it must have at least 16"),
         (None, 0, "cannot be read"),
@@ -185,7 +185,7 @@ def test_clients_by_hand_and_addresses_that_others_reach_need_a_token(clients, m
     with pytest.raises(ConfigError, match="PHYSX_TOKEN"), clients(launcher="physx/manual"):
         pass
     with (
-        pytest.raises(ConfigError, match=r"Others can reach .*PHYSX_TOKEN"),
+        pytest.raises(ConfigError, match=r"Other machines can reach .*PHYSX_TOKEN"),
         clients(ip_address="0.0.0.0"),
     ):
         pass

@@ -146,7 +146,10 @@ LATER = {
         pack(Kind.SHOW, encode([("eval", "mesh", "a", {})]), 1),
         "malformed drawing events",
     ),
-    "an error that is none": (pack(Kind.ERROR, encode({"classes": ["PhysxError"]})), "as an error"),
+    "an error that is none": (
+        pack(Kind.ERROR, encode({"classes": ["PhysxError"]})),
+        "does not describe an error",
+    ),
     "an error with a strange note": (
         pack(
             Kind.ERROR,
@@ -159,7 +162,7 @@ LATER = {
                 }
             ),
         ),
-        "as an error",
+        "does not describe an error",
     ),
 }
 

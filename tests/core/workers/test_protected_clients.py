@@ -234,7 +234,7 @@ def test_a_certificate_of_somebody_between_is_found_out(clients, here, port, joi
         assert honest.wait(PATIENCE) == 0
     said = victim.stdout.read()
     assert victim.returncode == 1
-    assert "somebody between the two answers in its place" in said
+    assert "someone in between answers in its place" in said
     reader = FrameReader(1 << 16)
     reader.receive(fed := memory_of(between.sent[0]))
     fed.close()
@@ -286,7 +286,7 @@ def test_plain_traffic_from_elsewhere_is_refused_though_it_knows_the_token(clien
 
 
 def refusal(connection):
-    with pytest.raises(PlainRefusedError, match="not encrypted"):
+    with pytest.raises(PlainRefusedError, match="only encrypted connections"):
         introduce(connection, TOKEN, 0)
 
 

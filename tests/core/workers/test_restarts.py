@@ -151,7 +151,7 @@ def test_a_client_that_breaks_is_started_again(
     assert warning.levelname == "WARNING"
     assert ("Client 2" if fault != "fail" else "Instance 2") in warning.getMessage()
     if place == "close":
-        assert "all its rows are there" in warning.getMessage()
+        assert "it has all its rows" in warning.getMessage()
     else:
         assert "Restart 1 of 1" in warning.getMessage()
     assert fresh_notes() == (2 if place == "close" else 3)
@@ -283,7 +283,8 @@ def test_a_client_that_fails_too_often_ends_the_run(clients, caplog, fresh_notes
         clients(WANDERER, num_clients=2, env_kwargs=kwargs, restarts=2) as source,
     ):
         source.batch(20)
-    texts = [record.getMessage() for record in caplog.records if record.name == "physx"]
+    said = [record.getMessage() for record in caplog.records if record.name == "physx"]
+    texts = [text for text in said if "has been waiting" not in text]  # on a busy machine
     assert ["Restart 1 of 2" in texts[0], "Restart 2 of 2" in texts[1]] == [True, True]
     assert len(texts) == 2
     assert fresh_notes() == 4

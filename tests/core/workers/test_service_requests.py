@@ -220,7 +220,7 @@ def test_options_arrive_exactly(clients, services):
 
 
 def test_options_that_cannot_travel_are_named_before_anything_starts(clients):
-    message = r"env_kwargs'\]\['options'\]\['deep'\].*cannot travel"
+    message = r"env_kwargs'\]\['options'\]\['deep'\].*cannot be sent"
     kwargs = {"options": {"deep": object()}}
     with pytest.raises(UsageError, match=message), clients("Echo", env_kwargs=kwargs):
         pass

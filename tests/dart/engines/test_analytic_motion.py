@@ -44,7 +44,7 @@ def test_a_symmetric_body_precesses_at_its_rate(backend):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("integrator", ["euler", "rk4"])
+@pytest.mark.parametrize("integrator", ["euler", pytest.param("rk4", marks=pytest.mark.faults)])
 def test_a_tumbling_body_keeps_its_energy_for_ten_seconds(backend, integrator):
     """About the middle axis it turns over again and again."""
     box = Box(name="box", size=(0.4, 0.2, 0.1))

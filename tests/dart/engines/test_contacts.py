@@ -103,7 +103,7 @@ def test_rays_hit_the_nearest_body(dart):
             simulation.step(100)
         with pytest.raises(SimulationError, match="begins"):
             simulation.raycast([[0, 0, np.nan]], [[0, 0, 0]])
-        with pytest.raises(SimulationError, match="1 start points of rays but 2 end points"):
+        with pytest.raises(SimulationError, match="1 ray start points but 2 end points"):
             simulation.raycast([[0, 0, 1]], [[0, 0, 0]] * 2)
 
 

@@ -102,7 +102,7 @@ def test_a_ball_rolls_down_an_incline_or_slips(backend, degrees, rolls):
         np.testing.assert_allclose(v[:2], [0.6 * speed, 0.8 * speed], rtol=2e-3)
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_a_pushed_quadruped_slips_when_the_push_exceeds_its_friction(backend, example):
     friction, stand = 0.3, np.tile([0.0, 0.8, -1.6], 4)
     robot = Robot(

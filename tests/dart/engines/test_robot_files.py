@@ -30,7 +30,7 @@ def chain(kind="continuous", extra=""):
         ("<sdf/>", 'root element is "sdf"'),
         ('<!DOCTYPE r [<!ENTITY a "b">]><robot/>', "DOCTYPE"),
         ("<robot name='r'/>", "no link"),
-        (robot(LINK.format("a"), LINK.format("a")), "there twice"),
+        (robot(LINK.format("a"), LINK.format("a")), "used twice"),
         (robot(LINK.format("a"), LINK.format("b")), "need.* one root link.*a, b"),
         (robot(LINK.format("a"), JOINT.format("j", "fixed", "a", "x", "")), 'child "x".*links: a'),
         (chain("ball"), 'type "ball"'),
@@ -47,7 +47,7 @@ def chain(kind="continuous", extra=""):
                 JOINT.format("k", "fixed", "b", "c", ""),
                 JOINT.format("l", "fixed", "c", "a", ""),
             ),
-            "circle",
+            "cycle",
         ),
         (
             robot(
@@ -55,7 +55,7 @@ def chain(kind="continuous", extra=""):
                 JOINT.format("k", "fixed", "b", "c", ""),
                 JOINT.format("l", "fixed", "c", "b", ""),
             ),
-            "links b, c form a circle",
+            "links b, c form a cycle",
         ),
         (
             robot(

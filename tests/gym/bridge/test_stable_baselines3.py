@@ -126,7 +126,7 @@ class Histories(stateful.RuleBasedStateMachine):
         )
 
 
-@pytest.mark.parametrize("kind", ["Gymnasium", "physx"])
+@pytest.mark.parametrize("kind", [pytest.param("Gymnasium", marks=pytest.mark.faults), "physx"])
 def test_any_history_is_that_of_stable_baselines3(kind):
     if kind == "physx":
         vector = ParallelVectorEnv(WALK, COUNT, num_processes=2, autoreset_mode="SameStep")
@@ -144,12 +144,12 @@ def test_monitored_episodes_and_what_is_refused():
     envs = GymnasiumVecEnv(SyncVectorEnv([Walk] * COUNT, autoreset_mode=SAME_STEP, copy=False))
     assert envs.env_is_wrapped(Monitor) == [False] * COUNT
     envs.set_options([{"place": 1.0}, {}, {}])
-    with pytest.raises(UsageError, match="the same options for all"):
+    with pytest.raises(UsageError, match="with the same options"):
         envs.reset()
     envs.set_options()
     first = envs.reset()
     kept = first.copy()
-    with pytest.raises(UsageError, match=r"shifted\(\) would be called in some"):
+    with pytest.raises(UsageError, match=r"shifted\(\) was requested for only some"):
         envs.env_method("shifted", 1.0, indices=[0, 1, 0])
     envs.step(np.zeros((COUNT, 1), np.float32))
     np.testing.assert_array_equal(first, kept)  # a buffer of its own, copy=False or not
@@ -227,7 +227,7 @@ def test_clipped_observations_are_a_warning(tmp_path, caplog):
     many = VecNormalize(DummyVecEnv([Walk]))
     with caplog.at_level(logging.WARNING, "physx"):
         save_policy(PPO("MlpPolicy", many, **SMALL), tmp_path)
-    assert "clips observations at 10 deviations" in caplog.text
+    assert "clips observations at 10 standard deviations" in caplog.text
 
 
 class Binary(Walk):
@@ -255,7 +255,7 @@ class Film(Walk):
         (lambda: PPO("MlpPolicy", Binary(), **SMALL), "its action space is MultiBinary"),
         (lambda: PPO("MultiInputPolicy", Parts(), **SMALL), "it observes Dict"),
         (lambda: PPO("CnnPolicy", Film(), **SMALL), "not an array of numbers"),
-        (lambda: PPO("MlpPolicy", Film(), **SMALL), "it observes pictures"),
+        (lambda: PPO("MlpPolicy", Film(), **SMALL), "it observes images"),
     ],
 )
 def test_what_is_no_policy_of_layers_says_so(model, problem, tmp_path):

@@ -123,7 +123,7 @@ def test_a_first_state_that_ends_the_episode_is_an_error():
             return True, False
 
     env = Over()
-    with pytest.raises(EpisodeError, match="terminated at its first state"):
+    with pytest.raises(EpisodeError, match="terminated in its initial state"):
         env.reset()
     assert not env.is_simulation_running
     with pytest.raises(EpisodeError):

@@ -156,7 +156,7 @@ def test_an_observation_outside_of_its_space_truncates_and_the_first_one_warns()
 
     env = Narrow("cartpole", 0.02, motors=SLIDER, period=5e-3)
     env.reset()
-    expected = r"Narrow is outside of its space: 0\.\d+ at \[0\] is not between -0\.1 and 0\.1"
+    expected = r"Narrow is outside its space: 0\.\d+ at \[0\] is not between -0\.1 and 0\.1"
     with pytest.warns(UserWarning, match=expected):
         assert env.step([0.0])[2:4] == (False, True)
     env.reset()

@@ -134,7 +134,7 @@ def test_an_acrobot_above_the_bar_terminates():
     env = make("Acrobot", "pinocchio").unwrapped
     env.reset(seed=0)
     env._sample_state = lambda: (np.array([np.pi, 0.0]), np.zeros(2))
-    with pytest.raises(EpisodeError, match="terminated at its first state"):
+    with pytest.raises(EpisodeError, match="terminated in its initial state"):
         env.reset()
     env._sample_state = lambda: (np.array([1.5, 0.0]), np.array([6.0, 0.0]))
     env.reset()

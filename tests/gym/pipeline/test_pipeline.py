@@ -232,7 +232,7 @@ def altered(path, value):
         (("env_config", "cls"), "RobotEn", ComponentNotFoundError, 'mean "RobotEnv"'),
         (("env_config", "cls"), "physx_gym:Nothing", ComponentNotFoundError, "Nothing"),
         (("env_config", "cls"), "nowhere:Nothing", ComponentNotFoundError, "nowhere"),
-        (("env_config", "cls"), 3, ConfigError, "does not make a valid environment"),
+        (("env_config", "cls"), 3, ConfigError, "is not a valid environment"),
         (("env_config", "kwargs"), 3, ConfigError, "env_config.kwargs is 3"),
         (("layers_config", 0, "blok"), {}, UnknownOptionError, 'no option "blok"'),
         (("layers_config", 0, "block"), None, ConfigError, "neither a block nor a wrapper"),

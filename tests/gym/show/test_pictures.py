@@ -43,7 +43,7 @@ def test_the_picture_of_the_demo_shows_the_arms_and_their_errors():
     PICTURES["check_demo"](PICTURES["DEMO"])
 
 
-@pytest.mark.slow
+@pytest.mark.faults
 def test_a_replay_with_contacts_plots_and_a_ghost_is_as_documented(tmp_path):
     drawn_or_skipped(PICTURES["replay"], tmp_path / "replay.png", (750, 400))
     for path in (DOCS / "replay.png", tmp_path / "replay.png"):
@@ -68,6 +68,7 @@ SCENES = {  # rows and columns in the sheet, and the least shares of the colors 
 }
 
 
+@pytest.mark.faults
 def test_a_picture_of_each_example_is_as_documented():
     pytest.importorskip("felupe", reason="needs felupe, which solves the beam")
     pytest.importorskip("matplotlib")

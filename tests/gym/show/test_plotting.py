@@ -124,5 +124,5 @@ def test_the_error_of_missing_matplotlib_names_the_remedy(monkeypatch):
 def test_sources_that_are_not_logs():
     with pytest.raises(LogError, match="is neither a log"):
         plot(3)
-    with pytest.raises(LogError, match="There is no log"):
+    with pytest.raises(LogError, match="No log was given"):
         plot([])

@@ -115,7 +115,7 @@ def test_a_replay_shows_signals_contacts_goals_ways_and_ghosts(paths):
     assert values["position"].tolist() == [2.0, 1.0, 1.0]
     assert moved == pytest.approx(0.5, abs=0.05)
     # the way of the torso, and the ghost
-    (way,) = added["way of torso"]["positions"]
+    (way,) = added["path of torso"]["positions"]
     trajectory = log.trajectory().positions
     assert way[0] == pytest.approx(trajectory[0, :3], abs=1e-5)
     assert way[-1] == pytest.approx(trajectory[-1, :3], abs=1e-5)

@@ -278,7 +278,7 @@ def test_mistakes_are_named(env):
         env.quantities.add("height", 3)
     env.quantities.add("height", BaseHeight())
     env.quantities.add("height", BaseHeight())
-    with pytest.raises(ConfigError, match="already is a quantity"):
+    with pytest.raises(ConfigError, match="is already a quantity"):
         env.quantities.add("height", RollPitch())
     env.quantities.remove("height")
     assert "height" not in env.quantities

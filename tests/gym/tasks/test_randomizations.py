@@ -276,7 +276,7 @@ def test_pushes_change_the_momentum():
         (lambda: RandomDelays([0, 1], ["torsoo"]), ComponentNotFoundError, '"torso"'),
         (lambda: RandomNoise({"positon": [0, 1]}), ComponentNotFoundError, '"position"'),
         (lambda: RandomPushes([0, 1], [1, 2], body="torsoo"), ComponentNotFoundError, '"torso"'),
-        (lambda: RandomGains(), ConfigError, "needs a PDController below it"),
+        (lambda: RandomGains(), ConfigError, "needs exactly one PDController below it"),
         (lambda: RandomGains(block="pd"), ComponentNotFoundError, "pd"),
         (lambda: "RandomMasses", ConfigError, "is not a Randomization"),
     ],
@@ -290,7 +290,7 @@ def test_layers_that_do_not_fit_together():
     masses = RandomMasses([1, 2])
     with pytest.raises(ConfigError, match="the same name"):
         RandomizedEnv(ant(), randomizations=[masses, masses])
-    with pytest.raises(ConfigError, match="has a RandomizedEnv already"):
+    with pytest.raises(ConfigError, match="already has a RandomizedEnv"):
         RandomizedEnv(RandomizedEnv(ant(), randomizations=masses), randomizations=masses)
     with pytest.raises(ConfigError, match="every is 0 but must be a number of episodes"):
         RandomizedEnv(ant(), randomizations=masses, every=0)

@@ -132,7 +132,7 @@ def test_values_that_are_not_arrays_are_rejected(value, message):
         (np.zeros(1), [""], "not a string"),
         ({"k": np.zeros(1)}, {"l": "a"}, "lack 'k': they must be nested like the value"),
         ({"k": np.zeros(1)}, "a", "lack 'k'"),
-        (np.zeros(2), ["a", "a"], r'a number "v\.a", but that is the name of a number of "v" too'),
+        (np.zeros(2), ["a", "a"], r'a number "v\.a", but that name is already used by "v" itself'),
     ],
 )
 def test_names_that_do_not_fit_are_rejected(value, fieldnames, message):
@@ -145,11 +145,11 @@ def test_names_are_unique():
     kept = np.zeros(2)
     telemetry.register("v", kept)
     telemetry.register("v", kept)
-    with pytest.raises(ConfigError, match='"v" is registered already'):
+    with pytest.raises(ConfigError, match='"v" is already registered'):
         telemetry.register("v", np.zeros(2))
-    with pytest.raises(ConfigError, match=r'"v\.0", but that is the name of a number of "v"'):
+    with pytest.raises(ConfigError, match=r'"v\.0", but that name is already used by "v"'):
         telemetry.register("0", np.zeros(()), namespace="v")
-    with pytest.raises(ConfigError, match="of the time"):
+    with pytest.raises(ConfigError, match="used by the time"):
         telemetry.register("time", np.zeros(()))
     with pytest.raises(ConfigError, match="needs a name"):
         telemetry.register("", kept)
@@ -176,7 +176,7 @@ def test_nothing_is_registered_during_an_episode():
     telemetry.register("v", np.zeros(2))
     telemetry.begin()
     for change in (lambda: telemetry.register("w", np.zeros(2)), lambda: telemetry.unregister("v")):
-        with pytest.raises(EpisodeError, match="while an episode runs"):
+        with pytest.raises(EpisodeError, match="during an episode"):
             change()
 
 

@@ -51,7 +51,7 @@ def test_of_several_environments_that_raise_the_first_is_named(nothing_stays_beh
         assert (error.instance_id, error.method, error.step) == (2, "step", 0)
         assert "ZeroDivisionError: after 0 steps" in str(error)
         assert "walk.py" in error.remote_traceback
-        assert error.__notes__ == ["in step() of environment 1 of the vector, counted from 0"]
+        assert error.__notes__ == ["in step() of environment 1 of the vector environment (from 0)"]
         with pytest.raises(UsageError, match="ended with an error"):
             vector.reset()
 
@@ -119,10 +119,10 @@ def test_errors_outside_of_steps_are_named_too(where, error, text, nothing_stays
 
 def test_calls_that_make_no_sense_are_refused(nothing_stays_behind):
     with vectors() as vector:
-        with pytest.raises(UsageError, match="No environment owes a result"):
+        with pytest.raises(UsageError, match="No result is pending"):
             vector.recv()
         vector.send(actions(faults=(0, 0), pauses=(0, 0)), [1, 2])
-        with pytest.raises(UsageError, match="Environment 1 still owes"):
+        with pytest.raises(UsageError, match="environment 1 is still pending"):
             vector.step(actions())
         for wrong in ([1, 1], [4], [-1], [0.5], [[0]], []):
             with pytest.raises((ConfigError, UsageError)):

@@ -92,7 +92,7 @@ def test_an_environment_that_raises_is_named(nothing_stays_behind):
             vector.step(actions(faults=(0, 0, 0, 1, 1)))
         error = caught.value
         assert (error.instance_id, error.method, error.step) == (4, "step", 0)
-        assert error.__notes__ == ["in step() of environment 3 of the vector, counted from 0"]
+        assert error.__notes__ == ["in step() of environment 3 of the vector environment (from 0)"]
 
 
 @pytest.mark.parametrize(

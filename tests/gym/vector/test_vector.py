@@ -212,7 +212,7 @@ def test_nested_spaces_infos_calls_and_attributes(caplog, launch, nothing_stays_
         env.set_attr("length", [7, 8, 9])
         assert env.get_attr("length") == (7, 8, 9)
         assert env.call("observe")[0]["parts"][0] == 3
-        with pytest.raises(UsageError, match=r"use step\(\) itself"):
+        with pytest.raises(UsageError, match=r"call step\(\) directly"):
             env.call("step")
     assert "left out" in caplog.text
     assert "object" in caplog.text

@@ -261,7 +261,7 @@ class Forgetful(RLEnvironment):
 
 
 SERVED = [
-    (None, {}, "None is not an environment. Give an RLEnvironment"),
+    (None, {}, "None is not an environment. Pass an RLEnvironment"),
     (RLAgent, {}, "which is not a Gymnasium environment"),
     (Forgetful, {}, r"Forgetful.__init__ must call super\(\).__init__\(\)"),
     (OnDart, {"env_kwargs": {"size": 3}}, "does not take these arguments"),
@@ -286,7 +286,7 @@ def test_an_environment_is_served_once(start, scene_class):
     with pytest.raises(UsageError, match="takes no env_kwargs"):
         start(environment, env_kwargs={"size": 1})
     start(environment).close()
-    with pytest.raises(UsageError, match="served already"):
+    with pytest.raises(UsageError, match="already served"):
         start(environment)
     closed = scene_class()
     closed.close()

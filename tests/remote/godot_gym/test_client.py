@@ -34,7 +34,7 @@ def test_a_server_that_says_nothing_of_itself(in_thread, scene_class):
                 super()._send_response(observation_request)
 
     service = in_thread(Silent(), clients="serve")
-    with pytest.raises(RemoteError, match="Give messages="):
+    with pytest.raises(RemoteError, match="Pass messages="):
         GodotGymEnv(service.address)
     messages = service.environment.messages
     with pytest.raises(RemoteError, match="give action_space="):
@@ -104,7 +104,7 @@ MESSAGES = Messages.of_fields(agent=[Field("a", (1,))])
 def test_an_end_of_the_connection_raises(part):
     with Stub(bytes(4), part) as stub, GodotGymClient(MESSAGES, stub.address) as client:
         assert client.request({}) == {"agent": None, "world": None}
-        with pytest.raises(RemoteClosedError, match="ended the connection"):
+        with pytest.raises(RemoteClosedError, match="closed the connection"):
             client.request({"observation": {"agent": []}})
         with pytest.raises(RemoteClosedError, match="is closed: "):
             client.request({})

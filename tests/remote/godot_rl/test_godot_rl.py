@@ -140,7 +140,7 @@ def test_call(trainer, cart):
         ("_who", "public method"),
         ("__class__", "public method"),
         (None, "public method"),
-        ("close", "message of its own"),
+        ("close", "its own message type"),
         ("length", "has no method"),
         ("needs", "missing 1 required"),
     ],
@@ -263,7 +263,7 @@ def test_observations_of_each_kind_are_told_in_full(trainer, space, key, size):
     [
         (spaces.Text(5), UNIT, "no fixed layout"),
         (UNIT, spaces.Text(5), "no fixed layout"),
-        (spaces.Dict({"lidar2d": UNIT}), UNIT, "another name"),
+        (spaces.Dict({"lidar2d": UNIT}), UNIT, "Rename the part"),
         (spaces.Dict({"a.b": UNIT, "a": spaces.Dict({"b": UNIT})}), UNIT, 'both be called "a.b"'),
     ],
 )

@@ -134,7 +134,7 @@ def test_nobody_comes(port):
 def test_the_port_is_taken(port):
     with (
         socket.create_server(("127.0.0.1", port)),
-        pytest.raises(RemoteError, match="may have the port"),
+        pytest.raises(RemoteError, match="may be using the port"),
     ):
         connect(f"127.0.0.1:{port}", "godot-rl", connect_timeout=0.1)
 

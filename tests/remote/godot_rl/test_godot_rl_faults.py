@@ -165,7 +165,7 @@ def test_a_service_may_be_closed_within_a_step(trainer, cart):
 def test_without_a_trainer_the_error_says_what_to_do(cart):
     with socket.create_server(("127.0.0.1", 0)) as listener:
         port = listener.getsockname()[1]
-    with pytest.raises(RemoteError, match=f"No trainer.*{port}.*0.2 s.*start the trainer"):
+    with pytest.raises(RemoteError, match=f"No godot-rl trainer.*{port}.*0.2 s.*start the trainer"):
         GodotRL(timeout=0.2).service(Worlds([cart()]), port=port)
 
 

@@ -78,7 +78,7 @@ def test_the_service_ends(serving):
     observer = PhysxObserver(_text(service), token=TOKEN)
     client.reset()
     service.close()
-    with pytest.raises(RemoteClosedError, match="ended the connection"):
+    with pytest.raises(RemoteClosedError, match="closed the connection"):
         client.step(0)
     with pytest.raises(RemoteClosedError):
         while observer.next(PATIENCE):
@@ -150,7 +150,7 @@ def test_what_is_no_service(said):
             pack_value(Kind.ANSWER, {"a": np.zeros(2)}, "", 1),
             "without the arrays of worlds",
         ),
-        (NOTHING, pack_value(Kind.REFUSAL, {"classes": 1}, "", 1), "does not describe one"),
+        (NOTHING, pack_value(Kind.REFUSAL, {"classes": 1}, "", 1), "does not describe an error"),
         (NOTHING, struct.pack("<IHHQ", 1 << 30, Kind.ANSWER, 0, 1), "not a physx message"),
         (NOTHING, pack(Kind.ANSWER, b"\xff" * 40, 1), "damaged"),
     ],

@@ -114,7 +114,7 @@ def test_somebody_between_with_a_certificate_of_his_own_is_found_out(serving, he
         thread = threading.Thread(target=deceive)
         thread.start()
         port = listener.getsockname()[1]
-        with pytest.raises(RemoteError, match="somebody between the two answers in its place"):
+        with pytest.raises(RemoteError, match="someone in between answers in its place"):
             connect(f"{here}:{port}", token=TOKEN)
         thread.join()
     assert heard in ([], [b""])

@@ -273,7 +273,7 @@ def test_a_snapshot_of_one_world_goes_on_in_another(client):
 def test_snapshots_that_cannot_be_made(place):
     with connect(place("gym/CartPole-v1"), token=TOKEN) as env:
         assert not env.client.has_snapshots
-        with pytest.raises(RequestError, match="not begun"):
+        with pytest.raises(RequestError, match="not started"):
             env.snapshot()
         env.reset()
         with pytest.raises(UsageError, match="no snapshots"):

@@ -134,7 +134,7 @@ def test_viewers_that_come_late_and_come_back_get_the_last_state_and_go_on(pytho
         _, errors = run.communicate(timeout=60)
         assert run.returncode == 0, errors
         assert "\x1b" not in errors  # Rerun's own messages are colored
-        assert errors.count("not there all the time") == 2
+        assert errors.count("not always reachable") == 2
         every = steps_of(tmp_path / "run.rrd")
         assert every == list(range(len(every)))
         for path in (back, late):

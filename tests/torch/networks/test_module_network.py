@@ -69,7 +69,7 @@ def test_parameters_round_trip(tmp_path):
         ("torch.nn:Linear", {"inputs": 3}, "in_features, out_features"),
         (Product, {"faktor": 3}, "It takes: factor"),
         (dict, {}, "not a torch.nn.Module"),
-        (FC, {"layers": [2, 1]}, "network already"),
+        (FC, {"layers": [2, 1]}, "already a network"),
     ],
 )
 def test_wrong_modules(module, arguments, told):

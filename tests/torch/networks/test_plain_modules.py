@@ -101,7 +101,7 @@ def test_clashing_names_are_an_error():
         Learner(config(Greedy, {"net_fields": "x"}), trains=False)
     with pytest.raises(ConfigError, match="module_kwargs"):
         Learner(config(Greedy, {"module": "x"}), trains=False)
-    with pytest.raises(ConfigError, match="width.*module_kwargs are given"):
+    with pytest.raises(ConfigError, match="width.*module_kwargs are set"):
         Learner(config(Greedy, {"width": 3, "module_kwargs": {}}), trains=False)
     arguments = {"net_fields": "x", "module_kwargs": {"net_fields": 5, "module": "own"}}
     network = Learner(config(Greedy, arguments), trains=False).network

@@ -233,7 +233,7 @@ def test_several_fields_are_channels():
         ({"input": (4, 4, 2), "ground_truth": (4, 4, 1)}, "nb_input_channels is 1 but must be 2"),
         ({"input": (4, 4, 1), "ground_truth": (4, 4, 2)}, "nb_output_channels is 1 but must be 2"),
         ({"input": (4, 4, 1), "ground_truth": (5, 4, 1)}, r"ground_truth.*not a grid of 4 x 4"),
-        ({"input": (16,), "ground_truth": (4, 4, 1)}, "give input_size"),
+        ({"input": (16,), "ground_truth": (4, 4, 1)}, "set input_size"),
     ],
 )
 def test_fields_that_are_no_grid_of_the_network(shapes, told):

@@ -123,7 +123,7 @@ def test_before_and_after_a_run_nothing_is_written(folder):
 
 
 def test_times_are_not_negative():
-    with pytest.raises(ConfigError, match="at least 0"):
+    with pytest.raises(ConfigError, match="must not be negative"):
         TensorBoard(interval=-1)
 
 

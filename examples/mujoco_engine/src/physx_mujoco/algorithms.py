@@ -1,7 +1,7 @@
 """MuJoCo's algorithms for a world in any state.
 
-Its velocities differ from those of physx in floating bases: their linear part is along the world's
-axes, not the base's own.
+Its velocities differ from those of physx for floating bases: their linear part is expressed in the
+world frame, not in the base frame.
 """
 
 from __future__ import annotations
@@ -116,8 +116,8 @@ class MujocoAlgorithms(Algorithms):
     def _mass(self) -> Vector:
         """Return the mass matrix in MuJoCo's convention, as a sum over the bodies, after `_place`.
 
-        MuJoCo computes its own about the center of mass of the whole robot, where the inertia of a
-        small part is lost to rounding.
+        MuJoCo computes its own matrix about the center of mass of the whole robot, where the
+        inertia of a small part is lost to rounding.
         """
         model, data, found = self._model, self._data, np.diag(self._model.dof_armature)
         linear, angular = np.zeros((2, 3, self.nv))
@@ -138,7 +138,7 @@ class MujocoAlgorithms(Algorithms):
         mujoco.mj_comPos(self._model, data)
 
     def _move(self, q: Vector, v: Vector, a: Vector | None = None) -> None:
-        """Place the bodies, and compute how they move with velocities and accelerations."""
+        """Place the bodies, and compute their motion for velocities and accelerations."""
         model, data = self._model, self._data
         self._place(q)
         data.qvel[:] = self._turned(q, v.copy(), inwards=True)
@@ -157,7 +157,7 @@ class MujocoAlgorithms(Algorithms):
         return outwards(np.concatenate([data.xpos[place], data.xquat[place]]))
 
     def _turned(self, q: Vector, rows: Vector, *, inwards: bool = False) -> Vector:
-        """Turn bases' linear parts of rows from the world's axes to their own, or `inwards`."""
+        """Rotate the bases' linear parts of rows to the base frame; `inwards`: to the world's."""
         for x, y in self._bases:
             turn = to_matrix(q[x + 3 : x + 7])
             rows[..., y : y + 3] = rows[..., y : y + 3] @ (turn.T if inwards else turn)

@@ -1,6 +1,6 @@
 """Servos, imposed velocities, and velocity limits, which MuJoCo does not have.
 
-A step is repeated with other torques until the velocities at its end are the wanted ones.
+A step is repeated with adjusted torques until it ends with the desired velocities.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from physx_core.typing import Vector
 from physx_mujoco.robot import Running
 
 _MOST, _EXACT = 30, 1e-10
-"""Most repetitions of a step, and the relative error of a velocity that ends them."""
+"""Maximum repetitions of a step, and the relative velocity error at which they end."""
 
 
 class Drives:
@@ -28,7 +28,7 @@ class Drives:
         self.idle = not (self._driven.any() or np.isfinite(self._fastest).any())
 
     def step(self) -> None:
-        """Simulate a physics step; the forces of driven joints are their wanted velocities."""
+        """Simulate a physics step; for driven joints, the applied force is the desired velocity."""
         running, at, driven = self._running, self._places, self._driven
         model, data = running.model, running.data
         q, v = running.positions, running.velocities

@@ -1,7 +1,7 @@
-"""MuJoCo's model of a world, built from what physx read of its files.
+"""MuJoCo's model of a world, built from what physx read from its files.
 
 MuJoCo's own URDF loader is not used: it merges links, rejects moments of inertia that no body of
-positive density has, and ignores what physx adds to a file.
+positive density can have, and ignores what physx adds to a file.
 """
 
 from __future__ import annotations
@@ -35,9 +35,9 @@ _SHAPES = {
     "mesh": mujoco.mjtGeom.mjGEOM_MESH,
 }
 _ALL, _STATIC, _MOVING, _OWN = (1 << 31) - 1, 1, 2, 2
-"""Bits of MuJoCo's collision masks: static things, what moves, and from `_OWN` on each robot."""
+"""Bits of MuJoCo's collision masks: static, moving and, from `_OWN` on, one for each robot."""
 _STEPS, _DAMPING, _IMPEDANCE = 2.0, 2.0, (0.9999, 0.9999, 0.001, 0.5, 2.0)
-"""Time constant in steps, damping ratio, and impedance of constraints, which are almost rigid."""
+"""Time constant in steps, damping ratio, and impedance of the nearly rigid constraints."""
 _DEEP = 10.0
 """Depth of a height field below its lowest point, in m."""
 
@@ -48,8 +48,8 @@ class WorldModel:
 
     Attributes:
         model: MuJoCo's model.
-        bodies: Its body of each link and object, in the order of `Layout.bodies`.
-        owners: Place in `Layout.names` of what each of its shapes belongs to.
+        bodies: The model's body for each link and object, in the order of `Layout.bodies`.
+        owners: For each shape of the model, the index of its owner in `Layout.names`.
     """
 
     model: Any
@@ -68,7 +68,7 @@ class ModelBuilder:
         self._owners: list[int] = []
         shapes = [shape for mover in parts.movers for shape in mover.model.shapes]
         frictions = {float(x.friction) for x in (*shapes, *(each.what for each in parts.statics))}
-        # Of two shapes MuJoCo takes the friction of the one with the higher priority.
+        # Of two shapes, MuJoCo uses the friction of the one with the higher priority.
         self._priorities = {mu: i for i, mu in enumerate(sorted(frictions, reverse=True))}
 
     def build(self) -> WorldModel:
@@ -107,7 +107,7 @@ class ModelBuilder:
                 new = self._add_body(parent, body, pose[:3, 3], pose[:3, :3])
             if body.joint is not None:
                 self._add_joint(new, body.joint, body.axis)
-                if body.parent == 0 and mover.fixed_base:  # MuJoCo lets it touch such a parent
+                if body.parent == 0 and mover.fixed_base:  # else it collides with its fixed parent
                     self._spec.add_exclude(bodyname1=new.parent.name, bodyname2=new.name)
             added.append(new)
         masks = self._masks(place, mover)
@@ -116,7 +116,7 @@ class ModelBuilder:
             self._add_shape(added[link], shape, first + link, **masks)
 
     def _add_body(self, parent: Any, body: RigidBody, position: Vector, turn: Vector) -> Any:
-        """Add a link with its mass; its moments of inertia, whatever they are, are set later."""
+        """Add a link with its mass; its moments of inertia, valid or not, are set later."""
         new = parent.add_body(name=str(len(self._moments)), pos=position, quat=_quaternion(turn))
         moments, axes = np.linalg.eigh(body.inertia)
         axes[:, 2] *= np.linalg.det(axes)  # a rotation, not a reflection
@@ -186,7 +186,7 @@ class ModelBuilder:
             more["meshname"] = f"mesh {len(self._owners)}"
             vertices = read_vertices(shape.mesh, shape.size)
             self._spec.add_mesh(name=more["meshname"], uservert=vertices.ravel())
-        else:  # MuJoCo takes half the edges and lengths, but radii
+        else:  # MuJoCo takes half the edges and lengths, but full radii
             halves = 0.5 * np.array(shape.size)
             halves[0] *= 1 if shape.kind == "box" else 2
             more["size"] = [*halves, 0.0, 0.0][:3]

@@ -1,4 +1,4 @@
-"""Entry point `mujoco`: references to the plugin's components, which are imported when used."""
+"""Entry point `mujoco`: references to the plugin's components, imported when used."""
 
 from __future__ import annotations
 

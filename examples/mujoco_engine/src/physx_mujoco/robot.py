@@ -18,7 +18,7 @@ INWARDS = [0, 1, 2, 6, 3, 4, 5]
 
 
 def outwards(pose: Vector) -> Vector:
-    """Return a pose, whose quaternion is w, x, y, z, with x, y, z, w, and w not negative."""
+    """Convert a pose's quaternion from w, x, y, z to x, y, z, w, with w not negative."""
     found: Vector = pose[[0, 1, 2, 4, 5, 6, 3]]
     if found[6] < 0:
         found[3:] *= -1
@@ -27,7 +27,7 @@ def outwards(pose: Vector) -> Vector:
 
 @dataclass
 class Running:
-    """A world that is stepped: MuJoCo's model and data, and the state before the last step."""
+    """A running world: MuJoCo's model and data, and the state before the last step."""
 
     model: Any
     data: Any

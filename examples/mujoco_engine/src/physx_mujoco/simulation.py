@@ -1,6 +1,6 @@
 """The engine MuJoCo: contacts, limits and friction are constraints of its solver.
 
-Steps are semi-implicit Euler, with damping and springs implicit (MuJoCo's integrator `discrete`).
+Steps are semi-implicit Euler, with implicit damping and springs (MuJoCo's integrator `discrete`).
 """
 
 from __future__ import annotations
@@ -40,28 +40,28 @@ class MujocoBackend(RobotBackend):
     """MuJoCo. Contact solvers: ``newton`` (default), ``cg`` and ``pgs``; one detector.
 
     Meshes collide as their convex hulls. Nothing bounces. MuJoCo's log, a file in the working
-    directory, is switched off in this process: what it warns of is an error here.
+    directory, is switched off in this process: what MuJoCo warns about is an error here.
     """
 
     def build(self, world: World, seed: int | None = None) -> Simulation:
         """Build a simulation; MuJoCo is deterministic, so the seed has no effect.
 
         Raises:
-            ModelError: If a robot or mesh cannot be loaded; the message says why.
+            ModelError: If a robot or mesh cannot be loaded; the message gives the reason.
             FeatureNotSupportedError: If the world needs a feature that MuJoCo does not have.
-            UnknownOptionError: If there is no solver of that name.
+            UnknownOptionError: If there is no solver with that name.
         """
         return MujocoSimulation(world)
 
 
 class MujocoSimulation(RobotSimulation[MujocoRobot]):
-    """A world of MuJoCo."""
+    """A world in MuJoCo."""
 
     engine = "mujoco"
     lacks: ClassVar[frozenset[str]] = frozenset({"derivatives", "raycast", "restitution"})
 
     def __init__(self, world: World) -> None:
-        """Build the world; errors are those of the backend's `build`."""
+        """Build the world; raises the same errors as the backend's `build`."""
         if world.solver is not None and world.solver not in _SOLVERS:
             raise UnknownOptionError("World.solver for mujoco", [world.solver], tuple(_SOLVERS))
         parts = read_parts(world)
@@ -124,7 +124,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
             frame = contact.frame.reshape(3, 3)
             mujoco.mj_contactForce(model, data, number, force)
             first, second = self._world.owners[contact.geom].tolist()
-            sign = -1.0 if first < second else 1.0  # MuJoCo's force acts on the second one
+            sign = -1.0 if first < second else 1.0  # MuJoCo's force acts on the second body
             row["body_a"], row["body_b"] = sorted((first, second))
             row["point"], row["depth"] = contact.pos, -contact.dist
             row["normal"], row["force"] = sign * frame[0], sign * (force[:3] @ frame)

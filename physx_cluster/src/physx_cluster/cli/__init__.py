@@ -1,1 +1,1 @@
-"""Commands of the package."""
+"""The package's commands."""

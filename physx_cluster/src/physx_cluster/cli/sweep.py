@@ -1,4 +1,4 @@
-"""``physx sweep``: try pipelines with many settings and seeds, here, on Ray, or on Slurm."""
+"""``physx sweep``: try pipelines with many settings and seeds: locally, on Ray, or on Slurm."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from physx_core.errors import UsageError, printable
 class Sweep:
     """Try pipelines with many settings and seeds.
 
-    A sweep that was killed goes on by the same command, to the same results.
+    The same command resumes a sweep that was killed; the results are the same.
 
     physx sweep sweep.toml --parallel 4
 
@@ -31,23 +31,23 @@ class Sweep:
     place: Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FILE.toml|STUDY")]
     """The file that describes the study, or the study's folder."""
     study: Path | None = None
-    """Folder of the study; by default studies/NAME, with the file's name."""
+    """Folder of the study; by default studies/NAME, where NAME is the file's name."""
     executor: str | None = None
-    """Where trials run: "local", "ray" or "slurm"; by default what the file says."""
+    """Where trials run: "local", "ray", or "slurm"; by default as in the file."""
     parallel: int | None = None
-    """Number of trials at the same time; by default what the file says."""
+    """Number of concurrent trials; by default as in the file."""
     status: bool = False
-    """Print the study's trials as a table; nothing is run."""
+    """Print the study's trials as a table, without running any."""
     view: bool = False
-    """Put the curves of all trials into one recording; nothing is run."""
+    """Put the curves of all trials into one recording, without running any."""
     visualizer: str = "rerun"
-    """Visualizer that --view gives the curves to."""
+    """Visualizer for the curves of --view."""
     figure: Path | None = None
-    """Draw the results into this file (.png, .svg, .pdf); nothing is run."""
+    """Draw the results into this file (.png, .svg, .pdf), without running any trials."""
 
 
 def run(words: Sequence[str]) -> None:
-    """Run the study, or show it."""
+    """Run or show the study."""
     from physx_cluster.sweep.definition import Definition
     from physx_cluster.sweep.runner import run_study
     from physx_cluster.sweep.study import STUDY, Study, is_study
@@ -57,7 +57,7 @@ def run(words: Sequence[str]) -> None:
     file = options.place
     if file.is_dir() or is_study(file):
         if options.study is not None:
-            raise UsageError("--study names the folder of a new study; this is one already.")
+            raise UsageError("--study names the folder of a new study; this one already exists.")
         folder, file = file, file / STUDY
         Study.read(folder)
     if options.status or options.view or options.figure is not None:
@@ -69,7 +69,7 @@ def run(words: Sequence[str]) -> None:
     try:
         study = run_study(definition, folder, _say)
     except KeyboardInterrupt as error:
-        error.add_note("the same command continues")
+        error.add_note("the same command resumes it")
         raise
     _report(study, folder)
 
@@ -98,8 +98,8 @@ def _report(study: Any, folder: Path) -> None:
     _say(f"next: physx sweep {shlex.quote(str(folder))} --status")
     if study.best() is None:
         raise StudyError(
-            f"No trial of {folder} is complete with all seeds. What ended each is at the end of "
-            "its output.txt."
+            f"No trial of {folder} is complete with all seeds. The end of each trial's output.txt "
+            "shows why it ended."
         )
 
 

@@ -1,1 +1,1 @@
-"""Launchers: clients as actors of Ray, and as jobs of Slurm."""
+"""Launchers: clients as Ray actors or as Slurm jobs."""

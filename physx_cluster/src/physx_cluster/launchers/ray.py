@@ -31,12 +31,12 @@ except ImportError as error:
 from physx_cluster.launchers.ray_agent import Agent
 from physx_cluster.launchers.ray_connection import RayConnection
 
-_CALLS = 100_000  # of one agent at a time: two for each client
-# A process of Ray that is told to exit kills its children: clients, whose own children would go on,
-# and the watchdog, which ends all of them.
+_CALLS = 100_000  # concurrent calls of one agent: two for each client
+# A Ray process kills its children when it is told to exit: the clients, whose own children would
+# survive, and the watchdog, which would have ended all of them.
 _LEAVE_CHILDREN = {"RAY_kill_child_processes_on_worker_exit": "false"}
-_ANSWER_TIME = 1.0  # for an agent that is asked to kill a client
-_LOOK_TIME = 2.0  # for Ray to find nodes
+_ANSWER_TIME = 1.0  # s, for an agent that is asked to kill a client
+_LOOK_TIME = 2.0  # s, for Ray to find nodes
 _PAUSE = 0.25
 _STRATEGIES = ("SPREAD", "PACK", "STRICT_SPREAD", "STRICT_PACK")
 
@@ -44,12 +44,11 @@ _STRATEGIES = ("SPREAD", "PACK", "STRICT_SPREAD", "STRICT_PACK")
 class RayLauncher(Launcher):
     """Starts the clients on the nodes of a Ray cluster.
 
-    What the clients need is reserved as one placement group. On each node an actor, the agent,
-    starts those that Ray put there as child processes, and follows them; on the node of the run
-    the run does that itself. If a node is lost, Ray
-    moves its part of the group to another one, where the run starts the clients again
-    (`EnvironmentConfig.restarts`); the rows are the same. In an elastic run each client has a group
-    of its own, and waits for a place alone.
+    The clients' resources are reserved as one placement group. On each node an actor, the agent,
+    starts the clients that Ray placed there as child processes and monitors them; on its own node,
+    the run does that itself. If a node is lost, Ray moves its part of the group to another node,
+    where the run restarts the clients (`EnvironmentConfig.restarts`); the rows are the same. In an
+    elastic run, each client has its own group and waits for a place independently.
     """
 
     elsewhere = True
@@ -65,21 +64,24 @@ class RayLauncher(Launcher):
         strategy: str = "SPREAD",
         runtime_env: dict[str, Any] | None = None,
     ) -> None:
-        """Keep the options.
+        """Store the options.
 
         Args:
-            address: ``HOST:PORT`` of Ray's head node, "auto" for the one that runs here, "local" to
-                start one; None: the environment variable ``RAY_ADDRESS``, or else the one that runs
-                here, or else one that is started and ends with the run.
-            num_cpus: Processors of each client; None: one, or an equal share if the cluster has
-                less than one for each.
-            num_gpus: Graphics cards of each client.
-            memory: Memory of each client, in bytes.
-            resources: Amounts of further resources of the nodes, by name.
+            address: ``HOST:PORT`` of Ray's head node, "auto" for the cluster on this machine,
+                "local" to start one; None: the environment variable ``RAY_ADDRESS``, else the
+                cluster on this machine, else a new one that ends with the run.
+            num_cpus: CPUs of each client; None: one, or an equal share if the cluster has fewer
+                CPUs than clients.
+            num_gpus: GPUs of each client.
+            memory: Memory of each client in bytes.
+            resources: Amounts of custom resources of the nodes, by name.
             strategy: How Ray distributes the clients over the nodes: "SPREAD", "PACK",
-                "STRICT_SPREAD" or "STRICT_PACK".
-            runtime_env: Ray's description of what the clients find on a node: packages, files,
-                environment variables.
+                "STRICT_SPREAD", or "STRICT_PACK".
+            runtime_env: Ray's runtime environment for the clients: packages, files, environment
+                variables.
+
+        Raises:
+            ConfigError: If the strategy is unknown, an amount is negative, or all amounts are 0.
         """
         if strategy not in _STRATEGIES:
             raise ConfigError(f"strategy is {strategy!r}, but must be one of {_STRATEGIES}.")
@@ -87,8 +89,8 @@ class RayLauncher(Launcher):
         wrong = [name for name, need in needs.items() if need is not None and need < 0]
         if wrong or (num_cpus == 0 and not any(needs.values())):
             raise ConfigError(
-                f"A client needs {needs}: give amounts that are not negative, and some of at least "
-                "one resource, such as num_cpus=0.1."
+                f"A client needs {needs}: amounts must not be negative, and at least one "
+                "resource must be positive, such as num_cpus=0.1."
             )
         self._address, self._strategy, self._needs = address, strategy, needs
         self._runtime_env = runtime_env
@@ -120,7 +122,7 @@ class RayLauncher(Launcher):
             connection.close()
 
     def _reserve(self, instances: Sequence[int], total: int) -> None:
-        """Reserve what some of all clients need; Ray says where when it has found nodes."""
+        """Reserve the resources of some of all clients; Ray decides where."""
         assert self._nodes is not None and self._connection is not None
         found = self._connection.nodes()
         needs = dict(self._needs)
@@ -142,7 +144,7 @@ class RayLauncher(Launcher):
             )
 
     def _find_reason(self, group: Any, bundle: Bundle) -> str:
-        """Return why Ray will never place a group on the nodes that there are; empty if it may."""
+        """Return why Ray can never place a group on the current nodes; empty if it may."""
         assert self._connection is not None
         found = self._connection.nodes()
         if misfit := find_misfit(found, bundle):
@@ -152,20 +154,20 @@ class RayLauncher(Launcher):
             return ""
         count = len(table["bundles"])
         return (
-            f"{count} clients, each with {describe(bundle)}, do not fit the {len(found)} nodes as "
-            f"{self._strategy}"
+            f"{count} clients, each with {describe(bundle)}, do not fit the {len(found)} nodes "
+            f"with the strategy {self._strategy}"
         )
 
 
 class RayHandle(ClientHandle):
-    """A client on some node of the cluster.
+    """A client on one of the cluster's nodes.
 
     Attributes:
-        agent: The agent of its node; None before there is one.
+        agent: The agent of its node; None until there is one.
     """
 
     def __init__(self, instance_id: int, nodes: _Nodes) -> None:
-        """Keep the arguments.
+        """Store the arguments.
 
         Args:
             instance_id: Number of the instance, from 1.
@@ -173,7 +175,7 @@ class RayHandle(ClientHandle):
         """
         self.instance_id = instance_id
         self.agent: Any = None
-        self.waits_for = "it waits for Ray"
+        self.waits_for = "waiting for Ray"
         self.end: Future[tuple[int, str]] = Future()
         self._nodes = nodes
         self._killed = False
@@ -201,14 +203,14 @@ class RayHandle(ClientHandle):
             self._nodes.do(self._signal(signal.SIGKILL))
 
     def finish(self, status: int, stderr: str = "") -> None:
-        """Note its end, unless that is known."""
+        """Record the end of the client, unless it is already known."""
         if not self.end.done():
             self.end.set_result((status, stderr))
 
     async def _signal(self, number: signal.Signals) -> None:
-        """Send a signal; a client that no agent answers for is gone with its node, or cut off.
+        """Send a signal; a client whose agent does not answer is lost with its node or cut off.
 
-        A client that is cut off ends when it notices that the server has closed the connection.
+        A client that is cut off exits when it notices that the server has closed the connection.
         """
         if self.agent is None:
             self.finish(-number)
@@ -222,10 +224,10 @@ class RayHandle(ClientHandle):
 
 
 class _Nodes:
-    """The agents of a run, and the thread that follows them.
+    """A run's agents, and the thread that monitors them.
 
     Attributes:
-        places: Instance to its placement group, its number in that, and what it needs.
+        places: Instance to its placement group, its index in the group, and its resources.
     """
 
     def __init__(self, runtime_env: dict[str, Any] | None) -> None:
@@ -236,7 +238,7 @@ class _Nodes:
         options["runtime_env"] = environment
         self._actor: Any = ray.remote(**options)(Agent)
         self._agents: dict[Any, Any] = {}
-        self._here = Agent()  # on this process's node there is no need for another process
+        self._here = Agent()  # this process's own node needs no other process
         self._own_node = ray.get_runtime_context().get_node_id()
         self._is_plain = runtime_env is None
         self._groups: list[Any] = []
@@ -245,22 +247,22 @@ class _Nodes:
         self._thread.start()
 
     def add(self, group: Any, instances: Sequence[int], bundle: Bundle) -> None:
-        """Add a placement group with a bundle for each of some instances."""
+        """Add a placement group with one bundle for each of the instances."""
         self._groups.append(group)
         self.places |= {number: (group, k, bundle) for k, number in enumerate(instances)}
 
     def start(self, number: int, address: str, token: str) -> RayHandle:
-        """Have a client started as soon as its node is known; return at once."""
+        """Arrange for a client to start as soon as its node is known; return immediately."""
         handle = RayHandle(number, self)
         self.do(self._live(handle, address, token))
         return handle
 
     def do(self, work: Coroutine[Any, Any, None]) -> None:
-        """Have the thread do something."""
+        """Run a coroutine in the thread."""
         asyncio.run_coroutine_threadsafe(work, self._loop)
 
     def close(self) -> None:
-        """End the agents, with all that they started, and give back what was reserved."""
+        """End the agents with everything that they started, and release the reserved resources."""
         self._loop.call_soon_threadsafe(self._loop.stop)
         self._thread.join()
         for task in asyncio.all_tasks(self._loop):
@@ -275,7 +277,7 @@ class _Nodes:
             remove_placement_group(group)
 
     async def _live(self, handle: RayHandle, address: str, token: str) -> None:
-        """Start a client, again on another node if that is lost meanwhile, and wait for its end."""
+        """Start a client, on another node if its node is lost meanwhile, and wait for its end."""
         number = handle.instance_id
         try:
             while not handle.end.done():
@@ -292,15 +294,15 @@ class _Nodes:
                     handle.agent = None
                     self._agents.pop(key, None)
                     await asyncio.sleep(_PAUSE)
-            handle.waits_for = f"it runs on {self._describe(number)}"
+            handle.waits_for = f"running on {self._describe(number)}"
             handle.finish(*await _ask(handle.agent, "follow", number))
         except RayActorError as error:
             handle.finish(1, f"Ray: {_first_line(error)}")
-        except Exception as error:  # of whatever kind, the run must hear of it
+        except Exception as error:  # whatever it is, the run must learn of it
             handle.finish(1, f"Ray: {error}")
 
     async def _find_agent(self, handle: RayHandle) -> tuple[Any, Any]:
-        """Return the agent where Ray put a client, with its key; wait until Ray has done so."""
+        """Wait until Ray has placed a client; return the agent there, preceded by its key."""
         group, index, bundle = self.places[handle.instance_id]
         while True:
             table = placement_group_table(group)
@@ -308,12 +310,12 @@ class _Nodes:
             if table["state"] == "CREATED" and node:
                 break
             free = {name: ray.available_resources().get(name, 0.0) for name in bundle}
-            handle.waits_for = f"it waits for {describe(bundle)}, and Ray has {describe(free)} free"
+            handle.waits_for = f"waiting for {describe(bundle)} (Ray has {describe(free)} free)"
             await asyncio.sleep(_PAUSE)
-        handle.waits_for = "it waits for the start of a process of Ray"
+        handle.waits_for = "waiting for a Ray process to start"
         if node == self._own_node and self._is_plain and not bundle.get("GPU"):
             return node, self._here
-        # Ray gives graphics cards to actors, so there an agent has just one client.
+        # Ray assigns GPUs to actors, so an agent with GPUs has exactly one client.
         key = (group.id, index if bundle.get("GPU") else node)
         if key not in self._agents:
             place = PlacementGroupSchedulingStrategy(group, placement_group_bundle_index=index)
@@ -327,7 +329,7 @@ class _Nodes:
 
 
 async def _ask(agent: Any, method: str, *arguments: Any) -> Any:
-    """Return what a method of an agent returns, which may be one of this process."""
+    """Call an agent's method and return the result; the agent may be in this process."""
     call = getattr(agent, method)
     return await (call(*arguments) if isinstance(agent, Agent) else call.remote(*arguments))
 

@@ -1,4 +1,4 @@
-"""Connection to a Ray cluster: one that runs, or one that is started here for this process."""
+"""Connection to a Ray cluster: a running one, or one started here for this process."""
 
 from __future__ import annotations
 
@@ -27,19 +27,19 @@ _PROBE_TIME = 3.0  # s
 
 
 class RayConnection:
-    """This process as a driver of Ray.
+    """This process as a Ray driver.
 
     Attributes:
-        host: Address of this machine that all nodes reach; None: all nodes are on this machine.
+        host: Address at which all nodes reach this machine; None: all nodes are on this machine.
     """
 
     def __init__(self, address: str | None) -> None:
-        """Connect, unless this process is connected already.
+        """Connect, unless this process is already connected.
 
         Args:
-            address: ``HOST:PORT`` of Ray's head node, "auto" for the one that runs here, "local" to
-                start one; None: the environment variable ``RAY_ADDRESS``, or else the one that runs
-                here, or else one that is started and ends with the run.
+            address: ``HOST:PORT`` of Ray's head node, "auto" for the cluster on this machine,
+                "local" to start one; None: the environment variable ``RAY_ADDRESS``, else the
+                cluster on this machine, else a new one that ends with the run.
 
         Raises:
             ConfigError: If there is no such cluster.
@@ -55,11 +55,11 @@ class RayConnection:
         self.host = address_towards(context.gcs_address.rpartition(":")[0])
 
     def nodes(self) -> list[dict[str, float]]:
-        """Return the resources of each node that is alive."""
+        """Return the resources of each live node."""
         return [dict(node["Resources"]) for node in ray.nodes() if node["Alive"]]
 
     def close(self) -> None:
-        """Disconnect, and end the cluster if it was started here."""
+        """Disconnect, and shut down the cluster if it was started here."""
         if self._is_own and ray.is_initialized():
             with _unchanged():
                 ray.shutdown()
@@ -68,8 +68,8 @@ class RayConnection:
         self._is_local = address == "local"
         if address is not None and address.startswith("ray://"):
             raise ConfigError(
-                f"{address} is the address of a Ray client, which only passes on calls. Start the "
-                'run on a node of the cluster, with launcher_kwargs={"address": "auto"}.'
+                f"{address} is the address of a Ray Client server, which only forwards calls. "
+                'Start the run on a cluster node, with launcher_kwargs={"address": "auto"}.'
             )
         try:
             if address in (None, "auto"):
@@ -84,8 +84,8 @@ class RayConnection:
             raise ConfigError(
                 f"Ray does not answer at {address}: {reason}. Start it with "
                 '"ray start --head" on one node and "ray start --address HOST:6379" on the others, '
-                f"this one too; or leave out the address and {_ADDRESS}, and the run starts a Ray "
-                "of its own."
+                f"including this one; or omit the address and {_ADDRESS}, and the run starts its "
+                "own Ray cluster."
             ) from error
 
 
@@ -101,7 +101,7 @@ def _find_running() -> str | None:
 
 
 def _probe(address: str) -> None:
-    """Raise an error if nothing listens at an address, for which Ray would wait two minutes."""
+    """Raise an error if nothing listens at an address; Ray itself would wait two minutes."""
     socket.create_connection(parse_address(address), timeout=_PROBE_TIME).close()
 
 
@@ -113,7 +113,7 @@ def _init(address: str) -> None:
 
 @contextlib.contextmanager
 def _unchanged() -> Iterator[None]:
-    """Undo what Ray does to this process: it handles SIGTERM, and draws random numbers."""
+    """Undo Ray's side effects on this process: it handles SIGTERM and draws random numbers."""
     handler, numbers = signal.getsignal(signal.SIGTERM), random.getstate()
     try:
         yield
@@ -124,9 +124,9 @@ def _unchanged() -> Iterator[None]:
 
 
 def _silence() -> None:
-    """Keep Ray from printing what its daemons log, which it has no option for.
+    """Keep Ray from printing its daemons' logs, for which it has no option.
 
-    And from being told of errors that end this process.
+    Also removes Ray's hook for uncaught exceptions.
     """
     worker: Any = sys.modules["ray._private.worker"]
     if sys.excepthook is getattr(worker, "custom_excepthook", None):

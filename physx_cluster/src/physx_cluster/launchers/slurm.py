@@ -1,4 +1,4 @@
-"""SlurmLauncher: clients as jobs of Slurm."""
+"""SlurmLauncher: clients as Slurm jobs."""
 
 from __future__ import annotations
 
@@ -39,24 +39,24 @@ except ImportError as error:
 
 from physx_cluster.launchers.slurm_job import TOKEN, ClientJob, status_file
 
-_RARELY = 5.0  # s between two questions to the queue
-_SOON = 0.25  # s, where somebody waits for the answer
-_TIMEOUTS = 1_000  # after which submitit starts a job again
-_LEAVE_TIME = 10.0  # for jobs to leave the queue
+_RARELY = 5.0  # s between queries of the queue
+_SOON = 0.25  # s between queries while someone waits for the answer
+_TIMEOUTS = 1_000  # how often submitit requeues a job that times out
+_LEAVE_TIME = 10.0  # s, for jobs to leave the queue
 _PAUSE = 0.05
 _INTERRUPTED = -15
 _ADVICE = (
-    "What a job asks for are launcher_kwargs, such as timeout_min, mem_gb, cpus_per_task and "
-    'slurm_partition; "sinfo" says what there is.'
+    "Set a job's resources with launcher_kwargs, such as timeout_min, mem_gb, cpus_per_task and "
+    'slurm_partition; "sinfo" shows what is available.'
 )
 
 
 class SlurmLauncher(Launcher):
-    """Starts each client as a job of Slurm; those that start together are one job array.
+    """Starts each client as a Slurm job; clients that start together form one job array.
 
-    A job that Slurm preempts, or whose time is over, is queued again; the run goes on where its
-    client was (`EnvironmentConfig.restarts`), with the same rows. While a job is queued, the time
-    does not count as that of a silent client (`EnvironmentConfig.timeout`).
+    A job that is preempted or reaches its time limit is requeued; its client then resumes where it
+    was (`EnvironmentConfig.restarts`), with the same rows. Time in the queue does not count as
+    silence of the client (`EnvironmentConfig.timeout`).
     """
 
     elsewhere = True
@@ -70,19 +70,19 @@ class SlurmLauncher(Launcher):
         timeout_min: int = 60,
         **parameters: Any,
     ) -> None:
-        """Keep the options.
+        """Store the options.
 
         Args:
-            cluster: "slurm", or "local" for processes of this machine in place of jobs.
-            folder: Folder on a disk that all nodes share. A hidden folder in it, which only its
-                user can enter, holds the token and the jobs' output until the run ends.
-            queue_time: Longest time in s for which a job may wait in the queue.
-            timeout_min: Time limit of a job in min; after it, the job is queued again.
+            cluster: "slurm", or "local" to run the jobs as processes on this machine.
+            folder: Folder on a disk that all nodes share. A hidden folder inside it, accessible
+                only to its owner, holds the token and the jobs' output until the run ends.
+            queue_time: Longest time in s that a job may be queued.
+            timeout_min: Time limit of a job in min; the job is then requeued.
             parameters: Parameters of `submitit.AutoExecutor`, such as ``mem_gb=4``,
                 ``cpus_per_task=2`` or ``slurm_partition="gpu"``.
 
         Raises:
-            ConfigError: If submitit does not know a parameter.
+            ConfigError: If `cluster` is invalid, or submitit does not know a parameter.
         """
         if cluster not in ("slurm", "local"):
             raise ConfigError(f'cluster is {cluster!r}, but must be "slurm" or "local".')
@@ -97,14 +97,19 @@ class SlurmLauncher(Launcher):
         logging.getLogger("submitit").setLevel(logging.WARNING)
 
     def open(self) -> str | None:
-        """Look for Slurm, and make the folder of the run: see `Launcher.open`."""
+        """Find Slurm and create the run's folder: see `Launcher.open`.
+
+        Raises:
+            ConfigError: If Slurm does not answer, there is no route to it, the folder cannot be
+                created, or a parameter is invalid.
+        """
         controller = None if self._cluster == "local" else find_controller()
         name = f"physx-{secrets.token_hex(6)}"
         try:
             self._folder = Path(tempfile.mkdtemp(prefix=f".{name}-", dir=self._place.resolve()))
         except OSError as error:
             raise ConfigError(
-                f"The folder of the jobs cannot be made in {self._place}: {error}. Name one that "
+                f"Cannot create the jobs' folder in {self._place}: {error}. Name a folder that "
                 'all nodes share with launcher_kwargs={"folder": ...}.'
             ) from error
         local = LocalQueue(self._folder)
@@ -119,7 +124,7 @@ class SlurmLauncher(Launcher):
         return None if controller is None else address_towards(controller)
 
     def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
-        """Submit the jobs, or take those that Slurm runs again: see `Launcher.launch`."""
+        """Submit the jobs, or reuse those that Slurm has requeued: see `Launcher.launch`."""
         self._write_token(token)
         former = {number: self._handles.get(number) for number in instances}
         again = {number: old for number, old in former.items() if old and old.runs_again()}
@@ -143,15 +148,15 @@ class SlurmLauncher(Launcher):
             time.sleep(_SOON)
         guard, self._guard = self._guard, None
         if guard is not None:
-            os.close(self._pipe)  # it does the rest, as it would if this process were killed
+            os.close(self._pipe)  # the guard does the rest, as if this process had been killed
             guard.wait()
 
     def state_of(self, job: Any, max_age: float) -> JobState:
-        """Return what the queue says of a job; all jobs are asked for at once.
+        """Return the state of a job in the queue; all jobs are queried at once.
 
         Args:
             job: The job.
-            max_age: How old the answer may be, in s.
+            max_age: Maximum age of the answer in s.
         """
         assert self._queue is not None
         if time.monotonic() - self._asked > max_age:
@@ -162,19 +167,19 @@ class SlurmLauncher(Launcher):
         return self._states.get(job.job_id, FORGOTTEN)
 
     def interrupt(self, job: Any) -> None:
-        """Ask the client of a job to end."""
+        """Ask a job's client to exit."""
         assert self._queue is not None
         self._queue.interrupt(job)
 
     def cancel(self, job: Any) -> None:
-        """End a job at once."""
+        """End a job immediately."""
         assert self._queue is not None
         self._queue.cancel([job])
         self._asked = 0.0
 
     @property
     def queue_time(self) -> float:
-        """Longest time in s for which a job may wait in the queue."""
+        """Longest time in s that a job may be queued."""
         return self._queue_time
 
     def _submit(self, instances: Sequence[int], address: str) -> dict[int, Any]:
@@ -213,23 +218,23 @@ class SlurmLauncher(Launcher):
 
 
 class JobHandle(ClientHandle):
-    """A client that is a job.
+    """A client that runs as a job.
 
     Attributes:
-        job: The job, of submitit.
+        job: The submitit job.
     """
 
     def __init__(
         self, instance_id: int, job: Any, launcher: SlurmLauncher, folder: Path, runs: int
     ) -> None:
-        """Keep the arguments.
+        """Store the arguments.
 
         Args:
             instance_id: Number of the instance, from 1.
-            job: The job, of submitit.
-            launcher: Asks the queue.
-            folder: Folder of the run.
-            runs: How often the job was started again before it got this client.
+            job: The submitit job.
+            launcher: Queries the queue.
+            folder: The run's folder.
+            runs: How often the job had been requeued when it got this client.
         """
         self.instance_id, self.job = instance_id, job
         self._launcher, self._folder, self._runs = launcher, folder, runs
@@ -238,11 +243,11 @@ class JobHandle(ClientHandle):
         self._began = time.monotonic()
 
     def look(self, max_age: float) -> JobState:
-        """Return what the queue says of the job, at most `max_age` s ago."""
+        """Return the state of the job in the queue, at most `max_age` s old."""
         return self._launcher.state_of(self.job, max_age)
 
     def runs_again(self) -> bool:
-        """Return whether Slurm has ended this client and starts the job again."""
+        """Return whether Slurm has ended this client and requeued its job."""
         state = self.look(_SOON)
         return not state.is_over and state.runs > self._runs
 
@@ -265,29 +270,32 @@ class JobHandle(ClientHandle):
     def state(self) -> str:
         """Return what it waits for: see `ClientHandle.state`."""
         state = self.look(_RARELY)
-        return f"its job {self.job.job_id} is {state.name} ({state.reason})"
+        return f"job {self.job.job_id} is {state.name} ({state.reason})"
 
     def is_queued(self) -> bool:
-        """Return whether it waits for its turn: see `ClientHandle.is_queued`."""
+        """Return whether it is queued: see `ClientHandle.is_queued`."""
         if not self.look(_RARELY).is_queued:
             return False
         if time.monotonic() - self._began < self._launcher.queue_time:
             return True
-        self._end(_INTERRUPTED, f"{self.state()} for longer than queue_time, {self.queue_time:g} s")
+        self._end(
+            _INTERRUPTED,
+            f"{self.state()}, queued for longer than queue_time, {self.queue_time:g} s",
+        )
         return False
 
     @property
     def queue_time(self) -> float:
-        """Longest time in s for which the job may wait in the queue."""
+        """Longest time in s that the job may be queued."""
         return self._launcher.queue_time
 
     def terminate(self) -> None:
-        """Ask the client to end, unless Slurm runs its job again: see `ClientHandle.terminate`."""
+        """Ask the client to exit, unless Slurm requeues its job: see `ClientHandle.terminate`."""
         if self._find_status(0.0) is None:
             self._launcher.interrupt(self.job)
 
     def kill(self) -> None:
-        """End the job, unless Slurm runs it again: see `ClientHandle.kill`."""
+        """End the job, unless Slurm requeues it: see `ClientHandle.kill`."""
         if self._find_status(0.0) is None:
             self._launcher.cancel(self.job)
 
@@ -297,12 +305,12 @@ class JobHandle(ClientHandle):
         state = self.look(max_age)
         if state.is_hopeless:
             self._launcher.cancel(self.job)
-            text = f"Slurm cannot give job {self.job.job_id} what it asks for ({state.reason})."
+            text = f"Slurm cannot give job {self.job.job_id} what it requests ({state.reason})."
             self._end(1, f"{text} {_ADVICE}")
             return self._status
         noted = self._read_note() if max_age < _RARELY or state.is_over else None
         if state.runs > self._runs:
-            self._end(_INTERRUPTED, f"Slurm interrupted job {self.job.job_id} and runs it again.")
+            self._end(_INTERRUPTED, f"Slurm interrupted and requeued job {self.job.job_id}.")
         elif noted is not None:
             self._end(*noted)
         elif state.is_over:
@@ -314,7 +322,7 @@ class JobHandle(ClientHandle):
         self._status, self._said = status, said
 
     def _read_note(self) -> tuple[int, str] | None:
-        """Return exit status and last lines that the job noted, if its client has ended."""
+        """Return the exit status and last lines that the job recorded, if its client has ended."""
         try:
             text = files.read_content(status_file(self._folder, self.instance_id), 1 << 20)
             status, _, said = text.decode(errors="replace").partition("\n")
@@ -325,7 +333,7 @@ class JobHandle(ClientHandle):
 
 @contextlib.contextmanager
 def _without_token() -> Iterator[None]:
-    """Keep the secret of the run out of the jobs' environments, which Slurm stores."""
+    """Keep the run's secret out of the jobs' environments, which Slurm stores."""
     token = os.environ.pop(TOKEN_VARIABLE, None)
     try:
         yield

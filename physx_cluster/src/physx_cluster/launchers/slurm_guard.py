@@ -1,7 +1,7 @@
-"""Guard: ends the jobs of a run and removes its folder once the run has ended, however it did.
+"""Guard: ends a run's jobs and removes its folder once the run has ended, even if killed.
 
-It is ``python -m physx_cluster.launchers.slurm_guard DESCRIPTOR FOLDER NAME``. The descriptor is
-that of a pipe to which only the run can write, so it closes with the run, even by SIGKILL.
+Started as ``python -m physx_cluster.launchers.slurm_guard DESCRIPTOR FOLDER NAME``. The descriptor
+belongs to a pipe to which only the run can write, so it closes with the run, even by SIGKILL.
 """
 
 from __future__ import annotations
@@ -19,10 +19,10 @@ from typing import TYPE_CHECKING
 if TYPE_CHECKING:
     from physx_core.processes import ChildProcess
 
-_PATIENCE = 20.0  # for jobs to leave the queue
-_KINDNESS = 3.0  # for processes to heed Ctrl-C, which they ignore if the run did
+_PATIENCE = 20.0  # s, for jobs to leave the queue
+_KINDNESS = 3.0  # s, for processes to obey Ctrl-C, which they ignore if the run did
 _PAUSE = 0.1
-# What the processes of submitit's local executor run; the folder's path may hold any word.
+# Modules that submitit's local executor runs, compared as whole words: a path may contain them.
 _MODULES = {b"submitit.local._local", b"submitit.core._submit"}
 
 
@@ -30,11 +30,11 @@ def start_guard(folder: Path, name: str) -> tuple[ChildProcess, int]:
     """Start a guard.
 
     Args:
-        folder: Folder of the run.
-        name: Name of its jobs in Slurm's queue; empty: they are processes of this machine.
+        folder: The run's folder.
+        name: Name of its jobs in Slurm's queue; empty if they are local processes.
 
     Returns:
-        The guard, and the descriptor whose closing has it begin.
+        The guard, and the descriptor whose closing activates it.
     """
     from physx_core.processes import ChildProcess
 
@@ -48,12 +48,12 @@ def start_guard(folder: Path, name: str) -> tuple[ChildProcess, int]:
 
 
 def main(descriptor: int, folder: Path, name: str) -> None:
-    """Wait for the end of the run, then tidy up.
+    """Wait for the end of the run, then clean up.
 
     Args:
-        descriptor: End of the pipe to read from.
-        folder: Folder of the run.
-        name: Name of its jobs in Slurm's queue; empty: they are processes of this machine.
+        descriptor: Read end of the pipe.
+        folder: The run's folder.
+        name: Name of its jobs in Slurm's queue; empty if they are local processes.
     """
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)
@@ -63,7 +63,7 @@ def main(descriptor: int, folder: Path, name: str) -> None:
         _end_jobs(name, until)
     else:
         _end_processes(folder, time.monotonic() + _KINDNESS)
-    while folder.exists() and time.monotonic() < until:  # a job may be writing its last lines
+    while folder.exists() and time.monotonic() < until:  # a job may still be writing
         shutil.rmtree(folder, ignore_errors=True)
         time.sleep(_PAUSE)
 
@@ -82,7 +82,7 @@ def _run(*words: str) -> subprocess.CompletedProcess[bytes]:
 
 
 def _end_processes(folder: Path, until: float) -> None:
-    """End the jobs of submitit's local executor; the folder stands on their command lines."""
+    """End the jobs of submitit's local executor, whose command lines contain the folder."""
     while found := _processes_of(folder):
         late = time.monotonic() > until
         for process in found:

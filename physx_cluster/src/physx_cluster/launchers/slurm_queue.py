@@ -1,4 +1,4 @@
-"""The queue that jobs wait in: Slurm's, or the processes of submitit's local executor."""
+"""The queue of jobs: Slurm's, or the processes of submitit's local executor."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ _LEAVING = ("COMPLETING", "PREEMPTED")
 _NEVER = (
     *("BadConstraints", "PartitionConfig", "PartitionNodeLimit", "PartitionTimeLimit"),
     *("InvalidAccount", "InvalidQOS"),
-)  # reasons to wait that do not pass
-_SECONDS = 10.0  # that a command of Slurm may take
+)  # reasons to wait that do not go away
+_SECONDS = 10.0  # timeout of a Slurm command
 
 
 @dataclass(frozen=True)
 class JobState:
-    """What the queue says of a job.
+    """The state of a job in the queue.
 
     Attributes:
-        name: Slurm's word for it.
-        runs: How often it was started again.
-        reason: Why it waits, or its node.
+        name: Slurm's name for it.
+        runs: How often the job was requeued.
+        reason: Why it waits, or the node it runs on.
     """
 
     name: str
@@ -41,35 +41,35 @@ class JobState:
 
     @property
     def is_queued(self) -> bool:
-        """Whether it waits for its turn."""
+        """Whether it is queued."""
         return self.name in _SOON
 
     @property
     def is_hopeless(self) -> bool:
-        """Whether it waits for what it cannot get."""
+        """Whether it waits for something that it can never get."""
         return self.is_queued and self.reason in _NEVER
 
     @property
     def is_over(self) -> bool:
-        """Whether it has ended and does not run again."""
+        """Whether it has ended and will not run again."""
         return self.name not in (*_SOON, *_NOW, *_LEAVING)
 
 
 FORGOTTEN = JobState("COMPLETED")
-"""State of a job that the queue does not know any more: it has ended a while ago."""
+"""State of a job that the queue no longer knows: it ended some time ago."""
 
 
 class Queue(Protocol):
-    """Asks for the states of all jobs of a run at once, and ends jobs."""
+    """Queries the states of all of a run's jobs at once, and ends jobs."""
 
     def states(self) -> dict[str, JobState] | None:
-        """Return the states of the jobs by their names; None: the queue does not answer now."""
+        """Return the states of the jobs by name; None: the queue is not answering."""
 
     def interrupt(self, job: Any) -> None:
-        """Ask the client of a job to end."""
+        """Ask a job's client to exit."""
 
     def cancel(self, jobs: Iterable[Any]) -> None:
-        """End jobs at once, whether they run or wait."""
+        """End jobs immediately, running or queued."""
 
 
 class SlurmQueue:
@@ -80,7 +80,7 @@ class SlurmQueue:
     """
 
     def __init__(self, name: str) -> None:
-        """Keep the name."""
+        """Store the name."""
         self.name = name
 
     def states(self) -> dict[str, JobState] | None:
@@ -97,7 +97,7 @@ class SlurmQueue:
         _run("scancel", "--quiet", "--signal=TERM", job.job_id)
 
     def cancel(self, jobs: Iterable[Any]) -> None:
-        """End jobs at once: see `Queue.cancel`."""
+        """End jobs immediately: see `Queue.cancel`."""
         if names := [job.job_id for job in jobs]:
             _run("scancel", "--quiet", "--signal=KILL", *names)
             _run("scancel", "--quiet", *names)
@@ -107,11 +107,11 @@ class LocalQueue:
     """The processes of submitit's local executor.
 
     Attributes:
-        jobs: The jobs of the run by instance.
+        jobs: The run's jobs by instance.
     """
 
     def __init__(self, folder: Path) -> None:
-        """Keep the folder of the run."""
+        """Store the run's folder."""
         self._folder = folder
         self._interrupted: set[str] = set()
         self.jobs: dict[int, Any] = {}
@@ -128,11 +128,11 @@ class LocalQueue:
         return found
 
     def interrupt(self, job: Any) -> None:
-        """End the job, within a second: see `Queue.interrupt`."""
-        if job.job_id in self._interrupted:  # a second time would cut its end short
+        """End the job within a second: see `Queue.interrupt`."""
+        if job.job_id in self._interrupted:  # a second interrupt would cut its cleanup short
             return
         self._interrupted.add(job.job_id)
-        if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # so its processes ignore it, too
+        if signal.getsignal(signal.SIGINT) == signal.SIG_IGN:  # so its processes ignore it too
             _kill(int(job.job_id))
         else:
             job.cancel()
@@ -147,7 +147,7 @@ def find_controller() -> str:
     """Return the address of Slurm's controller.
 
     Raises:
-        ConfigError: If Slurm is not installed here, or does not answer.
+        ConfigError: If Slurm is not installed here or does not answer.
     """
     done = _run("scontrol", "show", "config")
     found = re.search(r"^SlurmctldHost\[0\]\s*=\s*([^\s(]+)(?:\((\S+)\))?", done.stdout, re.M)

@@ -1,1 +1,1 @@
-"""Placement of clients: the nodes that have what each needs, and the run's address for them."""
+"""Placement of clients: nodes with the required resources, and the run's address for them."""

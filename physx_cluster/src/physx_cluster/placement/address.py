@@ -1,4 +1,4 @@
-"""Addresses of this machine, as others reach it."""
+"""Addresses at which other machines reach this one."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from physx_core.errors import ConfigError
 def address_towards(host: str) -> str:
     """Return the address of the interface through which this machine reaches another one.
 
-    Nothing is sent: the kernel is asked for the route.
+    Nothing is sent; the kernel is asked for the route.
 
     Args:
         host: Name or address of the other machine.
@@ -25,6 +25,6 @@ def address_towards(host: str) -> str:
             return str(probe.getsockname()[0])
     except OSError as error:
         raise ConfigError(
-            f"No interface of this machine reaches {host}: {error}. Name the address at which the "
+            f"No interface of this machine reaches {host}: {error}. Set the address at which the "
             "nodes reach this machine with EnvironmentConfig.ip_address."
         ) from error

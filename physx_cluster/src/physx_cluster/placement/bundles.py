@@ -1,4 +1,4 @@
-"""Bundles: what each client needs of the nodes that Ray has."""
+"""Bundles: the resources that each client needs from Ray's nodes."""
 
 from __future__ import annotations
 
@@ -6,17 +6,17 @@ import math
 from collections.abc import Sequence
 
 Bundle = dict[str, float]
-"""Name of a resource to how much of it a client needs, or a node has."""
+"""Name of a resource to the amount that a client needs or a node has."""
 
 _STEPS = 10_000  # Ray counts ten-thousandths of a resource
 
 
 def share_of_processors(nodes: Sequence[Bundle], clients: int) -> float:
-    """Return how many processors each client gets: one, or less if there are not as many.
+    """Return the CPUs per client: one, or less if there are fewer CPUs than clients.
 
     Args:
-        nodes: What each node has.
-        clients: How many clients share it.
+        nodes: Resources of each node.
+        clients: Number of clients that share them.
     """
     total = sum(math.floor(node.get("CPU", 0.0)) for node in nodes)
     if total >= clients or not total:
@@ -25,18 +25,16 @@ def share_of_processors(nodes: Sequence[Bundle], clients: int) -> float:
 
 
 def find_misfit(nodes: Sequence[Bundle], bundle: Bundle) -> str:
-    """Return what no node has enough of for one client, in words; empty if one has all of it.
+    """Return what no node has enough of for one client; empty if some node has everything.
 
     Args:
-        nodes: What each node has.
-        bundle: What a client needs.
+        nodes: Resources of each node.
+        bundle: Resources that a client needs.
     """
     if any(all(node.get(name, 0.0) >= need for name, need in bundle.items()) for node in nodes):
         return ""
     most = {name: max((node.get(name, 0.0) for node in nodes), default=0.0) for name in bundle}
-    return (
-        f"a client needs {describe(bundle)} of one node, and the nodes have up to {describe(most)}"
-    )
+    return f"a client needs {describe(bundle)} on one node, and nodes have at most {describe(most)}"
 
 
 def describe(bundle: Bundle) -> str:

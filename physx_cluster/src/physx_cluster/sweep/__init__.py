@@ -1,4 +1,4 @@
-"""Sweeps: studies of pipelines, settings and seeds that survive any kill.
+"""Sweeps: studies of pipelines, settings and seeds that survive being killed.
 
 The public names are imported on first use.
 """

@@ -1,4 +1,4 @@
-"""Definition: what a study is made of, as its TOML file says."""
+"""Definition: the contents of a study, read from its TOML file."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ from physx_core.errors import ConfigError, ConfigFileError, PhysxError, UnknownO
 T = TypeVar("T")
 
 STAGES: Mapping[str, type[Any]] = {"data_generation": DataGeneration, "training": Training}
-"""The pipelines that a trial may run, in this order, by the names of their tables."""
+"""The pipelines that a trial may run, by the names of their tables, in the order they run."""
 GIVEN = ("session_dir", "session_name", "new_session")
-"""Options that the sweep chooses for each trial."""
+"""Options that the sweep sets for each trial."""
 _COMPONENTS = {
     "environment": ("environment", "visualizer", "sampler", "launcher"),
     "network": ("network", "optimization", "transformation"),
@@ -28,59 +28,59 @@ _COMPONENTS = {
 
 @configuration
 class StudyOptions:
-    """What is tried, and what is compared. All results depend on these."""
+    """What is tried and compared. All results depend on these."""
 
     sampler: str = "grid"
-    """Chooses the settings: "grid", all combinations; "random"; or one of Optuna's, for example
-    "optuna/tpe"."""
+    """How settings are chosen: "grid", all combinations; "random"; or one of Optuna's samplers, for
+    example "optuna/tpe"."""
     sampler_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of Optuna's sampler."""
     trials: int | None = at_least(1, None)
-    """Number of settings of each pipeline; None: all of the grid."""
+    """Number of settings per pipeline; None: the whole grid."""
     seeds: list[int] = field(default_factory=lambda: [0])
     """Each setting is tried with each of these seeds."""
     seed: int = at_least(0, 0)
     """Seed of the sampler."""
     result: str = "loss/validation"
-    """The number to compare, one that a training records each epoch."""
+    """Name of the number to compare; the training must record it each epoch."""
     epoch: str = field(default="best", metadata={"choices": ("best", "last")})
-    """Which epoch's number is a trial's result."""
+    """The epoch whose number is the trial's result."""
     goal: str = field(default="minimize", metadata={"choices": ("minimize", "maximize")})
-    """Which numbers are good: small ones, or large ones."""
+    """Whether small or large numbers are better."""
     pruner: str | None = None
     """One of Optuna's pruners, for example "optuna/median", which ends trials that fall behind;
-    None: each trial runs to its end."""
+    None: every trial runs to its end."""
     pruner_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the pruner."""
     batch: int = at_least(1, 4)
-    """Number of settings that are chosen at once: Optuna knows the results of earlier batches
-    only, so that neither the number of processes nor a kill changes what it chooses."""
+    """Number of settings chosen at once: Optuna sees only the results of earlier batches, so
+    neither the number of processes nor a kill changes what it chooses."""
     threads: int = at_least(1, 1)
-    """Threads of a trial's numerical libraries. Another number changes the last bits."""
+    """Threads of each trial's numerical libraries. Changing the number changes the last bits."""
 
 
 @configuration
 class RunOptions:
-    """How the trials are run. No result depends on these."""
+    """How the trials run. No result depends on these."""
 
     executor: str = field(default="local", metadata={"choices": ("local", "ray", "slurm")})
-    """Where trials run: "local", in processes of this machine, "ray" or "slurm"."""
+    """Where trials run: "local", in processes on this machine, "ray", or "slurm"."""
     options: dict[str, Any] = field(default_factory=dict)
-    """Options of the executor: of Ray what its tasks take, of Slurm what submitit takes."""
+    """Options of the executor: those of Ray tasks, or submitit's parameters."""
     parallel: int = at_least(1, 1)
-    """Number of trials that run at the same time."""
+    """Number of concurrent trials."""
     restarts: int = at_least(0, 3)
-    """How many times in a row a trial may end without a result, and without having got further
-    than before, until it is given up."""
+    """Number of consecutive attempts at a trial that may end without a result and without progress
+    before it is given up."""
 
 
 @dataclass(frozen=True)
 class PipelineTable:
-    """A pipeline that is tried, with the parameters whose values it is tried with.
+    """A pipeline to try, with the parameters to vary.
 
     Attributes:
         stages: Tables of the pipelines, as in a session's ``config.toml``.
-        parameters: Path of an option to the values that it takes.
+        parameters: Path of an option to the values to try.
     """
 
     stages: Mapping[str, Mapping[str, Any]]
@@ -91,7 +91,7 @@ class PipelineTable:
 
         Args:
             setting: Values of the parameters.
-            seed: Seed of the training and of its environments, unless the tables have one.
+            seed: Seed of the training and of its environments, unless the tables set one.
         """
         tables: dict[str, Any] = {kind: copy.deepcopy(dict(t)) for kind, t in self.stages.items()}
         for path, value in setting.items():
@@ -109,9 +109,9 @@ class Definition:
 
     Attributes:
         name: Name of the study.
-        plain: The tables of the file.
+        plain: The file's tables.
         study: What is tried and compared.
-        run: How.
+        run: How the trials run.
         pipelines: The pipelines by name.
     """
 
@@ -129,14 +129,14 @@ class Definition:
 
         Args:
             path: The file.
-            name: Name of the study; None: that of the file.
-            builds: Whether to build the pipelines with the values of the parameters, and to find
-                their components, which imports the plugins.
-            run: Options of the table ``[run]`` that replace those of the file.
+            name: Name of the study; None: the file's name.
+            builds: Whether to build the pipelines with the parameters' values and find their
+                components, which imports the plugins.
+            run: Options that replace those of the file's table ``[run]``.
 
         Raises:
-            ConfigError: If an option is unknown or has an invalid value; the message names file,
-                table and option.
+            ConfigError: If an option is unknown or has an invalid value; the message names the
+                file, table and option.
         """
         plain = read_toml(path)
         known = ("study", "run", "parameters", "pipelines")
@@ -148,7 +148,7 @@ class Definition:
         if not tables["pipelines"]:
             raise ConfigFileError(
                 f"{path} has no table [pipelines.NAME.training], which holds the options of the "
-                "trainings that are tried, as a session's config.toml does in [training]."
+                "trainings to try, like [training] in a session's config.toml."
             )
         pipelines = {
             each: _pipeline(path, each, table, common)
@@ -164,18 +164,18 @@ class Definition:
 
     @property
     def columns(self) -> list[str]:
-        """Names of all parameters, in the order of the file."""
+        """Names of all parameters, in the file's order."""
         return list(dict.fromkeys(p for each in self.pipelines.values() for p in each.parameters))
 
     @property
     def sign(self) -> int:
-        """1 if small results are good, -1 if large ones are."""
+        """1 if small results are better, -1 if large ones are."""
         return 1 if self.study.goal == "minimize" else -1
 
     def find_change(self, other: Mapping[str, Any]) -> str:
-        """Return what differs in another definition's tables such that its results would; or "".
+        """Return a difference from another definition's tables that changes results; empty if none.
 
-        More trials than before are no difference: the first ones stay the same.
+        More trials than before are not a difference: the first ones stay the same.
         """
         mine, former = self._compared(self.plain), self._compared(other)
         for key in sorted(mine.keys() | former.keys()):
@@ -195,12 +195,12 @@ class Definition:
 def build_stage(
     kind: str, table: Mapping[str, Any], make: type[T] | None = None, **given: Any
 ) -> T:
-    """Return the pipeline of a table.
+    """Return a table's pipeline.
 
     Args:
         kind: Name of the table.
         table: Its options.
-        make: A class derived from that of the kind; None: that one.
+        make: A subclass of the kind's class; None: that class.
         given: Further options.
 
     Raises:
@@ -247,15 +247,15 @@ def _options(make: type[T], where: str, table: Mapping[str, Any]) -> T:
 def _check_study(path: Path, study: StudyOptions) -> None:
     where = f"{path}: [study]"
     if not study.seeds or len(set(study.seeds)) < len(study.seeds) or min(study.seeds) < 0:
-        raise ConfigError(f"{where} seeds is {study.seeds}: give different numbers from 0.")
+        raise ConfigError(f"{where} seeds is {study.seeds}, but must list distinct numbers from 0.")
     if study.sampler == "grid" and study.trials is not None:
-        raise ConfigError(f"{where} trials is for samplers that draw; a grid is tried completely.")
+        raise ConfigError(f"{where} trials is for samplers that draw; a grid is always complete.")
     if study.sampler != "grid" and study.trials is None:
-        raise ConfigError(f"{where} trials is missing: the number of settings to draw.")
+        raise ConfigError(f"{where} trials is missing: set the number of settings to draw.")
     if study.sampler_kwargs and not study.sampler.startswith("optuna/"):
-        raise ConfigError(f'{where} sampler_kwargs is for Optuna\'s, not for "{study.sampler}".')
+        raise ConfigError(f'{where} sampler_kwargs is only for Optuna, not for "{study.sampler}".')
     if study.pruner_kwargs and study.pruner is None:
-        raise ConfigError(f"{where} pruner_kwargs is given without a pruner.")
+        raise ConfigError(f"{where} pruner_kwargs is set without a pruner.")
 
 
 def _pipeline(path: Path, name: str, table: Any, common: Mapping[str, Parameter]) -> PipelineTable:
@@ -265,7 +265,7 @@ def _pipeline(path: Path, name: str, table: Any, common: Mapping[str, Parameter]
     if "training" not in table:
         raise ConfigFileError(
             f"{where} has no table [pipelines.{name}.training]: trials are trainings, whose "
-            f"numbers are compared. It has: {listed(table)}."
+            f"results are compared. It has: {listed(table)}."
         )
     stages: dict[str, Mapping[str, Any]] = {}
     for kind in STAGES:
@@ -273,16 +273,14 @@ def _pipeline(path: Path, name: str, table: Any, common: Mapping[str, Parameter]
             stage = _table(path, f"pipelines.{name}.{kind}", table[kind])
             for option in GIVEN:
                 if option in stage:
-                    raise ConfigError(
-                        f"{where} {kind}.{option} is chosen by the sweep: leave it out."
-                    )
+                    raise ConfigError(f"{where} {kind}.{option} is chosen by the sweep: omit it.")
             stages[kind] = stage
     own = read_parameters(f"{where} parameters", table.get("parameters", {}))
     return PipelineTable(stages, {**common, **own})
 
 
 def _check_settings(where: str, pipeline: PipelineTable, seed: int) -> None:
-    """Build the pipelines with the values of each parameter, and find all that they name."""
+    """Build the pipelines with each parameter's values, and find the components they name."""
     first = {name: parameter.ends()[0] for name, parameter in pipeline.parameters.items()}
     _check_setting(where, pipeline, first, seed)
     for name, parameter in pipeline.parameters.items():
@@ -317,6 +315,6 @@ def _put(tables: dict[str, Any], path: str, value: Any) -> None:
         table = table.setdefault(place, {})
         if not isinstance(table, dict):
             raise ConfigError(
-                f"The parameter {path} names an option in {place}, which is no table."
+                f"The parameter {path} names an option in {place}, which is not a table."
             )
     table[name] = value

@@ -1,4 +1,4 @@
-"""Optuna's samplers and pruners, asked in an order that no process and no kill can change."""
+"""Optuna's samplers and pruners, queried in an order that no process and no kill can change."""
 
 from __future__ import annotations
 
@@ -23,14 +23,13 @@ PREFIX = "optuna/"
 _UNFIT = ("base", "grid", "bruteforce", "partialfixed", "nop", "patient")
 _NAME = "study"
 _NEEDS = {"optuna/cmaes": "cmaes", "optuna/qmc": "scipy", "optuna/gp": "scipy"}
-"""Libraries that samplers import late, in the middle of a study."""
+"""Libraries that samplers import only in the middle of a study."""
 
 
 class OptunaSearch:
-    """Chooses settings by one of Optuna's samplers.
+    """Chooses settings with one of Optuna's samplers.
 
-    The sampler's state is not stored: it is asked the same again, and told the same results, which
-    brings it to the same state.
+    The sampler's state is not stored: repeating the same requests and results reproduces it.
     """
 
     def __init__(
@@ -44,15 +43,15 @@ class OptunaSearch:
         """Create the sampler.
 
         Args:
-            sampler: Its name, for example ``optuna/tpe``.
-            kwargs: Its keyword arguments.
+            sampler: Name of the sampler, for example ``optuna/tpe``.
+            kwargs: Keyword arguments of the sampler.
             parameters: The parameters by name.
-            seed: Its seed.
+            seed: Seed of the sampler.
             goal: "minimize" or "maximize".
 
         Raises:
-            ConfigError: If there is no such sampler, or it has no such arguments.
-            MissingLibraryError: If Optuna, or what the sampler needs, is not installed.
+            ConfigError: If the sampler does not exist, or rejects its arguments.
+            MissingLibraryError: If Optuna or a library that the sampler needs is not installed.
         """
         library = _import()
         made = _create(library.samplers, "Sampler", sampler, {"seed": seed, **kwargs})
@@ -73,11 +72,11 @@ class OptunaSearch:
         ]
 
     def tell(self, results: Sequence[Sequence[Result]]) -> None:
-        """Tell the sampler the results of the settings that it was asked for last.
+        """Report the results of the last requested settings to the sampler.
 
         Args:
-            results: Those of each setting, one for each seed. Means over the seeds count; a setting
-                of which one is pruned is so itself.
+            results: For each setting, the results for all seeds. Their means count; a setting with
+                a pruned result counts as pruned.
         """
         states = self._library.trial.TrialState
         for trial, of_setting in zip(self._asked, results, strict=True):
@@ -98,7 +97,7 @@ class OptunaSearch:
 
 
 class Pruning:
-    """Decides by one of Optuna's pruners whether a trial ends before its last epoch."""
+    """Decides with one of Optuna's pruners whether a trial ends before its last epoch."""
 
     def __init__(
         self,
@@ -110,14 +109,14 @@ class Pruning:
         """Create the pruner.
 
         Args:
-            pruner: Its name, for example ``optuna/median``.
-            kwargs: Its keyword arguments.
+            pruner: Name of the pruner, for example ``optuna/median``.
+            kwargs: Keyword arguments of the pruner.
             goal: "minimize" or "maximize".
-            earlier: Results of the trials of this pipeline before this one, in their order; None
-                for those that run at the same time and must not matter.
+            earlier: Results of this pipeline's earlier trials, in order; None for concurrent
+                trials, which must not matter.
 
         Raises:
-            ConfigError: If there is no such pruner, or it has no such arguments.
+            ConfigError: If the pruner does not exist, or rejects its arguments.
             MissingLibraryError: If Optuna is not installed.
         """
         library = _import()
@@ -130,7 +129,7 @@ class Pruning:
         """Return whether the trial ends.
 
         Args:
-            numbers: Its numbers so far, by epoch, at least those of the last call.
+            numbers: The trial's numbers so far, by epoch, including those of the last call.
         """
         ends = False
         for epoch in sorted(step for step in numbers if step > self._told):
@@ -142,7 +141,7 @@ class Pruning:
 
     @property
     def rungs(self) -> dict[str, float]:
-        """What the pruner keeps of the trial, to compare later ones with."""
+        """The pruner's records of the trial, to compare later trials with."""
         kept = self._study.get_trials(deepcopy=False)[-1].system_attrs
         return {name: float(value) for name, value in kept.items() if _is_rung(name)}
 
@@ -150,11 +149,11 @@ class Pruning:
 def check_optuna(
     sampler: str, sampler_kwargs: Mapping[str, Any], pruner: str | None, kwargs: Mapping[str, Any]
 ) -> None:
-    """Check that Optuna has a sampler and a pruner; other samplers are not looked at.
+    """Check that Optuna has a sampler and a pruner; samplers that are not Optuna's are ignored.
 
     Raises:
-        ConfigError: If it has not.
-        MissingLibraryError: If it is needed and not installed.
+        ConfigError: If one of them does not exist.
+        MissingLibraryError: If Optuna is needed but not installed.
     """
     if sampler.startswith(PREFIX):
         _create(_import().samplers, "Sampler", sampler, {"seed": 0, **sampler_kwargs})
@@ -174,7 +173,7 @@ def _import() -> Any:
 
 
 def known_samplers() -> list[str]:
-    """Return the names of Optuna's samplers; none if it is not installed."""
+    """Return the names of Optuna's samplers; empty if it is not installed."""
     try:
         return list(_classes(_import().samplers, "Sampler"))
     except MissingLibraryError:
@@ -182,7 +181,7 @@ def known_samplers() -> list[str]:
 
 
 def _classes(module: ModuleType, kind: str) -> dict[str, str]:
-    """Return the classes of a kind by the names that users give."""
+    """Return the classes of a kind by the names that users specify."""
     found = {_short(name, kind): name for name in dir(module) if name.endswith(kind)}
     return {PREFIX + name: made for name, made in found.items() if not name.startswith(_UNFIT)}
 
@@ -193,7 +192,7 @@ def _create(module: ModuleType, kind: str, reference: str, kwargs: Mapping[str, 
         others = ["grid", "random", *known] if kind == "Sampler" else known
         raise ConfigError(
             f'There is no {kind.lower()} "{reference}".{nearest(reference, others)} '
-            f"There are: {listed(others)}."
+            f"Available: {listed(others)}."
         )
     make = getattr(module, known[reference])
     names = inspect.signature(make).parameters
@@ -205,16 +204,16 @@ def _create(module: ModuleType, kind: str, reference: str, kwargs: Mapping[str, 
         raise MissingLibraryError(f'"{reference}"', needed, "optuna", "physx-cluster")
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # that it is experimental
+            warnings.simplefilter("ignore")  # many are experimental
             return make(**kwargs)
     except (TypeError, ValueError) as error:
         raise ConfigError(
-            f'The {kind.lower()} "{reference}" refuses its arguments: {error}'
+            f'The {kind.lower()} "{reference}" rejects its arguments: {error}'
         ) from None
 
 
 def _short(name: str, kind: str) -> str:
-    """Return the name of a class in words, as ``successive_halving`` of SuccessiveHalvingPruner."""
+    """Return a class's name in words: ``successive_halving`` for SuccessiveHalvingPruner."""
     plain = name.removesuffix(kind)
     words = re.findall(r"[A-Z]+(?![a-z])|[A-Z][a-z]+", plain)
     return "_".join(words).lower() if kind == "Pruner" else plain.lower()
@@ -234,7 +233,7 @@ def _value(parameter: Parameter, suggested: Any) -> Any:
 
 
 def _frozen(library: Any, result: Result | None) -> Any:
-    """Return a trial as Optuna keeps it; one that must not matter has failed, for all it knows."""
+    """Return a trial in Optuna's form; one that must not matter is declared as failed."""
     states = library.trial.TrialState
     if result is None or result.state == FAILED or not math.isfinite(result.value):
         return library.trial.create_trial(state=states.FAIL)

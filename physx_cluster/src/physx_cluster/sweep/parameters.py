@@ -1,4 +1,4 @@
-"""Parameters: which values the settings of a study take."""
+"""Parameters: the values that the settings of a study can take."""
 
 from __future__ import annotations
 
@@ -19,16 +19,16 @@ Setting = dict[str, Any]
 
 @dataclass(frozen=True)
 class Choices:
-    """A parameter that takes one of some values.
+    """A parameter that takes one of several values.
 
     Attributes:
-        values: The values, as TOML has them.
+        values: The values, as in TOML.
     """
 
     values: tuple[Any, ...]
 
     def grid(self, where: str) -> Sequence[Any]:
-        """Return the values of a grid."""
+        """Return the values for a grid."""
         return self.values
 
     def draw(self, random: np.random.Generator) -> Any:
@@ -36,19 +36,19 @@ class Choices:
         return self.values[int(random.integers(len(self.values)))]
 
     def ends(self) -> Sequence[Any]:
-        """Return the values between which, or among which, all others are."""
+        """Return all values."""
         return self.values
 
 
 @options
 @dataclass(frozen=True)
 class Range:
-    """A parameter that takes numbers of a range; whole ones if both ends are.
+    """A parameter that takes numbers in a range; integers if both ends are.
 
     Attributes:
         low: Smallest value.
         high: Largest value.
-        log: Whether the logarithms are evenly distributed, not the numbers.
+        log: Whether to distribute the logarithms evenly instead of the numbers.
         num: Number of values in a grid.
     """
 
@@ -58,10 +58,10 @@ class Range:
     num: int | None = at_least(2, None)
 
     def __post_init__(self) -> None:
-        """Check the ends.
+        """Validate the ends.
 
         Raises:
-            ConfigError: If there is no number between them, or none has a logarithm.
+            ConfigError: If the range is empty, or `log` is set and `low` is not positive.
         """
         if not (math.isfinite(self.low) and math.isfinite(self.high) and self.low < self.high):
             raise ConfigError(f"low is {self.low} and must be below high, which is {self.high}.")
@@ -74,20 +74,20 @@ class Range:
         return isinstance(self.low, int) and isinstance(self.high, int)
 
     def grid(self, where: str) -> Sequence[Any]:
-        """Return the values of a grid.
+        """Return the values for a grid.
 
         Args:
             where: The parameter, for messages.
         """
         if self.num is None:
-            raise ConfigError(f"{where}: a grid needs to know how many values: add num = 5.")
+            raise ConfigError(f"{where}: a grid needs the number of values: add num = 5.")
         space = np.geomspace if self.log else np.linspace
         return list(dict.fromkeys(self._value(x) for x in space(self.low, self.high, self.num)))
 
     def draw(self, random: np.random.Generator) -> Any:
         """Return a random value."""
         low, high = self.low, self.high
-        if self.is_whole:  # each number owns what lies within 0.5 of it
+        if self.is_whole:  # each integer gets the interval within 0.5 of it
             low, high = low - 0.5, high + 0.5
         if self.log:
             return self._value(math.exp(random.uniform(math.log(low), math.log(high))))
@@ -106,17 +106,17 @@ Parameter = Choices | Range
 
 
 def read_parameters(where: str, table: Mapping[str, Any]) -> dict[str, Parameter]:
-    """Return the parameters of a table by the dotted path of the option that each sets.
+    """Return a table's parameters by the dotted path of the option that each sets.
 
-    A list holds the values of a parameter. A table with ``low`` or ``high`` that are numbers is a
+    A list contains the values of a parameter. A table whose ``low`` or ``high`` is a number is a
     range. Any other table is part of a path.
 
     Args:
         where: The table and its file, for messages.
-        table: As TOML has it.
+        table: The table, as in TOML.
 
     Raises:
-        ConfigError: If it is neither.
+        ConfigError: If an entry is neither.
     """
     found: dict[str, Parameter] = {}
     for path, value in _leaves(table):
@@ -149,14 +149,14 @@ def _is_number(value: Any) -> bool:
 
 
 def grid_of(where: str, parameters: Mapping[str, Parameter]) -> list[Setting]:
-    """Return all combinations of the parameters' values; the last parameter changes first.
+    """Return all combinations of the parameters' values; the last parameter varies fastest.
 
     Args:
         where: The file, for messages.
         parameters: The parameters by name.
 
     Raises:
-        ConfigError: If a range does not say how many values it has in a grid.
+        ConfigError: If a range does not set its number of values for a grid.
     """
     values = [parameter.grid(f"{where}: {name}") for name, parameter in parameters.items()]
     return [dict(zip(parameters, each, strict=True)) for each in itertools.product(*values)]

@@ -1,4 +1,4 @@
-"""Plan: which trials a study has, batch by batch."""
+"""Plan: the trials of a study, batch by batch."""
 
 from __future__ import annotations
 
@@ -19,17 +19,17 @@ class Search(Protocol):
     """Chooses the settings of one pipeline."""
 
     def ask(self, count: int) -> list[Setting]:
-        """Return the next settings, fewer than asked for where there are no more."""
+        """Return the next settings, fewer than requested if there are no more."""
 
     def tell(self, results: Sequence[Sequence[Result]]) -> None:
-        """Take the results of the settings that it was asked for last, one for each seed."""
+        """Take the results of the last requested settings, one for each seed."""
 
 
 class Plan:
-    """The trials of a study, in an order that depends on its definition and on results alone.
+    """The trials of a study, in an order that depends only on its definition and results.
 
-    Within a batch trials are numbered by setting, then pipeline, then seed. So more settings leave
-    the numbers of the first ones as they are.
+    Within a batch, trials are numbered by setting, then pipeline, then seed. More settings
+    therefore leave the numbers of the first ones unchanged.
 
     Attributes:
         total: Number of trials.
@@ -37,10 +37,10 @@ class Plan:
     """
 
     def __init__(self, definition: Definition) -> None:
-        """Start with the first batch.
+        """Start before the first batch.
 
         Raises:
-            ConfigError: If the sampler cannot choose such settings.
+            ConfigError: If the sampler cannot choose settings of these parameters.
         """
         study = definition.study
         self._seeds = study.seeds
@@ -61,7 +61,7 @@ class Plan:
         self._last: list[Trial] = []
 
     def next_batch(self) -> list[Trial]:
-        """Return the next trials; none at the end. Before, `tell` takes the results of the last."""
+        """Return the next trials; empty at the end. First call `tell` with the last results."""
         chosen = {}
         for name, search in self._searches.items():
             count = min(self._batch, self._left[name])
@@ -79,7 +79,7 @@ class Plan:
         return self._last
 
     def tell(self, results: Mapping[int, Result]) -> None:
-        """Take the results of all trials of the last batch, by their numbers."""
+        """Take the results of all trials of the last batch, by trial number."""
         for name, search in self._searches.items():
             of_pipeline = [trial for trial in self._last if trial.pipeline == name]
             groups = itertools.groupby(of_pipeline, lambda trial: trial.setting)
@@ -87,38 +87,38 @@ class Plan:
 
 
 class Grid:
-    """Chooses all combinations, in order.
+    """Chooses all combinations in order.
 
     Attributes:
         settings: The combinations.
     """
 
     def __init__(self, settings: list[Setting]) -> None:
-        """Start with the first one."""
+        """Start with the first combination."""
         self.settings = settings
         self._next = iter(settings)
 
     def ask(self, count: int) -> list[Setting]:
-        """Return the next ones."""
+        """Return the next combinations."""
         return list(itertools.islice(self._next, count))
 
     def tell(self, results: Sequence[Sequence[Result]]) -> None:
-        """Do nothing: a grid learns nothing."""
+        """Do nothing: a grid does not depend on results."""
 
 
 class RandomSearch:
-    """Chooses settings at random; each depends on the seed and its own number alone."""
+    """Chooses settings at random; each depends only on the seed and its own number."""
 
     def __init__(self, parameters: Mapping[str, Parameter], seed: int) -> None:
-        """Start with the first one."""
+        """Start with the first setting."""
         self._parameters, self._seed, self._number = parameters, seed, 0
 
     def ask(self, count: int) -> list[Setting]:
-        """Return the next ones."""
+        """Return the next settings."""
         return [self._draw() for _ in range(count)]
 
     def tell(self, results: Sequence[Sequence[Result]]) -> None:
-        """Do nothing: chance learns nothing."""
+        """Do nothing: random choices do not depend on results."""
 
     def _draw(self) -> Setting:
         self._number += 1
@@ -134,4 +134,4 @@ def _search(definition: Definition, parameters: Mapping[str, Parameter]) -> Sear
         return OptunaSearch(study.sampler, study.sampler_kwargs, parameters, study.seed, study.goal)
     known = ["grid", "random", *known_samplers()]
     guess = nearest(study.sampler, known) or nearest(PREFIX + study.sampler, known)
-    raise ConfigError(f'There is no sampler "{study.sampler}".{guess} There are: {listed(known)}.')
+    raise ConfigError(f'There is no sampler "{study.sampler}".{guess} Available: {listed(known)}.')

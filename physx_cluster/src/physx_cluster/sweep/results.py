@@ -1,4 +1,4 @@
-"""Trials and their results, and the files that keep them in the folders of trials."""
+"""Trials and their results, and the files that store them in the trials' folders."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ COMPLETE, PRUNED, FAILED = "complete", "pruned", "failed"
 
 @dataclass(frozen=True)
 class Trial:
-    """A training, perhaps after a data generation, with one setting and one seed.
+    """A training, possibly preceded by a data generation, with one setting and one seed.
 
     Attributes:
-        number: Its number in the study, from 1.
-        pipeline: Name of its pipeline.
-        setting: Number of its setting among those of the pipeline, from 1.
-        seed: Its seed.
+        number: Number of the trial in the study, from 1.
+        pipeline: Name of the pipeline.
+        setting: Number of the setting within the pipeline, from 1.
+        seed: The seed.
         values: Values of the parameters.
         known: Number of trials whose results were known when its batch was chosen. They are the
             first ones, and the only ones that it is compared with while it runs.
@@ -43,21 +43,21 @@ class Trial:
 
     @property
     def name(self) -> str:
-        """Name of its folder."""
+        """Name of the trial's folder."""
         return f"trial_{self.number:04}"
 
 
 @dataclass(frozen=True)
 class Result:
-    """What a trial has come to.
+    """The result of a trial.
 
     Attributes:
         state: "complete"; "pruned" if it fell behind; "failed" if an error ended it.
-        value: The number that is compared; NaN if it failed.
-        epochs: Number of epochs that it took; None if it failed.
+        value: The number to compare; NaN if it failed.
+        epochs: Number of completed epochs; None if it failed.
         error: Name of the error's class.
-        numbers: That number after each epoch that has one.
-        rungs: What the pruner kept of it.
+        numbers: The number to compare, by epoch.
+        rungs: The pruner's records of the trial.
     """
 
     state: str
@@ -68,7 +68,7 @@ class Result:
     rungs: Mapping[str, float] = field(default_factory=dict)
 
     def write(self, folder: Path) -> None:
-        """Write it into a trial's folder, all or nothing."""
+        """Write it into a trial's folder atomically."""
         plain: dict[str, Any] = {"state": self.state, "value": self.value}
         plain |= {} if self.epochs is None else {"epochs": self.epochs}
         plain |= {"error": self.error} if self.error else {}
@@ -94,12 +94,12 @@ class Result:
             if state not in (COMPLETE, PRUNED, FAILED):
                 raise ValueError(f"the state is {state!r}")
             if not isinstance(epochs, int | None) or not isinstance(error, str):
-                raise TypeError("epochs or error is of the wrong type")
+                raise TypeError("epochs or error has the wrong type")
             return cls(state, float(plain["value"]), epochs, error, numbers, rungs)
         except (PhysxError, LookupError, TypeError, ValueError, AttributeError) as error:
             raise StudyError(
-                f"{path} is damaged ({error}). Remove it: the trial is then continued from its "
-                "last checkpoint, to the same result."
+                f"{path} is damaged ({error}). Remove it: the trial then resumes from its last "
+                "checkpoint and reaches the same result."
             ) from None
 
 
@@ -108,11 +108,11 @@ class Failure:
     """The error that ended an attempt at a trial.
 
     Attributes:
-        error: Name of its class.
-        message: What it says.
-        is_final: Whether another attempt would end in the same way.
-        is_result: Whether it is the trial's own doing, and so its result. Otherwise it is that of
-            the machine, as a full disk is, or of the study.
+        error: Name of the error's class.
+        message: Text of the error.
+        is_final: Whether another attempt would end the same way.
+        is_result: Whether the trial itself caused the error, which is then its result. Otherwise,
+            the cause is the machine, for example a full disk, or the study.
     """
 
     error: str
@@ -127,7 +127,7 @@ class Failure:
 
     @classmethod
     def read(cls, folder: Path) -> Failure | None:
-        """Return the error in a trial's folder; None if there is none that can be read."""
+        """Return the error in a trial's folder; None if there is none or it cannot be read."""
         try:
             plain = read_toml(folder / FAILURE)
             texts = str(plain["error"]), str(plain["message"])

@@ -1,4 +1,4 @@
-"""Runs a study: its trials, batch by batch, until each has a result."""
+"""Runs the trials of a study, batch by batch, until each has a result."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ Start = Callable[[Definition], Executor]
 
 
 def run_study(definition: Definition, folder: Path, say: Say, start: Start | None = None) -> Study:
-    """Run all trials of a study that have no result yet, and return it, closed.
+    """Run all trials of a study that have no result yet; return the closed study.
 
     Args:
-        definition: What the study is made of.
-        folder: Its folder; one that is there is continued.
+        definition: The definition of the study.
+        folder: Folder of the study; an existing study is resumed.
         say: Prints a line for the user.
-        start: Starts the executor; None: the one that the definition names.
+        start: Starts the executor; None: the one named in the definition.
 
     Raises:
-        StudyError: If the folder holds another study, or trials were given up; the same call
-            continues.
-        ConfigError: If sampler, pruner or executor cannot be used as they are to be.
+        StudyError: If the folder contains another study, or trials were given up; the same call
+            resumes it.
+        ConfigError: If the sampler, pruner or executor cannot be used as specified.
     """
     with Study.open(folder, definition) as study:
         plan = Plan(definition)
         say(f"study: {folder} ({plan.total} trials, {len(study.results)} of them done)")
         if plan.together < min(definition.run.parallel, plan.total):
             say(
-                f"note: no more trials than {plan.together} run at the same time, those of a batch "
-                f"(study.batch = {definition.study.batch}), though run.parallel is "
-                f"{definition.run.parallel}"
+                f"note: only {plan.together} of {definition.run.parallel} (run.parallel) trials "
+                "can run at the same time, those of a batch "
+                f"(study.batch = {definition.study.batch})"
             )
         with _Workers(study, start or _start_executor, say, plan.total) as workers:
             while batch := plan.next_batch():
@@ -69,12 +69,12 @@ def _start_executor(definition: Definition) -> Executor:
 
 @dataclass
 class _Attempts:
-    """What is known of the attempts at a trial.
+    """The attempts at a trial.
 
     Attributes:
         trial: The trial.
-        in_vain: Number of attempts in a row that got no further than the one before.
-        reached: How far the last one got.
+        in_vain: Number of consecutive attempts without progress.
+        reached: Progress of the last attempt.
     """
 
     trial: Trial
@@ -83,7 +83,7 @@ class _Attempts:
 
 
 class _Workers:
-    """Runs trials at the same time, and restarts those that end without a result."""
+    """Runs trials concurrently, and restarts those that end without a result."""
 
     def __init__(self, study: Study, start: Start, say: Say, total: int) -> None:
         self._study, self._say, self._total = study, say, total
@@ -92,7 +92,7 @@ class _Workers:
         self._executor: Executor | None = None
         self._jobs: dict[Job, _Attempts] = {}
         self._given_up: list[tuple[Trial, str]] = []
-        self._is_in_vain = False  # as each trial would end by the same error
+        self._is_in_vain = False  # whether every trial would end with the same error
 
     def __enter__(self) -> _Workers:
         return self
@@ -105,7 +105,7 @@ class _Workers:
         """Run the trials of a batch until each has a result.
 
         Raises:
-            StudyError: If some were given up.
+            StudyError: If trials were given up.
         """
         waiting = [_Attempts(trial) for trial in batch if self._study.take_result(trial) is None]
         while waiting or self._jobs:
@@ -131,7 +131,7 @@ class _Workers:
         self._jobs[self._executor.start(folder.resolve())] = attempts
 
     def _is_unfinished(self, attempts: _Attempts, job: Job) -> bool:
-        """Take the result of a trial whose process has ended; return whether it needs another."""
+        """Take the result of a trial whose process has ended; return whether to try again."""
         trial = attempts.trial
         folder = self._study.folder_of(trial)
         result = self._study.take_result(trial)
@@ -144,7 +144,7 @@ class _Workers:
         why = f"{failure.error}: {failure.message}" if failure is not None else job.describe_end()
         is_final = failure is not None and failure.is_final
         if not is_final and attempts.in_vain <= self._run.restarts:
-            self._say(f"{self._name(trial)} {_short(why)}; it is continued")
+            self._say(f"{self._name(trial)} {_short(why)}; resuming it")
             return True
         if failure is not None and failure.is_result:
             Result(FAILED, error=failure.error).write(folder)
@@ -154,7 +154,7 @@ class _Workers:
         else:
             self._given_up.append((trial, why))
             self._is_in_vain |= is_final
-            self._say(f"{self._name(trial)} {_short(why)}; it is given up")
+            self._say(f"{self._name(trial)} {_short(why)}; giving it up")
         return False
 
     def _tell(self, trial: Trial, result: Result, message: str = "") -> None:
@@ -169,17 +169,17 @@ class _Workers:
     def _error(self) -> PhysxError:
         trial, why = self._given_up[0]
         count = len(self._given_up)
-        others = f" (In all {count} trials were given up.)" if count > 1 else ""
+        others = f" ({count} trials were given up in total.)" if count > 1 else ""
         output = self._study.folder_of(trial) / OUTPUT
         return StudyError(
             f"Trial {trial.number} ({describe_trial(trial)}) has no result: "
-            f"{_sentence(why)}{others} See {output}. When that is put right, the same "
-            "command continues."
+            f"{_sentence(why)}{others} See {output}. Once this is fixed, the same command "
+            "resumes the sweep."
         )
 
 
 def describe_trial(trial: Trial) -> str:
-    """Return pipeline, setting and seed of a trial in words."""
+    """Describe a trial by its pipeline, setting and seed."""
     values: Mapping[str, object] = trial.values
     settings = [f"{name.rpartition('.')[2]} {_number(value)}" for name, value in values.items()]
     return ", ".join([trial.pipeline, *settings, f"seed {trial.seed}"])
@@ -190,7 +190,7 @@ def _number(value: object) -> str:
 
 
 def _reached(folder: Path) -> frozenset[str]:
-    """Return what a trial has brought about: later attempts continue from it."""
+    """Return what a trial has produced so far; later attempts continue from there."""
     names = {path.parent.name for path in folder.glob("network/*/checkpoint.toml")}
     return frozenset(names | {path.name for path in folder.glob("generated")})
 

@@ -1,4 +1,4 @@
-"""Shows a study: as a table, as curves in a viewer, and as a figure."""
+"""Shows a study as a table, as curves in a viewer, or as a figure."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ from physx_core.cli import show, show_table, spark_line, width
 from physx_core.errors import MissingLibraryError, SessionError, StudyError, UsageError
 
 _BARS = 16
-_GAP = 2  # columns between those of a table
+_GAP = 2  # characters between the columns of a table
 _MARK = "*"
 
 
 def show_status(study: Study) -> None:
-    """Print a line for each trial, and the best setting."""
+    """Print a line for each trial, then the best setting."""
     names = study.definition.columns
     best = study.best()
     marked = {trial.number for trial in best.trials} if best is not None else set()
@@ -45,7 +45,7 @@ def show_status(study: Study) -> None:
 
 
 def summary(study: Study) -> Iterator[str]:
-    """Yield lines that say how many trials have come to what, and which setting is best."""
+    """Yield lines with the number of trials in each state and the best setting."""
     states = [result.state for result in study.results.values()]
     counts = [f"{states.count(state)} {state}" for state in dict.fromkeys(states)]
     left = len(study.trials) - len(states)
@@ -65,13 +65,13 @@ def _describe(study: Study, best: Best) -> str:
 
 
 def _room(rows: Sequence[Sequence[str]]) -> int:
-    """Return how many bars a curve may have beside the columns of a table."""
+    """Return how many bars fit next to the columns of a table."""
     taken = sum(max(map(len, column)) + _GAP for column in zip(*rows, strict=True))
     return min(max(width() - taken, 1), _BARS)
 
 
 def _outcome(study: Study, trial: Trial) -> tuple[str, str, str]:
-    """Return state, epochs and result of a trial."""
+    """Return the state, epochs and result of a trial."""
     result, numbers = study.results.get(trial.number), numbers_of(study, trial)
     if result is not None:
         epochs = "" if result.epochs is None else str(result.epochs)
@@ -82,7 +82,7 @@ def _outcome(study: Study, trial: Trial) -> tuple[str, str, str]:
 
 
 def numbers_of(study: Study, trial: Trial) -> dict[int, float]:
-    """Return the numbers that are compared of a trial by epoch, as far as there are any."""
+    """Return the numbers to compare of a trial, by epoch; empty if there are none yet."""
     try:
         series = read_scalars(study.folder_of(trial))
     except SessionError:
@@ -91,18 +91,18 @@ def numbers_of(study: Study, trial: Trial) -> dict[int, float]:
 
 
 def record_curves(study: Study, reference: str) -> Sequence[str]:
-    """Give the numbers of all trials that they record each epoch to a visualizer, as one run.
+    """Send all numbers that the trials recorded each epoch to a visualizer, as one run.
 
     Args:
         study: The study.
         reference: The visualizer, for example ``rerun``.
 
     Returns:
-        What the visualizer says that it left.
+        Where the visualizer put its output.
 
     Raises:
         PhysxError: If there is no such visualizer, or it cannot start.
-        StudyError: If no trial has recorded any number.
+        StudyError: If no trial has recorded a number yet.
     """
     curves: dict[int, dict[str, float]] = {}
     for _, trial in sorted(study.trials.items()):
@@ -128,7 +128,7 @@ def record_curves(study: Study, reference: str) -> Sequence[str]:
 
 
 def draw_figure(study: Study, path: Path) -> None:
-    """Draw the results of the trials in turn, and over the values of each parameter.
+    """Plot the results of the trials in order, and over the values of each parameter.
 
     Args:
         study: The study.

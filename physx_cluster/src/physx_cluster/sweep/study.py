@@ -1,4 +1,4 @@
-"""Study: the folder of a sweep, with a session for each trial and the table of their results."""
+"""Study: the folder of a sweep, with a session for each trial and a table of their results."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ _LOCK = "study.lock"
 
 @dataclass(frozen=True)
 class Best:
-    """The setting with the best result, the mean over its seeds.
+    """The setting with the best result, averaged over its seeds.
 
     Attributes:
-        trials: Its trials.
+        trials: The setting's trials.
         value: The mean.
     """
 
@@ -40,20 +40,20 @@ class Best:
 
 
 class Study(Closeable):
-    """The folder of a study: ``study.toml``, ``trials.csv``, and the session of each trial.
+    """The folder of a study: ``study.toml``, ``trials.csv``, and a session for each trial.
 
-    The table has a row for each trial with a result, by number. It depends on the definition alone:
-    not on the number of processes, nor on what was killed, nor on time.
+    The table has one row for each trial with a result, ordered by number. It depends only on the
+    definition, not on the number of processes, on what was killed, or on timing.
 
     Attributes:
         folder: The folder.
-        definition: What the study is made of.
-        trials: The trials that were chosen so far, by number.
-        results: The results that there are, by the number of the trial.
+        definition: The definition of the study.
+        trials: The trials chosen so far, by number.
+        results: The results so far, by trial number.
     """
 
     def __init__(self, folder: Path, definition: Definition) -> None:
-        """Read the trials and results of a folder, which need not exist.
+        """Read the trials and results in a folder, which need not exist.
 
         Raises:
             StudyError: If a file is damaged.
@@ -71,24 +71,24 @@ class Study(Closeable):
 
     @classmethod
     def read(cls, folder: Path) -> Self:
-        """Read a study's folder, of a sweep that runs, too.
+        """Read a study's folder, even while its sweep is running.
 
         Raises:
-            StudyError: If there is no study, or a file of it is damaged.
+            StudyError: If there is no study, or one of its files is damaged.
         """
         if not (folder / STUDY).is_file():
             raise StudyError(
-                f"There is no study in {folder}, as it has no {STUDY}. Make one: physx sweep FILE"
+                f"There is no study in {folder}: {STUDY} is missing. Create one: physx sweep FILE"
             )
         return cls(folder, Definition.read(folder / STUDY, folder.resolve().name, builds=False))
 
     @classmethod
     def open(cls, folder: Path, definition: Definition) -> Self:
-        """Begin a study, or continue the one in the folder; no other process may write to it.
+        """Create a study, or resume the one in the folder; no other process can write to it.
 
         Raises:
-            StudyError: If another sweep writes to it, or the definition differs from that of the
-                trials that are there such that their results would.
+            StudyError: If another sweep is writing to it, or its definition differs in a way that
+                changes results.
             ConfigError: If the sampler or the pruner cannot be used.
         """
         options = definition.study
@@ -98,20 +98,18 @@ class Study(Closeable):
             files.make_folder(folder)
             lock = files.try_lock(folder / _LOCK)
         except OSError as error:
-            raise StudyError(
-                f"The study {folder} cannot be written to: {error.strerror}."
-            ) from None
+            raise StudyError(f"Cannot write to the study {folder}: {error.strerror}.") from None
         if lock is None:
-            raise StudyError(f"Another sweep writes to {folder}: wait for it, or end it.")
+            raise StudyError(f"Another sweep is writing to {folder}: wait for it, or stop it.")
         try:
             former = folder / STUDY
             if former.exists():
                 change = definition.find_change(read_toml(former))
                 if change:
                     raise StudyError(
-                        f"{folder} holds a study of another definition: {change}. Give the same, "
-                        "or another folder (--study). Only study.trials may grow, and [run] may "
-                        "change."
+                        f"{folder} holds a study with another definition: {change}. Use the same "
+                        "one, or another folder (--study). Only study.trials may grow, and [run] "
+                        "may change."
                     )
             files.replace(former, tomli_w.dumps(definition.plain).encode())
             study = cls(folder, definition)
@@ -123,28 +121,28 @@ class Study(Closeable):
         return study
 
     def close(self) -> None:
-        """Let other processes write to it."""
+        """Allow other processes to write to it."""
         if self._lock is not None:
             files.close(self._lock)
             self._lock = None
 
     def folder_of(self, trial: Trial) -> Path:
-        """Return the session's folder of a trial."""
+        """Return the folder of a trial's session."""
         return self.folder / trial.name
 
     def prepare(self, trial: Trial) -> None:
-        """Make the session's folder of a trial, with what it is to do.
+        """Create the folder of a trial's session, with its setting and tables.
 
         Raises:
-            StudyError: If another trial was planned in its place.
+            StudyError: If the folder contains another trial.
         """
         folder = self.folder_of(trial)
         former = self.trials.get(trial.number)
         if former is not None and former != trial:
             raise StudyError(
-                f"{folder} holds another trial than the one that is its turn: {former.values}, not "
-                f"{trial.values}. Its results were changed, or Optuna is of another version: "
-                "continue with the former version, or begin another study (--study)."
+                f"{folder} does not contain the trial that is next: it has {former.values}, not "
+                f"{trial.values}. Its results were changed, or Optuna's version is different: "
+                "use the former version, or start another study (--study)."
             )
         files.make_folder(folder)
         tables = self.definition.pipelines[trial.pipeline].with_setting(trial.values, trial.seed)
@@ -154,7 +152,7 @@ class Study(Closeable):
         self.trials[trial.number] = trial
 
     def take_result(self, trial: Trial) -> Result | None:
-        """Return the result of a trial, and add it to the table; None if there is none yet."""
+        """Return the result of a trial and add it to the table; None if there is none yet."""
         if trial.number not in self.results:
             result = Result.read(self.folder_of(trial))
             if result is None:
@@ -164,7 +162,11 @@ class Study(Closeable):
         return self.results[trial.number]
 
     def write_table(self) -> None:
-        """Write ``trials.csv``, all or nothing."""
+        """Write ``trials.csv`` atomically.
+
+        Raises:
+            StudyError: If it cannot be written.
+        """
         text = io.StringIO(newline="")
         writer = csv.writer(text, lineterminator="\n")
         columns = self.definition.columns
@@ -181,12 +183,12 @@ class Study(Closeable):
             files.replace(self.folder / TABLE, text.getvalue().encode())
         except OSError as error:
             raise StudyError(
-                f"{self.folder / TABLE} cannot be written: {error.strerror}. The results are kept "
-                "in the trials' folders: the same command continues."
+                f"Cannot write {self.folder / TABLE}: {error.strerror}. The results are kept in "
+                "the trials' folders; the same command resumes the sweep."
             ) from None
 
     def best(self) -> Best | None:
-        """Return the setting with the best result; None if none is complete with all seeds."""
+        """Return the setting with the best result; None if none is complete for all seeds."""
         groups: dict[tuple[str, int], list[Trial]] = {}
         for trial in self.trials.values():
             groups.setdefault((trial.pipeline, trial.setting), []).append(trial)
@@ -200,7 +202,7 @@ class Study(Closeable):
         return min(sound, key=lambda each: self.definition.sign * each.value, default=None)
 
     def is_running(self, trial: Trial) -> bool:
-        """Return whether a process works on a trial."""
+        """Return whether a process is working on a trial."""
         path = self.folder_of(trial) / LOCK
         if not path.exists():
             return False
@@ -211,10 +213,10 @@ class Study(Closeable):
 
 
 def read_trial(folder: Path) -> tuple[Trial, Mapping[str, Mapping[str, Any]]]:
-    """Return the trial of a folder, and the tables of its pipelines.
+    """Return the trial of a folder and the tables of its pipelines.
 
     Raises:
-        StudyError: If the folder has none, or it is damaged.
+        StudyError: If the folder contains no trial, or its file is damaged.
     """
     try:
         plain = read_toml(folder / TRIAL)
@@ -227,9 +229,9 @@ def read_trial(folder: Path) -> tuple[Trial, Mapping[str, Mapping[str, Any]]]:
 
 
 def earlier_results(folder: Path, trial: Trial) -> Iterator[Result | None]:
-    """Yield the results of the trials of a trial's pipeline before it, in their order.
+    """Yield the results of earlier trials of the same pipeline, in order.
 
-    Those of its own batch, whose results may or may not be there, are None.
+    Trials of the trial's own batch, which may or may not have results yet, yield None.
 
     Args:
         folder: The study's folder.
@@ -242,12 +244,12 @@ def earlier_results(folder: Path, trial: Trial) -> Iterator[Result | None]:
 
 
 def is_study(folder: Path) -> bool:
-    """Return whether a folder is that of a study."""
+    """Return whether a folder contains a study."""
     return (folder / STUDY).is_file()
 
 
 def _text(value: Any) -> str:
-    """Return a value of a parameter as the table has it; empty if the pipeline has no such one."""
+    """Format a parameter's value for the table; empty if the pipeline does not have it."""
     if value is None:
         return ""
     return value if isinstance(value, str) else json.dumps(value)

@@ -1,7 +1,7 @@
 """The process of a trial: ``python -m physx_cluster.sweep.trial FOLDER``.
 
-It continues where an earlier one ended, however that ended, and comes to the same result. Numbers
-that are compared come from ``stats/scalars.csv``, so that they do not depend on who computed them.
+It resumes where an earlier process ended, however that ended, and reaches the same result. The
+numbers to compare are read from ``stats/scalars.csv``, so they do not depend on who computed them.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ from physx_core.errors import (
 from physx_core.processes import raised_at_sigterm
 
 GENERATED = "generated"
-"""File that says that the trial's data generation is complete."""
+"""File that marks the trial's data generation as complete."""
 P = TypeVar("P", bound=DataGeneration | Training)
 Tables = Mapping[str, Mapping[str, Any]]
 
@@ -64,23 +64,23 @@ _OF_STUDY = (
     StudyError, MissingLibraryError, PluginError, PluginNotFoundError, ComponentNotFoundError,
     ReferenceFormError, DatasetNotFoundError,
 )  # fmt: skip
-"""Errors that each trial would end by: they are no result, and do not go away by themselves."""
+"""Errors that would end every trial: they are not results, and do not go away by themselves."""
 _OF_DISK = (DatasetError, SessionError, CheckpointError)
-"""Errors that are no result, either, but may go away."""
+"""Errors that are not results either, but may go away."""
 _FINAL = (ConfigError, UsageError, DivergedError, FieldsMismatchError)
 """Errors that do not go away by themselves."""
 _OF_SYSTEM = (
     errno.ENOSPC, errno.EDQUOT, errno.EFBIG, errno.EIO, errno.EROFS, errno.ENOMEM, errno.EMFILE,
     errno.ENFILE, errno.ESTALE, errno.EACCES, errno.EPERM,
 )  # fmt: skip
-"""Error numbers of a machine or a disk that fails."""
+"""Error numbers of a failing machine or disk."""
 _EVERY_EPOCH = "loss/training"
 _PATIENCE = 0.2
-"""Time in s between two looks whether another process still works on the trial."""
+"""Time in s between checks whether another process is still working on the trial."""
 
 
 class _CannotResumeError(Exception):
-    """A training cannot be resumed, and starts over."""
+    """A training cannot be resumed and starts over."""
 
 
 class TrialTraining(Training):
@@ -88,7 +88,7 @@ class TrialTraining(Training):
 
     Attributes:
         options: What the study compares.
-        pruning: Decides after each epoch; None: it runs to its end.
+        pruning: Decides after each epoch; None: the training runs to its end.
         is_pruned: Whether the pruner has ended it.
     """
 
@@ -97,7 +97,7 @@ class TrialTraining(Training):
     is_pruned = False
 
     def train_begin(self) -> None:
-        """Check that the numbers of all epochs before are there: a power cut may have lost some."""
+        """Check that the numbers of all earlier epochs exist; a power cut may have lost some."""
         super().train_begin()
         if self.epoch_id:
             known = read_scalars(self.session.path).get(("epoch", _EVERY_EPOCH), {})
@@ -105,13 +105,13 @@ class TrialTraining(Training):
                 raise _CannotResumeError("numbers of earlier epochs are lost")
 
     def epoch_condition(self) -> bool:
-        """Return whether there are epochs left, and neither patience nor the pruner ended it."""
+        """Return whether epochs are left and neither patience nor the pruner has ended it."""
         if self.pruning is not None and self.epoch_id and not self.is_pruned:
             self.is_pruned = self.pruning.decide(self.numbers())
         return super().epoch_condition() and not self.is_pruned
 
     def numbers(self) -> dict[int, float]:
-        """Return the numbers that are compared, by epoch.
+        """Return the numbers to compare, by epoch.
 
         Raises:
             StudyError: If the training does not record them.
@@ -121,14 +121,14 @@ class TrialTraining(Training):
         if found is None:
             names = [name for timeline, name in series if timeline == "epoch"]
             raise StudyError(
-                f'The trainings do not record "{self.options.result}", which is to be compared '
-                f"(study.result).{nearest(self.options.result, names)} Each epoch they record: "
+                f'The trainings do not record "{self.options.result}", the number to compare '
+                f"(study.result).{nearest(self.options.result, names)} Each epoch, they record: "
                 f"{listed(names)}."
             )
         return {epoch: found[epoch] for epoch in sorted(found) if epoch <= self.epoch_id}
 
     def result(self) -> Result:
-        """Return what it has come to."""
+        """Return the trial's result."""
         numbers = self.numbers()
         state = PRUNED if self.is_pruned else COMPLETE
         rungs = self.pruning.rungs if self.pruning is not None else {}
@@ -140,16 +140,16 @@ class TrialTraining(Training):
 
 
 def run_trial(folder: Path) -> None:
-    """Run a trial, or continue it; its result, or what it failed by, is then in its folder.
+    """Run or resume a trial; its folder then contains its result or its error.
 
     Args:
         folder: The trial's session.
 
     Raises:
-        SystemExit: After SIGTERM, with status 143; a checkpoint is then written.
+        SystemExit: After SIGTERM, with status 143, once a checkpoint is written.
     """
     lock = files.try_lock(folder / LOCK)
-    while lock is None:  # a process of a sweep that was killed is about to end
+    while lock is None:  # a process of a killed sweep is about to end
         time.sleep(_PATIENCE)
         lock = files.try_lock(folder / LOCK)
     try:
@@ -173,7 +173,7 @@ def _attempt(folder: Path) -> None:
 
 
 def _generate(folder: Path, tables: Tables) -> None:
-    """Generate the data of a trial that has its own; one that was cut short begins anew."""
+    """Generate the data of a trial that has its own; an interrupted generation starts over."""
     if "data_generation" in tables and not (folder / GENERATED).exists():
         _start_over(folder)
         _build("data_generation", tables, DataGeneration, folder).execute()
@@ -191,7 +191,7 @@ def _train(folder: Path, trial: Trial, tables: Tables, options: StudyOptions) ->
     if generates or "data_generation" not in tables:
         _start_over(folder)
         _generate(folder, tables)
-    else:  # the data stay
+    else:  # keep the data
         files.remove_folder(folder / "network")
         files.remove_folder(folder / "stats")
     return _run_training(folder, trial, tables, options, resume=False)
@@ -218,7 +218,7 @@ def _run_training(
 
 
 def _build(kind: str, tables: Tables, make: type[P], folder: Path, **given: Any) -> P:
-    """Return a pipeline in the trial's session, which keeps a checkpoint after each epoch."""
+    """Return a pipeline in the trial's session, which saves a checkpoint after each epoch."""
     table = {**tables[kind], "session_dir": str(folder.parent), "session_name": folder.name}
     writes = table.get("network", {}).get("save_each_epoch", False)
     if kind == "training" and not writes and not table.get("checkpoint_every"):
@@ -227,14 +227,14 @@ def _build(kind: str, tables: Tables, make: type[P], folder: Path, **given: Any)
 
 
 def _start_over(folder: Path) -> None:
-    """Remove all that earlier processes have left of a trial."""
+    """Remove everything that earlier processes left of a trial."""
     for path in folder.iterdir():
         if path.name not in _KEPT:
             (files.remove_folder if path.is_dir() else files.remove)(path)
 
 
 def describe(error: Exception) -> Failure:
-    """Return what is known of an error that ended an attempt at a trial."""
+    """Classify an error that ended an attempt at a trial."""
     system = any(map(_is_of_system, _chain(error)))
     is_ours = isinstance(error, _OF_DISK) and not isinstance(error, FieldsMismatchError)
     is_result = not system and not is_ours and not isinstance(error, _OF_STUDY)
@@ -243,7 +243,7 @@ def describe(error: Exception) -> Failure:
 
 
 def _chain(error: BaseException) -> Iterator[BaseException]:
-    """Yield an error and those that it came from."""
+    """Yield an error and its causes."""
     following: BaseException | None = error
     while following is not None:
         yield following
@@ -258,7 +258,7 @@ def _is_of_system(error: BaseException) -> bool:
 
 
 def main() -> None:
-    """Run the trial of the folder that the command line names, in the sweep's working directory."""
+    """Run the trial named on the command line, in the sweep's working directory."""
     folder, place = map(Path, sys.argv[1:])
     os.chdir(place)
     with raised_at_sigterm():

@@ -1,1 +1,1 @@
-"""Buffers: which rows the batches of a training hold while environments generate them."""
+"""Buffers: which rows training batches hold while environments generate them."""

@@ -1,4 +1,4 @@
-"""Fifo: each row the same number of times, in random order."""
+"""Fifo: uses each row the same number of times, in random order."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from physx_core.typing import Index
 class Fifo(MixingBuffer):
     """Draws each row exactly ``views`` times; after its last use it makes room for another.
 
-    Batches are drawn at random from the rows that wait: a shuffle buffer. With more than one view
+    Batches are drawn at random from the waiting rows: a shuffle buffer. With more than one view,
     rows wait for different numbers of uses, so there are slots for ``views`` times ``watermark``
     rows.
     """
@@ -25,7 +25,7 @@ class Fifo(MixingBuffer):
 
     @property
     def most_waiting(self) -> int:
-        """Number of rows for which there must be a slot, if each waits for its last use."""
+        """Number of rows that need a slot if each waits for its last use."""
         return self.watermark * self.views
 
     def begin(self, batch_size: int, batch_nb: int, seed: int) -> None:
@@ -45,7 +45,7 @@ class Fifo(MixingBuffer):
 
     @property
     def kept(self) -> Index:
-        """Numbers of the rows that wait: see `Buffer.kept`."""
+        """Numbers of the waiting rows: see `Buffer.kept`."""
         return self.rows[self._waiting()]
 
     def place(self, count: int, random: np.random.Generator) -> Index:
@@ -57,7 +57,7 @@ class Fifo(MixingBuffer):
         return np.array(slots)
 
     def draw(self, random: np.random.Generator) -> Index:
-        """Return slots of waiting rows, different ones if there are enough."""
+        """Return slots of waiting rows, distinct ones if there are enough."""
         drawn = self.pick(self.batch_size, random)
         if not len(drawn):
             waiting = self._waiting()
@@ -69,7 +69,7 @@ class Fifo(MixingBuffer):
         return drawn
 
     def is_allowed(self, slots: Index | slice) -> Mask:
-        """Return which of some slots have a waiting row."""
+        """Return which of the given slots hold a waiting row."""
         return (self.rows[slots] >= 0) & (self.uses[slots] < self.views)
 
     def _waiting(self) -> Index:

@@ -1,4 +1,4 @@
-"""MixingBuffer: what the buffers share that draw each batch from many rows."""
+"""MixingBuffer: base of the buffers that draw each batch from many rows."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class MixingBuffer(Buffer):
     """Waits for ``watermark`` rows, then for one row per ``views`` rows of the batches.
 
     So rows are used ``views`` times on average. The environments generate as many rows as the
-    batches of the whole run need: the last batches are drawn while no more rows arrive.
+    batches of the whole run need: the last batches are drawn when no more rows arrive.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class MixingBuffer(Buffer):
         if self.watermark < batch_size:
             raise ConfigError(
                 f"{name}: watermark is {self.watermark} but must be at least the batch size, "
-                f"{batch_size}, so that a batch holds different rows."
+                f"{batch_size}, so that a batch holds distinct rows."
             )
         if most > self.capacity:
             raise ConfigError(
@@ -70,7 +70,7 @@ class MixingBuffer(Buffer):
 
     @property
     def most_waiting(self) -> int:
-        """Number of rows for which there must be a slot."""
+        """Number of rows that need a slot."""
         return self.watermark
 
     @property
@@ -83,17 +83,17 @@ class MixingBuffer(Buffer):
         return min(self._total, self.watermark + batch * self.batch_size // self.views)
 
     def draw(self, random: np.random.Generator) -> Index:
-        """Return different slots of rows, each with the same probability."""
+        """Return distinct slots of rows, each with the same probability."""
         return random.choice(self.held, self.batch_size, replace=False)
 
     def is_allowed(self, slots: Index | slice) -> Mask:
-        """Return which of some slots `pick` may return."""
+        """Return which of the given slots `pick` may return."""
         return self.rows[slots] >= 0
 
     def pick(self, count: int, random: np.random.Generator) -> Index:
-        """Return different slots of those allowed, each with the same probability.
+        """Return distinct allowed slots, each with the same probability.
 
-        A few candidates are enough unless few slots are allowed; then all are looked at. The result
+        A few candidates are enough unless few slots are allowed; then all are checked. The result
         is empty if fewer than `count` are allowed.
         """
         candidates = random.integers(0, self.capacity, 4 * count)

@@ -9,23 +9,23 @@ from physx_core.typing import Index
 
 
 class Reservoir(MixingBuffer):
-    """Once it is full, a new row replaces a random one of those that were used before.
+    """Once it is full, a new row replaces a random one of those already used.
 
-    So every row is used at least once while rows arrive, and the rows that are kept are of all
-    ages, newer ones more than older ones. Batches are drawn from all of them alike.
+    So every row is used at least once while rows arrive, and the kept rows are of all ages, with
+    more newer than older ones. Batches are drawn uniformly from all of them.
     """
 
     def place(self, count: int, random: np.random.Generator) -> Index:
-        """Return empty slots, then random ones of used rows: see `Buffer.place`."""
+        """Return empty slots, then random slots of used rows: see `Buffer.place`."""
         empty = np.arange(self.held, min(self.held + count, self.capacity))
         count -= len(empty)
         if not count:
             return empty
         picked = self.pick(count, random)
-        if len(picked) < count:  # the run was made longer, and many rows arrive at once
+        if len(picked) < count:  # the run was extended, and many rows arrive at once
             picked = random.choice(self.capacity, count, replace=False)
         return np.concatenate([empty, picked])
 
     def is_allowed(self, slots: Index | slice) -> Mask:
-        """Return which of some slots have a used row."""
+        """Return which of the given slots hold a used row."""
         return self.uses[slots] > 0

@@ -1,4 +1,4 @@
-"""Stream: each row once, in the order of its arrival."""
+"""Stream: uses each row once, in order of arrival."""
 
 from __future__ import annotations
 

@@ -9,7 +9,7 @@ from physx_core.typing import Index
 
 
 class Window(MixingBuffer):
-    """Keeps the newest ``capacity`` rows, and draws from all of them alike."""
+    """Keeps the newest ``capacity`` rows, and draws uniformly from them."""
 
     def place(self, count: int, random: np.random.Generator) -> Index:
         """Return the slots of the oldest rows: see `Buffer.place`."""

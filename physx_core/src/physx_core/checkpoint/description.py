@@ -20,10 +20,10 @@ NAME = "network"
 BEST = "best"
 DESCRIPTION = "checkpoint.toml"
 BUFFER = "buffer.bin"
-"""File with the state of the buffer that draws the batches: whole numbers of 8 bytes."""
+"""File with the state of the buffer that draws the batches: 8-byte integers."""
 WHOLE = np.dtype("<i8")
 SAMPLER = "sampler.bin"
-"""File with the state of the sampler that learns from the training: numbers of 8 bytes."""
+"""File with the state of the sampler that learns from the training: 8-byte floats."""
 REAL = np.dtype("<f8")
 KEPT = (
     "network",
@@ -35,7 +35,7 @@ KEPT = (
 LARGEST = 2**28
 END = '\n[checksum]\ncrc32 = "{:08x}"\n'
 NUMBER = "(0|[1-9][0-9]*)"
-ADVICE = "Restore it from a copy, or use another checkpoint."
+ADVICE = "Restore it from a backup, or use another checkpoint."
 
 
 @dataclass(frozen=True)
@@ -72,8 +72,7 @@ class Checkpoint:
         normalization: Their normalization by name; empty if nothing was normalized.
         progress: Progress of the training.
         crc: CRC-32 of the description.
-        notice: Which later checkpoints it stands in for, and why; empty if it is what was asked
-            for.
+        notice: Which later checkpoints it replaces, and why; empty if it is the requested one.
     """
 
     path: Path
@@ -86,7 +85,7 @@ class Checkpoint:
 
 
 class UnreadableError(Exception):
-    """A checkpoint cannot be read, for the given reason, which is a sentence without its end."""
+    """A checkpoint cannot be read, for the given reason: a sentence without its final period."""
 
     def __init__(self, reason: str, advice: str = ADVICE) -> None:
         super().__init__(reason)
@@ -94,17 +93,17 @@ class UnreadableError(Exception):
 
 
 def partial_path(path: Path) -> Path:
-    """Return where a checkpoint is while it is written or removed."""
+    """Return the folder of a checkpoint while it is being written or removed."""
     return path.parent / f".{path.name}.partial"
 
 
 def former_path(path: Path) -> Path:
-    """Return where a checkpoint is while another one takes its name."""
+    """Return the folder of a checkpoint while another one takes its name."""
     return path.parent / f".{path.name}.former"
 
 
 def measure(path: Path) -> dict[str, Any]:
-    """Return the size and the checksum of a file, as they are described."""
+    """Return the size and checksum of a file, in the form used by descriptions."""
     nbytes = crc = 0
     for block in files.read_blocks(path):
         nbytes, crc = nbytes + len(block), crc32(block, crc)

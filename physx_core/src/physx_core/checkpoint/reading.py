@@ -1,4 +1,4 @@
-"""Finds checkpoints, checks that they are as they were written, and reads them."""
+"""Finds checkpoints, checks that they are unchanged, and reads them."""
 
 from __future__ import annotations
 
@@ -47,7 +47,7 @@ _INVALID = (
     ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError, MemoryError,
     PhysxError,
 )  # fmt: skip
-"""What parsing raises for text that does not describe a checkpoint."""
+"""Exceptions raised when parsing text that does not describe a checkpoint."""
 
 
 def list_numbers(network_dir: Path, name: str) -> list[int]:
@@ -60,7 +60,7 @@ def list_numbers(network_dir: Path, name: str) -> list[int]:
 
 
 def list_within_epochs(network_dir: Path, name: str) -> list[Path]:
-    """Return the folders of the checkpoints that were written within epochs, by number."""
+    """Return the folders of the checkpoints written within epochs, by number."""
     found = []
     for number in list_numbers(network_dir, name):
         path = network_dir / f"{name}_{number}"
@@ -82,14 +82,14 @@ def list_all(network_dir: Path) -> list[Path]:
 
 
 def find(place: Path, name: str | None, which: int | str) -> Checkpoint:
-    """Return the description of a checkpoint, all of whose files are intact.
+    """Return the description of a checkpoint whose files are all intact.
 
-    If the last one is asked for and cannot be read, the last one that can be is returned, with a
-    warning that says why.
+    If the last one is requested but cannot be read, the last readable one is returned, with a
+    warning that explains why.
 
     Args:
         place: A session's folder, its network folder, or a checkpoint's own folder.
-        name: Name of the network; None: the only one there, or else ``"network"``.
+        name: Name of the network; None: the only one there, otherwise ``"network"``.
         which: Number of the checkpoint; -1: the last; ``"best"``: the one with the smallest loss.
 
     Raises:
@@ -115,13 +115,13 @@ def find(place: Path, name: str | None, which: int | str) -> Checkpoint:
     wanted = f"{name}_<number>" if which == -1 else path.name
     if not list_all(folder):
         raise CheckpointError(
-            f"There is no network in {folder}: name the session of a training (physx train)."
+            f"There is no network in {folder}: name a training's session (physx train)."
         )
-    raise CheckpointError(f'There is no checkpoint "{wanted}" in {folder}. There are: {others}.')
+    raise CheckpointError(f'There is no checkpoint "{wanted}" in {folder}. Available: {others}.')
 
 
 def _find_last(folder: Path, name: str, numbers: list[int]) -> Checkpoint:
-    """Return the last readable checkpoint and warn of those that are not."""
+    """Return the last readable checkpoint, and warn about later ones that are unreadable."""
     problems = []
     for number in reversed(numbers):
         path = folder / f"{name}_{number}"
@@ -133,16 +133,16 @@ def _find_last(folder: Path, name: str, numbers: list[int]) -> Checkpoint:
         if not problems:
             return found
         lines = "\n  ".join(problems)
-        notice = f"{path} is used, because later checkpoints cannot be read:\n  {lines}"
+        notice = f"Using {path}, because later checkpoints cannot be read:\n  {lines}"
         warnings.warn(notice, stacklevel=4)
         return dataclasses.replace(found, notice=notice)
     lines = "\n  ".join(problems)
     best = ""
     if (folder / f"{name}_{BEST}").is_dir():
-        best = f' or try {name}_{BEST} (which_network="{BEST}"), from which none can be resumed,'
+        best = f' or use {name}_{BEST} (which_network="{BEST}"), which cannot be resumed,'
     raise CheckpointError(
         f"None of the checkpoints in {folder} can be read:\n  {lines}\n"
-        f"Restore one from a copy,{best} or train again."
+        f"Restore one from a backup,{best} or train again."
     )
 
 
@@ -154,11 +154,11 @@ def read(path: Path, *, content: bool = True) -> Checkpoint:
         content: Whether to check every byte of its files, not only their sizes.
 
     Raises:
-        CheckpointError: If a file of it is missing or damaged, or it is of a later format.
+        CheckpointError: If one of its files is missing or damaged, or its format is too new.
     """
     former = former_path(path)
     problem = UnreadableError(f"there is no {DESCRIPTION}")
-    for place in (path, former, path):  # while it is replaced it moves from one to the other
+    for place in (path, former, path):  # it moves between them while it is being replaced
         if place is former and (path.is_dir() or not former.is_dir()):
             continue
         try:
@@ -173,7 +173,7 @@ def read_buffer(found: Checkpoint) -> Index:
     """Return the state of the buffer that draws a training's batches, from its checkpoint.
 
     Raises:
-        CheckpointError: If the checkpoint has none, or was replaced meanwhile.
+        CheckpointError: If the checkpoint has none, or was replaced in the meantime.
     """
     return np.frombuffer(_read_numbers(found, BUFFER), WHOLE).astype(np.int64)
 
@@ -182,7 +182,7 @@ def read_sampler(found: Checkpoint) -> Array:
     """Return the state of the sampler that learns from a training, from its checkpoint.
 
     Raises:
-        CheckpointError: If the checkpoint has none, or was replaced meanwhile.
+        CheckpointError: If the checkpoint has none, or was replaced in the meantime.
     """
     return np.frombuffer(_read_numbers(found, SAMPLER), REAL).astype(np.float64)
 
@@ -210,7 +210,7 @@ def check_unchanged(found: Checkpoint) -> None:
     except OSError:
         content = b""
     if crc32(content) != found.crc:
-        raise CheckpointError(f"{found.path} was replaced while it was read. Try again.")
+        raise CheckpointError(f"{found.path} was replaced while it was being read. Try again.")
 
 
 def _read(path: Path, *, content: bool = True) -> Checkpoint:
@@ -236,12 +236,14 @@ def _read(path: Path, *, content: bool = True) -> Checkpoint:
     except _INVALID as error:
         reason = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
         size = f" ({len(text)} bytes)"
-        raise UnreadableError(f"{DESCRIPTION}{size} describes no checkpoint: {reason}") from error
+        raise UnreadableError(
+            f"{DESCRIPTION}{size} does not describe a checkpoint: {reason}"
+        ) from error
     return found
 
 
 def _parse(content: bytes) -> dict[str, Any]:
-    """Return the content of a description that is as it was written."""
+    """Return the content of a description after checking that it is unchanged."""
     plain = parse_toml(content)
     version, checksum = plain["format_version"], plain.get("checksum")
     if type(version) is not int:
@@ -253,7 +255,7 @@ def _parse(content: bytes) -> dict[str, Any]:
         is_whole = end is not None and int(end[1], 16) == crc32(content[: end.start()])
         if not is_whole and checksum != {"crc32": _EDITED}:
             raise UnreadableError(
-                f"{DESCRIPTION} was damaged, cut or edited by hand: its checksum does not match",
+                f"{DESCRIPTION} was damaged, cut, or edited by hand: its checksum does not match",
                 f'{ADVICE} If it was edited on purpose, put crc32 = "{_EDITED}" under '
                 "[checksum] at its end.",
             )
@@ -264,13 +266,13 @@ def _parse(content: bytes) -> dict[str, Any]:
 
 def _later(version: int) -> UnreadableError:
     return UnreadableError(
-        f"it has version {version} of the format, but this physx reads up to {FORMAT_VERSION}",
+        f"it has format version {version}, but this physx reads versions up to {FORMAT_VERSION}",
         install_hint("physx-core", update=True),
     )
 
 
 def _check_file(path: Path, name: str, written: Mapping[str, Any], content: bool) -> None:
-    """Check that a file beside the description is as it was written."""
+    """Check that a file listed in the description is unchanged."""
     if Path(name).name != name:
         raise ValueError(f"{name!r} is not the name of a file")
     try:

@@ -1,4 +1,4 @@
-"""Writes checkpoints, which are whole or not there whatever happens meanwhile."""
+"""Writes checkpoints so that each is complete or does not exist, whatever happens."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ def save(
 ) -> Path:
     """Write the next checkpoint ``<network_name>_<number>`` and return its folder.
 
-    It appears under its name only when it is complete, and is on the disk when this returns.
+    It gets its name only when it is complete, and is on the disk when this returns.
 
     Args:
         network_dir: Folder of the checkpoints; it is created in the session's folder.
@@ -69,13 +69,13 @@ def save(
         fields: The dataset's fields.
         normalization: Normalization of the transformation.
         progress: Progress of the training.
-        buffer: State of the buffer that draws its batches, if there is one.
-        sampler: State of the sampler that learns from it, if there is one.
-        best: Replace ``<network_name>_best``, to predict with or to start from, without the state
-            that a resumed training needs.
+        buffer: State of the buffer that draws the batches, if any.
+        sampler: State of the sampler that learns from the training, if any.
+        best: Replace ``<network_name>_best``, for prediction or as a starting point, without the
+            state that a resumed training needs.
 
     Raises:
-        CheckpointError: If it cannot be stored; the others are intact.
+        CheckpointError: If it cannot be stored; the other checkpoints stay intact.
         SessionError: If the session's folder was deleted.
     """
     name = config.network_name or NAME
@@ -87,7 +87,7 @@ def save(
         check_session(network_dir)
         if not network_dir.is_dir():
             files.make_folder(network_dir)
-        elif not numbers and not path.is_dir():  # whoever made it may not have waited for the disk
+        elif not numbers and not path.is_dir():  # its creator may not have waited for the disk
             files.sync_folder(network_dir.parent)
         _clear(network_dir, name)
         if best:
@@ -110,7 +110,7 @@ def save(
 
 
 def _not_stored(path: Path, cause: OSError, others: Sequence[str]) -> PhysxError:
-    """Return the error of a checkpoint that could not be stored."""
+    """Return the error for a checkpoint that could not be stored."""
     safe = f"The checkpoints {listed(others)}" if others else "The session's samples"
     what, advice = f"Checkpoint {path}", "resume the training"
     return files.storage_error(what, cause, safe, CheckpointError, advice)
@@ -144,7 +144,7 @@ def _write(
     buffer: Index | None = None,
     sampler: Array | None = None,
 ) -> None:
-    """Write the files of a checkpoint to a new folder, and wait until they are on the disk."""
+    """Write a checkpoint's files to a new folder, and wait until they are on the disk."""
     files.create_folder(partial, sync=False)
     network.save_parameters(partial / network.parameters_file)
     described = _describe_files(partial)
@@ -163,15 +163,15 @@ def _write(
 
 
 def rehearse(place: Path, network: Network, optimization: Optimization) -> None:
-    """Check that a network and its optimization can be saved, in a folder that is then removed.
+    """Check that a network and its optimization can be saved, using a temporary folder.
 
     Args:
-        place: Folder to make that folder in.
+        place: Parent of the temporary folder.
         network: The network.
         optimization: The optimization, after its first step.
 
     Raises:
-        CheckpointError: If they cannot.
+        CheckpointError: If they cannot be saved.
     """
     writers: list[tuple[Any, str, str]] = [(network, "save_parameters", network.parameters_file)]
     if optimization.state_file:
@@ -184,7 +184,7 @@ def rehearse(place: Path, network: Network, optimization: Optimization) -> None:
             except Exception as error:
                 cause = error if isinstance(error, OSError) else error.__cause__
                 if isinstance(cause, OSError) and cause.errno in _FULL:
-                    return  # there may be space when it is needed
+                    return  # there may be space later, when it is needed
                 if isinstance(error, PhysxError):
                     raise
                 raise CheckpointError(
@@ -194,13 +194,13 @@ def rehearse(place: Path, network: Network, optimization: Optimization) -> None:
             if not Path(name, file).is_file():
                 others = listed(path.name for path in Path(name).iterdir())
                 raise CheckpointError(
-                    f"{method} does not write the file whose path it is given, {file}, so the "
+                    f"{method} does not write to the path that it is given, {file}, so the "
                     f"network could not be saved after the training. It writes: {others}."
                 )
 
 
 def remove(path: Path) -> None:
-    """Remove a checkpoint; if that is cut short, it is as one whose writing was.
+    """Remove a checkpoint; if interrupted, it is left like one whose writing was interrupted.
 
     Raises:
         CheckpointError: If it cannot be removed.
@@ -211,26 +211,26 @@ def remove(path: Path) -> None:
         files.remove_folder(hidden)
     except OSError as error:
         raise CheckpointError(
-            f"{path} cannot be removed: {error.strerror or error}. Remove it, and resume the "
+            f"{path} cannot be removed: {error.strerror or error}. Remove it and resume the "
             "training."
         ) from error
 
 
 def check_session(network_dir: Path) -> None:
-    """Check that a session's folder, in which checkpoints are or will be stored, is still there.
+    """Check that a session's folder, in which checkpoints are stored, still exists.
 
     Raises:
-        SessionError: If it is not.
+        SessionError: If it does not.
     """
     if not network_dir.parent.is_dir():
         raise SessionError(
             f"The session's folder {network_dir.parent} is gone: it was deleted or renamed during "
-            "the run. Checkpoints cannot be stored; no new folder is created in its place."
+            "the run. Checkpoints cannot be stored, and no new folder is created in its place."
         )
 
 
 def _clear(network_dir: Path, name: str) -> None:
-    """Remove what a killed process left."""
+    """Remove what a killed process left behind."""
     pattern = re.compile(rf"\.{re.escape(name)}_({NUMBER}|{BEST})\.partial")
     for path in list(network_dir.iterdir()):
         if pattern.fullmatch(path.name):
@@ -250,11 +250,11 @@ def _publish(partial: Path, path: Path) -> None:
 
 
 def _settle(path: Path, *, finish: bool = True) -> None:
-    """Undo or finish a replacement that was cut short.
+    """Undo or finish an interrupted replacement.
 
     Args:
-        path: The checkpoint that was to be replaced.
-        finish: Whether the one moved aside is removed if the new one has its name.
+        path: The checkpoint to be replaced.
+        finish: Whether to remove the one moved aside if the new one already has its name.
     """
     former = former_path(path)
     if not former.is_dir():
@@ -267,7 +267,7 @@ def _settle(path: Path, *, finish: bool = True) -> None:
 
 
 def _describe_files(folder: Path, known: Container[str] = ()) -> dict[str, Any]:
-    """Return the sizes and checksums of files, which the disk begins to write."""
+    """Return the sizes and checksums of files, and start writing them to the disk."""
     found = {}
     for path in sorted(folder.iterdir()):
         if path.name not in known:

@@ -1,8 +1,8 @@
 """The command ``physx``, whose subcommands are entry points that other packages can add.
 
-A package adds a command with an entry point of the group ``physx.commands`` that names a module
-with a function ``run(words)``. The first line of the module's docstring, behind the colon, is its
-summary in ``physx --help``.
+A package adds a command with an entry point in the group ``physx.commands`` that names a module
+with a function ``run(words)``. The first line of the module's docstring, after the colon, is the
+command's summary in ``physx --help``.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""``python -m physx_core.cli`` is the command ``physx``, as ``torchrun -m`` needs it."""
+"""Runs the command ``physx`` for ``python -m physx_core.cli``, as needed by ``torchrun -m``."""
 
 from physx_core.cli import main
 

@@ -11,11 +11,11 @@ from typing import Any
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
 
 _WORDS = re.compile(r"\[[^][{},\s\"'=]+(\s*,\s*[^][{},\s\"'=]+)*\]")
-"""A list of words without brackets, spaces or quotes."""
+"""A list of words without brackets, spaces, or quotes."""
 
 
 def argument_registry() -> ConstructorRegistry:
-    """Return tyro's rules for ``NAME=VALUE ...`` and references; active as a context manager."""
+    """Return tyro's rules for ``NAME=VALUE ...`` and references; a context manager applies them."""
     registry = ConstructorRegistry()
 
     @registry.primitive_rule
@@ -46,18 +46,18 @@ def argument_registry() -> ConstructorRegistry:
 
 
 def _argument(word: str) -> tuple[str, Any]:
-    """Return name and value of ``NAME=VALUE``."""
+    """Return the name and value of ``NAME=VALUE``."""
     name, equals, text = word.partition("=")
     if not equals:
         example = "'layers=[3, 32, 2]'"
-        raise ValueError(f"{word!r} is not NAME=VALUE; quote one that has spaces: {example}")
+        raise ValueError(f"{word!r} is not NAME=VALUE; quote it if it has spaces: {example}")
     return name, _value(text)
 
 
 def _value(text: str) -> Any:
-    """Return a value that is TOML, or JSON, or a list of bare words, or else a string.
+    """Parse a value as TOML, JSON, or a list of bare words; anything else is a string.
 
-    Shells take quotes away: what is typed as ``["a","b"]`` arrives as ``[a,b]``.
+    Shells remove quotes: ``["a","b"]`` arrives as ``[a,b]``.
     """
     with contextlib.suppress(ValueError, RecursionError):  # a TOMLDecodeError is a ValueError
         return tomllib.loads(f"value = {text}")["value"]

@@ -1,4 +1,4 @@
-"""The command ``physx``, whose subcommands are entry points that are imported when used."""
+"""The command ``physx``, whose subcommands are entry points, imported when used."""
 
 from __future__ import annotations
 
@@ -35,15 +35,15 @@ _ORDER = (
     *("export", "import", "export-network", "client", "include", "plugins", "new", "check"),
     "completion",
 )
-"""Order of the core's commands in the overview; others follow by name."""
+"""Order of the core's commands in the overview; others follow alphabetically."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command and return its exit status.
 
     Returns:
-        0; 1 after an error; 130 after Ctrl-C; 143 after SIGTERM, with which a command ends as
-        orderly as with Ctrl-C.
+        0 on success; 1 after an error; 130 after Ctrl-C; 143 after SIGTERM, which ends a command as
+        cleanly as Ctrl-C.
     """
     words = list(sys.argv[1:] if arguments is None else arguments)
     debug = "--debug" in words
@@ -57,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
             sys.stderr.write(printable("".join(traceback.format_exception(error))))
         print(printable(_message(error, debug)), file=sys.stderr)
         return 1
-    except BrokenPipeError:  # the reader has closed the pipe, as in  physx info DIR | head
+    except BrokenPipeError:  # the reader closed the pipe, as in  physx info DIR | head
         os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())
         return 1
     except KeyboardInterrupt as error:
@@ -69,7 +69,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _show_crashes() -> None:
-    """Show where an engine or a plugin crashes."""
+    """Print a traceback if an engine or a plugin crashes."""
     if not faulthandler.is_enabled():
         with contextlib.suppress(io.UnsupportedOperation, AttributeError):  # there is no stderr
             faulthandler.enable()
@@ -77,7 +77,7 @@ def _show_crashes() -> None:
 
 @contextlib.contextmanager
 def _short_warnings() -> Iterator[None]:
-    """Show warnings on one line, without the place in the source that gives them."""
+    """Show warnings on one line, without their source location."""
 
     def show(
         message: Warning | str,
@@ -146,7 +146,7 @@ def _overview() -> str:
 
 
 def _summary(entries: list[EntryPoint]) -> str:
-    """Return the first docstring line of a command's module, which is read but not imported."""
+    """Return the first docstring line of a command's module, without importing it."""
     if len(entries) > 1:
         return f"(broken: {describe_conflict('command', entries)})"
     package, *module = entries[0].value.split(".")
@@ -158,7 +158,7 @@ def _summary(entries: list[EntryPoint]) -> str:
         path = Path(folders[0], *module).with_suffix(".py") if module else Path(spec.origin or "")
         line = path.read_text().lstrip().partition("\n")[0]
     except (ImportError, OSError, IndexError, ValueError) as error:
-        return f"(broken: {error})"  # a broken package breaks its own command only
+        return f"(broken: {error})"  # a broken package breaks only its own command
     return line.partition(": ")[2].rstrip('."') if line.startswith('"""') else ""
 
 
@@ -166,7 +166,7 @@ def _message(error: PhysxError, debug: bool) -> str:
     lines = [f"physx: {type(error).__name__}: {error}", *getattr(error, "__notes__", [])]
     remote = getattr(error, "remote_traceback", "")
     if remote and debug:
-        lines.append(f"Traceback where the environment runs:\n{remote}")
+        lines.append(f"Traceback from the environment's process:\n{remote}")
     elif remote:
         lines.append("(--debug shows the traceback)")
     return "\n".join(lines)

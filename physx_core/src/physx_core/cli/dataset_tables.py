@@ -17,15 +17,15 @@ from physx_core.statistics import Normalization
 from physx_core.typing import Array
 
 _SMALL = 9
-"""Largest number of components that are shown on lines of their own."""
+"""Largest number of components that are shown on separate lines."""
 
 
 def print_dataset(place: Path, *, verify: bool) -> None:
-    """Print origin, fields, trajectories and normalization of each mode, and the integrity.
+    """Print the origin, the fields, trajectories, and normalization of each mode, and integrity.
 
     Args:
         place: A session's or a dataset's folder.
-        verify: Whether every byte is checked, not only sizes and headers.
+        verify: Whether to check every byte, not only sizes and headers.
     """
     with Dataset.open(place) as dataset:
         rows = dataset.describe()
@@ -43,7 +43,7 @@ def print_dataset(place: Path, *, verify: bool) -> None:
 
 
 def size(nbytes: float) -> str:
-    """Return a human-readable number of bytes."""
+    """Return a number of bytes as human-readable text."""
     for unit in ("B", "kB", "MB", "GB"):
         if nbytes < 1000:
             return f"{nbytes:.3g} {unit}"
@@ -52,7 +52,7 @@ def size(nbytes: float) -> str:
 
 
 def count(number: int, what: str) -> str:
-    """Return a human-readable number of things."""
+    """Return a number and a noun as human-readable text."""
     return f"{number:,} {what}" + ("" if number == 1 else "s")
 
 
@@ -62,7 +62,7 @@ def _origin(dataset: Dataset) -> list[str]:
         f"  {key}: {dataset.info[key]}" for key in shown if dataset.info.get(key) not in (None, {})
     ]
     versions = ", ".join(f"{name} {version}" for name, version in dataset.versions.items())
-    return [*lines, f"  made with: {versions}"]
+    return [*lines, f"  created with: {versions}"]
 
 
 def _print_mode(dataset: Dataset, mode: str, rows: Sequence[dict[str, Any]]) -> None:
@@ -121,7 +121,7 @@ def _print_normalization(dataset: Dataset, mode: str) -> None:
 
 
 def _components(name: str, item: Normalization) -> list[list[str]]:
-    """Return a field's lines: one for each component, or one with ranges over many."""
+    """Return a field's table rows: one for each component, or one with ranges over all."""
     columns = [item.mean, item.std, item.minimum, item.maximum]
     if item.mean.size > _SMALL:
         return [[name, f"all {item.mean.size}", *(_range(column) for column in columns)]]

@@ -1,4 +1,4 @@
-"""The installation as `physx info` shows it: versions, plugins, drivers, and what is wrong."""
+"""Describes the installation for `physx info`: versions, plugins, drivers, and problems."""
 
 from __future__ import annotations
 
@@ -30,9 +30,9 @@ class Package:
 
     Attributes:
         name: Its name.
-        version: Its version, or what is wrong with its metadata.
+        version: Its version, or the problem with its metadata.
         place: Folder that its module is imported from.
-        problems: What is in its way, one sentence each.
+        problems: Conflicts and defects, one sentence each.
     """
 
     name: str
@@ -42,7 +42,7 @@ class Package:
 
 
 def describe_machine() -> dict[str, str]:
-    """Return what runs here: interpreter, system, processors, memory, by name."""
+    """Return a description of interpreter, system, processors, and memory, by name."""
     pages = 0
     with contextlib.suppress(ValueError, OSError):
         pages = os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
@@ -57,11 +57,11 @@ def describe_machine() -> dict[str, str]:
 
 
 def describe_drivers(variables: Mapping[str, str], root: Path = Path("/")) -> dict[str, str]:
-    """Return what there is to draw and compute with: display, Vulkan, graphics cards.
+    """Return what is available for graphics and computing: display, Vulkan, graphics cards.
 
     Args:
         variables: The environment variables.
-        root: Folder of the whole system.
+        root: The root folder of the system.
     """
     display = variables.get("WAYLAND_DISPLAY") or variables.get("DISPLAY")
     cards = sorted(
@@ -73,9 +73,9 @@ def describe_drivers(variables: Mapping[str, str], root: Path = Path("/")) -> di
     with contextlib.suppress(OSError):
         told = (root / "proc/driver/nvidia/version").read_text(encoding="utf-8", errors="replace")
         found = re.search(r"\b\d+\.\d+(\.\d+)?\b", told)
-        version = f", NVIDIA's driver {found[0]}" if found else ""
+        version = f", NVIDIA driver {found[0]}" if found else ""
     return {
-        "display": display or "none: windows cannot open; pictures, files and web pages can",
+        "display": display or "none: no viewer windows; images, files, and web pages work",
         "vulkan": _describe_vulkan(variables, root),
         "cards": (", ".join(cards) or "none") + version,
     }
@@ -90,14 +90,14 @@ def _describe_vulkan(variables: Mapping[str, str], root: Path) -> str:
         files = [path for folder in folders for path in sorted(folder.glob("*.json"))]
     names = ", ".join(path.stem.removesuffix(".x86_64") for path in files)
     if not names:
-        return "no driver: pictures need one, for example apt install mesa-vulkan-drivers"
+        return "no driver: images need one, for example apt install mesa-vulkan-drivers"
     if ctypes.util.find_library("vulkan") is None:
         return f"{names}, but no loader: apt install libvulkan1"
     return names
 
 
 def describe_variables(variables: Mapping[str, str]) -> dict[str, str]:
-    """Return the environment variables that change what runs; secrets only by their name."""
+    """Return the environment variables that affect physx; secrets only by name."""
     return {
         name: "(set)" if "TOKEN" in name or "KEY" in name else text
         for name, text in sorted(variables.items())
@@ -106,12 +106,10 @@ def describe_variables(variables: Mapping[str, str]) -> dict[str, str]:
 
 
 def find_packages() -> list[Package]:
-    """Return physx's packages, those of plugins, and the libraries that they are made for."""
+    """Return the packages of physx and of plugins, and the libraries that they require."""
     found: dict[str, list[Distribution]] = {}
     for each in distributions():
-        with contextlib.suppress(
-            Exception
-        ):  # it is another package's file: `physx plugins` names it
+        with contextlib.suppress(Exception):  # a foreign package's file: `physx plugins` reports it
             found.setdefault(_normal(each.metadata["Name"]), []).append(each)
     claims = [claim for info in plugins.available().values() for claim in info.distributions]
     owners = [claim.split()[0] for claim in claims]
@@ -133,16 +131,16 @@ def _required(packages: Sequence[Distribution]) -> Iterator[str]:
 
 
 def _describe(name: str, packages: Sequence[Distribution]) -> Package:
-    """Return what is known of a package; the first of several is the one that Python imports."""
+    """Describe a package; the first of several is the one that Python imports."""
     first = packages[0]
     places, problems = [], []
     modules = _modules(first)
     if not modules and not _has_files(first):
-        problems.append("its files are gone: install it again")
+        problems.append("its files are missing: reinstall it")
     for module, expected in modules:
         actual = _origin(module)
         if actual is not None and actual.resolve() not in {each.resolve() for each in expected}:
-            problems.append(f"import {module} takes {actual}, not {expected[0]}")
+            problems.append(f"import {module} loads {actual}, not {expected[0]}")
         places += [str(actual.parent)] if actual else []
     for other in packages[1:]:
         folder, hidden = first.locate_file(""), other.locate_file("")
@@ -155,12 +153,12 @@ def _describe(name: str, packages: Sequence[Distribution]) -> Package:
 def _version(package: Distribution) -> str:
     try:
         return str(package.version)
-    except Exception as error:  # its metadata are damaged
+    except Exception as error:  # its metadata is damaged
         return f"without a version ({type(error).__name__})"
 
 
 def _modules(package: Distribution) -> list[tuple[str, list[Path]]]:
-    """Return the modules that a package brings, each with the places where it may lie."""
+    """Return a package's modules, each with the locations where it may be."""
     found: dict[str, list[Path]] = {}
     for file in package.files or []:
         place = Path(str(package.locate_file(file)))
@@ -176,12 +174,12 @@ def _modules(package: Distribution) -> list[tuple[str, list[Path]]]:
                 "site-packages",
             )
         ):
-            found.setdefault(file.parent.name, []).append(place.parent)  # the latter: of cmeel
+            found.setdefault(file.parent.name, []).append(place.parent)  # nested one: from cmeel
     return [(name, found[name]) for name in sorted(found) if name.isidentifier()]
 
 
 def _has_files(package: Distribution) -> bool:
-    """Return whether anything is there but metadata, links and scripts."""
+    """Return whether a package has files other than metadata, links, and scripts."""
     files = [
         file for file in package.files or [] if file.parts[0] != ".." and file.suffix != ".pth"
     ]
@@ -190,7 +188,7 @@ def _has_files(package: Distribution) -> bool:
 
 
 def _linked(file: Path) -> Iterable[tuple[str, Path]]:
-    """Return the packages in the folders that a .pth file of an editable install names."""
+    """Return the packages in the folders named by the .pth file of an editable install."""
     with contextlib.suppress(OSError):
         for line in file.read_text(encoding="utf-8").splitlines():
             if not line.startswith("import ") and Path(line).is_dir():

@@ -1,4 +1,4 @@
-"""Prints what commands found."""
+"""Prints the output of commands."""
 
 from __future__ import annotations
 
@@ -9,16 +9,16 @@ from collections.abc import Collection, Sequence
 from physx_core.errors import printable
 
 WIDTH = 100
-"""Columns of what is printed to a file or a pipe; a terminal has its own."""
+"""Line width for output to a file or a pipe; a terminal has its own."""
 
 
 def show(text: object = "") -> None:
-    """Print text with names from files or packages, which must not control the terminal."""
+    """Print text whose names from files or packages must not control the terminal."""
     print(printable(text))
 
 
 def width() -> int:
-    """Return how many columns a line may have."""
+    """Return the maximum line width in columns."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else WIDTH
 
 
@@ -30,16 +30,16 @@ def show_table(
     curve: str | None = None,
     indent: int = 0,
 ) -> None:
-    """Print columns side by side, as wide as the terminal; color only where there is a terminal.
+    """Print a table as wide as the terminal, in color only on a terminal.
 
     Args:
         head: Names of the columns.
-        rows: Their texts. What is too long for its column continues on the next line.
-        numbers: Columns of numbers, which are never wrapped.
+        rows: The cells' texts. Text that is too long for its column wraps to the next line.
+        numbers: Columns of numbers, which never wrap.
         curve: Column of spark lines.
-        indent: Spaces in front of each line.
+        indent: Spaces before each line.
     """
-    from rich.console import Console  # not imported before it is needed: `physx --help` is quick
+    from rich.console import Console  # imported only when needed, to keep `physx --help` fast
     from rich.padding import Padding
     from rich.table import Table
     from rich.text import Text

@@ -39,13 +39,13 @@ def pipeline_from(
     Args:
         make: The pipeline's class.
         verb: The command, for messages.
-        places: Options that take the first words without a dash, for example
+        places: Options that take the leading words without a dash, for example
             ``environment.environment``.
         words: The words after the command. ``--config FILE`` names a TOML file, or a session that
-            has one, whose table of the pipeline's kind contains options; words override them.
+            has one. The table of the pipeline's kind contains options; words override them.
         given: Table of options that apply unless the file contains them.
-        arguments: What the first words without a dash are, for the help.
-        examples: Words of typical command lines, for the help.
+        arguments: Names of the leading words without a dash, for the help.
+        examples: Typical command lines without the command, for the help.
     """
     table, rest = _take_file(make, list(words))
     table = {**(given or {}), **table}
@@ -69,7 +69,7 @@ def pipeline_from(
 
 
 def take_session(words: Sequence[str]) -> tuple[Path | None, list[str]]:
-    """Return the session's folder that the first word names, if any, and the words with it named.
+    """Return the session folder that the first word names, if any, and the words as options.
 
     Args:
         words: The words after the command.
@@ -83,13 +83,13 @@ def take_session(words: Sequence[str]) -> tuple[Path | None, list[str]]:
 
 
 def _take_file(make: type[Pipeline], words: list[str]) -> tuple[dict[str, Any], list[str]]:
-    """Return the pipeline's table of the file after ``--config``, and the words without it."""
+    """Return the pipeline's table in the ``--config`` file, and the words without that option."""
     words = [part for w in words for part in (w.split("=", 1) if w[:9] == "--config=" else [w])]
     if "--config" not in words:
         return {}, words
     place = words.index("--config")
     if place + 1 == len(words):
-        raise UsageError("--config needs the path of a TOML file, or of a session.")
+        raise UsageError("--config needs the path of a TOML file or a session.")
     path = Path(words[place + 1])
     path = path / "config.toml" if path.is_dir() else path
     tables = read_toml(path)
@@ -113,7 +113,7 @@ def _name_positionals(verb: str, places: Sequence[str], words: list[str]) -> lis
 def _nested_defaults(
     make: type[Pipeline], table: Mapping[str, Any], words: Sequence[str]
 ) -> dict[str, Any]:
-    """Return the configurations in the file, by option name."""
+    """Return the file's configurations, by option name."""
     defaults: dict[str, Any] = {}
     for option in _dataclass_fields(make):
         name = _option_name(option.name)
@@ -136,7 +136,7 @@ def _nested_defaults(
 def _options_of(
     make: type[Pipeline], defaults: Mapping[str, Any], words: Sequence[str]
 ) -> list[tuple[str, Any, Any]]:
-    """Return name, type and default of each option for `dataclasses.make_dataclass`."""
+    """Return name, type, and default of each option for `dataclasses.make_dataclass`."""
     hints, docs = typing.get_type_hints(make), _docstrings(make)
     options: list[tuple[str, Any, Any]] = []
     for option in _dataclass_fields(make):
@@ -152,7 +152,7 @@ def _options_of(
             if default is None:
                 asked = any(word.startswith(f"--{name}.") for word in words)
                 if name == "environment" and not asked:
-                    continue  # it is optional, but one of its options is required
+                    continue  # optional, but one of its own options is required
                 default = dataclasses.MISSING if name == "environment" else hint()
         help_text = tyro.conf.arg(help=docs.get(option.name, ""))
         annotated = Annotated[hint, help_text] if name == option.name else hint
@@ -182,17 +182,14 @@ def _configuration(make: type[Pipeline], python_name: str) -> Any:
 
 
 def _set_help(cls: type[Any]) -> None:
-    """Give tyro the docstrings of a configuration as they are: its own reading breaks lines."""
+    """Pass a configuration's docstrings to tyro: its own parser would break their lines."""
     docs = _docstrings(cls)
     for option in _dataclass_fields(cls):
         option.metadata = MappingProxyType({**option.metadata, "help": docs.get(option.name, "")})
 
 
 def _docstrings(cls: type[Any]) -> dict[str, str]:
-    """Return the docstrings below the attributes in the source of a class and its bases.
-
-    Each is one line.
-    """
+    """Return the attribute docstrings of a class and its bases, each as one line."""
     docs: dict[str, str] = {}
     for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__)):
         tree = ast.parse(inspect.getsource(sys.modules[base.__module__]))

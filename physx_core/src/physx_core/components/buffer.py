@@ -1,4 +1,4 @@
-"""Buffer: decides which rows each batch of a training holds while environments generate them."""
+"""Buffer: decides which rows each training batch holds while environments generate them."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ class Draw(NamedTuple):
 
     Attributes:
         placed: Slot of each row that arrived for the batch; a later row replaces an earlier one.
-        drawn: Slot of each of the batch's rows, once the arrived ones are in theirs.
+        drawn: Slot of each of the batch's rows, once the arrived rows are placed.
         rows: Number of each of the batch's rows.
     """
 
@@ -28,18 +28,18 @@ class Draw(NamedTuple):
 
 
 class Buffer(ABC):
-    """Base of all buffers; a plugin offers its own with the hook ``physx_buffers``.
+    """Base of all buffers; plugins offer their own with the hook ``physx_buffers``.
 
-    While environments generate, rows arrive in an order that seed and number of instances
-    determine, and are numbered from 0. A buffer keeps some of them in *slots*, from which batches
-    are drawn. It handles numbers only: the training keeps the values. Everything that it decides
-    depends on the seed and on counts, never on time, so that runs can be repeated and resumed.
+    While environments generate, rows arrive in an order determined by the seed and the number of
+    instances, and are numbered from 0. A buffer keeps some of them in *slots*, from which batches
+    are drawn. It handles row numbers only: the training run keeps the values. All its decisions
+    depend on the seed and on counts, never on time, so runs can be repeated and resumed.
 
     The constructor takes the entries of `Training.online_kwargs`.
 
     Attributes:
-        capacity: Number of slots. 0: nothing is kept, each batch consists of the rows that arrive
-            for it; then only `needed` is implemented.
+        capacity: Number of slots. 0: nothing is kept, and each batch consists of the rows that
+            arrive for it; then only `needed` has to be implemented.
         batch_size: Number of rows in a batch.
         batch_nb: Number of batches in the run.
         arrived: Number of rows that have arrived.
@@ -77,7 +77,7 @@ class Buffer(ABC):
     def needed(self, batch: int) -> int:
         """Return how many rows must have arrived before a batch is drawn.
 
-        It depends on the options and the arguments of `begin` only, and never decreases.
+        It depends only on the options and the arguments of `begin`, and never decreases.
 
         Args:
             batch: Number of the batch, from 0 over the whole run.
@@ -89,13 +89,13 @@ class Buffer(ABC):
         return self.needed(self.batch_nb - 1) if self.batch_nb else 0
 
     def place(self, count: int, random: np.random.Generator) -> Index:
-        """Return the slots of the next rows, whose former rows are dropped.
+        """Return the slots for the next rows; the rows previously in them are dropped.
 
         Args:
             count: Number of rows that have just arrived.
             random: The only source of random numbers.
         """
-        raise NotImplementedError(f"{type(self).__name__} lacks place().")
+        raise NotImplementedError(f"{type(self).__name__} does not implement place().")
 
     def draw(self, random: np.random.Generator) -> Index:
         """Return the slots of a batch's rows, `batch_size` of them.
@@ -103,7 +103,7 @@ class Buffer(ABC):
         Args:
             random: The only source of random numbers.
         """
-        raise NotImplementedError(f"{type(self).__name__} lacks draw().")
+        raise NotImplementedError(f"{type(self).__name__} does not implement draw().")
 
     def take(self, batch: int, count: int) -> Draw:
         """Place the rows that have arrived for a batch, then draw the batch.
@@ -113,7 +113,7 @@ class Buffer(ABC):
             count: Number of rows that have arrived since the last one.
 
         Raises:
-            UsageError: If `place` or `draw` return anything but the slots that they should.
+            UsageError: If `place` or `draw` returns invalid slots.
         """
         random = np.random.default_rng([self._seed, _STREAM, batch])
         arrived, placed = self.arrived, np.zeros(0, np.intp)
@@ -133,11 +133,11 @@ class Buffer(ABC):
 
     @property
     def kept(self) -> Index:
-        """Numbers of the rows that batches are drawn from."""
+        """Numbers of the rows from which batches are drawn."""
         return self.rows[self.rows >= 0]
 
     def state(self, batches: int) -> Index:
-        """Return what `restore` needs to continue after some batches, as whole numbers.
+        """Return what `restore` needs to continue after some batches, as integers.
 
         Args:
             batches: Number of batches: all that were taken since the run began, or all but the
@@ -154,11 +154,11 @@ class Buffer(ABC):
         """Continue from a `state` of a buffer with the same options; called after `begin`.
 
         Args:
-            batches: Number of batches after which that was the state.
+            batches: Number of batches after which the state was taken.
             state: The state.
 
         Raises:
-            ValueError: If it is not the state of such a buffer.
+            ValueError: If `state` is not the state of such a buffer.
         """
         if state.shape != (1 + 2 * self.capacity,):
             raise ValueError("it is the state of a buffer with other options")

@@ -37,13 +37,13 @@ _OTHER_NAMES = {
     "update_line": "set_training_data()",
     "render": "Environment.update_visualization()",
 }
-"""Attributes of other systems' environments and factories, and what is here in their place."""
+"""Attributes of other systems' environments and factories, and their equivalents here."""
 
 
 class PredictedFields(dict[str, Array]):
     """A network's prediction for one sample: arrays by the names in `Network.pred_fields`.
 
-    A field that is the only one is also found under the name ``prediction``.
+    A single field is also available under the name ``prediction``.
     """
 
     def __missing__(self, name: str) -> Array:
@@ -57,9 +57,9 @@ class PredictedFields(dict[str, Array]):
 
 
 def not_finite_prediction(name: str) -> NotFiniteError:
-    """Return the error for a prediction that holds NaN or infinity."""
+    """Return the error for a prediction that contains NaN or infinity."""
     return NotFiniteError(
-        f'the network\'s prediction "{name}" holds NaN or an infinite number, for inputs that are '
+        f'the network\'s prediction "{name}" holds NaN or infinity, although its inputs are '
         "finite. Train the network again, with normalized data or a smaller learning rate.",
         field=name,
     )
@@ -95,22 +95,22 @@ class Environment(Closeable):
     Subclasses implement `create`, `init_database` and `step`. The methods are called in this
     order: `create`, `init`, `init_database`, `init_visualization` (only with a visualizer),
     `reset_parameters` (only if parameters are defined), then `step` repeatedly, and `close` at the
-    end, also after a failure.
+    end, even after a failure.
 
     Attributes:
         instance_id: Number of this instance among all instances of the run, from 1.
         instance_nb: Number of instances in the run.
         rng: Random number generator of this instance, with its own stream; if parameters are
             defined, with one for each episode.
-        factory: Draws the environment. Without a visualizer it accepts everything and does nothing,
-            and is false: ``if self.factory:`` saves what only the drawing needs.
-        compute_training_data: False in sub-steps whose data are not used.
+        factory: Draws the environment. Without a visualizer it accepts everything, does nothing,
+            and is false: ``if self.factory:`` skips work that only drawing needs.
+        compute_training_data: False in sub-steps whose data is not used.
         step_index: Number of finished steps.
         episode_index: Index of the current trajectory, from 0.
         sample_episode: Index of the trajectory of the last training data.
-        runs_programs: Whether arguments name programs to run, so that no file may give them.
+        runs_programs: Whether arguments name programs to run; then no file may supply them.
         step_time: Simulated time of a step, in s; None, the default: unknown. Viewers play what is
-            drawn in simulated time; if steps differ, call `Factory.set_time` instead.
+            drawn in simulated time; if the times of steps differ, call `Factory.set_time` instead.
     """
 
     step_time: float | None = None
@@ -158,7 +158,7 @@ class Environment(Closeable):
         self._defined_parameters: list[Parameter] = []
         self._choose_parameters: Choose | None = None
         self._has_begun_episodes = False
-        self._replayed: tuple[int, dict[str, Any]] | None = None  # place of a set, and its values
+        self._replayed: tuple[int, dict[str, Any]] | None = None  # index of a set, and its values
 
     # What a subclass implements -------------------------------------------------------------
 
@@ -180,11 +180,12 @@ class Environment(Closeable):
         """Prepare the next episode with these values of the defined parameters.
 
         Called before the first step and by `new_episode`, if `define_parameters` was called. Just
-        before it `rng` starts again, from a seed of this episode; so if this method sets the whole
-        state, the episode depends on nothing that was before it.
+        before the call, `rng` is reseeded for this episode: if this method sets the whole state,
+        the episode depends on nothing that came before it.
 
-        In a replay of stored samples they are the values that the sample was made with; it is
-        called for each sample of another episode than that before, and `rng` goes on.
+        When stored samples are replayed, these are the values that the sample was generated with.
+        The method is then called for each sample whose episode differs from the previous one's, and
+        `rng` is not reseeded.
 
         Args:
             values: A number for each parameter of shape ``()``, else an array.
@@ -287,16 +288,16 @@ class Environment(Closeable):
         Raises:
             UsageError: If the run has no network, or there are no training data yet.
             SampleError: If a field does not fit the network, or one of its inputs or predictions
-                holds NaN or infinity.
+                contains NaN or infinity.
         """
         if not fields and self._training is None:
-            raise UsageError("get_prediction() without fields needs set_training_data() before it.")
+            raise UsageError("Call set_training_data() before get_prediction() without fields.")
         self._infer_shapes()
         inputs = fields or dict(self._training or {})
         try:
             for name, value in inputs.items():
                 if not _is_finite(value):
-                    text = f'get_prediction() got the field "{name}" with NaN or an infinite number'
+                    text = f'get_prediction() got the field "{name}" with NaN or infinity'
                     raise NotFiniteError(f"{text}.", field=name)
             prediction = PredictedFields(self._run().predict(inputs))
             for name, value in prediction.items():
@@ -307,13 +308,13 @@ class Environment(Closeable):
         return prediction
 
     def _infer_shapes(self) -> None:
-        """Take open shapes of fields from this step's data."""
+        """Infer undefined shapes of fields from this step's data."""
         if any(field.shape is None for field in self._fields.values()):
             given = {**(self._training or {}), **(self._additional or {})}
             self._fields = {field.name: field for field in infer_shapes(self.fields, given)}
 
     def save_parameters(self, **values: Any) -> None:
-        """Save numbers, texts, lists, dictionaries and arrays of this instance with the dataset."""
+        """Save numbers, strings, lists, dictionaries and arrays of this instance in the dataset."""
         self._run().save_parameters(self.instance_id, values)
 
     def load_parameters(self) -> dict[str, Any]:
@@ -331,7 +332,7 @@ class Environment(Closeable):
         """Begin the first episode; physx calls it before the first step.
 
         Args:
-            episode: Index of the episode; None: that of the environment.
+            episode: Index of the episode; None: the environment decides.
         """
         self._has_begun_episodes = True
         if self._defined_parameters:
@@ -341,14 +342,14 @@ class Environment(Closeable):
     def replay_episode(self, place: int, values: Mapping[str, Any]) -> None:
         """Prepare the episode of a stored row with its parameters; physx calls it before the step.
 
-        If the row before was of the same set, nothing is done.
+        Does nothing if the previous row was of the same set.
 
         Args:
-            place: Place of the set in the dataset's record.
+            place: Index of the set in the dataset's record.
             values: The values of the parameters.
 
         Raises:
-            ConfigError: If they are other parameters than those that are defined.
+            ConfigError: If they are not the defined parameters.
         """
         self._has_begun_episodes = True
         if self._replayed is None or self._replayed[0] != place:
@@ -357,14 +358,14 @@ class Environment(Closeable):
             except ConfigError as error:
                 raise ConfigError(
                     f"The stored samples cannot be replayed with the parameters that they were "
-                    f"made with: {error}"
+                    f"generated with: {error}"
                 ) from error
             self._reset_with_parameters()
 
     def _reset_with_parameters(self) -> None:
-        """Have the parameters of the current episode chosen, and prepare it with them.
+        """Get the parameters of the current episode, and prepare it with them.
 
-        In a replay they are those of the stored row, and `rng` does not start again, as rows of an
+        In a replay they are those of the stored row, and `rng` is not reseeded, because rows of an
         episode may come one by one.
         """
         if self._replayed is not None:
@@ -376,7 +377,7 @@ class Environment(Closeable):
         else:
             values = draw(self._defined_parameters, self._seed_entropy, number)
         fresh = random_of(self._seed_entropy, number, 0).bit_generator.state
-        self.rng.bit_generator.state = fresh  # in place, as others may hold the generator
+        self.rng.bit_generator.state = fresh  # in place: others may hold the generator
         self.reset_parameters(**values)
 
     def _lacks(self, method: str) -> UsageError:
@@ -416,19 +417,19 @@ class Environment(Closeable):
 def _is_finite(value: Any) -> bool:
     try:
         return is_finite(np.asarray(value))
-    except NO_ARRAY:  # the network says what it is
+    except NO_ARRAY:  # the network reports what is wrong
         return True
 
 
 def explain_missing_attribute(error: AttributeError) -> str:
-    """Return what the user may have meant that an environment or its factory does not have."""
+    """Return a hint for an attribute that an environment or its factory does not have."""
     owner, name = error.obj, str(error.name)
     if not isinstance(owner, (Environment, Factory)):
         return ""
     if isinstance(owner, Environment) and owner._has_seed is None:
         return f" {type(owner).__name__}.__init__() must first call super().__init__(**kwargs)."
     if name in _OTHER_NAMES:
-        return f" In its place: {_OTHER_NAMES[name]}."
+        return f" Use {_OTHER_NAMES[name]} instead."
     own = dir(type(owner)) if isinstance(owner, Factory) else [*dir(type(owner)), *vars(owner)]
     return nearest(name, (known for known in own if not known.startswith("_")))
 

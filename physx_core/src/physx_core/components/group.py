@@ -13,7 +13,7 @@ from physx_core.typing import Array, Batch
 class Group:
     """The processes that train one network together, each on its share of every batch.
 
-    This class is the group of a single process; a plugin derives the group of its library. All
+    This class is the group of a single process; plugins derive groups for their libraries. All
     processes of a group must call its methods in the same order.
 
     Attributes:
@@ -45,7 +45,7 @@ class Group:
         """Return the numbers of all processes, in the order of their ranks.
 
         Args:
-            values: This process's numbers, shape (n,); n may be another one in each process.
+            values: This process's numbers, shape (n,); n may differ between processes.
         """
         counts = [float(len(values) if rank == self.rank else 0) for rank in range(self.size)]
         ends = np.cumsum(self.total(counts)).astype(int)
@@ -69,7 +69,7 @@ class Group:
         return self.share_for(self.rank, batch)
 
     def share_for(self, rank: int, batch: Batch) -> tuple[Batch, float]:
-        """Return the rows of the process of some rank, and their weight: see `share_of`."""
+        """Return the rows of the process with a given rank, and their weight: see `share_of`."""
         rows = len(next(iter(batch.values())))
         first, last = rows * rank // self.size, rows * (rank + 1) // self.size
         own = slice(first, last) if last > first else slice(0, 1)

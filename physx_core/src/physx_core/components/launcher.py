@@ -26,7 +26,7 @@ class ClientHandle(ABC):
 
     @abstractmethod
     def terminate(self) -> None:
-        """Ask the client and its child processes to end; return at once."""
+        """Ask the client and its child processes to end; return immediately."""
 
     @abstractmethod
     def kill(self) -> None:
@@ -37,11 +37,11 @@ class ClientHandle(ABC):
         return ""
 
     def state(self) -> str:
-        """Return what a client that has not connected waits for, for messages; empty: unknown."""
+        """Return what an unconnected client is waiting for, for messages; empty: unknown."""
         return ""
 
     def is_queued(self) -> bool:
-        """Return whether the client waits for its turn to start, which is not silence."""
+        """Return whether the client waits for its turn to start; this does not count as silence."""
         return False
 
     def wait(self, until: float) -> bool:
@@ -54,20 +54,20 @@ class ClientHandle(ABC):
 
 
 class Launcher(Closeable):
-    """Starts clients; a plugin offers its own with the hook ``physx_launchers``.
+    """Starts clients; plugins offer their own with the hook ``physx_launchers``.
 
     The constructor takes the entries of `EnvironmentConfig.launcher_kwargs`. The started processes
     must run ``physx client --connect ADDRESS --instance NUMBER``, with the token in the environment
     variable ``PHYSX_TOKEN`` or in a file that only its owner may read. Do not pass the token on a
-    command line, which everybody on the machine can read.
+    command line: everyone on the machine can read it.
 
     Attributes:
         by_hand: Whether the user starts the clients. Then the token is one that the user knows, and
             clients may leave and be replaced at any time.
-        elsewhere: Whether clients may run on other machines, to which the launcher brings the
+        elsewhere: Whether clients may run on other machines, to which the launcher transfers the
             token. Then the server listens at the address that `open` returns, unless
-            `EnvironmentConfig.ip_address` is another one than the loopback address.
-        elastic: Whether the run begins, and goes on, without some of the clients; set before
+            `EnvironmentConfig.ip_address` is not the loopback address.
+        elastic: Whether the run starts and continues even if some clients are missing; set before
             `open`. Clients for which there is no place yet may wait for one.
     """
 
@@ -76,11 +76,11 @@ class Launcher(Closeable):
     elastic: bool = False
 
     def open(self) -> str | None:
-        """Reach what starts the clients; called once, before the server listens.
+        """Connect to what starts the clients; called once, before the server listens.
 
         Returns:
-            Address of this machine at which clients can reach the server; None: any that the
-            configuration says.
+            Address of this machine at which clients can reach the server; None: the configured
+            one.
 
         Raises:
             ConfigError: If it cannot be reached.
@@ -92,13 +92,13 @@ class Launcher(Closeable):
 
     @abstractmethod
     def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
-        """Start a client for each instance and return at once.
+        """Start a client for each instance and return immediately.
 
         Called again, with a single instance, to restart a client.
 
         Args:
-            instances: Numbers of the instances, from 1. In an elastic run those of the clients,
-                which are as many as `EnvironmentConfig.max_clients`; some may come later or never.
+            instances: Numbers of the instances, from 1. In an elastic run, numbers of the clients,
+                1 to `EnvironmentConfig.max_clients`; some may join later or never.
             address: ``HOST:PORT`` of the server. If the server listens at all addresses of its
                 machine, the host is the one that `open` returned, or else the loopback address.
             token: Secret of the run.
@@ -107,5 +107,5 @@ class Launcher(Closeable):
             A handle for each instance; empty if they are started by hand.
 
         Raises:
-            ClientError: If a client cannot be started; started ones are ended.
+            ClientError: If a client cannot be started; those already started are ended.
         """

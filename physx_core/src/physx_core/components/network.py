@@ -1,4 +1,4 @@
-"""Network: base class of networks, which predict fields from fields."""
+"""Network: base class of networks that predict fields from fields."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ _UNREADABLE = (
     OSError, ValueError, KeyError, EOFError, TypeError, AttributeError, MemoryError,
     zipfile.BadZipFile, zlib.error,
 )  # fmt: skip
-"""What NumPy raises for a file that is no archive of arrays, or damaged."""
+"""What NumPy raises for a file that is damaged or not an archive of arrays."""
 _LONGEST_HEADER = 2**14
 _WIDEST = 16
 
@@ -35,18 +35,18 @@ _WIDEST = 16
 class Network(ABC):
     """Base of all networks; a plugin's base class implements it for one library.
 
-    Tensors are of the library's own type. In every dictionary of tensors the first axis is that of
-    the samples. Unless the methods are implemented for a library, arrays are the tensors, and a
+    Tensors have the library's own type. In every dictionary of tensors, the first axis is the
+    sample axis. Unless the methods are implemented for a library, tensors are NumPy arrays, and a
     network in NumPy needs only `predict` and `get_parameters`: see `physx_core.toy`.
 
     Attributes:
         net_fields: Input fields of the network.
         opt_fields: Target fields that the loss compares the prediction with.
-        pred_fields: Fields that the network predicts; the i-th has shape, unit and normalization
-            of the i-th of `opt_fields`.
+        pred_fields: Fields that the network predicts; the i-th has the shape, unit and
+            normalization of the i-th of `opt_fields`.
         parameters_file: Name of the file that `save_parameters` writes into a checkpoint.
         default_optimization: Reference of the optimization used if none is configured; empty: one
-            must be configured for a training.
+            must be configured for training.
         default_transformation: Reference of the transformation used if none is configured.
         export_forms: File formats that the network can be exported in.
         exporter: Function that exports, as ``"package.module:function"``. It is called with the
@@ -76,7 +76,7 @@ class Network(ABC):
     def check_arguments(cls, arguments: Mapping[str, Any], path: Path) -> None:
         """Check arguments from a checkpoint against its parameters, before a network is created.
 
-        So that a small file cannot have a network of any size created.
+        This keeps a small file from causing a network of arbitrary size to be created.
 
         Args:
             arguments: Keyword arguments of the constructor.
@@ -94,12 +94,12 @@ class Network(ABC):
             device: As for `set_device`.
 
         Raises:
-            ConfigError: If there are several, but the network's library does not support that, or
+            ConfigError: If there are several, but the network's library does not support this, or
                 not on this device.
         """
         if int(os.environ.get("WORLD_SIZE", "1")) > 1:
             raise ConfigError(
-                f"{cls.__name__} cannot be trained by several processes: leave torchrun out."
+                f"{cls.__name__} cannot be trained by several processes: run it without torchrun."
             )
         return Group()
 
@@ -119,8 +119,8 @@ class Network(ABC):
         }
         if missing:
             raise FieldsMismatchError(
-                f"{type(self).__name__} needs other fields. Those that it reads and is compared "
-                "with are named in network_kwargs, net_fields and opt_fields",
+                f"{type(self).__name__} needs other fields. Name those that it reads and is "
+                "compared with in network_kwargs, net_fields and opt_fields",
                 missing,
             )
 
@@ -135,6 +135,9 @@ class Network(ABC):
         """Return the network's output for the tensors of `net_fields`, given in that order.
 
         A library's base class leaves this to its networks, and calls it in `predict`.
+
+        Raises:
+            UsageError: If the network does not implement it.
         """
         raise UsageError(f"{type(self).__name__} does not implement forward().")
 
@@ -158,7 +161,7 @@ class Network(ABC):
 
     @abstractmethod
     def get_parameters(self) -> dict[str, Any]:
-        """Return the network's own parameters by name, no copies."""
+        """Return the network's own parameters by name, not copies."""
 
     def get_gradients(self) -> dict[str, Any]:
         """Return the gradients of the last step by parameter; empty if there are none."""
@@ -169,7 +172,7 @@ class Network(ABC):
         return sum(int(np.size(array)) for array in self._arrays().values())
 
     def find_not_finite(self) -> str:
-        """Return the name of a parameter that holds NaN or infinity; empty if there is none."""
+        """Return the name of a parameter that contains NaN or infinity; empty if there is none."""
         for name, array in self._arrays().items():
             if not is_finite(array):
                 return name

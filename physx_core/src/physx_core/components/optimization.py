@@ -1,4 +1,4 @@
-"""Optimization: base class of what computes the loss and updates the network's parameters."""
+"""Optimization: base class for computing the loss and updating the network's parameters."""
 
 from __future__ import annotations
 
@@ -17,12 +17,12 @@ class Optimization(ABC):
     """Base of all optimizations.
 
     Attributes:
-        extra_fields: Fields of the batch that the loss reads beside those of the network.
+        extra_fields: Fields of the batch that the loss reads in addition to the network's.
         state_file: Name of the file that `save_state` writes into a checkpoint; empty if the
             optimization has no state.
-        network: The network to train; known after `set_optimizer`.
+        network: The network to train; set by `set_optimizer`.
         stops_at_nan: Whether a loss or gradient that is not finite ends the training; set by the
-            training.
+            training run.
     """
 
     state_file: ClassVar[str] = ""
@@ -89,18 +89,19 @@ class Optimization(ABC):
     def compute_row_losses(self, prediction: Tensors, targets: Tensors, data: Tensors) -> Any:
         """Return the loss of each row of a batch, shape (rows,), for samplers that learn from them.
 
-        Called after `compute_loss`, with the same arguments, before `optimize`; nothing may change.
+        Called after `compute_loss`, with the same arguments, before `optimize`; must not change
+        anything.
 
         Raises:
-            ConfigError: If the optimization does not know them.
+            ConfigError: If the optimization does not compute them.
         """
         raise ConfigError(
-            f"{type(self).__name__} does not compute the losses of single rows, from which the "
+            f"{type(self).__name__} does not compute the loss of each row, from which the "
             "sampler learns: implement compute_row_losses(), or choose another sampler."
         )
 
     def transform_loss(self, loss: Any, data: Tensors) -> dict[str, Any]:
-        """Return the statistics of this step; entries beside ``loss`` are recorded too.
+        """Return the statistics of this step; entries other than ``loss`` are recorded too.
 
         Called after `optimize`. All entries are numbers or can be converted with ``float``.
 
@@ -115,9 +116,9 @@ class Optimization(ABC):
         """Update the parameters along the gradient of the loss.
 
         Raises:
-            DivergedError: If loss or gradient are not finite; the parameters are not changed then.
-                Not raised if `stops_at_nan` is off, nor by optimizations that do not look: the
-                training looks at the loss itself.
+            DivergedError: If the loss or gradient is not finite; the parameters are then unchanged.
+                Not raised if `stops_at_nan` is off, nor by optimizations that do not check: the
+                training run checks the loss itself.
         """
 
     def learning_rate(self) -> float | None:
@@ -127,7 +128,7 @@ class Optimization(ABC):
     def join(self, group: Group) -> None:
         """Train with the gradients of all processes of a group from now on.
 
-        Called once, when the network has its initial parameters; all processes take those of the
+        Called once, when the network has its initial parameters; all processes adopt those of the
         leading one.
 
         Raises:
@@ -135,7 +136,7 @@ class Optimization(ABC):
         """
         if group.size > 1:
             raise ConfigError(
-                f"{type(self).__name__} cannot work in several processes: leave torchrun out."
+                f"{type(self).__name__} cannot work in several processes: run it without torchrun."
             )
 
     def epoch_end(self, loss: float) -> None:  # noqa: B027
@@ -143,17 +144,17 @@ class Optimization(ABC):
 
         Args:
             loss: Validation loss of the epoch, or its mean training loss if nothing is validated.
-                NaN: not validated, though other epochs are.
+                NaN: this epoch is not validated, although others are.
         """
 
     def save_state(self, path: Path) -> None:  # noqa: B027
-        """Write the state that a training needs, beside the parameters, to resume exactly here.
+        """Write the state that training needs, besides the parameters, to resume exactly here.
 
         Called only if `state_file` is not empty; the file must be readable without running code.
         """
 
     def load_state(self, path: Path) -> None:  # noqa: B027
-        """Read the state that `save_state` wrote; loss and optimizer are chosen.
+        """Read the state that `save_state` wrote, once loss and optimizer are chosen.
 
         Raises:
             CheckpointError: If the file is missing, damaged or of another optimization.

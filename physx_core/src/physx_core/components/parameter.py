@@ -28,8 +28,8 @@ SET_FIELDS = (
     Field("mode_index", (), "int8", role="additional"),
     Field("failed", (), "bool", role="additional"),
 )
-"""Fields beside the parameters in the dataset's record of them: number of the set, instance and
-episode that it is for, the place of their rows' mode in `physx_core.config.MODES`, and whether its
+"""Fields of the dataset's record of sets, in addition to the parameters: the set's number, its
+instance and episode, the index of its rows' mode in `physx_core.config.MODES`, and whether its
 simulation failed."""
 
 _DISTRIBUTIONS = ("uniform", "log_uniform", "normal", "integer")
@@ -38,8 +38,8 @@ _MOST_ELEMENTS = 2**16
 _SMALLEST = 2.0**-53  # a normal distribution has no quantile of 0
 
 Point: TypeAlias = Array
-"""A point of the unit cube: for each element of each parameter, the share of its distribution that
-lies below its value."""
+"""A point of the unit cube: for each element of each parameter, the cumulative probability of its
+value."""
 
 
 @dataclass(frozen=True)
@@ -51,12 +51,12 @@ class Parameter:
 
     Attributes:
         name: Name, a Python identifier.
-        low: Lower bound; None: none, in a normal distribution.
-        high: Upper bound; None: none, in a normal distribution.
+        low: Lower bound; None: none, for a normal distribution only.
+        high: Upper bound; None: none, for a normal distribution only.
         shape: Shape of a value; ``()`` for a number.
-        distribution: ``uniform``; ``log_uniform``, whose logarithm is uniform; ``normal``, cut off
-            at the bounds if there are any; or ``integer``, uniform, bounds included.
-        mean: Mean of a normal distribution before it is cut off.
+        distribution: ``uniform``; ``log_uniform``, whose logarithm is uniform; ``normal``,
+            truncated at the bounds, if any; or ``integer``, uniform, bounds included.
+        mean: Mean of a normal distribution before truncation.
         deviation: Its standard deviation.
         unit: Unit of the values.
     """
@@ -71,20 +71,22 @@ class Parameter:
     unit: str = ""
 
     def __post_init__(self) -> None:
-        """Check the options, and make flat tuples of bounds, mean and deviation.
+        """Check the options, and flatten bounds, mean and deviation to tuples.
 
         Raises:
             ConfigError: If the name is taken, a number is missing or not finite, or the bounds are
                 not in order.
         """
         if self.distribution not in _DISTRIBUTIONS:
-            raise self._error(f"has no distribution {self.distribution!r}: {_DISTRIBUTIONS}")
+            raise self._error(
+                f"has the unknown distribution {self.distribution!r}; use one of {_DISTRIBUTIONS}"
+            )
         field = Field(self.name, self.shape, unit=self.unit)
         if self.name in _TAKEN:
-            raise self._error("has a name that physx uses itself")
+            raise self._error("has a name that is reserved by physx")
         object.__setattr__(self, "shape", field.shape)
         if not 0 < self.size <= _MOST_ELEMENTS:
-            raise self._error(f"has {self.size} elements; 1 to {_MOST_ELEMENTS} are possible")
+            raise self._error(f"has {self.size} elements, but must have 1 to {_MOST_ELEMENTS}")
         is_normal = self.distribution == "normal"
         for option in ("low", "high", "mean", "deviation"):
             object.__setattr__(self, option, self._flat(option))
@@ -117,7 +119,7 @@ class Parameter:
         if low is not None and high is not None and not np.all(np.less(low, high)):
             raise self._error(f"has bounds {self.low} and {self.high}: low must be below high")
         if self.distribution == "log_uniform" and np.min(low) <= 0:
-            raise self._error("has a logarithm, so its lower bound must be above 0")
+            raise self._error("is log_uniform, so its lower bound must be above 0")
         if self.deviation is not None and np.min(self.deviation) <= 0:
             raise self._error("must have a deviation above 0")
         if self.distribution == "integer" and np.any(np.mod([low, high], 1)):
@@ -133,7 +135,7 @@ class Parameter:
 
     @property
     def columns(self) -> list[str]:
-        """Names of its elements in a table: its own, or with numbers if it has a shape."""
+        """Names of its elements in a table: its own name, numbered if it has a shape."""
         if not self.shape:
             return [self.name]
         return [f"{self.name}_{element}" for element in range(self.size)]
@@ -145,10 +147,10 @@ class Parameter:
         return Field(self.name, self.shape, dtype, self.unit)
 
     def quantile(self, point: Point) -> Any:
-        """Return the value below which given shares of the distribution lie.
+        """Return the value with given cumulative probabilities.
 
         Args:
-            point: The shares, from 0 to 1, shape (size,).
+            point: The probabilities, from 0 to 1, shape (size,).
 
         Returns:
             An array of the parameter's shape, or a number if that is ``()``.
@@ -162,7 +164,7 @@ class Parameter:
             flat = np.minimum(np.floor(low + point * (high - low + 1)), high).astype(np.int64)
         else:
             flat = low + point * (high - low)
-        if self.distribution == "log_uniform":  # beyond the bounds by rounding
+        if self.distribution == "log_uniform":  # rounding may exceed the bounds
             flat = np.clip(flat, low, high)
         return flat.reshape(self.shape) if self.shape else flat.item()
 
@@ -178,9 +180,9 @@ class Parameter:
         return value if high is None else min(value, high)
 
     def share(self, value: Any) -> Point:
-        """Return the shares of the distribution that lie below a value: the inverse of `quantile`.
+        """Return the cumulative probabilities of a value: the inverse of `quantile`.
 
-        Of an integer it is the middle of the shares whose quantile it is.
+        For an integer, this is the midpoint of the probabilities whose quantile it is.
 
         Args:
             value: A value of the parameter's shape.
@@ -220,7 +222,7 @@ class Parameter:
         return self.low is not None and self.high is not None
 
     def contains(self, value: Any) -> bool:
-        """Return whether a value lies between the bounds, as far as there are any."""
+        """Return whether a value lies within the bounds, if any."""
         flat = np.ravel(value)
         return bool(
             (self.low is None or np.all(flat >= np.asarray(self.low)))
@@ -233,10 +235,10 @@ class Parameter:
 
     @staticmethod
     def from_dict(plain: Mapping[str, Any]) -> Parameter:
-        """Return the parameter that plain data describe.
+        """Create the parameter that plain data describes.
 
         Raises:
-            ConfigError: If they do not describe any.
+            ConfigError: If it does not describe a parameter.
         """
         try:
             return Parameter(**plain)
@@ -275,12 +277,12 @@ def values_at(parameters: Sequence[Parameter], point: Point) -> dict[str, Any]:
 
 
 def random_of(entropy: int | Sequence[int], number: int, stream: int) -> np.random.Generator:
-    """Return the random numbers of a set of parameters, independent of those of all others.
+    """Return the random generator of a set of parameters, independent of all others.
 
     Args:
         entropy: Seed of the run.
         number: Number of the set.
-        stream: What they are for: 0 the environment's episode, 1 the choice of the set.
+        stream: Its purpose: 0 for the environment's episode, 1 for choosing the set.
     """
     return np.random.default_rng(np.random.SeedSequence(entropy, spawn_key=(number, stream)))
 
@@ -288,7 +290,7 @@ def random_of(entropy: int | Sequence[int], number: int, stream: int) -> np.rand
 def draw(
     parameters: Sequence[Parameter], entropy: int | Sequence[int], number: int
 ) -> dict[str, Any]:
-    """Return values of a set that are drawn from the parameters' distributions.
+    """Return the values of a set, drawn from the parameters' distributions.
 
     Args:
         parameters: The parameters.

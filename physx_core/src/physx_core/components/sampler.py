@@ -1,4 +1,4 @@
-"""Sampler: base class of what chooses the parameters of the next simulations."""
+"""Sampler: base class for choosing the parameters of the next simulations."""
 
 from __future__ import annotations
 
@@ -14,16 +14,16 @@ from physx_core.typing import Array, Index
 
 
 class Sampler(ABC):
-    """Chooses sets of parameters; a plugin offers its own with the hook ``physx_samplers``.
+    """Chooses sets of parameters; plugins offer their own with the hook ``physx_samplers``.
 
     The constructor takes the entries of `EnvironmentConfig.sampler_kwargs`; `begin` follows. Sets
     are numbered from 0: set k is for episode ``k // instance_nb`` of instance ``k % instance_nb``
-    (from 0 here). They are asked for in any order, and a set is asked for again when a run is
-    continued, so what `ask` returns may depend only on the arguments of `begin`, on the set's
-    number, and on what was told.
+    (from 0 here). Sets are requested in any order, and again when a run is resumed, so what `ask`
+    returns may depend only on the arguments of `begin`, on the set's number, and on the losses that
+    the sampler was told.
 
     Attributes:
-        learns: Whether it is told the losses of the samples that its sets led to.
+        learns: Whether it is told the losses of the samples generated with its sets.
         parameters: The parameters to choose.
         seed: Seed of the run.
         size: Number of elements of all parameters.
@@ -58,7 +58,7 @@ class Sampler(ABC):
     def values(self, point: Point) -> dict[str, Any]:
         """Return the parameters' values at a point of the unit cube.
 
-        A point that is uniform in the cube has values of the parameters' distributions.
+        A uniformly distributed point yields values from the parameters' distributions.
 
         Args:
             point: Shape (size,), each from 0 to 1.
@@ -66,21 +66,21 @@ class Sampler(ABC):
         return values_at(self.parameters, point)
 
     def random(self, number: int) -> np.random.Generator:
-        """Return random numbers that only the seed and the number of a set determine."""
+        """Return a random generator determined only by the seed and the number of a set."""
         return random_of(self.seed, number, 1)
 
 
 class LearningSampler(Sampler):
-    """A sampler that learns from the losses of a training's rows.
+    """A sampler that learns from the losses of training rows.
 
-    What a set may depend on is counted in batches, never in time: for a row of batch n these are
-    the losses of the batches before n - `delay`. So the simulations are the same in every run. With
-    a delay of 1 or more, clients generate the rows of a batch while the network learns from those
-    before.
+    What a set may depend on is counted in batches, never in time: a set for a row of batch n may
+    depend on the losses of the batches before n - `delay`. So the simulations are the same in every
+    run. With a delay of 1 or more, clients generate the rows of a batch while the network learns
+    from the previous ones.
 
     Attributes:
         delay: Number of batches before a row's own whose losses its set does not depend on yet.
-        memory: Number of sets, up to the latest one of which there are losses, that are told.
+        memory: Number of sets, up to the latest one with losses, that the sampler is told of.
     """
 
     learns: ClassVar[bool] = True
@@ -88,7 +88,7 @@ class LearningSampler(Sampler):
     memory: int = 512
 
     def ask(self, number: int) -> Mapping[str, Any]:
-        """Return the values of a set that depends on no losses."""
+        """Return the values of a set that does not depend on losses."""
         return self.ask_after(number, 0)
 
     @abstractmethod
@@ -97,8 +97,8 @@ class LearningSampler(Sampler):
 
         Args:
             number: Number of the set, from 0.
-            batches: Number of batches, from the first one on, whose losses it may depend on: those
-                told by now, or up to `delay` fewer.
+            batches: Number of batches, from the first one, whose losses it may depend on: those
+                told so far, or up to `delay` fewer.
         """
 
     @abstractmethod
@@ -114,11 +114,11 @@ class LearningSampler(Sampler):
         """Continue from a `state` of a sampler with the same options; called after `begin`.
 
         Args:
-            batches: Number of batches after which that was the state.
+            batches: Number of batches after which the state was taken.
             state: The state.
 
         Raises:
-            ValueError: If it is not the state of such a sampler.
+            ValueError: If `state` is not the state of such a sampler.
         """
 
     @abstractmethod
@@ -128,8 +128,8 @@ class LearningSampler(Sampler):
         """Learn from a batch.
 
         Args:
-            batches: Number of batches told by now, this one included.
-            numbers: Numbers of the sets of which the batch holds rows, increasing.
+            batches: Number of batches told so far, including this one.
+            numbers: Numbers of the sets with rows in the batch, increasing.
             values: Their values.
             losses: Mean loss of the batch's rows of each set.
         """
@@ -152,6 +152,6 @@ def checked(parameters: Sequence[Parameter], values: Mapping[str, Any]) -> dict[
         except Exception as error:
             raise ConfigError(f"The sampler's choice does not fit: {error}") from error
         if not np.isfinite(array).all():
-            raise ConfigError(f'The sampler chose "{parameter.name}" = {array}, not finite.')
+            raise ConfigError(f'The sampler chose "{parameter.name}" = {array}: not finite.')
         fitting[parameter.name] = array if parameter.shape else array.item()
     return fitting

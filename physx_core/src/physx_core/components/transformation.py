@@ -1,4 +1,4 @@
-"""Transformation: base class of what converts tensors between dataset, network, and environment."""
+"""Transformation: base class for converting tensors between dataset, network and environment."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from physx_core.typing import Tensors
 
 
 class Transformation:
-    """Identity; plugins derive their own.
+    """The identity; plugins derive their own.
 
     Attributes:
         normalization: Mean and standard deviation by field; empty if nothing is normalized. They

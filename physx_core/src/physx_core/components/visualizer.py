@@ -18,7 +18,7 @@ if TYPE_CHECKING:
 class Observer(Closeable):
     """Receives the events of a running pipeline. All methods do nothing unless overridden.
 
-    An observer that raises is reported once and then left out; the run continues.
+    An observer that raises is reported once and then ignored; the run continues.
     """
 
     def open(self, run_name: str, session_dir: Path, instance_nb: int) -> None:
@@ -71,7 +71,7 @@ class Observer(Closeable):
         """
 
     def fields(self, fields: Sequence[Field]) -> None:
-        """Receive the fields of a training's samples, with their units, before its first numbers.
+        """Receive the fields of the training samples, with their units, before the first numbers.
 
         Args:
             fields: The fields.
@@ -90,7 +90,7 @@ class Observer(Closeable):
         """
 
     def flush(self) -> None:
-        """Called before a checkpoint: store what a killed run is to have that resumes from it."""
+        """Called before a checkpoint: store what a killed run needs in order to resume from it."""
 
     def note(self, text: str) -> None:
         """Receive a message, for example that a training stopped early."""
@@ -102,7 +102,7 @@ class Observer(Closeable):
         """Called at the end of the run, also after a failure."""
 
     def outputs(self) -> Sequence[str]:
-        """Return a line for each file or folder that it left, for example ``recording: PATH``.
+        """Return a line for each file or folder that it wrote, for example ``recording: PATH``.
 
         A command that shows it follows the path in brackets. Called after `close`.
         """

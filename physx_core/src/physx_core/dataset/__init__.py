@@ -1,6 +1,6 @@
-"""Datasets: samples in HDF5 partitions, written at the speed of the disk and safe at any moment.
+"""Datasets: samples in HDF5 partitions, written at disk speed and crash-safe at all times.
 
-`physx_core.dataset.store` describes the format: `partition.format` and `manifest`.
+The format is documented in `physx_core.dataset.store`: `partition.format` and `manifest`.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""Dataset: samples by mode and field, written by one process or by several, and read by any."""
+"""Dataset: samples by mode and field, written by one or more processes, read by any number."""
 
 from __future__ import annotations
 
@@ -36,14 +36,14 @@ MAX_FILE_SIZE = 0.25
 
 
 class Dataset(Closeable):
-    """A folder of partition files with its manifest, created or opened by `create` and `open`.
+    """A folder of partition files and their manifest; use `create` or `open` to get one.
 
-    A context manager. Unless it is shared, one process at a time may write; any number may read,
-    even meanwhile. What `append` has stored survives if the process dies at any later moment.
+    A context manager. Unless the dataset is shared, one process at a time may write; any number
+    may read at the same time. Rows stored by `append` survive if the process dies later.
 
     Attributes:
         directory: The folder.
-        session: Session that new partitions are named after; empty when only reading.
+        session: Session that new partitions are named after; empty when reading only.
     """
 
     def __init__(self, directory: Path, manifest: Manifest, writer: Writer | None = None) -> None:
@@ -71,18 +71,18 @@ class Dataset(Closeable):
         """Create a dataset and open it for writing.
 
         Args:
-            directory: Its folder, which is created if it does not exist.
-            session: Name that its files begin with.
+            directory: Folder of the dataset; created if it does not exist.
+            session: Prefix of the file names.
             max_file_size: Size in GB at which a partition is full and the next one begins.
-            durable: Whether every append waits for the disk, so that the rows survive a power cut
-                too. Otherwise, what is written reaches the disk within about a second.
+            durable: Whether every append waits for the disk, so that rows also survive a power
+                failure. Otherwise, rows reach the disk within about a second.
             shared: Whether other processes may write to it at the same time: see `open`.
             info: Where the data come from: see `update_info`.
 
         Raises:
-            DatasetError: If there is a dataset already, or the folder cannot be written.
-            DatasetLockedError: If another process is creating one there.
-            ConfigError: If the session's name or the size is not valid.
+            DatasetError: If the folder already holds a dataset or cannot be written.
+            DatasetLockedError: If another process is creating a dataset there.
+            ConfigError: If the session's name or the size is invalid.
         """
         options = WriterOptions(session, max_file_size, durable, shared)
         writer = create(Path(directory), options, info or {})
@@ -103,21 +103,20 @@ class Dataset(Closeable):
 
         Args:
             directory: The dataset's folder, or the session's folder that holds it.
-            writable: Whether to add rows. Otherwise nothing on the disk is ever changed.
-            session: Name of the new files when writing; None: that of the last session.
+            writable: Whether the dataset can be changed. Otherwise nothing on disk is changed.
+            session: Prefix of the new file names when writing; None: that of the last session.
             max_file_size: Size in GB at which a new partition is full.
-            durable: Whether every append waits for the disk, so that the rows survive a power cut
-                too.
+            durable: Whether every append waits for the disk, so that rows also survive a power
+                failure.
             shared: Whether other processes may write to it at the same time, each with
-                ``shared=True``. Each writes partitions of its own; the partitions follow each
-                other in the order in which they were begun.
+                ``shared=True``. Each writes separate partitions, ordered by when they were begun.
 
         Raises:
             DatasetNotFoundError: If there is no dataset.
-            DatasetLockedError: If it is to be written, and another process writes to it.
-            DatasetError: If its manifest is not valid, or a partition is damaged and it is to be
-                written.
-            ConfigError: If the session's name or the size is not valid.
+            DatasetLockedError: If opened for writing while another process writes to it.
+            DatasetError: If the manifest is invalid, or a partition is damaged and the dataset is
+                opened for writing.
+            ConfigError: If the session's name or the size is invalid.
         """
         folder = recovery.locate(directory)
         if not writable:
@@ -136,7 +135,7 @@ class Dataset(Closeable):
         Closing a closed dataset does nothing.
 
         Raises:
-            DatasetError: If pending samples cannot be stored; all that was committed is intact.
+            DatasetError: If pending samples cannot be stored; committed rows stay intact.
         """
         if self._closed:
             return
@@ -159,12 +158,12 @@ class Dataset(Closeable):
 
     @property
     def info(self) -> dict[str, Any]:
-        """Where the data come from: environment, its keyword arguments, seed and the like."""
+        """Where the data come from: environment, its keyword arguments, seed, etc."""
         return dict(self._manifest.info)
 
     @property
     def versions(self) -> dict[str, str]:
-        """Versions of Python and of the packages that made the dataset."""
+        """Versions of Python and of the packages that created the dataset."""
         return dict(self._manifest.versions)
 
     def fields(self, mode: str) -> dict[str, Field]:
@@ -176,7 +175,7 @@ class Dataset(Closeable):
         return dict(self._reader.mode(mode).fields)
 
     def num_samples(self, mode: str) -> int:
-        """Return the number of committed samples of a mode, 0 if there is no such mode.
+        """Return the number of committed samples of a mode; 0 if there is no such mode.
 
         Raises:
             DatasetError: If a partition is missing or damaged.
@@ -193,10 +192,10 @@ class Dataset(Closeable):
         return mode in self._manifest.modes
 
     def refresh(self) -> None:
-        """See the rows that another process has committed since the dataset was opened.
+        """Load the rows that another process has committed since the dataset was opened.
 
-        Rows of an open partition that it has updated since `batches` read them into memory keep
-        their earlier values in later batches; open the dataset again to see the new ones.
+        If that process updates rows of an open partition after `batches` has read them into
+        memory, later batches still hold the old values; reopen the dataset to see the new ones.
 
         Raises:
             DatasetError: If the manifest is no longer valid.
@@ -214,24 +213,25 @@ class Dataset(Closeable):
 
         Args:
             mode: Name of the mode.
-            batch_size: Samples of a batch; only the last one of an epoch may have fewer.
+            batch_size: Samples per batch; only the last batch of an epoch may have fewer.
             **options: Any of these keyword arguments:
 
-                shuffle (bool): Whether each epoch is a new random order of all samples; False.
+                shuffle (bool): Whether each epoch visits all samples in a new random order. False
+                by default.
                 seed (int | Sequence[int] | None): Seed of the orders; None, the default: a
                 different one each time.
-                epochs (int | None): How often to iterate over all samples, once by default; None:
-                endlessly. An epoch begins with the samples that are committed by then.
+                epochs (int | None): Number of passes over all samples, 1 by default; None:
+                endless. An epoch covers the samples that are committed when it begins.
                 fields (Sequence[str] | None): Names of the fields to read; None, the default: all.
-                dtype (DTypeLike | None): Type to convert floating fields to; None, the default:
-                their own.
+                dtype (DTypeLike | None): Type to convert floating-point fields to; None, the
+                default: no conversion.
                 reuse (bool): Whether every batch is returned in the same arrays, which is faster;
-                each batch is then valid until the next. False by default.
-                normalize (bool | Mapping[str, Normalization]): Whether floating fields are
-                normalized, in place, by the mean and deviation of all samples of the mode; or the
-                normalization to use. False by default.
+                each batch is then valid only until the next. False by default.
+                normalize (bool | Mapping[str, Normalization]): Whether to normalize floating-point
+                fields in place by the mean and standard deviation of all samples of the mode; or
+                the normalization to use. False by default.
                 strategy (str): How samples are read, see `physx_core.dataset.read.strategies`;
-                ``"auto"``, the default: as suits the fields' sizes and the free memory.
+                ``"auto"``, the default: chosen by the fields' sizes and the free memory.
 
         Returns:
             An iterator over batches: field name to array of shape (samples, *field shape).
@@ -250,7 +250,7 @@ class Dataset(Closeable):
 
         Args:
             mode: Name of the mode.
-            fields: Names of the fields that are read together; None: all of them.
+            fields: Names of the fields to read together; None: all.
 
         Raises:
             DatasetError: If there is no such mode or field.
@@ -266,7 +266,7 @@ class Dataset(Closeable):
         rejects a sample, and when another run begins.
 
         Raises:
-            DatasetError: If there is no such mode, or its rows do not tell where trajectories
+            DatasetError: If there is no such mode, or its rows do not record where trajectories
                 begin.
         """
         return find_episodes(self[mode], self.num_samples(mode))
@@ -274,29 +274,29 @@ class Dataset(Closeable):
     def split(
         self, mode: str, shares: Mapping[str, float], *, by: str = "row", seed: int = 0
     ) -> dict[str, Subset]:
-        """Split the samples that a mode has now into parts, without copying any.
+        """Split the current samples of a mode into parts without copying them.
 
         Args:
             mode: Name of the mode.
-            shares: Name of each part to its share. They add up to 1 at most; what remains is in no
-                part.
-            by: ``row``: rows are drawn at random; ``episode``: whole trajectories are, so that
-                none has rows in two parts.
+            shares: Name of each part to its share. Shares add up to at most 1; remaining samples
+                belong to no part.
+            by: ``row``: draw rows at random; ``episode``: draw whole trajectories, so that none
+                has rows in two parts.
             seed: Seed of the draw; the same rows and seed give the same parts.
 
         Raises:
-            DatasetError: If there is no such mode, or trajectories are not known.
-            ConfigError: If the shares are not valid, or a part would be empty.
+            DatasetError: If there is no such mode, or its trajectories are unknown.
+            ConfigError: If the shares are invalid, or a part would be empty.
         """
         return split(self[mode], self.num_samples(mode), shares, by, seed)
 
     @property
     def normalization(self) -> dict[str, Normalization]:
-        """Mean and standard deviation of the floating fields of mode ``training``."""
+        """Mean and standard deviation of the floating-point fields of mode ``training``."""
         return self.normalization_of("training") if "training" in self else {}
 
     def normalization_of(self, mode: str) -> dict[str, Normalization]:
-        """Return mean and standard deviation of the floating fields of a mode, of all its samples.
+        """Return mean and standard deviation of a mode's floating-point fields over all samples.
 
         Raises:
             DatasetError: If there is no such mode, or a partition is missing or damaged.
@@ -306,7 +306,7 @@ class Dataset(Closeable):
         return {name: s.normalization() for name, s in statistics.items() if s.count}
 
     def recompute_normalization(self, mode: str = "training") -> dict[str, Normalization]:
-        """Recompute mean and standard deviation from all stored samples, and keep them.
+        """Recompute mean and standard deviation from all stored samples and store them.
 
         Raises:
             DatasetError: If there is no such mode, or a partition is missing or damaged.
@@ -315,13 +315,13 @@ class Dataset(Closeable):
         self._reader.mode(mode).forget_statistics()
         found = self.normalization_of(mode)
         store = self._appender.writer.store if self._appender is not None else None
-        if store is not None and not store.shared:  # several writers leave it to the next one
+        if store is not None and not store.shared:  # of several writers, the next one stores them
             with files.storing("The statistics"), store.change():
                 pass
         return found
 
     def describe(self) -> list[dict[str, Any]]:
-        """Return one row of a table for each field of each mode.
+        """Return a table with one row for each field of each mode.
 
         Returns:
             Rows with the entries mode, field, role, dtype, shape, unit, samples, partitions and
@@ -331,13 +331,13 @@ class Dataset(Closeable):
         return summarize(self._manifest)
 
     def verify(self, *, content: bool = True) -> list[str]:
-        """Check that all partition files are there, complete, consistent and unchanged.
+        """Check that all partition files exist and are complete, consistent and unchanged.
 
         Args:
             content: Whether to read every byte; otherwise only headers and sizes are checked.
 
         Returns:
-            One text for each problem; empty for a sound dataset.
+            One message per problem; empty for a sound dataset.
         """
         self._prepare_reading()
         return find_problems(self.directory, self._manifest, content)
@@ -352,7 +352,7 @@ class Dataset(Closeable):
             fields: The fields; a shape of None is taken from the first rows.
 
         Raises:
-            FieldsMismatchError: If the mode has other fields already.
+            FieldsMismatchError: If the mode already has different fields.
             ConfigError: If the mode's name is not an identifier, or there are no fields.
             UsageError: If the dataset is closed or open for reading only.
         """
@@ -364,13 +364,13 @@ class Dataset(Closeable):
         Args:
             mode: Name of the mode. If it has no fields yet, they are inferred from the rows.
             rows: Field name to array of shape (n, *field shape), all fields of the mode.
-                `Field.convert` decides what fits.
+                Accepts what `Field.convert` accepts.
             checked: Whether the rows are known to be finite, as those of a `Source` are: arrays of
-                the fields' types are then stored without another look at their values.
+                the fields' types are then stored without checking their values again.
 
         Raises:
-            SampleError: If a field is missing, unknown, of another shape, type or length, or holds
-                NaN or an infinite number. None of the rows is stored.
+            SampleError: If a field is missing, unknown, of the wrong shape, type or length, or
+                holds NaN or infinity. None of the rows is stored.
             DatasetError: If the disk is full or fails; says how many of the rows are stored.
             UsageError: If the dataset is closed or open for reading only.
         """
@@ -379,12 +379,12 @@ class Dataset(Closeable):
     def stripes(self, mode: str, count: int) -> Stripes:
         """Let `count` other processes write the rows of a mode from now on, in turn.
 
-        Row r of those that they write, counted from 0, comes from process ``r % count``. They share
-        the dataset's folder, and write with a `StripeWriter` each; this process keeps the manifest.
+        Of the rows they write, row r, counted from 0, comes from process ``r % count``. They share
+        the dataset's folder, each with a `StripeWriter`; this process maintains the manifest.
 
         Args:
             mode: Name of the mode; nothing else may change its rows until the dataset is closed.
-            count: How many processes write it.
+            count: Number of processes that write it.
 
         Raises:
             UsageError: If the dataset is closed, open for reading only, or shared.
@@ -393,15 +393,15 @@ class Dataset(Closeable):
         return self._as_only_writer("let others write stripes").stripes(mode, count)
 
     def append_sample(self, mode: str, sample: Mapping[str, Any]) -> None:
-        """Store one sample; it is committed together with others, or by `flush`.
+        """Store one sample; it is committed together with others or by `flush`.
 
         Args:
             mode: Name of the mode. If it has no fields yet, they are inferred from the sample.
             sample: Field name to value of the field's shape, all fields of the mode.
 
         Raises:
-            SampleError: If the sample cannot be stored, as in `append`.
-            DatasetError: If pending samples cannot be stored: the disk is full or fails.
+            SampleError: If the sample is invalid, as in `append`.
+            DatasetError: If pending samples cannot be stored because the disk is full or fails.
             UsageError: If the dataset is closed or open for reading only.
         """
         self._for_writing().append_sample(mode, sample)
@@ -410,7 +410,7 @@ class Dataset(Closeable):
         """Commit the pending samples.
 
         Raises:
-            DatasetError: If the disk is full or fails; says how many of them are stored. The
+            DatasetError: If the disk is full or fails; says how many samples are stored. The
                 others are discarded.
             UsageError: If the dataset is closed or open for reading only.
         """
@@ -420,8 +420,8 @@ class Dataset(Closeable):
         """Set entries of `info` and store them.
 
         Args:
-            values: Numbers, texts, lists, dictionaries; tuples and arrays become lists, classes
-                and paths become texts.
+            values: Numbers, strings, lists, dictionaries; tuples and arrays become lists, classes
+                and paths become strings.
 
         Raises:
             ConfigError: If JSON cannot represent a value.
@@ -434,19 +434,19 @@ class Dataset(Closeable):
     def update(self, mode: str, index: Any, rows: Mapping[str, Any]) -> None:
         """Overwrite stored rows in place.
 
-        The new values are committed when this returns. If the process dies meanwhile, each value
-        is either old or new, and a concurrent reader may see some of both. Checksums and
-        statistics of the updated partitions are recomputed when the dataset is closed.
+        The new values are committed when this returns. If the process dies before that, each value
+        is either old or new; a concurrent reader may also see a mix. Checksums and statistics of
+        the updated partitions are recomputed when the dataset is closed.
 
         Args:
             mode: Name of the mode.
-            index: Number of a row, a slice, or an array of numbers or booleans.
+            index: Row number, slice, or array of row numbers or booleans.
             rows: Field name to rows of shape (n, *field shape), or to a single value if `index` is
                 one number; any of the mode's fields.
 
         Raises:
-            SampleError: If a field is unknown, or rows are of another shape, type or number, or
-                hold NaN or an infinite number. Nothing is changed.
+            SampleError: If a field is unknown, or rows have the wrong shape, type or number, or
+                hold NaN or infinity. Nothing is changed.
             IndexError: If there are no such rows.
             DatasetError: If the disk fails, or a partition is damaged.
             UsageError: If the dataset is closed, open for reading only, or shared.
@@ -460,15 +460,15 @@ class Dataset(Closeable):
             writer.update(mode, numbers, values)
 
     def merge(self, directory: str | Path) -> None:
-        """Append all rows of another dataset, which is not changed; all of them, or none.
+        """Append either all rows or none of another dataset; that one is not changed.
 
         Args:
             directory: The other dataset's folder, or the session's folder that holds it.
 
         Raises:
             DatasetNotFoundError: If there is no dataset.
-            FieldsMismatchError: If a mode has other fields here than there.
-            DatasetError: If the other is damaged or this very dataset, or the disk is full.
+            FieldsMismatchError: If the fields of a mode differ between the datasets.
+            DatasetError: If the other dataset is damaged or is this one, or the disk is full.
             UsageError: If the dataset is closed or open for reading only.
         """
         appender, source = self._for_writing(), recovery.locate(directory)
@@ -486,15 +486,15 @@ class Dataset(Closeable):
             add_partitions(appender.writer, source, given)
 
     def remove_partition(self, mode: str, index: int, session: str | None = None) -> int:
-        """Remove a partition with all its rows and files; the rows behind it move up.
+        """Remove a partition with all its rows and files; the rows after it move up.
 
         Args:
             mode: Name of the mode.
             index: Number of the partition, as in the names of its files.
-            session: Session that wrote it; required if several have one of this number.
+            session: Session that wrote it; required if several sessions have this number.
 
         Returns:
-            How many rows it had.
+            Number of rows removed.
 
         Raises:
             DatasetError: If there is no such partition or mode, or the disk fails.
@@ -507,29 +507,29 @@ class Dataset(Closeable):
 
     @staticmethod
     def repair(directory: str | Path) -> list[str]:
-        """Repair what `verify` finds, as far as that is possible; no file is ever deleted.
+        """Repair what `verify` finds, as far as possible; no file is ever deleted.
 
-        What a killed writer left open is sealed; a manifest that is missing, cut or edited is
-        checked against the partition files or rebuilt from them; a damaged header is rewritten
-        around sound rows. The files of partitions that cannot be read are moved to the folder
+        Partitions that a killed writer left open are sealed; a missing, truncated or edited
+        manifest is checked against the partition files or rebuilt from them; damaged headers of
+        sound rows are rewritten. The files of unreadable partitions are moved to the folder
         ``damaged``, so that the other rows can be used.
 
         Args:
             directory: The dataset's folder, or the session's folder that holds it.
 
         Returns:
-            One text for each thing that was repaired; empty if there was nothing to do.
+            One message per repair; empty if there was nothing to repair.
 
         Raises:
             DatasetNotFoundError: If there is no dataset.
-            DatasetLockedError: If a process writes to it.
+            DatasetLockedError: If a process is writing to it.
             DatasetError: If the folder cannot be written.
         """
         return repair.repair(recovery.locate(directory))
 
     @staticmethod
     def rebuild(directory: str | Path) -> None:
-        """Rebuild the manifest from the partition files alone; the old one is kept beside it.
+        """Rebuild the manifest from the partition files alone; the old one is kept next to it.
 
         Everything but the info is restored: fields, units, order, checksums and statistics.
 
@@ -538,7 +538,7 @@ class Dataset(Closeable):
 
         Raises:
             DatasetNotFoundError: If there is no dataset.
-            DatasetLockedError: If a process writes to it.
+            DatasetLockedError: If a process is writing to it.
             DatasetError: If a partition is missing or damaged, or the folder cannot be written.
         """
         repair.rebuild(recovery.locate(directory))
@@ -564,7 +564,7 @@ class Dataset(Closeable):
         return self._appender
 
     def _as_only_writer(self, what: str) -> Writer:
-        """Return the writer with all samples stored, unless the dataset is shared."""
+        """Store pending samples and return the writer; an error if the dataset is shared."""
         appender = self._for_writing()
         if appender.writer.store.shared:
             raise UsageError(

@@ -1,7 +1,7 @@
 """Base classes of engines for articulated bodies: robot models, algorithms and simulations.
 
 An engine implements `RobotEngine` for one robot or object, `Algorithms` for a world in any state,
-and `RobotSimulation.advance` for the steps.
+and `RobotSimulation.advance` for stepping.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What engines of articulated bodies share: models of robots, and the simulation around them."""
+"""Common code of engines for articulated bodies: robot models and the simulation around them."""
 
 from .algorithms import Algorithms as Algorithms
 from .backend import RobotBackend as RobotBackend

@@ -1,4 +1,4 @@
-"""Algorithms: what an engine computes for a world in any state, whatever the present one is."""
+"""Algorithms: what an engine computes for a world in any state, not only its current one."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from physx_core.typing import Vector
 class Algorithms(Closeable):
     """Kinematics and dynamics of the robots and objects of a world.
 
-    States follow the convention of `physx_core.simulation.layout`; `RobotSimulation` has validated
-    them, and scaled quaternions to length 1. All results are new arrays of float64 in C order,
-    which ``torch.from_numpy`` accepts as they are. Bodies are places in `Layout.names`, so static
-    things are among them.
+    States follow the convention of `physx_core.simulation.layout`; `RobotSimulation` has already
+    validated them and normalized their quaternions. All results are new C-ordered float64 arrays,
+    which ``torch.from_numpy`` accepts directly. Bodies are indices into `Layout.names`, so they may
+    be static.
 
     Attributes:
         nq: Length of the positions.
@@ -29,29 +29,29 @@ class Algorithms(Closeable):
 
     @abstractmethod
     def body_poses(self, q: Vector, bodies: Sequence[int]) -> Vector:
-        """Return the poses of bodies, shape (bodies, 7), by their places in `Layout.names`."""
+        """Return the poses of bodies, given as indices into `Layout.names`, shape (bodies, 7)."""
 
     @abstractmethod
     def motions(self, q: Vector, v: Vector, a: Vector, bodies: Sequence[int]) -> Vector:
-        """Return the motions of bodies, shape (bodies, 19), along the world's axes.
+        """Return the motions of bodies in the world frame, shape (bodies, 19).
 
         Args:
             q: Positions.
             v: Velocities.
             a: Accelerations.
-            bodies: Their places in `Layout.names`.
+            bodies: Indices into `Layout.names`.
 
         Returns:
-            In each row the pose (7), velocity (6), and acceleration (6) of the body's origin.
+            One row per body: pose (7), velocity (6), and acceleration (6) of its origin.
         """
 
     @abstractmethod
     def forward_dynamics(self, q: Vector, v: Vector, tau: Vector) -> Vector:
-        """Return the accelerations, shape (nv,), that torques (nv,) and resistance cause."""
+        """Return the accelerations, shape (nv,), caused by torques (nv,) and resistance."""
 
     @abstractmethod
     def inverse_dynamics(self, q: Vector, v: Vector, acceleration: Vector) -> Vector:
-        """Return the torques, shape (nv,), that cause accelerations (nv,) against resistance."""
+        """Return the torques, shape (nv,), that produce accelerations (nv,) against resistance."""
 
     @abstractmethod
     def mass_matrix(self, q: Vector) -> Vector:
@@ -59,39 +59,39 @@ class Algorithms(Closeable):
 
     @abstractmethod
     def jacobian(self, body: int, q: Vector, point: Vector) -> Vector:
-        """Return the Jacobian, shape (6, nv), of a point of a body, by its place in the layout."""
+        """Return the Jacobian, shape (6, nv), of a point on a body, given by its index."""
 
     def joint_wrenches(
         self, q: Vector, v: Vector, a: Vector, outer: Mapping[int, Sequence[float]]
     ) -> Vector:
-        """Return the reactions of joints in a state, shape (joints, 6); feature `joint_wrenches`.
+        """Return the joint reactions in a state, shape (joints, 6); feature `joint_wrenches`.
 
         Args:
             q: Positions.
             v: Velocities.
             a: Accelerations.
-            outer: External wrenches on bodies, by their places: force, then torque about the body's
-                origin, 6 numbers along the world's axes.
+            outer: External wrenches by body index: force, then torque about the body's origin, 6
+                numbers in the world frame.
         """
         raise NotImplementedError
 
     def forward_dynamics_derivatives(
         self, q: Vector, v: Vector, tau: Vector
     ) -> tuple[Vector, Vector, Vector]:
-        """Return the derivatives of `forward_dynamics` by positions, velocities, and torques.
+        """Return the derivatives of `forward_dynamics` w.r.t. positions, velocities, and torques.
 
         Feature `derivatives`.
         """
         raise NotImplementedError
 
     def forward_batch(self, q: Vector, v: Vector, tau: Vector, processes: int = 1) -> Vector:
-        """Return `forward_dynamics` of many states, shape (n, nv); each row is a state.
+        """Return `forward_dynamics` for many states, one per row, shape (n, nv).
 
         Args:
             q: Positions, shape (n, nq).
             v: Velocities, shape (n, nv).
             tau: Torques, shape (n, nv).
-            processes: Most processes that may share the rows.
+            processes: Maximum number of processes that share the rows.
         """
         found = [self.forward_dynamics(*state) for state in zip(q, v, tau, strict=True)]
         return np.array(found, np.float64).reshape(-1, self.nv)
@@ -104,9 +104,9 @@ class Algorithms(Closeable):
         Args:
             q: Positions, shape (n, nq).
             v: Velocities, shape (n, nv).
-            a: Accelerations that the torques cause, shape (n, nv).
+            a: Accelerations that result from the torques, shape (n, nv).
             weights: Shape (n, nv).
-            processes: Most processes that may share the rows.
+            processes: Maximum number of processes that share the rows.
         """
         found = np.empty((3, *weights.shape))
         for place, (q_i, v_i, a_i, weight) in enumerate(zip(q, v, a, weights, strict=True)):
@@ -118,4 +118,4 @@ class Algorithms(Closeable):
         return found
 
     def close(self) -> None:
-        """Free what the algorithms hold, such as processes."""
+        """Release resources such as processes."""

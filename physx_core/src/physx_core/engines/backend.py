@@ -1,4 +1,4 @@
-"""RobotBackend: an engine whose worlds may name robots of physx instead of files."""
+"""RobotBackend: an engine whose worlds may refer to physx's robots by name instead of by file."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ class RobotBackend(Backend):
     """A physics engine that loads its robots with `physx_core.engines.read_parts`."""
 
     def robots(self) -> Sequence[RobotInfo]:
-        """Return the robots of physx and of ``example-robot-data``."""
+        """Return the robots of physx and ``example-robot-data``."""
         return catalog.robots()
 
     def robot_path(self, name: str) -> Path | None:
-        """Return the URDF file of the robot of a name, None if there is none."""
+        """Return the URDF file of a named robot, or None if there is none."""
         return robot_files.robot_path(name)

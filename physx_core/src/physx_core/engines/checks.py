@@ -1,4 +1,4 @@
-"""Validation of what callers give to a simulation."""
+"""Validation of the arguments that callers pass to a simulation."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ def integer(name: str, given: Any, least: int) -> int:
 
 
 class LayoutChecks:
-    """Validates states and names of bodies against a simulation's layout."""
+    """Validates states and body names against a simulation's layout."""
 
     def __init__(self, layout: Layout) -> None:
         self._layout = layout
@@ -34,7 +34,7 @@ class LayoutChecks:
         self._floating = [part for part in layout.parts.values() if part.floating]
 
     def positions(self, given: Any) -> Vector:
-        """Return positions as a new vector (nq,), their quaternions scaled to length 1."""
+        """Return positions as a new vector (nq,) with normalized quaternions."""
         q = finite_vector("positions", given, self._layout.nq)
         for part in self._floating:
             base = slice(part.positions.start + 3, part.positions.start + 7)
@@ -73,7 +73,7 @@ class LayoutChecks:
         return [q, *rows]
 
     def body(self, name: Any) -> int:
-        """Return the place of a body in `Layout.names`."""
+        """Return the index of a body in `Layout.names`."""
         place = self._bodies.get(name) if isinstance(name, str) else None
         if place is None:
             raise SimulationError(
@@ -83,11 +83,11 @@ class LayoutChecks:
         return place
 
     def bodies(self, names: Any) -> list[int]:
-        """Return the places of bodies in `Layout.names`; None: all that move."""
+        """Return the indices of bodies in `Layout.names`; None: all moving bodies."""
         if names is None:
             return list(range(len(self._layout.bodies)))
         if isinstance(names, str):
-            raise SimulationError(f'names is the text "{names}" but must be a list of names.')
+            raise SimulationError(f'names is the string "{names}" but must be a list of names.')
         try:
             return [self._bodies[name] for name in names]
         except (KeyError, TypeError):
@@ -98,11 +98,11 @@ class LayoutChecks:
             raise SimulationError(f"names is {names!r} but must be a list of names.") from None
 
     def part(self, name: Any) -> int:
-        """Return the place of a robot or moving object in `Layout.parts`."""
+        """Return the index of a robot or moving object in `Layout.parts`."""
         known = list(self._layout.parts)
         if name not in known:
             raise SimulationError(
-                f'There is no robot or object "{name}" that moves.{nearest(str(name), known)} '
-                f"There are: {listed(known)}."
+                f'There is no moving robot or object "{name}".{nearest(str(name), known)} '
+                f"Available: {listed(known)}."
             )
         return known.index(name)

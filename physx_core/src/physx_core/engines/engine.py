@@ -1,4 +1,4 @@
-"""Interface that an engine implements for a robot or object."""
+"""The interface that an engine implements for a robot or object."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from physx_core.typing import Vector
 
 
 class RobotEngine(ABC):
-    """A robot or object in an engine. Vectors follow the convention of `physx_core`.
+    """A robot or object in an engine; vectors follow the convention of `physx_core`.
 
     Attributes:
         mover: Its description.
@@ -36,26 +36,26 @@ class RobotEngine(ABC):
         self.resistance = Resistance.of(mover)
 
     def neutral(self) -> Vector:
-        """Return the positions at rest: 0 or the closest limit; the base at its initial pose."""
+        """Return the rest positions: 0 or the nearest limit, with the base at its initial pose."""
         mover = self.mover
         base = [] if self.fixed_base else [*mover.position, *mover.orientation]
         return np.array([*base, *(max(j.lower, min(0.0, j.upper)) for j in self.model.joints)])
 
     @abstractmethod
     def hold(self, commands: Vector) -> None:
-        """Hold commands, shape (joints,), that are within their limits."""
+        """Hold commands, shape (joints,), already clipped to their limits."""
 
     @abstractmethod
     def positions(self) -> Vector:
-        """Return the present positions, shape (nq,), as a new vector."""
+        """Return the current positions, shape (nq,), as a new vector."""
 
     @abstractmethod
     def velocities(self) -> Vector:
-        """Return the present velocities, shape (nv,), as a new vector."""
+        """Return the current velocities, shape (nv,), as a new vector."""
 
     @abstractmethod
     def accelerations(self) -> Vector:
-        """Return the change of the velocities in the last step over the period, shape (nv,)."""
+        """Return the velocity change in the last step divided by the period, shape (nv,)."""
 
     @abstractmethod
     def write(self, positions: Vector, velocities: Vector) -> None:
@@ -63,11 +63,11 @@ class RobotEngine(ABC):
 
     @abstractmethod
     def native(self) -> tuple[Vector, Vector]:
-        """Return a copy of the engine's own state."""
+        """Return a copy of the engine's native state."""
 
     @abstractmethod
     def set_native(self, positions: Vector, velocities: Vector) -> None:
-        """Set the state that `native` returned."""
+        """Set a state returned by `native`."""
 
     @abstractmethod
     def speed(self) -> float:
@@ -75,18 +75,18 @@ class RobotEngine(ABC):
 
     @abstractmethod
     def can_move(self, link: int) -> bool:
-        """Return whether a link, by its place in the model, can move."""
+        """Return whether a link, given by its index in the model, can move."""
 
     @abstractmethod
     def push(self, link: int, force: Vector, torque: Vector, point: Vector, local: bool) -> None:
         """Apply a wrench until `release`.
 
         Args:
-            link: Place of the link in the model.
-            force: Force on the point, shape (3,), in N.
+            link: Index of the link in the model.
+            force: Force at the point, shape (3,), in N.
             torque: Torque, shape (3,), in N m.
             point: Point of application in the link's frame, in m.
-            local: Whether force and torque are along the link's axes instead of the world's.
+            local: Whether force and torque are in the link's frame instead of the world's.
         """
 
     @abstractmethod
@@ -97,12 +97,12 @@ class RobotEngine(ABC):
 def base_accelerations(
     orientation: Sequence[float], linear: Sequence[float], twist: Vector
 ) -> Triple:
-    """Return the derivative of the linear part of a base's twist, along its own axes, in m/s².
+    """Return the time derivative of the linear part of a base's twist, in its own frame, in m/s².
 
     Args:
         orientation: Quaternion x, y, z, w of the base.
-        linear: Acceleration of its origin along the world's axes, in m/s².
-        twist: Its linear, then its angular velocity along its own axes; more may follow.
+        linear: Acceleration of its origin in the world frame, in m/s².
+        twist: Its linear, then angular velocity in its own frame; further entries are ignored.
     """
     u, v, w, p, q, r = twist[:6].tolist()
     a, b, c = rotate_back(orientation, *linear)
@@ -113,14 +113,14 @@ def base_accelerations(
 def twist_change(
     earlier: Sequence[float], before: Vector, now: Sequence[float], after: Vector, period: float
 ) -> Vector:
-    """Return the change of a base's twist in a step over the period, shape (6,).
+    """Return the change of a base's twist in a step divided by the period, shape (6,).
 
     Args:
         earlier: Quaternion x, y, z, w of the base before the step.
-        before: Its velocities then: linear along the world's axes, angular along its own; more may
-            follow.
+        before: Its velocities before the step: linear in the world frame, angular in its own;
+            further entries are ignored.
         now: Quaternion after the step.
-        after: Velocities after the step, likewise.
+        after: Velocities after the step, as in `before`.
         period: Length of the step, in s.
     """
     pace, linear = 1 / period, after[:3].tolist()

@@ -1,4 +1,4 @@
-"""Wrenches and hooks, which act on a world while it is stepped."""
+"""Wrenches and hooks that act on a world while it is stepped."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ class Wrenches:
         return len(self._active)
 
     def add(self, wrench: Wrench, frame: int) -> int:
-        """Apply a wrench from a frame on; return its number."""
+        """Apply a wrench starting at a frame; return its number."""
         number, self._next = self._next, self._next + 1
         self._active[number] = AppliedWrench(number, frame, wrench)
         return number
@@ -36,7 +36,7 @@ class Wrenches:
         del self._active[number]
 
     def at(self, frame: int) -> Iterator[tuple[Wrench, Vector, Vector]]:
-        """Drop expired wrenches; return each of the others with its force and torque."""
+        """Drop expired wrenches; yield each remaining one with its force and torque."""
         for number, applied in list(self._active.items()):
             steps = applied.wrench.steps(self._period)
             if steps is not None and frame >= applied.begin + steps:
@@ -46,7 +46,7 @@ class Wrenches:
                 yield applied.wrench, *applied.wrench.at(time)
 
     def before(self, frame: int) -> Iterator[tuple[Wrench, Vector, Vector]]:
-        """Return each wrench that acted in the step before a frame, with its force and torque."""
+        """Yield each wrench that acted in the step before a frame, with its force and torque."""
         for applied in self._active.values():
             steps, since = applied.wrench.steps(self._period), frame - 1 - applied.begin
             if since >= 0 and (steps is None or since < steps):
@@ -63,7 +63,7 @@ class Wrenches:
 
 
 class Hooks:
-    """Functions that are called before physics steps."""
+    """Functions called before physics steps."""
 
     def __init__(self) -> None:
         self._hooks: list[tuple[Hook, int]] = []
@@ -91,7 +91,7 @@ class Hooks:
         self._hooks.clear()
 
     def pause(self, frame: int) -> int:
-        """Return the number of steps from a frame to the next call, at least 1."""
+        """Return the number of steps from a frame until the next call, at least 1."""
         return min((every - frame % every for _, every in self._hooks), default=2**30)
 
     def call(self, simulation: Simulation, frame: int) -> None:

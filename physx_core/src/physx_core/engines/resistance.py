@@ -11,13 +11,13 @@ from physx_core.typing import Vector
 
 
 class Resistance:
-    """Damping, friction, springs, and rotors of a robot, each of shape (nv,); 0 for its base.
+    """Damping, friction, springs, and rotors of a robot, each of shape (nv,), 0 for its base.
 
     Attributes:
         damping: In N m s/rad or N s/m.
         friction: In N m or N.
         stiffness: Stiffness of the springs, in N m/rad or N/m.
-        rest: Relaxed positions of the springs, in rad or m.
+        rest: Rest positions of the springs, in rad or m.
         armature: Inertia of the rotors, in kg m² or kg.
         table: All five as rows, shape (5, nv).
     """
@@ -44,14 +44,14 @@ class Resistance:
         return cls(table)
 
     def torques(self, positions: Vector, velocities: Vector) -> Vector | float:
-        """Return the torques against a motion, shape (..., nv), or 0 if there are none."""
+        """Return the torques that resist a motion, shape (..., nv), or 0 if there are none."""
         if not self._any:
             return 0.0
         found: Vector = self.smooth(positions, velocities) + self.friction * np.sign(velocities)
         return found
 
     def smooth(self, positions: Vector, velocities: Vector) -> Vector | float:
-        """Return the torques of damping and springs alone, likewise."""
+        """Return the torques of damping and springs only, as in `torques`."""
         if not self._smooth:
             return 0.0
         stretch = positions[..., positions.shape[-1] - velocities.shape[-1] :] - self.rest

@@ -1,4 +1,4 @@
-"""The classic Runge-Kutta method of fourth order, for robots without constraints."""
+"""The classic fourth-order Runge-Kutta method, for robots without constraints."""
 
 from __future__ import annotations
 
@@ -20,11 +20,16 @@ RK4_LACKS = (
     "restitution",
     "self_collisions",
 )
-"""Features that a simulation does not have with this integrator."""
+"""Features that a simulation lacks with this integrator."""
 
 
 def check_rk4(parts: Parts, engine: str, features: Collection[str]) -> None:
-    """Raise an error if a world needs constraints."""
+    """Raise an error if a world needs constraints.
+
+    Raises:
+        FeatureNotSupportedError: If there may be contacts, or a joint has limits, friction, or a
+            mode other than ``"force"``.
+    """
     advice = 'Use World(integrator="euler").'
     solid = sum(bool(mover.model.shapes) for mover in parts.movers) + len(parts.statics)
     if parts.world.contacts != "none" and solid > 1:
@@ -52,11 +57,11 @@ def rk4_step(
 
     Args:
         q: Positions.
-        v: Velocities; the twist of a base along axes in which its motions add up: the world's for
+        v: Velocities; a base's twist uses the axes in which its motions add up: the world's for
             its origin, its own for its rotation.
         period: Length of the step, in s.
-        acceleration: Returns the derivative of velocities in a state.
-        integrate: Returns positions after a motion.
+        acceleration: Returns the time derivative of the velocities in a state.
+        integrate: Returns the positions after a motion.
     """
     half = 0.5 * period
     a1 = acceleration(q, v)

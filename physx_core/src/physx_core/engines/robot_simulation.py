@@ -1,7 +1,7 @@
-"""Simulation of a world whose robots and objects are stepped by an engine.
+"""Simulation of a world whose robots and objects an engine steps.
 
 An engine implements `RobotEngine` for one robot, `Algorithms` for any state of a world, and the
-abstract methods of `RobotSimulation` for its steps.
+abstract methods of `RobotSimulation` for stepping.
 """
 
 from __future__ import annotations
@@ -33,9 +33,9 @@ from physx_core.simulation import (
 from physx_core.typing import Records, Vector
 
 _FASTEST = 1e8
-"""Speed, in m/s or rad/s, beyond which a state counts as no longer finite."""
+"""Speed, in m/s or rad/s, above which a state counts as no longer finite."""
 _BLOCK = 64
-"""Physics steps between two checks of the state."""
+"""Physics steps between checks of the state."""
 
 
 Engine = TypeVar("Engine", bound=RobotEngine)
@@ -45,7 +45,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
     """A world whose robots and moving objects are each simulated by a `RobotEngine`."""
 
     lacks: ClassVar[frozenset[str]] = frozenset()
-    """Features that the engine never has."""
+    """Features that the engine never supports."""
 
     def __init__(self, parts: Parts, robots: Sequence[Engine], lacks: Sequence[str]) -> None:
         """Put the robots at rest in their neutral configuration.
@@ -53,7 +53,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         Args:
             parts: Everything in the world.
             robots: One for each mover of the world.
-            lacks: Features that this simulation does not have.
+            lacks: Features that this simulation lacks.
         """
         self.features = frozenset(FEATURES) - self.lacks - set(lacks)
         self.parts = parts
@@ -97,7 +97,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._least, self._most = least, most
         self._forces_only = bool((modes == "force").all())
         tame = min(most.min(initial=np.inf), -least.max(initial=-np.inf))
-        # Square of a norm up to which no command has to be clipped.
+        # Square of the norm up to which no command needs clipping.
         self._tame = tame**2 if tame > 0 else -1.0
         self._positioned = np.flatnonzero(modes == "position")
         joints = [joint for mover in self.parts.movers for joint in mover.model.joints]
@@ -114,10 +114,10 @@ class RobotSimulation(Simulation, Generic[Engine]):
 
     @abstractmethod
     def make_algorithms(self) -> Algorithms:
-        """Return the algorithms for any state of the world; called when they are first needed."""
+        """Return the algorithms for any state of the world; called on first use."""
 
     def forget(self) -> None:
-        """Forget what the engine remembers of earlier steps: the state determines what follows."""
+        """Clear what the engine keeps from earlier steps, so that only the state matters."""
 
     @property
     def frame(self) -> int:
@@ -126,7 +126,12 @@ class RobotSimulation(Simulation, Generic[Engine]):
         return self._frame
 
     def set_torques(self, torques: Vector) -> None:
-        """Hold torques, shape (joints,), in N m or N, clipped at the joints' limits."""
+        """Hold torques, shape (joints,), in N m or N, clipped to the joints' limits.
+
+        Raises:
+            SimulationError: If the shape is wrong, a value is not finite, or a joint's mode is not
+                ``"force"``.
+        """
         if self._closed:
             self._check_open()
         if not self._forces_only:
@@ -142,13 +147,13 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._hold(finite_vector("torques", torques, self._joint_count))
 
     def set_commands(self, commands: Vector) -> None:
-        """Hold commands, shape (joints,), in each joint's mode, clipped at the limits."""
+        """Hold commands, shape (joints,), in each joint's mode, clipped to the limits."""
         if self._closed:
             self._check_open()
         self._hold(finite_vector("commands", commands, self._joint_count))
 
     def commands(self) -> Vector:
-        """Return the held commands, clipped at the joints' limits, shape (joints,)."""
+        """Return the held commands, clipped to the joints' limits, shape (joints,)."""
         if self._closed:
             self._check_open()
         return self._commands.copy()
@@ -165,13 +170,18 @@ class RobotSimulation(Simulation, Generic[Engine]):
             robot.hold(commands[part])
 
     def step(self, n: int = 1) -> None:
-        """Simulate n physics steps under the held commands."""
+        """Simulate n physics steps under the held commands.
+
+        Raises:
+            SimulationError: If `n` is invalid, the state is no longer finite, or a hook calls
+                `step`.
+        """
         if self._closed:
             self._check_open()
         if type(n) is not int or n < 0:
             n = integer("n, the number of steps,", n, 0)
         if self._stepping:
-            raise SimulationError("A hook must not call step, which calls the hook.")
+            raise SimulationError("A hook must not call step, because step calls the hook.")
         if self._watched:
             self._step_watched(n)
             return
@@ -221,7 +231,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
             robot.release()
 
     def _steer(self) -> None:
-        """Update the velocities of servos that approach position commands."""
+        """Update the velocities of servos that track position commands."""
         at = self._positioned
         if not len(at):
             return
@@ -241,7 +251,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
                 )
 
     def _watch(self) -> None:
-        """Note whether anything has to be done between steps."""
+        """Note whether any work is needed between steps."""
         self._watched = bool(len(self._hooks) or len(self._wrenches) or len(self._positioned))
 
     def add_hook(self, hook: Hook, every: int = 1) -> None:
@@ -282,7 +292,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
     # State ----------------------------------------------------------------------------------
 
     def positions(self, out: Vector | None = None) -> Vector:
-        """Return the positions, shape (nq,), copied to `out` if it is given."""
+        """Return the positions, shape (nq,), copied to `out` if given."""
         if self._closed:
             self._check_open()
         only = self._only
@@ -290,7 +300,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         return found if out is None else copy_to(found, out)
 
     def velocities(self, out: Vector | None = None) -> Vector:
-        """Return the velocities, shape (nv,), copied to `out` if it is given."""
+        """Return the velocities, shape (nv,), copied to `out` if given."""
         if self._closed:
             self._check_open()
         only = self._only
@@ -298,7 +308,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         return found if out is None else copy_to(found, out)
 
     def accelerations(self) -> Vector:
-        """Return the change of the velocities in the last step over the period, shape (nv,)."""
+        """Return the velocity change in the last step divided by the period, shape (nv,)."""
         if self._closed:
             self._check_open()
         if not self._stepped:
@@ -307,7 +317,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         return only.accelerations() if only else _join([r.accelerations() for r in self._robots])
 
     def set_state(self, positions: Vector, velocities: Vector) -> None:
-        """Set the state; time goes on."""
+        """Set the state without resetting the time."""
         self._check_open()
         q = self._checks.positions(positions)
         self._write(q, self._checks.velocities("velocities", velocities))
@@ -333,7 +343,11 @@ class RobotSimulation(Simulation, Generic[Engine]):
         )
 
     def restore(self, state: State) -> None:
-        """Return to a snapshot: bit for bit to an own one, within rounding to another engine's."""
+        """Return to a snapshot: exactly if it is this engine's, within rounding if another's.
+
+        Raises:
+            SimulationError: If it is not a snapshot, or one of a world with a different layout.
+        """
         self._check_open()
         if not isinstance(state, State):
             raise SimulationError(f"restore needs the result of snapshot, not {state!r}.")
@@ -367,18 +381,18 @@ class RobotSimulation(Simulation, Generic[Engine]):
     # Measurements ---------------------------------------------------------------------------
 
     def contacts(self) -> Records:
-        """Return the contacts of the last physics step: an array of `CONTACT` records, a copy."""
+        """Return the contacts of the last physics step as a new array of `CONTACT` records."""
         self._check_has("contacts")
         return self.read_contacts() if self._stepped else np.zeros(0, CONTACT)
 
     def joint_wrenches(self) -> Vector:
-        """Return the reactions of joints in the last step, shape (joints, 6)."""
+        """Return the joint reactions in the last step, shape (joints, 6)."""
         self._check_has("joint_wrenches")
         q, v, a = self.positions(), self.velocities(), self.accelerations()
         return self._algorithms.joint_wrenches(q, v, a, self._outer(q))
 
     def _outer(self, q: Vector) -> dict[int, list[float]]:
-        """Return external forces on bodies in the last step, and torques about their origins."""
+        """Return the external forces on bodies in the last step, and torques about origins."""
         found: dict[int, list[float]] = {}
         if not self._stepped:
             return found
@@ -419,7 +433,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         positions: Vector | None = None,
         velocities: Vector | None = None,
     ) -> Vector:
-        """Return the velocities of bodies' origins, shape (names, 6): linear, angular."""
+        """Return the velocities of body origins, shape (names, 6): linear, angular."""
         if positions is None and velocities is None:
             return self.body_motions(names)[:, 7:13].copy()
         self._check_open()
@@ -431,18 +445,18 @@ class RobotSimulation(Simulation, Generic[Engine]):
         return self._algorithms.motions(q, v, nothing, chosen)[:, 7:13].copy()
 
     def body_accelerations(self, names: Sequence[str] | None = None) -> Vector:
-        """Return the accelerations of bodies' origins, shape (names, 6): linear, angular."""
+        """Return the accelerations of body origins, shape (names, 6): linear, angular."""
         return self.body_motions(names)[:, 13:].copy()
 
     def body_motions(self, names: Sequence[str] | None = None) -> Vector:
-        """Return the present poses, velocities, and accelerations of bodies, shape (names, 19)."""
+        """Return the current poses, velocities, and accelerations of bodies, shape (names, 19)."""
         if self._closed:
             self._check_open()
         q, v, a = self.positions(), self.velocities(), self.accelerations()
         return self._algorithms.motions(q, v, a, self._checks.bodies(names))
 
     def reach(self, name: str, direction: Vector, positions: Vector | None = None) -> float:
-        """Return how far the collision shapes of a robot or object reach along a direction."""
+        """Return how far a robot's or object's collision shapes extend along a direction."""
         self._check_open()
         place, along = self._checks.part(name), finite_vector("direction", direction, 3)
         if place not in self._reaches:
@@ -453,7 +467,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         return self._reaches[place].along(along, poses)
 
     def forward_dynamics(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
-        """Return the accelerations, shape (nv,), that torques (nv,) cause in a state."""
+        """Return the accelerations, shape (nv,), caused by torques (nv,) in a state."""
         return self._algorithms.forward_dynamics(
             *self._checked_state(positions, velocities, torques=torques)
         )
@@ -461,7 +475,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
     def inverse_dynamics(
         self, positions: Vector, velocities: Vector, accelerations: Vector
     ) -> Vector:
-        """Return the torques, shape (nv,), that cause accelerations (nv,) in a state."""
+        """Return the torques, shape (nv,), that produce accelerations (nv,) in a state."""
         return self._algorithms.inverse_dynamics(
             *self._checked_state(positions, velocities, accelerations=accelerations)
         )
@@ -474,7 +488,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
     def jacobian(
         self, body: str, positions: Vector, point: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> Vector:
-        """Return the Jacobian, shape (6, nv), of a point of a link or object."""
+        """Return the Jacobian, shape (6, nv), of a point on a link or object."""
         self._check_open()
         place, at = self._checks.body(body), finite_vector("point", point, 3)
         return self._algorithms.jacobian(place, self._checks.positions(positions), at)
@@ -482,7 +496,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
     def forward_dynamics_derivatives(
         self, positions: Vector, velocities: Vector, torques: Vector
     ) -> tuple[Vector, Vector, Vector]:
-        """Return the derivatives of `forward_dynamics` by positions, velocities, and torques."""
+        """Return derivatives of `forward_dynamics` w.r.t. positions, velocities, and torques."""
         self._check_has("derivatives")
         return self._algorithms.forward_dynamics_derivatives(
             *self._checked_state(positions, velocities, torques=torques)
@@ -491,7 +505,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
     def forward_dynamics_batch(
         self, positions: Vector, velocities: Vector, torques: Vector, *, processes: int = 1
     ) -> Vector:
-        """Return `forward_dynamics` of many states, shape (n, nv)."""
+        """Return `forward_dynamics` for many states, shape (n, nv)."""
         self._check_open()
         processes = integer("processes", processes, 1)
         q, v, tau = self._checks.rows(positions, velocities=velocities, torques=torques)
@@ -551,7 +565,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
 
 
 def _join(parts: Sequence[Vector]) -> Vector:
-    """Return vectors one after the other."""
+    """Concatenate vectors."""
     return parts[0] if len(parts) == 1 else np.concatenate(parts)
 
 

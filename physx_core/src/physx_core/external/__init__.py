@@ -1,4 +1,4 @@
-"""The plugin ``external``: environments whose samples come from programs in C, C++ or Fortran."""
+"""The plugin ``external``: environments whose samples come from programs in C, C++, or Fortran."""
 
 from __future__ import annotations
 
@@ -7,10 +7,10 @@ from pathlib import Path
 from physx_core.plugins.hookspecs import Components, hookimpl
 
 INCLUDE = Path(__file__).parent / "include"
-"""Folder of what such a program is compiled with: ``physx.h`` and ``physx.f90``."""
+"""Include folder for compiling such programs: ``physx.h`` and ``physx.f90``."""
 
 
 @hookimpl
 def physx_environments() -> Components:
-    """Return the environment of a program."""
+    """Return the environment that runs a program."""
     return {"program": "physx_core.external.environment:ExternalProgram"}

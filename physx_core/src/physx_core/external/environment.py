@@ -1,4 +1,4 @@
-"""ExternalProgram: an environment whose samples come from a program, in whatever language."""
+"""ExternalProgram: an environment whose samples come from a program in any language."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ _OPTIONS = {field.name: field for field in dataclasses.fields(Parameter) if fiel
 
 
 class ExternalProgram(Environment):
-    """Starts a program, and takes one sample from it in each step.
+    """Starts a program and takes one sample from it in each step.
 
-    The program is compiled with ``physx.h`` or ``physx.f90`` in the folder that ``physx include``
-    prints. It declares the fields itself. When it ends in order and further samples are needed, it
-    is started again, which begins a new episode; so does its request for parameters after a sample.
+    The program is compiled with ``physx.h`` or ``physx.f90`` from the folder that ``physx include``
+    prints. It declares the fields itself. If it ends normally and more samples are needed, it is
+    started again, which begins a new episode, as does a request for parameters after a sample.
     """
 
     runs_programs: ClassVar[bool] = True
@@ -37,19 +37,19 @@ class ExternalProgram(Environment):
         timeout: float = 50.0,
         **kwargs: Any,
     ) -> None:
-        """Keep what to start.
+        """Keep the arguments.
 
         Args:
             program: The program and its arguments. Paths are relative to the working directory.
-            parameters: Numbers and arrays that the program may ask for by name, beside
-                ``seed`` (from 0 to 2**31 - 1, another one for each episode), ``instance_id``,
-                ``instance_nb`` and ``episode``.
-            ranges: Parameters that are chosen for each episode by the run's sampler, or drawn: name
-                to ``[low, high]``, or to a table of the arguments of `Parameter`.
-            additional: Names of fields that are stored, but not for networks to read.
+            parameters: Numbers and arrays that the program may request by name, in addition to
+                ``seed`` (from 0 to 2**31 - 1, different in each episode), ``instance_id``,
+                ``instance_nb``, and ``episode``.
+            ranges: Parameters that the run's sampler chooses for each episode, or that are drawn:
+                name to ``[low, high]``, or to a table of the arguments of `Parameter`.
+            additional: Names of fields that are stored, but not read by networks.
             units: Units of fields by name.
-            timeout: How long the program may keep the environment waiting, in s. If it is shorter
-                than that of `EnvironmentConfig`, an error says what the program did.
+            timeout: Longest time in s that the program may keep the environment waiting. If it is
+                shorter than that of `EnvironmentConfig`, the error tells what the program did.
             kwargs: See `Environment`.
 
         Raises:
@@ -59,7 +59,7 @@ class ExternalProgram(Environment):
         command = [program] if isinstance(program, str) else program
         if not (isinstance(command, Sequence) and command and all(map(_is_word, command))):
             raise ConfigError(
-                f'program must be a list of texts such as ["./heat", "0.1"], not {program!r}.'
+                f'program must be a list of strings such as ["./heat", "0.1"], not {program!r}.'
             )
         if not (isinstance(timeout, (int, float)) and timeout > 0):
             raise ConfigError(f"timeout must be a number of seconds above 0, not {timeout!r}.")
@@ -100,11 +100,11 @@ class ExternalProgram(Environment):
         self.define_additional_fields(additional)
 
     def reset_parameters(self, **values: Any) -> None:
-        """Keep the values for when the program asks for them."""
+        """Keep the values until the program requests them."""
         self._chosen = values
 
     def step(self) -> None:
-        """Take the program's next sample, and answer what it asks before it."""
+        """Take the program's next sample, answering requests that precede it."""
         while True:
             assert self._process is not None
             message = self._process.receive()
@@ -132,7 +132,7 @@ class ExternalProgram(Environment):
             process.close()
 
     def _start(self) -> tuple[ProgramProcess, Sequence[Field]]:
-        """Start the program; return it and the fields that it declares."""
+        """Start the program, and return it and the fields that it declares."""
         variables = {"PHYSX_INSTANCE": str(self.instance_id)}
         process = ProgramProcess(self._command, variables, self._timeout)
         try:
@@ -145,7 +145,7 @@ class ExternalProgram(Environment):
         return process, message.wanted
 
     def _restart(self, process: ProgramProcess) -> None:
-        """Start the program again, after it has ended in order."""
+        """Start the program again after it has ended normally."""
         if not process.samples:
             raise process.error("called physx_close() without having sent a sample.")
         process.end()
@@ -153,7 +153,7 @@ class ExternalProgram(Environment):
         self._process, declared = self._start()
         if declared != self._declared:
             raise self._process.error(
-                f"declared other fields when it was started again: {declared}, not "
+                f"declared different fields when it was started again: {declared}, not "
                 f"{self._declared}."
             )
 
@@ -162,7 +162,7 @@ class ExternalProgram(Environment):
         self._is_new, self._seed = True, None
 
     def _own_parameters(self) -> dict[str, Any]:
-        """Return the parameters of every program but the seed, which has yet to be drawn."""
+        """Return the parameters of every program; the seed is not drawn yet."""
         return {
             "seed": 0,
             "instance_id": self.instance_id,
@@ -204,12 +204,12 @@ def _as_parameter(name: str, given: Any) -> Parameter:
 
 
 def _convert(process: ProgramProcess, what: str, values: Mapping[str, Any], field: Field) -> Any:
-    """Return one of the values as the program asks for it."""
+    """Return one of the values in the type and shape that the program requests."""
     name = field.name
     if name not in values:
         raise process.error(
             f'asked for the {what} "{name}", which does not exist.{nearest(name, values)} '
-            f"There are: {listed(values)}."
+            f"Available: {listed(values)}."
         )
     try:
         return field.convert(values[name])

@@ -1,8 +1,8 @@
 """Messages between an environment and its program: a header, descriptions of arrays, their data.
 
-The other side of it is ``include/physx.h``, which describes every array that it sends, and every
-one that it wants to receive; an answer is the data of the latter alone. So a program parses nothing
-but headers.
+The other side is ``include/physx.h``, which describes every array that it sends and every array
+that it requests. An answer contains only the data of the requested arrays, so a program parses
+nothing but headers.
 """
 
 from __future__ import annotations
@@ -19,9 +19,9 @@ from physx_core.fields import RESERVED, Field
 from physx_core.typing import Array, Sample
 
 HEADER = struct.Struct("<4sHHQ")
-"""Magic, kind, how many arrays are described, bytes of data after the descriptions."""
+"""Magic number, kind, number of described arrays, bytes of data after the descriptions."""
 DESCRIPTION = struct.Struct("<52sIiI8q")
-"""Name, type, rank (-1: the shape is open), whether it is wanted rather than sent, shape."""
+"""Name, type, rank (-1: the shape is open), whether it is requested rather than sent, shape."""
 
 _MAGIC, _VERSION = b"phy", 1
 _MOST_ARRAYS = 64
@@ -32,14 +32,14 @@ _TYPES = {
     ord(name[0]) * 256 + int(name[1:]): np.dtype(f"<{name}")
     for name in ["b1", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f4", "f8", "c8", "c16"]
 }
-"""Number of a type to the type; "b1" stands for a boolean."""
+"""Type number to type; "b1" is a boolean."""
 
 
 class Kind(enum.IntEnum):
     """Kind of a message."""
 
     FIELDS = 1
-    """Program, once at its start: the fields of a sample."""
+    """Program, once at startup: the fields of a sample."""
     PARAMETERS = 2
     """Program: request for parameters."""
     SAMPLE = 3
@@ -49,19 +49,19 @@ class Kind(enum.IntEnum):
     CLOSE = 5
     """Program: there are no more samples."""
     ANSWER = 6
-    """Environment: the data of what was wanted."""
+    """Environment: the data of the requested arrays."""
 
 
 class MalformedMessageError(Exception):
-    """What a program sent breaks the protocol; the text completes ``The program ...``."""
+    """A program's message violates the protocol; the text completes ``The program ...``."""
 
 
 class Header(NamedTuple):
-    """What a message consists of.
+    """The header of a message.
 
     Attributes:
-        kind: Its kind.
-        arrays: How many arrays it describes.
+        kind: Kind of the message.
+        arrays: Number of arrays that it describes.
         size: Bytes of the data after the descriptions.
     """
 
@@ -71,12 +71,12 @@ class Header(NamedTuple):
 
 
 class Message(NamedTuple):
-    """A message of a program.
+    """A program's message.
 
     Attributes:
         kind: Its kind.
-        given: The arrays that it holds, by name.
-        wanted: The arrays that it asks for.
+        given: The arrays that it contains, by name.
+        wanted: The arrays that it requests.
     """
 
     kind: Kind
@@ -85,34 +85,34 @@ class Message(NamedTuple):
 
 
 def parse_header(data: bytes | bytearray) -> Header:
-    """Return the parts of a header after checking them.
+    """Check a header and return its parts.
 
     Raises:
-        MalformedMessageError: If it is none of a message that a program may send.
+        MalformedMessageError: If it does not belong to a message that a program may send.
     """
     magic, kind, count, size = HEADER.unpack(data)
     if magic[:3] != _MAGIC:
-        raise MalformedMessageError(f"sent {magic.hex(' ')}... where a message should begin.")
+        raise MalformedMessageError(f"sent {magic.hex(' ')}... where a message should start.")
     if magic[3] != _VERSION:
         raise MalformedMessageError(
-            f"was compiled with a physx.h of protocol {magic[3]}, but this one speaks {_VERSION}: "
+            f"was compiled with a physx.h of protocol {magic[3]}, but this physx uses {_VERSION}: "
             "compile it with the header in the folder that  physx include  prints."
         )
     if not Kind.FIELDS <= kind <= Kind.CLOSE or count > _MOST_ARRAYS or size > _LARGEST:
         raise MalformedMessageError(
-            f"sent a message of kind {kind} with {count} arrays of {size} bytes, which is none "
-            f"that physx.h sends, or is longer than {_LARGEST} bytes."
+            f"sent a message of kind {kind} with {count} arrays of {size} bytes, which physx.h "
+            f"never sends, or which is longer than {_LARGEST} bytes."
         )
     return Header(Kind(kind), count, size)
 
 
-@functools.lru_cache(maxsize=16)  # all samples of a program have the same
+@functools.lru_cache(maxsize=16)  # the same for all samples of a program
 def parse_descriptions(header: Header, data: bytes) -> tuple[tuple[Field, ...], tuple[Field, ...]]:
-    """Return the arrays whose data follow, and those that are wanted.
+    """Return the arrays whose data follows, and those that are requested.
 
     Raises:
-        MalformedMessageError: If a description is malformed, or the data that follow have another
-            size than the header says.
+        MalformedMessageError: If a description is malformed, or the size of the data differs from
+            the header.
     """
     given: list[Field] = []
     wanted: list[Field] = []
@@ -122,7 +122,9 @@ def parse_descriptions(header: Header, data: bytes) -> tuple[tuple[Field, ...], 
     for group in (given, wanted):
         names = [field.name for field in group]
         if len(set(names)) < len(names):
-            raise MalformedMessageError(f"named two arrays alike in one message: {sorted(names)}.")
+            raise MalformedMessageError(
+                f"gave two arrays in one message the same name: {sorted(names)}."
+            )
     size = sum(field.nbytes for field in given)
     if size != header.size or sum(field.nbytes for field in wanted) > _LARGEST:
         raise MalformedMessageError(
@@ -137,7 +139,7 @@ def _parse_description(parts: tuple[Any, ...], may_be_open: bool) -> Field:
     name = raw.partition(b"\0")[0].decode("ascii", errors="replace")
     if not name.isidentifier() or name in RESERVED:
         raise MalformedMessageError(
-            f"named an array {name!r}, which is no identifier, or a name that physx uses itself."
+            f"named an array {name!r}, which is not an identifier, or is reserved by physx."
         )
     if number not in _TYPES:
         raise MalformedMessageError(f'gave the array "{name}" the unknown type {number}.')
@@ -151,7 +153,7 @@ def _parse_description(parts: tuple[Any, ...], may_be_open: bool) -> Field:
 
 
 def check_values(field: Field, values: Array) -> None:
-    """Check what no other rule does: that the bytes of booleans are zeros and ones.
+    """Check that the bytes of booleans are zeros and ones, which nothing else checks.
 
     Raises:
         MalformedMessageError: If they are not.
@@ -161,7 +163,7 @@ def check_values(field: Field, values: Array) -> None:
 
 
 def pack_answer(values: list[Array]) -> list[bytes | memoryview]:
-    """Return the parts of an answer: a header, and the data of each array that was wanted."""
+    """Return the parts of an answer: a header, and the data of each requested array."""
     size = sum(array.nbytes for array in values)
     header = HEADER.pack(_MAGIC + bytes([_VERSION]), Kind.ANSWER, len(values), size)
     return [header, *(np.ascontiguousarray(array).data for array in values if array.size)]

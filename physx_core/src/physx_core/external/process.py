@@ -1,4 +1,4 @@
-"""ProgramProcess: a running program, and the messages from and to it."""
+"""ProgramProcess: a running program, and the messages to and from it."""
 
 from __future__ import annotations
 
@@ -30,17 +30,17 @@ from physx_core.typing import Array
 
 Result = TypeVar("Result")
 
-_TICK = 0.1  # s between looks at whether a silent program still runs
-_EXIT_TIME = 2.0  # for a program that closed its connection to end
-_LINES_TIME = 1.0  # for the rest of its standard error, if something still holds that open
-_LONGEST_PATH = 107  # bytes, of the system's addresses
+_TICK = 0.1  # s between checks that a silent program still runs
+_EXIT_TIME = 2.0  # s for a program to end after it closed its connection
+_LINES_TIME = 1.0  # s for the rest of its standard error, if something still keeps that open
+_LONGEST_PATH = 107  # bytes, of a socket address
 
 
 class ProgramProcess(Closeable):
-    """A program that was started, and that has connected with ``physx_open``.
+    """A started program that has connected with ``physx_open``.
 
-    It connects to a socket in a folder that only this user can enter, and that is removed when it
-    has connected. A socket that it inherits would not do: launchers of MPI close those.
+    It connects to a socket in a folder that only this user can access, and that is removed after
+    the connection. An inherited socket would not work, because MPI launchers close those.
 
     Attributes:
         samples: Number of samples that it has sent.
@@ -53,8 +53,8 @@ class ProgramProcess(Closeable):
 
         Args:
             command: Program and arguments.
-            variables: Environment variables that it gets beside those of this process.
-            timeout: How long it may take for whatever it is waited for, in s.
+            variables: Environment variables that it gets in addition to those of this process.
+            timeout: Longest time in s to wait for the program at any point.
 
         Raises:
             ProgramError: If it cannot be started, or ends or does nothing before it connects.
@@ -73,7 +73,7 @@ class ProgramProcess(Closeable):
         """Return the next message.
 
         Raises:
-            ProgramError: If the program ends, sends nothing for too long, or breaks the protocol.
+            ProgramError: If the program ends, sends nothing for too long, or violates the protocol.
         """
         try:
             header = parse_header(self._read(bytearray(HEADER.size)))
@@ -91,10 +91,10 @@ class ProgramProcess(Closeable):
         return Message(header.kind, values, wanted)
 
     def answer(self, values: list[Array]) -> None:
-        """Send the arrays that the last message asked for, in its order.
+        """Send the arrays that the last message requested, in its order.
 
         Raises:
-            ProgramError: If the program does not take them.
+            ProgramError: If the program does not receive them.
         """
         for part in pack_answer(values):
             rest = memoryview(part).cast("B")
@@ -103,23 +103,23 @@ class ProgramProcess(Closeable):
                 rest = rest[sent:]
 
     def end(self) -> None:
-        """Wait for the end of a program that has sent all its samples.
+        """Wait for a program that has sent all its samples to end.
 
         Raises:
-            ProgramError: If it does not end, or not with exit status 0.
+            ProgramError: If it does not end, or its exit status is not 0.
         """
         status = self._wait(self._timeout)
         if status is None:
-            raise self.error(f"called physx_close(), but still runs {self._timeout:g} s later.")
+            raise self.error(f"was still running {self._timeout:g} s after physx_close().")
         if status != 0:
             raise self.error(f"{describe_exit(status)} after physx_close().")
         self.close()
 
     def error(self, message: str) -> ProgramError:
-        """End the program, and return the error for something that it did.
+        """End the program and return an error about it.
 
         Args:
-            message: What it did; completes ``The program ...``.
+            message: What the program did; completes ``The program ...``.
         """
         status = self._wait(0.0)
         self.close()
@@ -127,7 +127,7 @@ class ProgramProcess(Closeable):
         return ProgramError(self._name, message, exit_status=status, stderr=lines)
 
     def close(self) -> None:
-        """End the program and all that it started; none is left when this returns."""
+        """End the program and all its child processes; none is left when this returns."""
         connection, self._connection = self._connection, None
         if connection is not None:
             connection.close()
@@ -175,14 +175,14 @@ class ProgramProcess(Closeable):
         return into
 
     def _attempt(self, call: Callable[[], Result]) -> Result:
-        """Return what a call returns that times out at each tick while the program does nothing."""
+        """Repeat a call that times out at each tick while the program does nothing."""
         until = time.monotonic() + self._timeout
         ended = False
         while True:
             try:
                 return call()
             except TimeoutError:
-                if ended:  # and what it had sent is read
+                if ended:  # and everything that it sent has been read
                     raise self._gone() from None
                 ended = self._wait(0.0) is not None
             except OSError:

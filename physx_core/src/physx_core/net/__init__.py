@@ -1,4 +1,4 @@
-"""Framed, authenticated TCP: what servers and clients of physx share."""
+"""Framed, authenticated TCP, shared by the servers and clients of physx."""
 
 from __future__ import annotations
 

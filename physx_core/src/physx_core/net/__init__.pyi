@@ -1,4 +1,4 @@
-"""Framed, authenticated TCP: what servers and clients of physx share."""
+"""Framed, authenticated TCP, shared by the servers and clients of physx."""
 
 from .addresses import check_address as check_address
 from .addresses import format_address as format_address

@@ -1,4 +1,4 @@
-"""Network addresses: parsing, formatting and checking them, and trying to reach one for a while."""
+"""Network addresses: parsing, formatting and checking them, and retrying to reach one."""
 
 from __future__ import annotations
 
@@ -47,17 +47,17 @@ def check_address(address: Any, port: Any) -> None:
 
 
 def is_loopback(host: str) -> bool:
-    """Return whether only its own machine can reach a server at an address."""
+    """Return whether a server at an address can be reached only from its own machine."""
     try:
         found = socket.getaddrinfo(host, 0, type=socket.SOCK_STREAM)
         places = [ipaddress.ip_address(entry[4][0]) for entry in found]
-    except (OSError, ValueError):  # whoever uses it reports what is wrong with it
+    except (OSError, ValueError):  # the code that uses the address reports the problem
         return False
     return all((getattr(one, "ipv4_mapped", None) or one).is_loopback for one in places)
 
 
 def stays_here(connection: socket.socket) -> bool:
-    """Return whether the other side is on this machine, as far as its address says."""
+    """Return whether the peer is on this machine, judging by its address."""
     if connection.family not in (socket.AF_INET, socket.AF_INET6):
         return True
     try:
@@ -72,13 +72,13 @@ def retry(
     pause: float,
     *errors: type[Exception],
 ) -> Reached:
-    """Return what an attempt returns, and repeat it as long as it fails.
+    """Repeat an attempt until it succeeds, and return its result.
 
     Args:
         attempt: Called with the time in s that it may take.
-        patience: How long to go on, in s.
+        patience: How long to keep trying, in s.
         pause: Time between two attempts, in s.
-        errors: Errors after which to try again; the last one is raised in the end.
+        errors: Errors after which to try again; when time is up, the last one is raised.
     """
     until = time.monotonic() + patience
     while True:

@@ -1,4 +1,4 @@
-"""Connection: a server's end of one connection, with what has arrived and what is to be sent."""
+"""Connection: a server's end of one connection, with its incoming and outgoing data."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ _MOST_AT_ONCE = 1 << 20
 
 
 class Reader(ABC):
-    """Cuts messages out of the stream of bytes that arrives on a socket."""
+    """Splits the byte stream of a socket into messages."""
 
     @abstractmethod
     def receive(self, connection: socket.socket) -> int:
-        """Take what has arrived and return how many bytes it is, 0 at the end of the stream.
+        """Receive available bytes and return their number; 0 at the end of the stream.
 
         Raises:
             BlockingIOError: If nothing has arrived.
@@ -29,22 +29,22 @@ class Reader(ABC):
 
     @abstractmethod
     def take(self) -> Any:
-        """Return the next whole message, or None until more has arrived.
+        """Return the next complete message, or None until more has arrived.
 
         Raises:
-            PhysxError: If the bytes are not a message, or one that is too long. The stream cannot
-                be read any further.
+            PhysxError: If the bytes are not a message, or the message is too long. The stream is
+                then unusable.
         """
 
     @property
     @abstractmethod
     def waiting(self) -> int:
-        """How many bytes have arrived and were not taken."""
+        """Number of bytes that have been received but not taken."""
 
     @property
     @abstractmethod
     def has_room(self) -> bool:
-        """Whether more may be received before a message is taken."""
+        """Whether more can be received before a message is taken."""
 
 
 class Connection(Closeable):
@@ -52,11 +52,11 @@ class Connection(Closeable):
 
     Attributes:
         socket: The socket.
-        reader: Cuts what arrives into messages.
-        name: The other side as ``host:port``, for messages to people.
-        heard: When the other side last sent or was sent something, in monotonic s.
+        reader: Splits the incoming bytes into messages.
+        name: The peer as ``host:port``, for log and error messages.
+        heard: When something was last received from the peer or sent to it, in monotonic s.
         closed: Whether the socket is closed.
-        outgoing: Bytes that wait to be sent.
+        outgoing: Bytes waiting to be sent.
         events: The events that the selector watches for.
     """
 
@@ -65,8 +65,8 @@ class Connection(Closeable):
 
         Args:
             connected: The socket.
-            reader: Cuts what arrives into messages.
-            name: The other side, for messages to people.
+            reader: Splits the incoming bytes into messages.
+            name: The peer, for log and error messages.
         """
         connected.setblocking(False)
         prepare_connection(connected)
@@ -83,7 +83,7 @@ class Connection(Closeable):
         return True
 
     def write(self, *parts: bytes | memoryview) -> None:
-        """Send parts as one piece, as much as the connection takes now; `flush` sends the rest.
+        """Send parts as one message, as far as possible now; `flush` sends the rest.
 
         Raises:
             OSError: If the connection is broken.
@@ -107,7 +107,7 @@ class Connection(Closeable):
             self.watch()
 
     def flush(self) -> int:
-        """Send what waits, as far as the connection takes it, and return how many bytes it took.
+        """Send waiting bytes, as far as possible now, and return the number of bytes sent.
 
         Raises:
             OSError: If the connection is broken.
@@ -120,12 +120,12 @@ class Connection(Closeable):
         return sent
 
     def attach(self, selector: selectors.BaseSelector) -> None:
-        """Have a selector watch the connection from now on."""
+        """Register the connection with a selector."""
         self._selector = selector
         self.watch()
 
     def watch(self) -> None:
-        """Have the selector watch for the events that matter now."""
+        """Make the selector watch for the events that matter now."""
         events = selectors.EVENT_READ * self.wants_more
         events |= selectors.EVENT_WRITE * bool(self.outgoing)
         selector = self._selector
@@ -140,7 +140,7 @@ class Connection(Closeable):
         self.events = events
 
     def close(self) -> None:
-        """Close the socket, which the selector watches no longer."""
+        """Unregister and close the socket."""
         self.closed = True
         if self.events and self._selector is not None:
             self._selector.unregister(self.socket)

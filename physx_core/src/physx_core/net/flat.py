@@ -1,8 +1,8 @@
-"""Flat dictionaries of arrays, encoded with a layout that is worked out only once.
+"""Flat dictionaries of arrays, encoded with a layout that is computed only once.
 
-Samples and predictions have the same names, types and shapes again and again. So the JSON text in
-front of the raw bytes, and the place of each array in them, are cached. Each message is complete:
-neither side needs to have seen an earlier one.
+Samples and predictions keep the same names, types and shapes. Therefore, the JSON text before the
+raw bytes, and the place of each array in them, are cached. Each message is self-contained: neither
+side needs to have seen an earlier one.
 """
 
 from __future__ import annotations
@@ -43,11 +43,11 @@ _Finish: TypeAlias = tuple[str, Callable[[Array], Any]]
 
 
 def describe_flat(value: dict[Any, Any]) -> tuple[bytes, int]:
-    """Return the bytes in front of a dictionary's arrays, and the length of all bytes.
+    """Return the bytes that precede a dictionary's arrays, and the total length in bytes.
 
     Args:
-        value: Flat if all keys are ASCII strings, and all values arrays of numbers or NumPy's
-            numbers; otherwise the prefix is empty.
+        value: Flat if all keys are ASCII strings and all values are arrays of numbers or NumPy
+            numbers; otherwise, the prefix is empty.
     """
     try:
         return _prefix((*value, *map(type, value)), tuple(map(_layout_of, value.values())))
@@ -56,7 +56,7 @@ def describe_flat(value: dict[Any, Any]) -> tuple[bytes, int]:
 
 
 def pack_flat(prefix: bytes, value: dict[str, Any]) -> bytes:
-    """Return a flat dictionary as bytes behind its prefix."""
+    """Return the prefix followed by a flat dictionary's bytes."""
     try:
         return b"".join((prefix, *value.values()))
     except TypeError:  # an array is not contiguous
@@ -66,11 +66,11 @@ def pack_flat(prefix: bytes, value: dict[str, Any]) -> bytes:
 
 @lru_cache(_MOST_KEPT)
 def _prefix(keys: tuple[Any, ...], layouts: tuple[_Layout, ...]) -> tuple[bytes, int]:
-    """Return the JSON text behind its length, and the length of all bytes; no text: not flat.
+    """Return the length-prefixed JSON text (empty if not flat) and the total length in bytes.
 
     Args:
-        keys: The keys, and then their types.
-        layouts: Type, and type and shape of the elements, of each value.
+        keys: The keys, followed by their types.
+        layouts: Class, dtype and shape of each value.
     """
     entries: list[list[Any]] = []
     length = 0
@@ -95,7 +95,7 @@ def unpack_flat(text: bytes, payload: bytearray) -> dict[str, Any]:
 
     Args:
         text: The JSON text, not longer than `LONGEST_TEXT`.
-        payload: All bytes, those of the text among them; the arrays are views of them.
+        payload: All bytes, including those of the text; the arrays are views of them.
     """
     places, finishes, length = _places(text)
     if len(payload) != length:
@@ -135,10 +135,10 @@ def _scalar(array: Array) -> Any:
 
 
 def check_array(array: Array) -> Array:
-    """Return an array that was received, after checking its bytes."""
+    """Return a received array after checking its bytes."""
     kind, order = array.dtype.kind, array.dtype.byteorder
     if kind == "b" and (array.view(np.uint8) > 1).any():
-        raise ValueError("truth values are neither 0 nor 1")
+        raise ValueError("some booleans are neither 0 nor 1")
     if kind == "U" and array.size and array.dtype.itemsize:
         codes = array.reshape(-1).view(np.dtype(np.uint32).newbyteorder(order))
         if (codes > _LAST_CHARACTER).any():
@@ -147,14 +147,14 @@ def check_array(array: Array) -> Array:
 
 
 def parse_dtype(text: Any) -> np.dtype[Any]:
-    """Return the NumPy type of a string that was received."""
+    """Return the NumPy type named by a received string."""
     if not isinstance(text, str) or not _DTYPE.fullmatch(text):
         raise ValueError(f"{str(text)[:50]!r} is not a plain type")
     return np.dtype(text)
 
 
 def parse_shape(sizes: Any) -> tuple[int, ...]:
-    """Return the shape in a list that was received."""
+    """Return the shape given by a received list."""
     if not isinstance(sizes, list) or not all(type(n) is int and 0 <= n < 1 << 60 for n in sizes):
         raise ValueError(f"{str(sizes)[:50]!r} is not a shape")
     return tuple(sizes)

@@ -22,7 +22,7 @@ MAX_PAYLOAD = 1 << 30
 
 
 class Kind(enum.IntEnum):
-    """Kind of a frame; the meaning of `number` is in brackets where it has one."""
+    """Kind of a frame; the meaning of `number`, if it has one, is in brackets."""
 
     HELLO = 1
     """Client: magic, version, challenge."""
@@ -33,45 +33,45 @@ class Kind(enum.IntEnum):
     SETUP = 4
     """Server: the arguments of the instance."""
     READY = 5
-    """Client: the environment is ready; its fields, whose shapes may still be open."""
+    """Client: the environment is ready; its fields, whose shapes may still be undefined."""
     FIELDS = 6
     """Client: the fields with the shapes of the first sample."""
     CREDIT = 7
-    """Server: rows may be made [their total number since the start]."""
+    """Server: permission to generate rows [their total number since the start]."""
     ROWS = 8
     """Client: a block of rows, column by column [number of rows]."""
     PREDICT = 9
     """Client: request for the prediction of one sample [number of the request]."""
     SAVE = 10
-    """Client: request to keep parameters [number of the request]."""
+    """Client: request to save parameters [number of the request]."""
     LOAD = 11
-    """Client: request for the parameters that were kept [number of the request]."""
+    """Client: request for the saved parameters [number of the request]."""
     ANSWER = 12
     """Server: answer to a request [number of the request]."""
     REFUSAL = 13
-    """Server: error of a request that failed [number of the request]."""
+    """Server: error of a failed request [number of the request]."""
     SHOW = 14
     """Client: drawing events [step]."""
     APPLY = 15
     """Server: predictions for the environment [number of rows]."""
     ERROR = 16
-    """Either: an error that ends the client [row that could not be made, 0: no row]."""
+    """Either: an error that ends the client [row that could not be generated, 0: no row]."""
     CLOSE = 17
     """Server: order to close the environment and exit [for HOST: time for it, in ms]."""
     BYE = 18
     """Client: the environment is closed."""
     STORED = 19
-    """Server: stored rows from which to make the next rows [number of rows]."""
+    """Server: stored rows from which to generate the next rows [number of rows]."""
     WRONG = 20
-    """Client: rows that `check_sample` rejected, sent before the next accepted ones [how many]."""
+    """Client: rows that `check_sample` rejected, before the next accepted ones [their number]."""
     AGAIN = 21
-    """Client: repeats rows that the server has from its predecessor [number of rows so far]."""
+    """Client: repeats rows that its predecessor has already sent [number of rows so far]."""
     REQUEST = 22
     """Client of a served environment: a request [number of the request]."""
     ACTIONS = 23
     """Client of a served environment: actions of its worlds [number of the request]."""
     NOTES = 24
-    """Server: values of no fixed layout that belong to the next message [as there]."""
+    """Server: values without a fixed layout that belong to the next message [as there]."""
     SEEN = 25
     """Server: the result of a request, for observing clients [number of results so far]."""
     PARAMETERS = 26
@@ -79,23 +79,23 @@ class Kind(enum.IntEnum):
     CHOOSE = 27
     """Client: request for the parameters of an episode [number of the request]."""
     HOST = 28
-    """Server: run workers as told, not an instance of its own. Client: the name of its machine."""
+    """Server: run workers on request instead of an instance. Client: the name of its machine."""
     START = 29
     """Server: start a worker [its ticket]."""
     STOP = 30
-    """Server: end a worker; at once if the payload is not empty [its ticket]."""
+    """Server: end a worker, immediately if the payload is not empty [its ticket]."""
     ENDED = 31
-    """Client: exit status and last words of a worker that ended [its ticket]."""
+    """Client: exit status and last output of a worker that ended [its ticket]."""
     PING = 32
-    """Server: are you there? Client: the same back."""
+    """Server: liveness check. Client: its reply."""
     FOLDER = 33
     """Client that writes partitions: what it read in the dataset's folder."""
     PARTITION = 34
     """Server: a partition that the client writes its rows to [its number among the client's]."""
     WRITTEN = 35
-    """Client: rows are in its partitions [their total number since the start]."""
+    """Client: rows have been written to its partitions [their total number since the start]."""
     SEAL = 36
-    """Server: order to make no more rows and to seal the last partition [rows to keep in all]."""
+    """Server: order to stop generating and seal the last partition [total rows to keep]."""
     SEALED = 37
     """Client: a partition is sealed; its checksums and statistics [its number]."""
 
@@ -109,7 +109,7 @@ class Frame(NamedTuple):
     Attributes:
         kind: Its kind.
         number: A number whose meaning depends on the kind.
-        payload: Its content, a buffer of its own.
+        payload: Its content, in a separate buffer.
     """
 
     kind: Kind
@@ -134,26 +134,26 @@ def pack_header(kind: Kind, length: int, number: int = 0) -> bytes:
     """
     if length > MAX_PAYLOAD:
         raise UsageError(
-            f"A message ({kind.name}) of {length} bytes is too long for one between client and "
-            f"server, which takes {MAX_PAYLOAD}. Pass large data by file, or run with "
+            f"A message ({kind.name}) of {length} bytes is too long: client and server exchange at "
+            f"most {MAX_PAYLOAD} bytes per message. Pass large data in a file, or run with "
             "as_tcp_ip_client=False."
         )
     return HEADER.pack(length, kind, 0, number)
 
 
 class FrameReader(Reader):
-    """Reads frames from a socket, blocking or not.
+    """Reads frames from a blocking or non-blocking socket.
 
     One system call may read several frames into a buffer. The missing bytes of a long frame are
     read directly into its payload, which grows as they arrive, so that a peer that announces much
-    and sends little takes little memory.
+    but sends little takes little memory.
     """
 
     def __init__(self, limit: int) -> None:
-        """Start in front of a header.
+        """Start before a header.
 
         Args:
-            limit: Longest payload in bytes that is accepted.
+            limit: Longest accepted payload in bytes.
         """
         self._limit = limit
         self._socket_may_have_more = False
@@ -165,7 +165,7 @@ class FrameReader(Reader):
 
     @property
     def limit(self) -> int:
-        """Longest payload in bytes that is accepted."""
+        """Longest accepted payload in bytes."""
         return self._limit
 
     @limit.setter
@@ -179,7 +179,7 @@ class FrameReader(Reader):
 
     @property
     def has_buffered(self) -> bool:
-        """Whether a whole frame has been received and not read."""
+        """Whether a complete frame has been received but not read."""
         waiting = self._end - self._start - HEADER.size
         if waiting < 0 or self._large is not None:
             return False
@@ -187,21 +187,21 @@ class FrameReader(Reader):
 
     @property
     def arrived(self) -> int:
-        """How many bytes of an unfinished long frame have arrived; 0 if there is none."""
+        """Number of bytes of an unfinished long frame that have arrived; 0 if there is none."""
         return 0 if self._large is None else self._large.received
 
     @property
     def may_have_more(self) -> bool:
-        """Whether another `read` may find something at once; False means that it does not."""
+        """Whether another `read` may find data immediately; False: it certainly does not."""
         return self._socket_may_have_more or self.has_buffered
 
     def read(self, connection: socket.socket) -> Frame | None:
-        """Return the next frame, or None if a non-blocking socket has no whole one yet.
+        """Return the next frame, or None if a non-blocking socket has no complete one yet.
 
         Raises:
             EOFError: If the peer is gone.
-            ConnectionRefusedByPeerError: If the peer sent something that is not a frame, or one
-                that is too long.
+            ConnectionRefusedByPeerError: If the peer sent something that is not a frame, or a
+                frame that is too long.
         """
         while True:
             frame = self.take()
@@ -217,11 +217,11 @@ class FrameReader(Reader):
                 raise EOFError("end of stream")
 
     def take(self) -> Frame | None:
-        """Return the next whole frame that was received, or None until more has arrived.
+        """Return the next complete frame, or None until more has arrived.
 
         Raises:
-            ConnectionRefusedByPeerError: If the peer sent something that is not a frame, or one
-                that is too long.
+            ConnectionRefusedByPeerError: If the peer sent something that is not a frame, or a
+                frame that is too long.
         """
         if self._large is not None:
             if self._large.missing:
@@ -231,7 +231,7 @@ class FrameReader(Reader):
         return self._buffered() if self._start < self._end else None
 
     def receive(self, connection: socket.socket) -> int:
-        """Take what has arrived and return how many bytes it is, 0 at the end of the stream.
+        """Receive available bytes and return their number; 0 at the end of the stream.
 
         Raises:
             BlockingIOError: If nothing has arrived.
@@ -248,18 +248,18 @@ class FrameReader(Reader):
 
     @property
     def waiting(self) -> int:
-        """How many bytes have arrived and were not taken."""
+        """Number of bytes that have been received but not taken."""
         return self._end - self._start + self.arrived
 
     @property
     def has_room(self) -> bool:
-        """Whether more may be received before a frame is taken."""
+        """Whether more can be received before a frame is taken."""
         if self._large is not None:
             return self._large.missing > 0
         return self._end - self._start < len(self._bytes)
 
     def _buffered(self) -> Frame | None:
-        """Return the frame at the start of the buffer if it is whole; begin a long one."""
+        """Return the frame at the start of the buffer if it is complete; begin a long one."""
         start = self._start + HEADER.size
         if start > self._end:
             return None
@@ -267,8 +267,8 @@ class FrameReader(Reader):
         known = _KINDS.get(kind)
         if length > self._limit or spare or known is None:
             raise ConnectionRefusedByPeerError(
-                "The other side of a connection sent something that is not a physx message, or one "
-                f"longer than the {self._limit} bytes that are accepted here."
+                "The peer of a connection sent something that is not a physx message, or a message "
+                f"longer than the {self._limit} bytes accepted here."
             )
         end = start + length
         if end <= self._end:
@@ -281,7 +281,7 @@ class FrameReader(Reader):
         return None
 
     def _room(self) -> memoryview:
-        """Return where the next bytes go."""
+        """Return the buffer for the next bytes."""
         if self._large is not None:
             return self._large.room()
         waiting = self._end - self._start
@@ -299,8 +299,8 @@ class _LargeFrame:
 
     Attributes:
         frame: The frame.
-        received: How many bytes of its payload have arrived.
-        missing: How many have not arrived.
+        received: Number of bytes of its payload that have arrived.
+        missing: Number of bytes that have not arrived.
     """
 
     def __init__(self, kind: Kind, number: int, length: int) -> None:
@@ -309,20 +309,20 @@ class _LargeFrame:
         self.received = 0
 
     def put(self, data: memoryview) -> None:
-        """Append bytes that were received into another buffer."""
+        """Append bytes received into another buffer."""
         self.frame.payload[: len(data)] = data
         self.received += len(data)
         self.missing -= len(data)
 
     def room(self) -> memoryview:
-        """Return where the next bytes go."""
+        """Return the buffer for the next bytes."""
         payload = self.frame.payload
         if self.received == len(payload):
             payload += bytes(min(self.missing, len(payload)))
         return memoryview(payload)[self.received :]
 
     def filled(self, room: memoryview, count: int) -> None:
-        """Count the bytes that were received into `room`."""
+        """Count the bytes received into `room`."""
         room.release()
         self.received += count
         self.missing -= count

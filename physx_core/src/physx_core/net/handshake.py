@@ -1,8 +1,8 @@
 """Handshake: both sides prove that they know the token before any other message is read.
 
 Each side sends 32 random bytes; the other answers with their HMAC-SHA256 under the token. The
-token itself never travels. Where the connection is encrypted the proofs also cover the fingerprint
-of the server's certificate: see `tls`.
+token itself is never sent. If the connection is encrypted, the proofs also cover the fingerprint of
+the server's certificate: see `tls`.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ VERSION = 2
 """Version of the protocol between client and server."""
 
 HANDSHAKE_LIMIT = 256
-"""Longest payload in bytes that is accepted from a stranger."""
+"""Longest payload in bytes accepted from a stranger."""
 
 _OPENING = struct.Struct("<8sI32s")
 _MAGIC = b"physxtcp"
@@ -33,9 +33,9 @@ _NOT_PLAIN = 1
 
 
 class PlainRefusedError(ConnectionRefusedByPeerError):
-    """A server wants the connection to be encrypted, although its address is on this machine.
+    """A server requires encryption although its address is on this machine.
 
-    It is that of something that forwards the connection to another machine.
+    Something at that address forwards the connection to another machine.
     """
 
 
@@ -50,7 +50,7 @@ class ServerHandshake:
     """The server's part of one handshake.
 
     Attributes:
-        instance_id: Number of the instance that the client asks for, 0 for any; None until it is
+        instance_id: Number of the instance that the client requests, 0 for any; None until it is
             trusted.
         since: When the server began to wait for the client, in monotonic s.
     """
@@ -69,10 +69,10 @@ class ServerHandshake:
         self._is_greeted = False
 
     def answer(self, frame: Frame, channel: bytes | None = b"") -> bytes:
-        """Return what to send back; `instance_id` is set once the client is trusted.
+        """Return the bytes to send back; `instance_id` is set once the client is trusted.
 
         Args:
-            frame: What the client sent.
+            frame: The client's message.
             channel: See `SecureSocket.channel`.
 
         Raises:
@@ -82,9 +82,9 @@ class ServerHandshake:
             magic, version, other = _parse_opening(frame.payload)
             self.since, self._is_greeted = time.monotonic(), True
             if magic != _MAGIC:
-                raise ConnectionRefusedByPeerError("What connected is not a physx client.")
+                raise ConnectionRefusedByPeerError("The peer is not a physx client.")
             opening = _OPENING.pack(_MAGIC, VERSION, self._own)
-            if version != VERSION:  # the client knows both versions now and says what is wrong
+            if version != VERSION:  # the client now knows both versions and reports the mismatch
                 return pack(Kind.CHALLENGE, opening + bytes(_PROOF_SIZE))
             if channel is None:
                 return pack(Kind.CHALLENGE, opening + bytes(_PROOF_SIZE), _NOT_PLAIN)
@@ -96,16 +96,16 @@ class ServerHandshake:
             if hmac.compare_digest(wanted, bytes(frame.payload)):
                 self.instance_id = frame.number
                 return b""
-        raise ConnectionRefusedByPeerError("A client connected that does not know the token.")
+        raise ConnectionRefusedByPeerError("The client does not know the token.")
 
 
 def encrypt(connection: socket.socket, *, always: bool = False) -> socket.socket:
-    """Return a client's connection as it may be used: encrypted if it leaves this machine.
+    """Return a client's connection ready for use: encrypted if it leaves this machine.
 
     Args:
-        connection: Connected, blocking socket, which is taken over if it does; its timeout is that
-            of all that is exchanged here.
-        always: Encrypt in any case, because the server wants it.
+        connection: Connected, blocking socket, which is taken over if it is encrypted; its timeout
+            covers the whole exchange.
+        always: Whether to encrypt in any case because the server requires it.
 
     Raises:
         SilentPeerError: If the server does not answer in time.
@@ -117,8 +117,8 @@ def encrypt(connection: socket.socket, *, always: bool = False) -> socket.socket
     from physx_core.net.tls import SecureSocket  # takes a while to import
 
     older = (
-        "If it belongs to physx, it is of a version that does not encrypt: install the same "
-        "version of physx-core on both sides."
+        "If it belongs to physx, its version does not support encryption: install the same version "
+        "of physx-core on both sides."
     )
     try:
         return SecureSocket.of_client(connection)
@@ -126,18 +126,17 @@ def encrypt(connection: socket.socket, *, always: bool = False) -> socket.socket
         raise SilentPeerError("The server did not answer in time.") from error
     except ConnectionAbortedError as error:
         raise ConnectionRefusedByPeerError(
-            f"What answers at that address does not encrypt as physx does ({error}). {older}"
+            f"The server at that address does not use physx's encryption ({error}). {older}"
         ) from error
     except OSError as error:
         raise UnansweredError(f"The server ended the connection ({error}). {older}") from error
 
 
 def introduce(connection: socket.socket, token: str, instance: int) -> FrameReader:
-    """Prove to a server that this client knows the token, and have it prove the same.
+    """Prove to a server that this client knows the token, and verify that the server does.
 
     Args:
-        connection: Blocking socket whose timeout is that of the whole handshake; `encrypt` returns
-            it.
+        connection: Blocking socket returned by `encrypt`; its timeout covers the whole handshake.
         token: The run's token.
         instance: Number of the instance to run, 0 for any that is free.
 
@@ -147,7 +146,7 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
     Raises:
         SilentPeerError: If the server does not answer in time.
         UnansweredError: If the server ended the connection.
-        PlainRefusedError: If the server wants the connection to be encrypted.
+        PlainRefusedError: If the server requires an encrypted connection.
         ConnectionRefusedByPeerError: If the server has another version or another token, or is
             not a physx server.
     """
@@ -162,7 +161,7 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
     except (EOFError, OSError) as error:
         raise UnansweredError(f"The server ended the connection ({error}).") from error
     if frame.kind is not Kind.CHALLENGE:
-        raise ConnectionRefusedByPeerError("What answers at that address is not a physx server.")
+        raise ConnectionRefusedByPeerError("The peer at that address is not a physx server.")
     magic, version, other = _parse_opening(frame.payload[:-_PROOF_SIZE])
     if magic != _MAGIC or version != VERSION:
         raise ConnectionRefusedByPeerError(
@@ -170,13 +169,13 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
             "Install the same version of physx-core on both sides."
         )
     if frame.number == _NOT_PLAIN and not channel:
-        raise PlainRefusedError("The server takes no connection from here that is not encrypted.")
+        raise PlainRefusedError("The server accepts only encrypted connections from here.")
     if not hmac.compare_digest(
         _proof(token, b"server", own, other, channel), bytes(frame.payload[-_PROOF_SIZE:])
     ):
         raise ConnectionRefusedByPeerError(
             "The server does not know this client's token"
-            + (", or somebody between the two answers in its place" if channel else "")
+            + (", or someone in between answers in its place" if channel else "")
             + f". Set the environment variable {TOKEN_VARIABLE} to the token of the run to join, "
             "or name the file that holds it with --token-file."
         )
@@ -190,7 +189,7 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
 
 
 def _read_in_time(connection: socket.socket, reader: FrameReader) -> Frame:
-    """Return the next frame; one that comes in pieces has no more time than another."""
+    """Return the next frame within the timeout, even if it arrives in pieces."""
     patience = connection.gettimeout()
     until = None if patience is None else time.monotonic() + patience
     while (frame := reader.take()) is None:

@@ -27,11 +27,11 @@ AnyConnection = TypeVar("AnyConnection", bound=Connection)
 
 
 class Listener(Closeable, Generic[AnyConnection]):
-    """The sockets of one server: one that listens, and any number that are connected.
+    """The sockets of one server: a listening one and any number of connected ones.
 
     Attributes:
-        address: Host and port where it listens; an empty host: it does not.
-        timers: Functions to be called later; whoever owns the listener calls those that are due.
+        address: Host and port where it listens; an empty host: it does not listen.
+        timers: Functions to be called later; the listener's owner calls those that are due.
     """
 
     def __init__(
@@ -44,9 +44,9 @@ class Listener(Closeable, Generic[AnyConnection]):
         """Start without listening.
 
         Args:
-            accepted: Called with each new connection, and its other side as ``host:port``.
-            vanished: Called with a connection whose other side's machine no longer answers.
-            encrypts: Whether clients may encrypt, so that `accepted` gets `SecureSocket`.
+            accepted: Called with each new connection and its peer as ``host:port``.
+            vanished: Called with a connection if the peer's machine no longer answers.
+            encrypts: Whether clients may encrypt; `accepted` then gets a `SecureSocket`.
         """
         self.address = ("", 0)
         self.timers = Timers()
@@ -68,7 +68,7 @@ class Listener(Closeable, Generic[AnyConnection]):
         return self._socket is not None
 
     def listen(self, address: str, port: int) -> None:
-        """Start to accept connections.
+        """Start accepting connections.
 
         Args:
             address: Address of this machine.
@@ -90,7 +90,7 @@ class Listener(Closeable, Generic[AnyConnection]):
         self._selector.register(self._socket, selectors.EVENT_READ)
 
     def add(self, connection: AnyConnection) -> None:
-        """Watch a connection, until it is closed."""
+        """Watch a connection until it is closed."""
         connection.attach(self._selector)
         self._connections.add(connection)
         if not self._is_watching:
@@ -98,11 +98,11 @@ class Listener(Closeable, Generic[AnyConnection]):
             self.timers.add(LOOK_EVERY, self._look_for_vanished)
 
     def select(self, timeout: float | None, spin: float = 0.0) -> list[tuple[AnyConnection, int]]:
-        """Return the connections with something to do, and the events.
+        """Return the connections with pending events, and these events.
 
         Args:
-            timeout: How long to wait for the first, in s; None: for ever.
-            spin: How long to look for it without sleeping before that, in s.
+            timeout: How long to wait for the first event, in s; None: forever.
+            spin: How long to poll for it without sleeping before that, in s.
         """
         select = self._selector.select
         hidden = self._find_hidden() if self._hidden else {}
@@ -121,7 +121,7 @@ class Listener(Closeable, Generic[AnyConnection]):
         return ready
 
     def _find_hidden(self) -> dict[AnyConnection, int]:
-        """Return connections that may have something to receive that the selector does not see."""
+        """Return connections that may have received data that the selector does not see."""
         watched = self._selector.get_map()
         keys = [watched[one] for one in self._hidden if one in watched]
         return {key.data: selectors.EVENT_READ for key in keys if key.events & selectors.EVENT_READ}
@@ -129,7 +129,8 @@ class Listener(Closeable, Generic[AnyConnection]):
     def accept(self) -> bool:
         """Accept some of the connections that `select` found; return whether there were any.
 
-        Called after those who left have made room. A flood must not keep the others waiting.
+        To be called after closed connections have made room. A flood of new connections must not
+        keep the others waiting.
         """
         if not self._has_guests:
             return False
@@ -144,7 +145,7 @@ class Listener(Closeable, Generic[AnyConnection]):
             except ConnectionError:  # it was gone before it was accepted
                 continue
             except OSError as error:  # the process has too many open files
-                _LOG.warning("No connection can be accepted for now: %s", error)
+                _LOG.warning("Connections cannot be accepted for now: %s", error)
                 self._selector.unregister(self._socket)
                 self.timers.add(_PAUSE, self._accept_again)
                 break
@@ -155,12 +156,12 @@ class Listener(Closeable, Generic[AnyConnection]):
         return True
 
     def wake(self) -> None:
-        """End the present or next `select`; may be called from any thread."""
+        """End the current or next `select`; may be called from any thread."""
         with contextlib.suppress(BlockingIOError):
             self._wakes.send(b"x")
 
     def close(self) -> None:
-        """Stop listening; the connections are closed by their owner."""
+        """Stop listening; the owner closes the connections."""
         if self._socket is not None:
             self._socket.close()
             self._socket = None

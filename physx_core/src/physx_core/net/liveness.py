@@ -1,10 +1,10 @@
-"""Liveness: notices that the machine of a peer is gone, although nobody closed the connection.
+"""Liveness: detects that a peer's machine is gone although the connection was not closed.
 
-A machine that loses its power or its network says nothing. So the system probes an idle connection,
-and whoever waits for a peer looks now and then whether it acknowledges what was sent to it. What
-counts is the system of the other machine: a peer that computes for minutes, is stopped, or does not
-read what arrives, is alive. (Therefore there is no ``TCP_USER_TIMEOUT``: Linux ends with it the
-connection of a peer that acknowledges every probe but has no room for more data.)
+A machine that loses power or network sends nothing. Therefore, the operating system probes idle
+connections, and code that waits for a peer periodically checks whether it acknowledges data. Only
+the peer's operating system counts: a peer that computes for minutes, is stopped, or does not read
+its data is alive. (``TCP_USER_TIMEOUT`` is not used for this reason: with it, Linux ends the
+connection to a peer that acknowledges every probe but has no room for more data.)
 """
 
 from __future__ import annotations
@@ -19,21 +19,21 @@ import sys
 import time
 
 LOOK_EVERY = 2.0
-"""How often whoever waits for a peer calls `has_vanished`, in s."""
+"""Interval at which code that waits for a peer calls `has_vanished`, in s."""
 
 VANISHED = "its machine no longer answers"
-"""What happened to such a peer, for messages."""
+"""Reason why such a peer was lost, for messages."""
 
-_IDLE, _INTERVAL, _PROBES = 5, 3, 3  # s, s: the system gives an idle connection up after 14 s
+_IDLE, _INTERVAL, _PROBES = 5, 3, 3  # s, s: the system gives up an idle connection after 14 s
 _SILENCE = 12_000  # ms
-_LONGEST_PAUSE = 3_000  # ms between two probes; without this option it doubles, up to two minutes
+_LONGEST_PAUSE = 3_000  # ms between two probes; without this option it doubles up to two minutes
 _TCP_RTO_MAX_MS = 44  # Linux 6.15 or later
-_INFO = struct.Struct("=8B13I")  # the beginning of Linux's tcp_info
+_INFO = struct.Struct("=8B13I")  # beginning of Linux's tcp_info
 _LOSSES = {errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN, errno.EHOSTDOWN}
 
 
 def prepare_connection(connected: socket.socket) -> None:
-    """Have the system send small messages at once, and probe the other side when it is idle."""
+    """Make the system send small messages immediately and probe the peer when idle."""
     options = [(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)]
     idle = getattr(socket, "TCP_KEEPIDLE", getattr(socket, "TCP_KEEPALIVE", None))
     for option, value in (
@@ -50,9 +50,9 @@ def prepare_connection(connected: socket.socket) -> None:
 
 
 def has_vanished(connected: socket.socket) -> bool:
-    """Return whether a peer has acknowledged nothing for 12 s, though it was asked repeatedly.
+    """Return whether a peer has acknowledged nothing for 12 s despite repeated probes.
 
-    Systems other than Linux do not say; they give up after their own times.
+    Only Linux provides this information; other systems give up after their own timeouts.
     """
     option = getattr(socket, "TCP_INFO", None)
     if option is None:
@@ -67,20 +67,20 @@ def has_vanished(connected: socket.socket) -> bool:
 
 
 def is_loss(error: BaseException | None) -> bool:
-    """Return whether the system gave a connection up because the other side did not answer."""
+    """Return whether the system gave up a connection because the peer did not answer."""
     return isinstance(error, OSError) and error.errno in _LOSSES
 
 
 def poll_peer(poll: select.poll, connected: socket.socket, seconds: float | None) -> bool:
-    """Wait for what `poll` watches for on a connection; return whether it came.
+    """Wait for the events of `poll` on a connection; return whether one occurred.
 
     Args:
         poll: Watches the connection.
         connected: The connection.
-        seconds: How long to wait, in s; None: as long as the other side's machine answers.
+        seconds: How long to wait, in s; None: as long as the peer's machine answers.
 
     Raises:
-        TimeoutError: If the other side's machine no longer answers; `is_loss` knows it.
+        TimeoutError: If the peer's machine no longer answers; `is_loss` recognizes the error.
     """
     until = math.inf if seconds is None else time.monotonic() + seconds
     while True:

@@ -1,4 +1,4 @@
-"""Encodes errors of physx as plain values, and decodes them to the same classes."""
+"""Encodes physx errors as plain values and decodes them to the same classes."""
 
 from __future__ import annotations
 
@@ -13,10 +13,10 @@ _PARTS = {"classes": list, "message": str, "attributes": dict, "traceback": str}
 
 
 class RemoteTraceback(Exception):  # noqa: N818 - it is the cause of an error, not an error itself
-    """The traceback of an error as text, as it was in the process that raised it."""
+    """The traceback of an error as text, from the process that raised it."""
 
     def __str__(self) -> str:
-        """Return the text on lines of its own."""
+        """Return the text, starting on a new line."""
         return f"\n{self.args[0]}"
 
 
@@ -34,17 +34,17 @@ def encode_error(error: PhysxError) -> bytes:
 
 
 def decode_error(payload: bytes | bytearray) -> PhysxError:
-    """Return the error that `encode_error` was given.
+    """Return the error that was given to `encode_error`.
 
-    Its class is found by name among those of `physx_core.errors` only; an error class of a plugin
-    comes back as the nearest of them that it derives from.
+    Its class is looked up by name in `physx_core.errors` only; an error class of a plugin is
+    replaced by the nearest of these that it derives from.
 
     Raises:
         ConnectionRefusedByPeerError: If the bytes do not describe an error.
     """
     plain: dict[str, Any] = decode(payload)
     if not _is_error(plain):
-        raise ConnectionRefusedByPeerError("What was received as an error does not describe one.")
+        raise ConnectionRefusedByPeerError("A received error message does not describe an error.")
     cls = next((c for c in map(_error_class, plain["classes"]) if c is not None), PhysxError)
     error = cls.__new__(cls)
     Exception.__init__(error, plain["message"])

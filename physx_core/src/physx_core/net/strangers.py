@@ -1,4 +1,4 @@
-"""Strangers: connections that have not yet shown that they belong to a server."""
+"""Strangers: connections that have not yet proved that they belong to a server."""
 
 from __future__ import annotations
 
@@ -15,17 +15,17 @@ from physx_core.net.tls import SecureSocket
 
 
 class Strangers(Generic[AnyConnection]):
-    """Connections that have not yet shown that they belong to a server: not too many.
+    """A limited number of connections that have not yet proved that they belong to a server.
 
-    Those that have do not count, so strangers do not keep them out.
+    Connections that have proved it do not count, so strangers cannot keep them out.
     """
 
     def __init__(self, most: int, drop: Callable[[AnyConnection, str], None]) -> None:
         """Start without any.
 
         Args:
-            most: How many there are at most.
-            drop: Closes a connection for a reason and calls `forget`.
+            most: Maximum number of strangers.
+            drop: Closes a connection for a given reason and calls `forget`.
         """
         self._most, self._drop = most, drop
         self._waiting: dict[AnyConnection, None] = {}
@@ -35,14 +35,14 @@ class Strangers(Generic[AnyConnection]):
         return connection in self._waiting
 
     def __len__(self) -> int:
-        """Return how many there are."""
+        """Return the number of strangers."""
         return len(self._waiting)
 
     def add(self, connection: AnyConnection) -> None:
         """Count a new connection as a stranger.
 
-        Where there are too many, one of them is dropped at random: whoever occupies the places
-        cannot keep out a client that tries again.
+        If there are too many, one of them is dropped at random, so that an attacker who occupies
+        all places cannot keep out a client that retries.
         """
         if len(self._waiting) >= self._most:
             self._drop(secrets.choice([*self._waiting]), "too many strangers are connected")
@@ -53,16 +53,16 @@ class Strangers(Generic[AnyConnection]):
         self._waiting.pop(connection, None)
 
     def drop_all(self) -> None:
-        """Drop all strangers, because the server ends."""
+        """Drop all strangers because the server is shutting down."""
         for connection in [*self._waiting]:
             self._drop(connection, "")
 
 
 class Handshakes(Strangers[AnyConnection]):
-    """Strangers that have to prove that they know a token, and soon.
+    """Strangers that must prove within a time limit that they know a token.
 
     Attributes:
-        patience: How long a stranger may take for the next part of its handshake, in s.
+        patience: Time a stranger may take for the next part of its handshake, in s.
     """
 
     def __init__(
@@ -77,9 +77,9 @@ class Handshakes(Strangers[AnyConnection]):
 
         Args:
             token: The token that they must know.
-            patience: How long a stranger may take for the next part of its handshake, in s.
-            most: How many there are at most.
-            drop: Closes a connection for a reason and calls `forget`.
+            patience: Time a stranger may take for the next part of its handshake, in s.
+            most: Maximum number of strangers.
+            drop: Closes a connection for a given reason and calls `forget`.
             timers: Timers of the server.
         """
         super().__init__(most, drop)
@@ -97,13 +97,13 @@ class Handshakes(Strangers[AnyConnection]):
             self._timers.add(self.patience, self._drop_silent)
 
     def greet(self, connection: AnyConnection, frame: Frame) -> tuple[bytes, int | None]:
-        """Go on with the handshake of a connection, which is forgotten once it is trusted.
+        """Continue the handshake of a connection, which is forgotten once it is trusted.
 
         Returns:
-            What to send back, and the number that the client asks for once it is trusted.
+            The bytes to send back, and the number that the client requests, None until trusted.
 
         Raises:
-            ConnectionRefusedByPeerError: If it sent nonsense or does not know the token.
+            ConnectionRefusedByPeerError: If the client sent nonsense or does not know the token.
         """
         handshake = self._handshakes[connection]
         secure = connection.socket if isinstance(connection.socket, SecureSocket) else None

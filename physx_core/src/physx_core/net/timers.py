@@ -1,4 +1,4 @@
-"""Timers: calls functions at later times, in one thread."""
+"""Timers: call functions at later times, in one thread."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ class Timers:
     """Functions to be called at later times.
 
     Attributes:
-        next: When the first of them is due, in monotonic s; infinite if there are none.
+        next: When the first of them is due, in monotonic s; infinity if there are none.
     """
 
     def __init__(self) -> None:
@@ -23,12 +23,12 @@ class Timers:
         self._numbers = itertools.count()
 
     def add(self, seconds: float, action: Callable[[], None]) -> None:
-        """Have a function called once, `seconds` from now."""
+        """Schedule one call of a function, `seconds` from now."""
         heapq.heappush(self._heap, (time.monotonic() + seconds, next(self._numbers), action))
         self.next = self._heap[0][0]
 
     def call_due(self) -> None:
-        """Call all functions that are due, in the order of their times."""
+        """Call all due functions in the order of their times."""
         now = time.monotonic()
         while self.next <= now:
             action = heapq.heappop(self._heap)[2]

@@ -1,9 +1,9 @@
-"""TLS: encrypts connections between machines; those within one stay plain.
+"""TLS: encrypts connections between machines; those within one machine stay plain.
 
-A server makes a certificate for itself that nobody signs. It is trusted because the proofs of the
-token in the handshake cover its fingerprint: whoever stands between the two sides has another
-certificate, and lets proofs pass that do not fit it. So there is nothing to install or to renew,
-and one mechanism serves every Python. (Pre-shared keys would need Python 3.13 on both sides.)
+A server creates an unsigned certificate for itself. It is trusted because the token proofs in the
+handshake cover its fingerprint: a man in the middle has a different certificate, which the proofs
+it relays do not match. So there is nothing to install or renew, and one mechanism works with every
+Python version. (Pre-shared keys would require Python 3.13 on both sides.)
 """
 
 from __future__ import annotations
@@ -20,33 +20,33 @@ from typing import Any
 from physx_core.net.addresses import stays_here
 from physx_core.processes import anonymous_file
 
-_HANDSHAKE = b"\x16"  # first byte of a client that begins TLS; no frame of a stranger begins so
+_HANDSHAKE = b"\x16"  # first byte of a client that starts TLS; no stranger's frame starts with it
 _PIECE = 1 << 16
 _CHUNK = 1 << 17
 _SMALL = 1 << 14
 _AT_ONCE = getattr(socket, "MSG_DONTWAIT", 0)
-_VALID = datetime.timedelta(days=3650)  # nobody looks at it
+_VALID = datetime.timedelta(days=3650)  # not checked by anyone
 
 
 class Identity:
-    """A server's certificate, made when it is first needed; the key exists in memory only.
+    """A server's certificate, created when first needed; the key exists only in memory.
 
     Attributes:
-        fingerprint: SHA-256 of the certificate; empty before it is made.
+        fingerprint: SHA-256 of the certificate; empty before it is created.
     """
 
     def __init__(self) -> None:
-        """Make nothing yet."""
+        """Start without a certificate."""
         self.fingerprint = b""
         self._context: ssl.SSLContext | None = None
 
     def prepare(self) -> ssl.SSLContext:
-        """Return what the server's ends of connections are made with."""
+        """Return the SSL context for the server's ends of connections."""
         if self._context is None:
             certificate, key, self.fingerprint = _make_certificate()
             context = ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER)
             context.minimum_version = ssl.TLSVersion.TLSv1_3
-            context.num_tickets = 0  # nobody comes back to a session
+            context.num_tickets = 0  # sessions are never resumed
             with anonymous_file("certificate") as file:
                 file.write(key + certificate)
                 file.seek(0)
@@ -80,17 +80,17 @@ def _make_certificate() -> tuple[bytes, bytes, bytes]:
 
 
 class SecureSocket(socket.socket):
-    """A socket that encrypts, used like the one that it replaces, blocking or not.
+    """An encrypting socket, used like the one that it replaces, blocking or non-blocking.
 
-    As with any non-blocking socket, what `send` did not take has to be sent again, beginning with
-    the same bytes: some of them may be encrypted already.
+    As with any non-blocking socket, bytes that `send` did not take must be sent again, starting
+    with the same bytes: some of them may already be encrypted.
 
     Attributes:
-        channel: What proofs of the token are bound to: the fingerprint of the server's certificate;
-            nothing if the connection is plain and stays on this machine; None if it is plain and
+        channel: What the token proofs are bound to: the fingerprint of the server's certificate;
+            empty if the connection is plain and stays on this machine; None if it is plain and
             comes from elsewhere, or before anything has arrived.
-        hidden: The sockets, this one or others, that may hold something to receive that the system
-            does not know of, as it was taken from there to be decrypted.
+        hidden: Sockets, possibly including this one, that may hold received data that the system
+            does not report, because it has already been read for decryption.
     """
 
     def __init__(self, connected: socket.socket, hidden: set[SecureSocket] | None = None) -> None:
@@ -98,7 +98,7 @@ class SecureSocket(socket.socket):
 
         Args:
             connected: The socket.
-            hidden: The set that `hidden` is.
+            hidden: The set to use as `hidden`.
         """
         timeout = connected.gettimeout()
         super().__init__(
@@ -112,7 +112,7 @@ class SecureSocket(socket.socket):
         self._tls: ssl.SSLObject | None = None
         self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
         self._unsent = memoryview(b"")  # encrypted
-        self._owed = 0  # bytes that are encrypted and not reported as sent
+        self._owed = 0  # bytes that are encrypted but not reported as sent
 
     @classmethod
     def of_server(
@@ -134,12 +134,12 @@ class SecureSocket(socket.socket):
         """Return a client's end of a connection, encrypted.
 
         Args:
-            connected: The connected, blocking socket, which is taken over. Its timeout is that of
-                all that is exchanged here.
+            connected: The connected, blocking socket, which is taken over. Its timeout covers the
+                whole exchange.
 
         Raises:
             ConnectionAbortedError: If the server does not encrypt.
-            OSError: If the connection is broken, or the time is over.
+            OSError: If the connection is broken or the timeout expires.
         """
         context = ssl.SSLContext(ssl.PROTOCOL_TLS_CLIENT)
         context.minimum_version = ssl.TLSVersion.TLSv1_3
@@ -157,9 +157,9 @@ class SecureSocket(socket.socket):
         return made
 
     def settle(self) -> socket.socket:
-        """Return what to use from now on, as the other side is trusted: a plain socket if it may.
+        """Return the socket to use once the peer is trusted: a plain one if not encrypted.
 
-        This one is then empty.
+        In that case, this one is detached.
         """
         if not self._is_plain:
             return self
@@ -171,7 +171,7 @@ class SecureSocket(socket.socket):
     # As a socket ------------------------------------------------------------------------------
 
     def recv_into(self, buffer: Any, nbytes: int = 0, flags: int = 0) -> int:
-        """Receive as much as there is now, and fits; return how many bytes it is, 0 at the end.
+        """Receive as many bytes as are available and fit; return their number, 0 at the end.
 
         Raises:
             OSError: If nothing has arrived, or the connection is broken or was cut.
@@ -185,15 +185,15 @@ class SecureSocket(socket.socket):
         return self._decrypt(tls, view[: nbytes or len(view)])
 
     def recv(self, bufsize: int, flags: int = 0) -> bytes:
-        """Receive at most so many bytes: see `recv_into`."""
+        """Receive at most `bufsize` bytes: see `recv_into`."""
         buffer = bytearray(bufsize)
         return bytes(buffer[: self.recv_into(buffer, bufsize, flags)])
 
     def send(self, data: Any, flags: int = 0) -> int:
-        """Send as much as the connection takes now; return how many bytes it took.
+        """Send as many bytes as the connection takes now; return their number.
 
         Raises:
-            OSError: If it takes nothing now, or is broken.
+            OSError: If the connection takes nothing now or is broken.
         """
         tls = self._tls
         if tls is None:
@@ -223,7 +223,7 @@ class SecureSocket(socket.socket):
             rest = rest[self.send(rest, flags) :]
 
     def sendmsg(self, buffers: Iterable[Any], *rest: Any) -> int:
-        """Send parts as one piece: see `send`."""
+        """Send parts as one message: see `send`."""
         if self._tls is None:
             return super().sendmsg(buffers, *rest)
         sent = 0
@@ -240,16 +240,16 @@ class SecureSocket(socket.socket):
         return sent
 
     def shutdown(self, how: int) -> None:
-        """End the connection; only ending the direction of sending says goodbye.
+        """Shut down the connection; only ``SHUT_WR`` sends a TLS goodbye.
 
-        So any thread may end both.
+        Hence, any thread may shut down both directions.
         """
         if how == socket.SHUT_WR:
             self._say_goodbye(0)
         super().shutdown(how)
 
     def close(self) -> None:
-        """Say goodbye, if that needs no waiting, and close the socket."""
+        """Send a TLS goodbye, if that does not block, and close the socket."""
         self.hidden.discard(self)
         if self.fileno() >= 0:
             self._say_goodbye(_AT_ONCE)
@@ -258,7 +258,7 @@ class SecureSocket(socket.socket):
     # Encryption -------------------------------------------------------------------------------
 
     def _choose(self) -> ssl.SSLObject | None:
-        """Look at a client's first byte: does it encrypt?"""
+        """Determine from a client's first byte whether it encrypts."""
         if self._is_plain or self._identity is None:
             return None
         first = super().recv(1, socket.MSG_PEEK)
@@ -272,7 +272,7 @@ class SecureSocket(socket.socket):
         return None
 
     def _shake_hands(self, tls: ssl.SSLObject) -> None:
-        """Do a client's handshake within the timeout."""
+        """Perform a client's TLS handshake within the timeout."""
         patience = self.gettimeout()
         until = None if patience is None else time.monotonic() + patience
         while True:
@@ -292,15 +292,15 @@ class SecureSocket(socket.socket):
             return
 
     def _decrypt(self, tls: ssl.SSLObject, view: memoryview) -> int:
-        """Fill a buffer as far as possible; return how many bytes it took, 0 at the end.
+        """Fill a buffer as far as possible; return the number of bytes, 0 at the end.
 
-        If it is full, or the end is near, the socket is `hidden` from now on.
+        If the buffer is full or the end is near, the socket is added to `hidden`.
         """
         filled, size = 0, len(view)
         while filled < size:
             try:
                 count: Any = tls.read(size - filled, view[filled:])
-                if not count:  # the other side said goodbye
+                if not count:  # the peer said goodbye
                     break
                 filled += count
             except ssl.SSLWantReadError:
@@ -309,10 +309,10 @@ class SecureSocket(socket.socket):
                 if filled:
                     return filled
                 self._fetch()
-            except ssl.SSLZeroReturnError:  # the same, after a goodbye of this side
+            except ssl.SSLZeroReturnError:  # the same, after this side said goodbye
                 break
             except ssl.SSLError as error:
-                if filled:  # it comes again
+                if filled:  # the next call raises it again
                     break
                 raise self._failed(error) from error
         if filled:
@@ -322,19 +322,19 @@ class SecureSocket(socket.socket):
         return filled
 
     def _answer(self) -> None:
-        """Send what TLS itself has to say, be it only a part now."""
+        """Send protocol messages of TLS itself, as far as possible now."""
         if self._outgoing.pending:
             with contextlib.suppress(BlockingIOError):
                 self._push()
 
     def _fetch(self) -> None:
-        """Take encrypted bytes from the system.
+        """Read encrypted bytes from the system.
 
         Raises:
             OSError: If there are none, or the connection is broken.
         """
         if self._is_broken:
-            raise ConnectionAbortedError("its encryption failed before")
+            raise ConnectionAbortedError("its encryption has already failed")
         data = super().recv(_PIECE)
         if data:
             self._incoming.write(data)
@@ -342,10 +342,10 @@ class SecureSocket(socket.socket):
             self._incoming.write_eof()
 
     def _push(self) -> None:
-        """Give the system what is encrypted.
+        """Pass encrypted bytes to the system.
 
         Raises:
-            BlockingIOError: If it does not take all of it now.
+            BlockingIOError: If it does not take all of them now.
         """
         if self._outgoing.pending:
             new = self._outgoing.read()
@@ -354,26 +354,26 @@ class SecureSocket(socket.socket):
             self._unsent = self._unsent[super().send(self._unsent) :]
 
     def _failed(self, error: ssl.SSLError) -> OSError:
-        """Return the error for a stream that is no TLS, was changed, or ends without a goodbye."""
+        """Return the error for a stream that is not TLS, was modified, or lacks a goodbye."""
         self._is_broken = True
         if isinstance(error, ssl.SSLEOFError | ssl.SSLZeroReturnError):
-            return ConnectionResetError("it was cut: the other side is gone without a word")
+            return ConnectionResetError("it was cut: the peer vanished without closing it")
         reason = (error.reason or str(error)).replace("_", " ").lower()
         return ConnectionAbortedError(f"its encryption failed: {reason}")
 
     def _say_goodbye(self, flags: int) -> None:
-        """Tell the other side that nothing follows, unless it lacks some of what came before."""
+        """Tell the peer that nothing follows, unless earlier data has not been sent completely."""
         tls, is_complete = self._tls, not (self._unsent or self._owed or self._is_broken)
         if tls is None or not is_complete:
             return
         with contextlib.suppress(OSError, ValueError):
-            with contextlib.suppress(ssl.SSLError):  # it would wait for the other side's goodbye
+            with contextlib.suppress(ssl.SSLError):  # it would wait for the peer's goodbye
                 tls.unwrap()
             super().send(self._outgoing.read(), flags)
 
 
 def _blocks(parts: Iterable[Any]) -> Iterator[bytes | bytearray | memoryview]:
-    """Join small parts, because each piece that is encrypted is longer by 22 bytes."""
+    """Join small parts, because encryption adds 22 bytes to each piece."""
     joined = bytearray()
     for part in parts:
         view = memoryview(part).cast("B")

@@ -1,4 +1,4 @@
-"""Tokens: finds and checks the secret of a run."""
+"""Tokens: find and check the secret of a run."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ _OTHERS = 0o077
 
 
 def find_token(token_file: str | None, token: str | None = None) -> str | None:
-    """Return the token that the user gave, None if there is none.
+    """Return the user's token, or None if there is none.
 
     Args:
         token_file: File that holds it; None: it is in the environment variable ``PHYSX_TOKEN``.
-        token: The token itself, which then counts.
+        token: The token itself, which takes precedence.
 
     Raises:
-        ConfigError: If the file cannot be read, others may read it, or the token is too short.
+        ConfigError: If the file cannot be read, other users can read it, or the token is too short.
     """
     if token is not None:
         return check_token(token, "token")
@@ -44,33 +44,33 @@ def check_token(token: str, place: str) -> str:
     if len(token) < _SHORTEST:
         raise ConfigError(
             f"The token in {place} has {len(token)} characters: it must have at least {_SHORTEST}, "
-            "so that nobody finds it by trying."
+            "so that it cannot be guessed."
         )
     return token
 
 
 def choose_token(config: EnvironmentConfig, by_hand: bool, elsewhere: bool = False) -> str:
-    """Return the token of a run: the one that the user gave, or a random one.
+    """Return the token of a run: the user's or a random one.
 
     Args:
-        config: Where the server listens, and the file with the token, if there is one.
-        by_hand: Whether clients are started by hand, by somebody who has to know the token.
-        elsewhere: Whether clients are started on other machines, and get the token there.
+        config: Where the server listens, and the file with the token, if any.
+        by_hand: Whether clients are started by hand, by someone who must know the token.
+        elsewhere: Whether clients are started on other machines and get the token there.
     """
     token = find_token(config.token_file)
     if token is not None:
         return token
     how = (
-        f"set {TOKEN_VARIABLE}, at least {_SHORTEST} characters, for the server and for each "
-        "client; or write it into a file that only you can read, and name it with "
-        "EnvironmentConfig.token_file and with physx client --token-file."
+        f"set {TOKEN_VARIABLE} (at least {_SHORTEST} characters) for the server and each client, "
+        "or write it to a file that only you can read, and pass that file with "
+        "EnvironmentConfig.token_file and physx client --token-file."
     )
     if by_hand:
         raise ConfigError(f"Clients that are started by hand need a secret: {how}")
     if not (elsewhere or is_loopback(config.ip_address)):
         raise ConfigError(
-            f"Others can reach the server at {config.ip_address}, so its clients need a secret: "
-            f"{how}"
+            f"Other machines can reach the server at {config.ip_address}, so its clients need a "
+            f"secret: {how}"
         )
     return secrets.token_hex(32)
 
@@ -84,7 +84,7 @@ def _read(token_file: str) -> str:
         raise ConfigError(f"The token file {token_file} cannot be read: {error}.") from error
     if mode & _OTHERS:
         raise ConfigError(
-            f"Other users may read or write the token file {token_file}: "
-            f"chmod 600 {token_file}, and choose another token."
+            f"Other users can read or write the token file {token_file}: "
+            f"run chmod 600 {token_file}, and choose a new token."
         )
     return text.strip()

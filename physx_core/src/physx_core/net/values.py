@@ -1,9 +1,9 @@
-"""Values: plain Python and NumPy values as bytes and back, each of the same type and bits.
+"""Values: converts plain Python and NumPy values to bytes and back, preserving types and bits.
 
-The bytes are a JSON text and, behind it, the raw bytes of arrays. In the JSON text None, booleans,
-strings, lists, finite floats and integers below 2**63 stand for themselves; everything else is an
-object with one key, its tag. Flat dictionaries take a shorter way: see `flat`. Nothing that is
-decoded can run code.
+The bytes are a JSON text followed by the raw bytes of arrays. In the JSON text, None, booleans,
+strings, lists, finite floats and integers below 2**63 are written as they are; everything else is
+an object with one key, its tag. Flat dictionaries have a faster path: see `flat`. Decoding never
+runs code from the data.
 """
 
 from __future__ import annotations
@@ -48,8 +48,8 @@ def encode(value: Any, what: str = "value") -> bytes:
         what: Name of the value for error messages.
 
     Raises:
-        UsageError: If something in it has another type (the message says where), or it contains
-            too much text.
+        UsageError: If any part has another type (the message says where), or there is too much
+            text.
     """
     if type(value) is dict:
         prefix, _ = describe_flat(value)
@@ -59,7 +59,7 @@ def encode(value: Any, what: str = "value") -> bytes:
 
 
 def pack_value(kind: Kind, value: Any, what: str, number: int = 0) -> bytes:
-    """Return a message whose payload is a value as the bytes to send.
+    """Return the bytes of a message whose payload is a value.
 
     Args:
         kind: Kind of the message.
@@ -86,7 +86,7 @@ def _tree_bytes(value: Any, what: str) -> bytes:
         raise UsageError(f"{what} is nested too deeply to be sent to another process.") from None
     if len(text) > _MAX_TEXT:
         raise UsageError(
-            f"{what} holds so many separate values that they take {len(text)} bytes of text, and "
+            f"{what} holds so many separate values that they take {len(text)} bytes of text, but "
             f"at most {_MAX_TEXT} can be sent. Pass NumPy arrays instead of long lists."
         )
     return b"".join([LENGTH.pack(len(text)), text, *blobs])
@@ -127,8 +127,8 @@ def _tree(value: Any, where: str, blobs: list[bytes]) -> Any:
     if isinstance(value, Path):
         return {"p": str(value)}
     raise UsageError(
-        f"{where} is {reprlib.repr(value)} ({type(value).__name__}), which cannot travel to "
-        "another process. Use numbers, texts, bytes, paths, NumPy arrays, and lists, tuples and "
+        f"{where} is {reprlib.repr(value)} ({type(value).__name__}), which cannot be sent to "
+        "another process. Use numbers, strings, bytes, paths, NumPy arrays, and lists, tuples and "
         "dictionaries of those; or run with as_tcp_ip_client=False."
     )
 
@@ -140,7 +140,7 @@ def _itself(value: Any, where: str, blobs: list[bytes]) -> Any:
 def _str_tree(value: str, where: str, blobs: list[bytes]) -> Any:
     try:
         value.encode()
-    except UnicodeEncodeError:  # lone surrogates, two of which JSON would take for a pair
+    except UnicodeEncodeError:  # lone surrogates; JSON would treat two of them as a pair
         return {"w": _blob(value.encode("utf-8", "surrogatepass"), blobs)}
     return value
 
@@ -169,7 +169,7 @@ def _dict_tree(value: dict[Any, Any], where: str, blobs: list[bytes]) -> Any:
 def _array_parts(value: Array, where: str, blobs: list[bytes]) -> list[Any]:
     if value.dtype.kind not in _PLAIN_KINDS:
         raise UsageError(
-            f"{where} is an array of {value.dtype}, which cannot travel to another process: "
+            f"{where} is an array of {value.dtype}, which cannot be sent to another process: "
             "its elements have no fixed plain layout."
         )
     return [value.dtype.str, list(value.shape), _blob(value.tobytes(), blobs)]
@@ -198,7 +198,7 @@ _ENCODERS: dict[type[Any], Callable[[Any, str, list[bytes]], Any]] = {
 
 
 class _Blobs:
-    """The raw bytes behind the JSON text, in their order."""
+    """The raw bytes after the JSON text, in order."""
 
     def __init__(self, payload: bytes | bytearray | memoryview, start: int) -> None:
         self._view = memoryview(payload)

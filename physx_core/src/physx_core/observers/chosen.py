@@ -19,13 +19,13 @@ def statistics_observers(
     """Return the observers of a run's statistics.
 
     Args:
-        given: References of visualizers; a string is a single one.
+        given: References of visualizers; a string is a single reference.
         kwargs: Keyword arguments by reference.
         environment: Its visualizer receives the statistics anyway and is not created again.
 
     Raises:
-        UnknownOptionError: If there are arguments for another reference.
-        ConfigError: If the arguments of a reference are no table.
+        UnknownOptionError: If there are arguments for a reference that was not given.
+        ConfigError: If the arguments of a reference are not a table.
         PhysxError: If a reference cannot be resolved.
     """
     references = [given] if isinstance(given, str) else list(given)
@@ -35,7 +35,7 @@ def statistics_observers(
     for name, options in kwargs.items():
         if not isinstance(options, Mapping):
             raise ConfigError(
-                f"The statistics_kwargs of {name} are {options!r:.100} and must be a table: "
+                f"The statistics_kwargs of {name} are {options!r:.100} but must be a table: "
                 f"""{{"{name}": {{"option": 1}}}}, on the command line '{name}={{option=1}}'."""
             )
     drawn = environment.visualizer if environment is not None else None

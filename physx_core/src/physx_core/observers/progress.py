@@ -10,7 +10,7 @@ from physx_core.components.visualizer import Observer
 
 
 class ProgressBar(Observer):
-    """A bar on a terminal; otherwise one line a minute and one at the end, suited for logs."""
+    """A bar on a terminal; otherwise, for logs, one line per minute and one at the end."""
 
     def __init__(self) -> None:
         self._bar: Any = None
@@ -44,9 +44,9 @@ class ProgressBar(Observer):
             self._bar.update(count)
 
     def scalars(self, values: Mapping[str, float], step: int, timeline: str) -> None:
-        """Show the statistics of an epoch behind the bar, except those over several epochs.
+        """Show an epoch's statistics after the bar, except those over several epochs.
 
-        While environments generate, what there is about that is shown in their place.
+        While environments generate, show their statistics instead.
         """
         if self._bar is None:
             return

@@ -14,16 +14,16 @@ from physx_core.errors import SessionError
 
 HEADER = ("timeline", "step", "name", "value")
 FIELDS = "fields"
-"""Group of the names of the statistics of rows: ``fields/<field>/<component>/<figure>``."""
+"""Name prefix of row statistics: ``fields/<field>/<component>/<figure>``."""
 FLUSH_SECONDS = 0.2
 _LONGEST_LINE = 2**16
 
 
 class ScalarsFile(Observer):
-    """Appends rows (timeline, step, name, value) to ``stats/scalars.csv`` of the session.
+    """Appends rows (timeline, step, name, value) to the session's ``stats/scalars.csv``.
 
-    Rows are flushed five times a second, before each checkpoint, and those of an epoch at once, so
-    that a killed run keeps its statistics.
+    Rows are flushed five times a second and before each checkpoint, those of an epoch immediately,
+    so a killed run keeps its statistics.
     """
 
     def __init__(self) -> None:
@@ -69,12 +69,12 @@ class ScalarsFile(Observer):
             self._stream = None
 
     def outputs(self) -> Sequence[str]:
-        """Name the file, if a number was written."""
+        """Return a line that names the file, if any number was written."""
         return [f"statistics: {self._path}"] if self._wrote else []
 
 
 def _cut_unfinished_line(path: Path) -> None:
-    """Remove the incomplete last line of a killed run."""
+    """Remove an incomplete last line that a killed run left."""
     if path.exists():
         content = path.read_bytes()
         if not content.endswith(b"\n"):
@@ -85,15 +85,15 @@ def _cut_unfinished_line(path: Path) -> None:
 def read_scalars(session_dir: Path) -> dict[tuple[str, str], dict[int, float]]:
     """Return a session's statistics: (timeline, name) to step to value, in the order of writing.
 
-    If a resumed run recorded a step again, the later value counts. An incomplete last line is left
-    out.
+    If a resumed run recorded a step again, the later value counts. An incomplete last line is
+    ignored.
 
     Raises:
-        SessionError: If the session has no such file, or it was not written by physx.
+        SessionError: If the session has no statistics file, or it was not written by physx.
     """
     path = session_dir / "stats" / "scalars.csv"
     if not path.is_file():
-        raise SessionError(f"There is no {path}: a session has statistics after a training.")
+        raise SessionError(f"There is no {path}: only training runs write statistics.")
     found: dict[tuple[str, str], dict[int, float]] = {}
     try:
         with path.open(encoding="utf-8", newline="") as stream:
@@ -107,7 +107,9 @@ def read_scalars(session_dir: Path) -> dict[tuple[str, str], dict[int, float]]:
 def _rows(path: Path, stream: io.TextIOBase) -> Iterator[tuple[str, int, str, float]]:
     lines = csv.reader(_complete_lines(stream))
     if tuple(next(lines, ())) not in (HEADER, ()):
-        raise SessionError(f"{path} is not a file of physx: it must begin with {','.join(HEADER)}.")
+        raise SessionError(
+            f"{path} was not written by physx: it must start with {','.join(HEADER)}."
+        )
     for line in lines:
         try:
             timeline, step, name, value = line

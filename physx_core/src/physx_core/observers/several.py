@@ -1,4 +1,4 @@
-"""Observers: passes a run's events to several observers, none of which can end the run."""
+"""Observers: passes a run's events to several observers, whose errors cannot end the run."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from physx_core.typing import Array
 
 
 class Observers(Observer):
-    """Passes everything to each observer; one that raises is reported once and then left out."""
+    """Passes everything to each observer; one that raises is reported once, then disabled."""
 
     def __init__(self, observers: Iterable[Observer]) -> None:
         self._observers = list(observers)
         self._muted: list[Observer] = []
 
     def open(self, run_name: str, session_dir: Path, instance_nb: int) -> None:
-        """Announce a run. Here the errors of observers are raised, as they are the user's.
+        """Announce a run. Here observers' errors are raised, because the user can fix them.
 
         Raises:
-            PhysxError: If an observer cannot start, for example because a viewer is not reachable.
+            PhysxError: If an observer cannot start, for example because a viewer is unreachable.
         """
         opened: list[Observer] = []
         try:
@@ -72,12 +72,12 @@ class Observers(Observer):
 
     @property
     def want_predictions(self) -> bool:
-        """Whether an observer does anything with predictions."""
+        """Whether any observer uses predictions."""
         ignored = Observer.predictions
         return any(type(each).predictions is not ignored for each in self._observers)
 
     def flush(self) -> None:
-        """Have what was passed on stored."""
+        """Have observers store everything that they received."""
         self._call("flush")
 
     def note(self, text: str) -> None:
@@ -93,7 +93,7 @@ class Observers(Observer):
         self._call("close")
 
     def outputs(self) -> Sequence[str]:
-        """Return the lines of all observers, also of those that failed meanwhile."""
+        """Return the lines of all observers, including those that have failed."""
         self._observers, self._muted = [*self._observers, *self._muted], []
         return [line for lines in self._call("outputs") for line in lines]
 
@@ -108,7 +108,7 @@ class Observers(Observer):
                 self._observers = [other for other in self._observers if other is not observer]
                 self._muted.append(observer)
                 warnings.warn(
-                    f"{type(observer).__name__} failed and is left out from here on: "
+                    f"{type(observer).__name__} failed and is disabled from here on: "
                     f"{type(error).__name__}: {error}",
                     stacklevel=3,
                 )

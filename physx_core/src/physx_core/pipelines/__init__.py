@@ -1,7 +1,7 @@
 """Pipelines: data generation, training, prediction, and replay.
 
 The pipelines to run or to derive from; `load_learner`, which loads a trained network; and
-`read_drawn_rows`, which says which rows the batches of a training held.
+`read_drawn_rows`, which returns the rows in each batch of a training.
 """
 
 from __future__ import annotations

@@ -38,7 +38,7 @@ class DataGeneration(NewSessionPipeline):
     Attributes:
         dataset: The session's dataset, open for writing.
         source: The environments.
-        batch: The last batch; empty if the clients write the rows themselves.
+        batch: The last batch; empty if the clients write their own rows.
         batch_id: Number of stored batches.
     """
 
@@ -54,7 +54,7 @@ class DataGeneration(NewSessionPipeline):
     batch_size: int = at_least(1)
     """Number of samples in a batch."""
     mode: str | None = field(default=None, metadata={"choices": MODES})
-    """Mode to store the samples in; None: that of the dataset's configuration."""
+    """Mode to store the samples in; None: `DatasetConfig.mode`."""
 
     kind: ClassVar[str] = "data_generation"
     dataset: Dataset = field(init=False, repr=False)
@@ -94,8 +94,8 @@ class DataGeneration(NewSessionPipeline):
     def batch_produce(self) -> None:
         """Generate a batch and store it; the samples are committed when this returns.
 
-        With ``record_wrong_samples`` the samples that `check_sample` rejected meanwhile are stored
-        too, in the mode "wrong".
+        With ``record_wrong_samples``, the samples that `check_sample` rejected are stored too, in
+        the mode "wrong".
         """
         if self.batch_id == 0:
             end_generation(self.dataset)
@@ -129,8 +129,8 @@ class DataGeneration(NewSessionPipeline):
         dataset_config = self.dataset_config or DatasetConfig()
         if dataset_config.existing_dir is not None:
             raise ConfigError(
-                "DataGeneration writes into the dataset of its own session, so existing_dir cannot "
-                "be set. To add to a session, give its name and new_session=False."
+                "DataGeneration writes to its own session's dataset, so existing_dir cannot be "
+                "set. To add to a session, give its name and new_session=False."
             )
         config = self.environment_config
         if config.load_samples:

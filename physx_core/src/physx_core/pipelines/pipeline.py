@@ -1,4 +1,4 @@
-"""Pipeline: the session, observers, and orderly end that all pipelines share."""
+"""Pipeline: the session, observers, and clean shutdown that all pipelines share."""
 
 from __future__ import annotations
 
@@ -33,21 +33,21 @@ _STREAMS = {"training": 0, "validation": 1, "prediction": 2}
 
 @dataclass(eq=False, kw_only=True)
 class Pipeline(ABC):
-    """Base of the pipelines.
+    """Base class of the pipelines.
 
-    A pipeline is a context manager: entering it opens its session, dataset, environments and
-    network, and leaving it closes them in any case. `execute` does both if the pipeline is not
-    open. Subclasses may override every event method; an override calls that of its base class,
-    which does the work that its docstring names.
+    A pipeline is a context manager: entering it opens its session, dataset, environments, and
+    network, and leaving it always closes them. `execute` does both if the pipeline is not open.
+    Subclasses may override any event method; an override must call the base class's method, which
+    does the work described in its docstring.
 
-    At its beginning a run says on stderr where it writes, and at its end what it left there and the
-    next commands. A run that fails before it has kept anything removes the session that was created
-    for it.
+    When it starts, a run prints to stderr where it writes; when it ends, what it stored and the
+    next commands. A run that fails before it has stored anything removes the session created for
+    it.
 
     Attributes:
         session: The run's folder; known once the pipeline is open.
-        observers: Progress bar, statistics and viewers.
-        kind: The pipeline's table in configuration files.
+        observers: Progress bar, statistics, and viewers.
+        kind: Name of the pipeline's table in configuration files.
     """
 
     session_dir: str = "sessions"
@@ -55,22 +55,22 @@ class Pipeline(ABC):
     session_name: str = "training"
     """Name of the session's folder."""
     quiet: bool = field(default=False, metadata={"recorded": False})
-    """Leave out the progress bar, and what the run says of its session; warnings remain."""
+    """Hide the progress bar and the messages about the session; warnings remain."""
 
     kind: ClassVar[str]
     session: Session = field(init=False, repr=False)
     observers: Observers = field(init=False, repr=False)
     _resources: contextlib.ExitStack | None = field(init=False, repr=False, default=None)
-    _leads = True  # whether this process writes the session; others only help with the training
+    _leads = True  # whether this process writes the session; others only help with training
     _began = 0.0
 
-    if not TYPE_CHECKING:  # or every misspelt attribute would be one
+    if not TYPE_CHECKING:  # type checkers would accept every misspelled attribute
 
         def __getattr__(self, name: str) -> object:
-            """Explain why an attribute of a running pipeline is not there yet."""
+            """Explain why an attribute of a running pipeline does not exist yet."""
             what = f"{type(self).__name__!r} object has no attribute {name!r}"
             if name in {each.name for each in fields(self) if not each.init}:
-                what += " yet: it is known once the pipeline runs; call execute() before"
+                what += " yet: it is known once the pipeline runs; call execute() first"
             raise AttributeError(what, name=name, obj=self)
 
     @abstractmethod
@@ -82,18 +82,18 @@ class Pipeline(ABC):
         """Open everything, and push what must be closed onto the stack."""
 
     def _plan(self) -> Iterable[str]:
-        """Return lines that say what the run is about to do, now that it is open."""
+        """Return lines on what the run, now open, is about to do."""
         return ()
 
     def _results(self) -> Iterable[str]:
-        """Return lines that say what the run did and left, also if it failed."""
+        """Return lines on what the run did and stored, even if it failed."""
         return ()
 
     def _next(self, error: BaseException | None) -> Iterable[str]:
         """Return commands that continue from here.
 
         Args:
-            error: What ended the run; None: nothing.
+            error: What ended the run; None: it finished.
         """
         return ()
 
@@ -149,18 +149,18 @@ class Pipeline(ABC):
             self._end(error)
 
     def _end(self, error: BaseException | None) -> None:
-        """Say what the run left, or remove its session if that is nothing."""
+        """Report what the run stored, or remove its session if that is nothing."""
         outputs = self.observers.outputs()
         if error is not None and not outputs and remove_unused(self.session, opened=True):
-            self._say(f"session: {self.session.path} is removed, as the run kept nothing in it")
+            self._say(f"session: {self.session.path} was removed: the run stored nothing in it")
             return
         commands = (f"next: {command}" for command in self._next(error))
         self._say(*self._results(), *outputs, *commands)
 
     def _say(self, *lines: str) -> None:
-        """Print lines on stderr, in the process that writes the session."""
+        """Print lines to stderr, in the process that writes the session."""
         if self._leads and not self.quiet and sys.stderr is not None:
-            with contextlib.suppress(OSError, ValueError):  # a closed stderr ends no run
+            with contextlib.suppress(OSError, ValueError):  # a closed stderr must not end a run
                 sys.stderr.write("".join(f"{line}\n" for line in lines))
                 sys.stderr.flush()
 
@@ -172,7 +172,7 @@ class Pipeline(ABC):
 
     @property
     def _duration(self) -> float:
-        """Time in s since the pipeline began to open."""
+        """Time in s since the pipeline started to open."""
         return time.monotonic() - self._began
 
     def _note_end(self, error: BaseException | None) -> None:
@@ -186,7 +186,7 @@ class Pipeline(ABC):
                 self.session.note(f"{how} after {self._duration:.1f} s")
 
     def _count(self, counter: str, method: str) -> None:
-        """Call the method that counts; one that overrides it without `super` would never end."""
+        """Call the counting method; an override without `super` would make the run endless."""
         before = getattr(self, counter)
         getattr(self, method)()
         if getattr(self, counter) == before:
@@ -210,7 +210,7 @@ class Pipeline(ABC):
         environment: EnvironmentConfig | None,
         further: Iterable[Observer] = (),
     ) -> None:
-        """Open the run's observers; only the process that writes the session has any."""
+        """Open the run's observers, only in the process that writes the session."""
         if not self._leads:
             self.observers = Observers([])
             return
@@ -227,7 +227,7 @@ class Pipeline(ABC):
         resources.callback(self.observers.close)
 
     def _why_here(self) -> str:
-        """Return why the run writes to this session, if that is not evident."""
+        """Return why the run writes to this session, if that is not obvious."""
         if not self.session.is_new:
             return " (continued)"
         taken = self.session.name != self.session_name
@@ -258,14 +258,15 @@ class Pipeline(ABC):
             predict: The network's prediction for a batch; None: there is no network.
             show: Receives drawing events; None: the observers.
             run_ahead: Number of rows that clients may generate before they are requested; None: as
-                many as `ClientSource` permits. See there for when it must be 0.
+                many as `ClientSource` permits. `ClientSource` describes when it must be 0.
             total: Number of rows that will be requested; None: unknown.
             in_process: Whether they must run in this process.
             replayed: Folder of the dataset whose samples they replay; the parameters saved there
                 can be loaded. None: they generate new samples.
-            accept_all: Whether samples that `check_sample` rejects count like the others.
-            skip: The rows that an earlier run has had: they are generated again, but not returned.
-            stripes: Where clients write the rows themselves; None: the source returns them.
+            accept_all: Whether to accept samples that `check_sample` rejects.
+            skip: The rows that an earlier run already had: they are generated again, but not
+                returned.
+            stripes: Where clients write their own rows; None: the source returns them.
         """
         services = RunServices(
             self.session.dataset_dir, show or self.observers.events, predict, replayed
@@ -291,7 +292,7 @@ class Pipeline(ABC):
         return resources.enter_context(source)
 
     def _record_config(self, seed: int) -> None:
-        """Write the options into the session, with the seed that is used."""
+        """Write the options and the actual seed to the session."""
         if not self._leads:
             return
         plain = {**to_plain(self), "session_name": self.session.name}
@@ -302,10 +303,11 @@ class Pipeline(ABC):
 
 @dataclass(eq=False, kw_only=True)
 class NewSessionPipeline(Pipeline):
-    """Base of the pipelines that may create their session."""
+    """Base class of the pipelines that may create their session."""
 
     new_session: bool = True
-    """Number the new session if one of this name exists; otherwise continue in the existing one."""
+    """If a session of this name exists, create a new one with a number; otherwise continue in the
+    existing one."""
 
     def _create_session(self) -> Session:
         return Session.create(self.session_dir, self.session_name, self.new_session)
@@ -323,7 +325,7 @@ def derive_seed(seed: int, mode: str, offset: int) -> list[int]:
 
     Args:
         seed: The configured seed.
-        mode: Mode of the samples, so that no two modes get the same samples.
-        offset: Number of samples that the mode has, so that a run does not generate them again.
+        mode: Mode of the samples, so that different modes get different samples.
+        offset: Number of samples already in the mode, so that a run does not generate them again.
     """
     return [seed, _STREAMS[mode], offset]

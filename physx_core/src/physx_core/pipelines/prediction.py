@@ -40,22 +40,22 @@ from physx_core.typing import Batch
 class Prediction(Pipeline):
     """Steps the environments and applies the network's predictions to them.
 
-    One environment runs in this process. Several (``num_clients``) run in clients, or in this
-    process with ``as_tcp_ip_client=False``. In each step every instance generates one sample, the
-    network predicts for all of them as one batch, row i for instance i + 1, and each instance gets
-    its row with `Environment.apply_prediction`: the same numbers either way. Requests with
-    `Environment.get_prediction` are predicted one by one in this process, but for all clients as
-    one batch, which a network may round differently.
+    A single environment runs in this process. Several (``num_clients``) run in clients, or in this
+    process with ``as_tcp_ip_client=False``; the numbers are the same. In each step every instance
+    generates one sample, the network predicts for all of them as one batch, row i for instance
+    i + 1, and each instance gets its row through `Environment.apply_prediction`. Requests through
+    `Environment.get_prediction` are answered one by one in this process, but as one batch for all
+    clients, which a network may round differently.
 
-    With ``load_samples`` the environments replay stored samples: those of
-    ``dataset_config.existing_dir`` or else of the session, mode ``dataset_config.mode``, in the
-    order of writing. Each step takes one per instance, available as `Environment.sample`. After
-    the last sample it starts over. The dataset is only read.
+    With ``load_samples``, the environments replay stored samples of mode ``dataset_config.mode``,
+    from ``dataset_config.existing_dir`` if set, otherwise from the session, in the order of
+    writing. Each step takes one sample per instance, available as `Environment.sample`. After the
+    last sample it starts over. The dataset is only read.
 
     Attributes:
         learner: The network and its transformation, from the session's checkpoint.
         source: The environments.
-        dataset: The session's own dataset, open for writing, if samples are recorded; else None.
+        dataset: The session's own dataset, open for writing; None if samples are not recorded.
         batch: The current samples, one row for each instance of the environment.
         prediction: The network's prediction for them, in physical units.
         step_id: Number of finished steps.
@@ -66,18 +66,17 @@ class Prediction(Pipeline):
     environment_config: EnvironmentConfig
     """The environment, and where its instances run."""
     dataset_config: DatasetConfig | None = None
-    """The stored samples that are replayed, and how samples are recorded; None: the session's."""
+    """The stored samples to replay, and how samples are recorded; None: the session's own."""
     _: KW_ONLY
     session_name: str = "training"
     """Name of the session whose network predicts."""
     step_nb: int = at_least(-1, -1)
     """Number of steps; -1: until Ctrl-C."""
     record: bool = False
-    """Store samples and predictions in the session's dataset, mode "prediction"; rejected samples
-    too, with `record_wrong_samples`."""
+    """Store samples and predictions in the session's dataset, mode "prediction"; with
+    `record_wrong_samples` also rejected samples."""
     trust: bool = field(default=False, metadata={"recorded": False})
-    """Import whatever the checkpoint names, which can be any code, not only components of installed
-    plugins."""
+    """Import whatever code the checkpoint names, not only components of installed plugins."""
 
     kind: ClassVar[str] = "prediction"
     learner: Learner = field(init=False, repr=False)
@@ -90,12 +89,12 @@ class Prediction(Pipeline):
     _is_asked: bool = field(init=False, repr=False, default=False)
 
     def execute(self) -> None:
-        """Run all steps. Ctrl-C and SIGTERM end the run in an orderly way after the current step.
+        """Run all steps. Ctrl-C and SIGTERM end the run cleanly after the current step.
 
         Raises:
             PhysxError: If there is no network, or the environment fails.
             KeyboardInterrupt: After Ctrl-C before ``step_nb`` steps; a second signal ends the run
-                at once.
+                immediately.
             SystemExit: After SIGTERM, with status 143.
         """
         with self._running(), deferred_interrupt() as interrupt:
@@ -151,7 +150,7 @@ class Prediction(Pipeline):
         self.observers.end()
 
     def _store(self, dataset: Dataset) -> None:
-        """Store samples and predictions; a predicted field gets a prefix if its name is taken."""
+        """Store samples and predictions; predicted fields get a prefix if their name is taken."""
         predicted = {
             name if name not in self.batch else f"predicted_{name}": values
             for name, values in self.prediction.items()
@@ -202,7 +201,7 @@ class Prediction(Pipeline):
 
     def _plan(self) -> Iterable[str]:
         if self.step_nb < 0:
-            yield "steps until Ctrl-C; step_nb (--step-nb) is their number"
+            yield "runs until Ctrl-C; step_nb (--step-nb) limits the number of steps"
 
     def _results(self) -> Iterable[str]:
         yield f"{self.step_id} steps with {self.learner.config.network}"

@@ -35,11 +35,11 @@ _MOST_CLIENTS = 64
 class Replay(NewSessionPipeline):
     """Sends stored samples through the environments that generated them, to view them.
 
-    The samples of ``dataset_config.existing_dir``, mode ``dataset_config.mode``, come in the order
+    The samples of mode ``dataset_config.mode`` in ``dataset_config.existing_dir`` come in the order
     of writing and are available as `Environment.sample`, as in a `Prediction` with
-    ``load_samples``. The result of `Environment.check_sample` is ignored, so that the samples of
-    the mode "wrong" can be viewed too. The dataset is only read; the session keeps what the
-    visualizer records.
+    ``load_samples``. The result of `Environment.check_sample` is ignored, so the samples of the
+    mode "wrong" can be viewed too. The dataset is only read; the session stores what the visualizer
+    records.
 
     Attributes:
         source: The environments.
@@ -55,11 +55,11 @@ class Replay(NewSessionPipeline):
     session_name: str = "replay"
     """Name of the new session."""
     step_nb: int | None = at_least(-1, None)
-    """Number of steps, starting over after the last sample; None: until each sample was shown once;
-    -1: until Ctrl-C."""
+    """Number of steps, starting over after the last sample; None: show each sample once; -1: until
+    Ctrl-C."""
     trust: bool = field(default=False, metadata={"recorded": False})
-    """Import whatever the dataset names as its environment, which can be any code, not only
-    components of installed plugins."""
+    """Import whatever code the dataset names as its environment, not only components of installed
+    plugins."""
 
     kind: ClassVar[str] = "replay"
     source: Source = field(init=False, repr=False)
@@ -68,11 +68,11 @@ class Replay(NewSessionPipeline):
     _stored: StoredRows = field(init=False, repr=False)
 
     def execute(self) -> None:
-        """Replay. Ctrl-C and SIGTERM end the run in an orderly way after the current step.
+        """Replay the samples. Ctrl-C and SIGTERM end the run cleanly after the current step.
 
         Raises:
             PhysxError: If there are no such samples, or the environment fails.
-            SystemExit: After SIGTERM, with status 143; a second signal ends the run at once.
+            SystemExit: After SIGTERM, with status 143; a second signal ends the run immediately.
         """
         with self._running(), deferred_interrupt() as interrupt:
             self.replay_begin()
@@ -154,15 +154,15 @@ def recorded_environment(
     """Return the options of the environment that a dataset was generated with.
 
     Args:
-        dataset: The dataset, which may come from a stranger.
-        given: The environment that the user named; None: the dataset's. If it is another one, the
-            dataset's options do not apply.
+        dataset: The dataset, which is not trusted.
+        given: The environment that the user named; None: the dataset's. If it is a different one,
+            the dataset's options do not apply.
         trust: Whether the dataset may name any class.
 
     Raises:
         ConfigError: If the dataset does not name its environment.
-        UntrustedReferenceError: If it names code that is no component of an installed plugin, or a
-            program.
+        UntrustedReferenceError: If it names code that is not a component of an installed plugin, or
+            a program.
     """
     info: Mapping[str, Any] = dataset.info
     recorded = info.get("environment")
@@ -184,14 +184,14 @@ def recorded_environment(
     component = find("environment", recorded if given is None else given)
     if not trust and getattr(component, "runs_programs", False):
         raise UntrustedReferenceError(
-            f"The dataset in {dataset.directory} has the arguments of {recorded}, which runs the "
+            f"The dataset in {dataset.directory} contains arguments for {recorded}, which runs the "
             "programs that they name. Give the arguments yourself, or trust the dataset: --trust "
             "(in Python trust=True)."
         )
     count = info.get("num_clients", 1)
     if not trust and isinstance(count, int) and count > _MOST_CLIENTS:
         raise ConfigError(
-            f"{dataset.directory} asks for {count} processes. If that is right, --trust (in Python "
-            "trust=True); otherwise give the environment's options yourself."
+            f"{dataset.directory} asks for {count} processes. If this is intended, use --trust (in "
+            "Python trust=True); otherwise give the environment's options yourself."
         )
     return {name: info[name] for name in _RECORDED if name in info}

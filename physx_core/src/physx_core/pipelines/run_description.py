@@ -15,7 +15,7 @@ _MOST_NAMED = 5
 
 
 def describe_component(component: object) -> str:
-    """Return a component's own text, or its class's name if it defines none."""
+    """Return a component's text, or the name of its class if it defines none."""
     cls = type(component)
     has_text = cls.__str__ is not object.__str__ or cls.__repr__ is not object.__repr__
     return str(component) if has_text else cls.__name__
@@ -24,7 +24,7 @@ def describe_component(component: object) -> str:
 def describe_training(
     learner: Learner, environment: EnvironmentConfig | None, dataset: Dataset
 ) -> Mapping[str, str]:
-    """Return descriptions of a training's components by name."""
+    """Return descriptions of a training's components, by name."""
     return {
         **describe_learner(learner),
         "environment": describe_environment_config(environment),
@@ -33,7 +33,7 @@ def describe_training(
 
 
 def describe_learner(learner: Learner) -> Mapping[str, str]:
-    """Return descriptions of network, transformation, and optimization, if any, by name."""
+    """Return descriptions of network, transformation, and any optimization, by name."""
     network = learner.network
     reads, predicts = ", ".join(network.net_fields), ", ".join(network.pred_fields)
     counted = f"{reads} -> {predicts}, {network.nb_parameters():,} parameters"
@@ -66,7 +66,7 @@ def describe_samples(directory: Path) -> str:
 
 
 def describe_failed_sets(source: Source | None) -> Iterator[str]:
-    """Yield lines that name the sets of parameters whose simulations failed, the first ones."""
+    """Yield lines on the sets of parameters whose simulations failed, naming the first few."""
     failures = source.sets.failures if source is not None else {}
     if failures:
         yield f'sets of parameters that failed: {len(failures)}, marked in the mode "{SETS}"'

@@ -1,4 +1,4 @@
-"""RunServices: the requests that environments can make to their pipeline."""
+"""RunServices: answers the requests that environments make to their pipeline."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from physx_core.typing import Batch, Sample
 Predict: TypeAlias = Callable[[Batch], Batch]
 """The network's prediction for a batch, both in physical units."""
 Show: TypeAlias = Callable[[int, int, list[Event]], None]
-"""Receives an instance, its step, and what it draws then."""
+"""Receives an instance, its step, and its drawing events."""
 
 
 class RunServices:
-    """Serves the requests of environments, those of clients by way of the server."""
+    """Serves requests from environments; clients send theirs through the server."""
 
     def __init__(
         self,
@@ -37,8 +37,8 @@ class RunServices:
             dataset_dir: Folder for the instances' parameters.
             show: Receives drawing events.
             predict: The network's prediction; None: the pipeline has no network.
-            source_dir: Folder of a dataset that is only read, to look for parameters that are not
-                in `dataset_dir`.
+            source_dir: Folder of a read-only dataset, searched for parameters that are not in
+                `dataset_dir`.
         """
         self._dir, self._source_dir = dataset_dir, source_dir
         self._show = show
@@ -53,13 +53,13 @@ class RunServices:
         """Return the prediction for several samples."""
         if self._predict is None:
             raise UsageError(
-                "get_prediction() needs a network, and this run has none. "
+                "get_prediction() needs a network, but this run has none. "
                 "It works in training and prediction."
             )
         return self._predict(batch)
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
-        """Save an instance's values beside the dataset; earlier ones of other names are kept."""
+        """Save an instance's values next to the dataset; earlier values of other names are kept."""
         path = self._dir / PARAMETERS.format(instance_id)
         content = encode({**self.load_parameters(instance_id), **values})
         with files.storing(str(path)):
@@ -81,7 +81,7 @@ class RunServices:
 
 
 def _read_parameters(path: Path) -> dict[str, Any]:
-    """Return the values in a file, which may come with a stranger's dataset."""
+    """Return the values in a file, which may belong to an untrusted dataset."""
     try:
         values = decode(files.read_content(path, LARGEST_PARAMETERS))
     except OSError as error:

@@ -1,4 +1,4 @@
-"""Opens and checks the datasets that pipelines write to and read from, and removes unused ones."""
+"""Opens and checks the datasets that pipelines write and read, and removes unused ones."""
 
 from __future__ import annotations
 
@@ -26,16 +26,16 @@ from physx_core.session import NOTES, Session, installed_versions, related_sessi
 from physx_core.sources.source import Source
 
 PARAMETERS = "parameters_{}.bin"
-"""Name of the file beside a dataset that contains an instance's saved parameters."""
+"""Name of the file in a dataset's folder that contains an instance's saved parameters."""
 _FORMER = ".former"
 LARGEST_PARAMETERS = 2**32
-"""Bytes of such a file."""
+"""Maximum size of such a file in bytes."""
 GENERATION = "generation"
-"""Entry of a dataset's info that describes the last training whose environments generated rows."""
+"""Entry in a dataset's info that describes the last training whose environments generated rows."""
 
 
 def open_own(session: Session, config: DatasetConfig) -> Dataset:
-    """Open a session's own dataset for writing; create it if it does not exist."""
+    """Open a session's own dataset for writing, creating it if it does not exist."""
     if (session.dataset_dir / "dataset.json").exists():
         return Dataset.open(
             session.dataset_dir,
@@ -49,7 +49,7 @@ def open_own(session: Session, config: DatasetConfig) -> Dataset:
 
 
 def open_existing(session: Session, config: DatasetConfig) -> Dataset:
-    """Open the dataset that a configuration names, or else the session's own, for reading."""
+    """Open the dataset that a configuration names, by default the session's own, for reading."""
     try:
         return Dataset.open(config.existing_dir or session.dataset_dir)
     except DatasetNotFoundError as error:
@@ -62,14 +62,14 @@ def open_existing(session: Session, config: DatasetConfig) -> Dataset:
 
 
 def other_samples(directory: Path, mode: str) -> str:
-    """Return a sentence that names the sessions of another number that have samples of a mode.
+    """Return a sentence that names the related, numbered sessions that have samples of a mode.
 
     Args:
         directory: A session's dataset.
-        mode: The mode of which it has none.
+        mode: The mode, of which this dataset has no samples.
 
     Returns:
-        The sentence after a space; empty if there is no such session.
+        The sentence, with a leading space; empty if there is no such session.
     """
     found = []
     for other in related_sessions(directory.parent) if directory.name == "dataset" else ():
@@ -80,14 +80,14 @@ def other_samples(directory: Path, mode: str) -> str:
 
 
 def remove_unused(session: Session, *, opened: bool) -> bool:
-    """Remove a new session in which a run that failed has kept nothing; return whether it did.
+    """Remove a new session if its failed run stored nothing in it; return whether it was removed.
 
-    It stays if it holds samples, parameters of an environment, a checkpoint, numbers, a recording,
-    notes, or any file that is not known here.
+    The session stays if it contains samples, parameters of an environment, a checkpoint,
+    statistics, a recording, notes, or any unknown file.
 
     Args:
         session: The run's session.
-        opened: Whether the pipeline was open. Otherwise what the dataset holds was copied into it.
+        opened: Whether the pipeline was open. If not, the dataset contains only copied data.
     """
     if not session.is_new or not session.path.is_dir():
         return False
@@ -95,13 +95,13 @@ def remove_unused(session: Session, *, opened: bool) -> bool:
         if not all(_is_unused(session, path, opened) for path in session.path.rglob("*")):
             return False
         files.remove_folder(session.path)
-    except (OSError, UnicodeDecodeError, PhysxError):  # whatever cannot be read stays
+    except (OSError, UnicodeDecodeError, PhysxError):  # keep anything that cannot be read
         return False
     return True
 
 
 def _is_unused(session: Session, path: Path, opened: bool) -> bool:
-    """Return whether a file or folder in a session was made by its opening and holds nothing."""
+    """Return whether a file or folder was created when the session opened and is still empty."""
     if path.is_dir() and not path.is_symlink():
         return True
     match path.relative_to(session.path).parts:
@@ -134,7 +134,7 @@ def check_sources(config: DatasetConfig, environment: EnvironmentConfig | None) 
     if config.mode == WRONG:
         raise ConfigError(
             'The mode "wrong" contains samples that check_sample rejected: environments neither '
-            "generate nor replay them for a training. To view them: physx replay."
+            "generate nor replay them for training. To view them: physx replay."
         )
     if environment.load_samples and environment.always_produce:
         raise ConfigError(
@@ -143,22 +143,22 @@ def check_sources(config: DatasetConfig, environment: EnvironmentConfig | None) 
         )
     if config.existing_dir is not None and not environment.load_samples:
         raise ConfigError(
-            "A training takes its samples from existing_dir or from an environment, not both. To "
+            "Training takes its samples from existing_dir or from an environment, not both. To "
             "send the stored samples through the environment, set load_samples=True."
         )
 
 
 def check_client_writers(config: EnvironmentConfig) -> None:
-    """Check that the environments of a data generation can write their rows themselves."""
-    clients = "DatasetConfig.writers='clients' has each client write the rows that it makes"
+    """Check that the clients of a data generation can write their own rows."""
+    clients = "DatasetConfig.writers='clients' has each client write its own rows"
     if not config.as_tcp_ip_client:
         raise ConfigError(
             f"{clients}, but as_tcp_ip_client=False starts none. Use writers='server'."
         )
     if config.record_wrong_samples:
         raise ConfigError(
-            f"{clients}, and the run, which stores the rejected ones, does not know to which batch "
-            "they belong. Use writers='server', or leave out record_wrong_samples."
+            f"{clients}, so the run, which stores the rejected ones, does not know which batch "
+            "they belong to. Use writers='server', or leave out record_wrong_samples."
         )
     if config.redraw:
         raise ConfigError(
@@ -167,7 +167,7 @@ def check_client_writers(config: EnvironmentConfig) -> None:
 
 
 def reject_client_writers(config: DatasetConfig, what: str) -> None:
-    """Reject the option that clients write their rows, where the run itself needs them."""
+    """Reject the option that clients write their own rows if the run itself needs the rows."""
     if config.writers != "server":
         raise ConfigError(
             f"DatasetConfig.writers='clients' is for data generation: {what} needs the rows in the "
@@ -176,12 +176,12 @@ def reject_client_writers(config: DatasetConfig, what: str) -> None:
 
 
 def reject_environments(environment: EnvironmentConfig) -> None:
-    """Reject environments that replay samples in a training of several processes."""
+    """Reject environments that replay samples when several processes train together."""
     if not environment.load_samples:
         return
     advice = (
         "First send the stored samples through them in one process, with epoch_nb=1; then continue "
-        "in several with resume=True (physx train --resume)."
+        "in several processes with resume=True (physx train --resume)."
     )
     if not environment.only_first_epoch:
         advice = "Leave out only_first_epoch=False, or train in one process."
@@ -191,8 +191,8 @@ def reject_environments(environment: EnvironmentConfig) -> None:
 def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:
     """Copy an existing dataset into a session's own: all rows and the environments' parameters.
 
-    The existing one is not changed. Rows in whole partitions are copied by the operating system,
-    which shares them on the disk if the file system can.
+    The existing dataset is not changed. The operating system copies rows in whole partitions, which
+    share their disk space if the file system supports it.
 
     Args:
         dataset: The session's own dataset, open for writing.
@@ -202,8 +202,8 @@ def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:
         return
     if any(dataset.num_samples(mode) for mode in dataset.modes):
         raise ConfigError(
-            "The session already has samples of its own, so it cannot start with a copy of "
-            f"{config.existing_dir}. To continue with its own, leave existing_dir out; otherwise "
+            "The session already has its own samples, so it cannot start with a copy of "
+            f"{config.existing_dir}. To continue with its own, leave out existing_dir; otherwise "
             "use a new session."
         )
     dataset.merge(config.existing_dir)
@@ -217,7 +217,7 @@ def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:
 
 
 def keep_parameters(directory: Path) -> None:
-    """Copy the instances' parameters in a dataset's folder, as a training begins."""
+    """Back up the instances' parameters in a dataset's folder when a training begins."""
     with files.storing(f"{directory}"):
         for path in directory.glob(PARAMETERS.format("*") + _FORMER):
             files.remove(path)
@@ -227,7 +227,7 @@ def keep_parameters(directory: Path) -> None:
 
 
 def restore_parameters(directory: Path) -> None:
-    """Have the instances' parameters be those of when `keep_parameters` copied them."""
+    """Restore the instances' parameters that `keep_parameters` backed up."""
     with files.storing(f"{directory}"):
         for path in directory.glob(PARAMETERS.format("*")):
             former = path.with_name(path.name + _FORMER)
@@ -248,20 +248,20 @@ def is_copy(directory: Path) -> bool:
 def record_beside_rows(
     source: Source, dataset: Dataset | None, mode: str, earlier: Mapping[int, int] | None = None
 ) -> Iterator[None]:
-    """Store what a source makes beside the rows of a batch.
+    """Store what a source produces in addition to the rows of a batch.
 
     These are the samples that `check_sample` rejects during the body, in the mode "wrong", and the
     sets of parameters that begin in its batch, in the mode "parameters". They are stored after the
-    body's batch, the sets before its rows if the body calls `store_sets`. The rejected samples are
-    stored also if too many of them end the run, and sets with which a simulation failed also if
-    that ends it. If the batch fails for another reason, they are not stored either.
+    body's batch, or the sets before its rows if the body calls `store_sets`. Rejected samples are
+    stored even if too many of them end the run, and sets whose simulation failed even if that ends
+    it. If the batch fails for another reason, rejected samples are not stored.
 
     Args:
         source: Generates the batch.
         dataset: Stores the samples; None: they are discarded.
         mode: Mode of the batch.
         earlier: Instance to the step of its last row before the batch, if a run was killed before
-            it stored what was rejected until then: that is stored first. None: nothing is left.
+            it stored the samples rejected up to then: these are stored first. None: there are none.
     """
     try:
         yield
@@ -294,7 +294,7 @@ def _store_rejected(
 def store_sets(source: Source, dataset: Dataset | None, mode: str) -> None:
     """Store the sets of parameters that begin in a source's last batch.
 
-    Before its rows, so that rows have their parameters even if the process is killed.
+    They are stored before its rows, so rows have their parameters even if the process is killed.
     """
     sets, failed = source.sets.pop(mode)
     if dataset is None or not (sets or failed):
@@ -309,10 +309,10 @@ def store_sets(source: Source, dataset: Dataset | None, mode: str) -> None:
 
 
 def end_generation(dataset: Dataset) -> None:
-    """Note where the rows of the last training end whose environments generated some.
+    """Record where the rows end that the environments of the last training generated.
 
-    Called before another run adds its own, so that the training can still be resumed if it needs no
-    more.
+    Called before another run adds rows, so that the training can still be resumed if it needs no
+    more rows.
 
     Args:
         dataset: The dataset, open for writing.
@@ -325,7 +325,7 @@ def end_generation(dataset: Dataset) -> None:
 
 
 def describe_environment(config: EnvironmentConfig, seed: int) -> dict[str, Any]:
-    """Return the description of its samples' environment that a dataset keeps."""
+    """Return the description of the environment that is stored in the dataset of its samples."""
     plain = to_plain(config)
     reference = plain["environment"]
     with contextlib.suppress(UsageError):  # a class that only this process can find

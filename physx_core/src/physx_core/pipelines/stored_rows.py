@@ -17,10 +17,10 @@ Index = NDArray[np.intp]
 
 
 class StoredRows:
-    """Rows of a mode, all in each pass: in the order of writing, or in a new random order.
+    """Rows of a mode, all of them in each pass: in the order of writing or a new random order.
 
-    About 4 MB are read ahead, but not beyond the end of a pass, so that the next pass reads what
-    has replaced the rows meanwhile. Rows that are added later are not included.
+    About 4 MB are read ahead, but not beyond the end of a pass, so the next pass reads rows that
+    were replaced in the meantime. Rows that are added later are not included.
 
     Attributes:
         count: Number of rows in a pass.
@@ -63,8 +63,8 @@ class StoredRows:
 
         Returns:
             Their indices in the mode, and the rows: field name to array of shape
-            (rows, *field shape), and the parameters that they were made with, if that is recorded:
-            see `Instance.step`.
+            (rows, *field shape), and the parameters that they were generated with, if recorded: see
+            `Instance.step`.
         """
         if self._given == len(self._order):
             random = self._random
@@ -82,7 +82,7 @@ class StoredRows:
         return self._order[first:last], {name: rows[place] for name, rows in self._block.items()}
 
     def take_cyclic(self, count: int) -> Batch:
-        """Return exactly `count` rows; after the end of a pass the next one begins."""
+        """Return exactly `count` rows, starting the next pass if needed."""
         parts: list[Batch] = []
         while count:
             index, rows = self.take(count)

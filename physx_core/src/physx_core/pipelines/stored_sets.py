@@ -1,4 +1,4 @@
-"""StoredSets: the sets of parameters that stored rows were made with."""
+"""StoredSets: the sets of parameters that stored rows were generated with."""
 
 from __future__ import annotations
 
@@ -12,21 +12,21 @@ from physx_core.typing import Array, Batch, Index
 from physx_core.workers.instance import PARAMETER, SET
 
 _CHUNK = 1 << 20
-_FIRST = 1  # the instance that makes the first row of each run, and begins its first set
+_FIRST = 1  # the instance that generates the first row and begins the first set of each run
 
 
 class StoredSets:
-    """Finds the set of each row by its instance and episode, which begin anew with each run.
+    """Finds the set of each row by its instance and episode, which restart with each run.
 
-    The runs that added rows to a mode, and those that added sets for it, are the same in the same
-    order; a run whose simulations all failed has sets, but no rows.
+    The runs that added rows to a mode are those that added sets for it, in the same order. A run
+    whose simulations all failed has sets but no rows.
     """
 
     def __init__(self, dataset: Dataset, mode: str) -> None:
         """Read the record of the sets.
 
         Args:
-            dataset: Has the rows, and the record in the mode "parameters".
+            dataset: Contains the rows, and the record in the mode "parameters".
             mode: The rows' mode.
 
         Raises:
@@ -45,9 +45,9 @@ class StoredSets:
         self._starts = _first_rows(dataset, mode)
         if len(self._starts) != has_rows.sum():
             raise DatasetError(
-                f'The samples of mode "{mode}" in {dataset.directory} are of {len(self._starts)} '
-                f"runs, but the parameters that are recorded for them of {has_rows.sum()}, so it "
-                "is not known with which each was made. Generate them again."
+                f'The samples of mode "{mode}" in {dataset.directory} come from '
+                f"{len(self._starts)} runs, but their recorded parameters from {has_rows.sum()}, "
+                "so each sample's parameters are unknown. Generate them again."
             )
         self._values = {name: record[name] for name in record if name not in _OWN}
         self._base = int(env_id.max(initial=0)) + 1, int(episode.max(initial=0)) + 1
@@ -56,10 +56,10 @@ class StoredSets:
         self._known, self._places = np.unique(keys, return_index=True)
 
     def of(self, index: Index, rows: Batch) -> Batch:
-        """Return the parameters of some rows, by entries of a batch that `Instance.step` reads.
+        """Return the parameters of some rows, as the batch entries that `Instance.step` reads.
 
         Args:
-            index: Their numbers in the mode.
+            index: Their indices in the mode.
             rows: The rows.
         """
         runs = np.searchsorted(self._starts, index, "right") - 1
@@ -78,7 +78,7 @@ _OWN = {field.name for field in SET_FIELDS}
 
 
 def has_sets(dataset: Dataset, mode: str) -> bool:
-    """Return whether a dataset records with which parameters the rows of a mode were made."""
+    """Return whether a dataset records the parameters that a mode's rows were generated with."""
     if mode not in MODES or not dataset.num_samples(SETS):
         return False
     return bool((dataset[SETS]["mode_index"][:] == MODES.index(mode)).any())
@@ -88,8 +88,8 @@ def _runs(first: Index, order: Array, count: int) -> Index:
     """Return the run of each entry, from 0; -1 before the first one.
 
     Args:
-        first: Places of the entries of the first instance.
-        order: A number of each entry that increases in each run for each instance.
+        first: Indices of the entries of the first instance.
+        order: A number for each entry; it increases within a run for each instance.
         count: Number of entries.
     """
     begins = np.zeros(count, bool)
@@ -100,7 +100,7 @@ def _runs(first: Index, order: Array, count: int) -> Index:
 
 
 def _first_rows(dataset: Dataset, mode: str) -> Index:
-    """Return the number of the first row of each run."""
+    """Return the index of the first row of each run."""
     view, total = dataset[mode], dataset.num_samples(mode)
     starts: list[Index] = []
     last = np.iinfo(np.int64).max

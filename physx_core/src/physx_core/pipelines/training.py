@@ -1,4 +1,4 @@
-"""Training: trains a network on a dataset, or on samples that environments generate."""
+"""Training: trains a network on a dataset or on samples that environments generate."""
 
 from __future__ import annotations
 
@@ -55,7 +55,7 @@ _ADVICE = (
 )
 _KEPT_WITHIN_EPOCHS = 2
 _SESSION_INTERVAL = 1.0
-"""Time in s between checks that the session's folder is still there."""
+"""Time in s between checks that the session's folder still exists."""
 
 
 @options
@@ -66,30 +66,32 @@ class Training(NewSessionPipeline):
     The samples come from
 
     - an existing dataset (``dataset_config.existing_dir``), which is only read, or the session's
-      own one;
-    - environments, which generate samples in the first epoch, stored and reused in later ones, or
-      in every epoch with ``always_produce``; ``online`` says how they make up batches meanwhile;
-    - an existing dataset by way of environments, with ``load_samples``: the session gets its own
-      copy of the dataset; in the first epoch, or in every one with ``only_first_epoch=False``, each
-      stored sample goes through an environment, whose result is trained on and replaces the sample
-      in the copy: see `TrainingData`. Without ``existing_dir`` the session's own samples are used.
+      own dataset;
+    - environments, which generate samples in the first epoch, stored and reused in later epochs, or
+      in every epoch with ``always_produce``; ``online`` decides how batches are formed while they
+      generate;
+    - an existing dataset replayed through environments, with ``load_samples``: the session gets its
+      own copy of the dataset; in the first epoch, or in every epoch with
+      ``only_first_epoch=False``, each stored sample goes through an environment. The result is
+      trained on and replaces the sample in the copy: see `TrainingData`. Without ``existing_dir``,
+      the session's own samples are replayed.
 
     Several processes started by ``torchrun`` train one network together: each takes its share of
-    every batch, which is ``batch_size`` times the number of processes. The first one writes the
-    session; it has the environments, and passes on each one's share of what they generate. If they
-    replay the samples of the first epoch, train that epoch in one process, then continue in several
-    with ``resume``.
+    every batch, whose size is ``batch_size`` times the number of processes. The first process
+    writes the session, runs the environments, and passes each process its share of what they
+    generate. If they replay samples in the first epoch, train that epoch in one process, then
+    continue in several with ``resume``.
 
     Attributes:
         group: The processes that train together.
         learner: The network, its transformation and its optimization.
         data: Source of the batches.
-        batch: The current batch, in physical units; in one of several processes only its share
-            while environments generate.
+        batch: The current batch, in physical units; while environments generate, only this
+            process's share of it.
         epoch_id: Number of finished epochs.
         batch_id: Number of finished batches of the current epoch.
         losses: The result of `Optimization.transform_loss` for the current batch, as numbers.
-        training_loss: Mean loss over the batches of the last epoch; NaN before its end.
+        training_loss: Mean loss over the batches of the last epoch; NaN before the first one ends.
         validation_loss: Mean loss over the validation samples; NaN before the first validation.
         best: The epoch with the smallest loss, whose network is the checkpoint "best".
         checkpoint_path: Folder of the last checkpoint.
@@ -98,50 +100,51 @@ class Training(NewSessionPipeline):
     network_config: NetworkConfig
     """The network, its transformation and its optimization."""
     dataset_config: DatasetConfig | None = None
-    """The stored samples, and how they are read; None: those of the session itself."""
+    """The stored samples, and how they are read; None: the session's own samples."""
     environment_config: EnvironmentConfig | None = None
     """The environment that generates samples, or replays stored ones; None: no environment."""
     _: KW_ONLY
     epoch_nb: int = at_least(1)
     """Number of epochs."""
     batch_size: int = at_least(1)
-    """Number of samples in a batch; with several processes (torchrun), in each one's share."""
+    """Number of samples in a batch; with several processes (torchrun), in each process's share."""
     batch_nb: int | None = at_least(1, None)
     """Batches in an epoch; None: as many as needed to use each stored sample once."""
     seed: int | None = at_least(0, None)
     """Seed of the network's initial parameters and of the order of samples; None: a random one."""
     online: str | type[Any] = "physx/stream"
-    """Buffer that decides which rows a batch holds while environments generate them:
-    "physx/stream", each row once, in order; "physx/reservoir", "physx/window" or "physx/fifo",
-    batches drawn at random from the rows kept in memory; or that of a plugin."""
+    """Buffer that decides which rows a batch contains while environments generate them:
+    "physx/stream" uses each row once, in order; "physx/reservoir", "physx/window" and "physx/fifo"
+    draw batches at random from the rows kept in memory; or a plugin's buffer."""
     online_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the buffer: ``capacity``, number of rows kept in memory;
-    ``watermark``, number of rows before the first batch; ``views``, how many times a row is used on
-    average. All rows are stored, whatever is kept in memory."""
+    ``watermark``, number of rows before the first batch; ``views``, average number of times that a
+    row is used. All rows are stored, whether they are kept in memory or not."""
     validation_every: int = at_least(0, 1)
     """Number of epochs between validations, if the dataset has a validation mode or
     `validation_split` holds samples back; 0: never."""
     patience: int | None = at_least(1, None)
     """Number of consecutive validations (epochs, if nothing is validated) without improvement of
-    the loss after which to stop; None: never. The last network is kept, beside "best"."""
+    the loss after which to stop; None: never. The last network is kept in addition to "best"."""
     min_improvement: float = at_least(0, 0.0)
-    """Least decrease below the best loss that counts as an improvement."""
+    """Smallest decrease below the best loss that counts as an improvement."""
     on_nan: str = field(default="stop", metadata={"choices": ("stop", "continue")})
-    """What to do if a loss, gradient or parameter is NaN or infinite: "stop" with an error and the
-    checkpoint of before, or "continue" as if nothing had happened."""
+    """What to do if a loss, gradient, or parameter is NaN or infinite: "stop" with an error and the
+    previous checkpoint, or "continue" and ignore it."""
     statistics: Sequence[str | type[Any]] = ()
-    """Observers of numbers beside stats/scalars.csv, for example "torch/tensorboard" or "rerun"."""
+    """Observers that receive the statistics in addition to stats/scalars.csv, for example
+    "torch/tensorboard" or "rerun"."""
     statistics_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of each observer, by its name; in a command ``rerun={mode="save"}``."""
     histograms_every: int = at_least(0, 0)
     """Number of epochs between histograms of weights and gradients; 0: none."""
     checkpoint_every: int | Literal["epoch"] = at_least(0, 0)
     """Number of batches between checkpoints within epochs, counted over all epochs; "epoch": one
-    after the last batch of each; 0: none. The last two of them are kept."""
+    after the last batch of each epoch; 0: none. The last two of these are kept."""
     resume: bool = field(default=False, metadata={"recorded": False})
-    """Resume from the session's last checkpoint, up to `epoch_nb` epochs in total. While
-    environments generate the samples, they generate those that are stored again, unless they depend
-    on predictions; without a checkpoint the training begins again with the stored samples."""
+    """Resume from the session's last checkpoint, up to `epoch_nb` epochs in total. If environments
+    were generating the samples, they generate the stored ones again, unless these depend on
+    predictions; without a checkpoint, training restarts with the stored samples."""
 
     kind: ClassVar[str] = "training"
     group: Group = field(init=False, repr=False, default_factory=Group)
@@ -164,14 +167,14 @@ class Training(NewSessionPipeline):
     _blocks: int = field(init=False, repr=False, default=0)
 
     def execute(self) -> None:
-        """Train. However the training ends, the network trained so far is a checkpoint to resume.
+        """Train, and write a checkpoint to resume from however the training ends.
 
-        Ctrl-C and SIGTERM end it after the current batch; a second signal ends it at once, without
-        a checkpoint. An error ends it, too, and has a note that names the checkpoint.
+        Ctrl-C and SIGTERM end it after the current batch; a second signal ends it immediately,
+        without a checkpoint. An error also ends it, and gets a note that names the checkpoint.
 
         Raises:
-            DivergedError: If a loss, gradient or parameter is not finite, with ``on_nan="stop"``.
-            PhysxError: If data, network or environments do not fit the training, or fail.
+            DivergedError: If a loss, gradient, or parameter is not finite, with ``on_nan="stop"``.
+            PhysxError: If data, network, or environments do not fit together, or fail.
             KeyboardInterrupt: After Ctrl-C.
             SystemExit: After SIGTERM, with status 143.
         """
@@ -204,7 +207,7 @@ class Training(NewSessionPipeline):
             self.train_end()
 
     def train_begin(self) -> None:
-        """Called before the first epoch, or before the one in which a resumed training ended."""
+        """Called before the first epoch, or before the epoch at which training resumes."""
         self.epoch_id = self._resumed.epoch
 
     def epoch_condition(self) -> bool:
@@ -212,7 +215,7 @@ class Training(NewSessionPipeline):
         return self.epoch_id < self.epoch_nb and not self.stopped
 
     def epoch_begin(self) -> None:
-        """Called before each epoch; decides how many batches it has."""
+        """Called before each epoch; determines its number of batches."""
         begins = self.epoch_id == self._resumed.epoch
         self.batch_id = self._resumed.batch if begins else 0
         names = self.learner.batch_fields
@@ -232,14 +235,14 @@ class Training(NewSessionPipeline):
         """Called before each batch."""
 
     def batch_produce(self) -> None:
-        """Read the next batch, or have the environments generate and the dataset store it."""
+        """Read the next batch, or have the environments generate it and the dataset store it."""
         self.batch = self.data.next_batch()
         if self.data.produces:  # the normalization grows with the samples
             self.learner.bind(self.data.fields, self.data.normalization())
             self.learner.network.set_train()
 
     def optimize(self) -> None:
-        """Train the network on the batch; after the first one, check that it can be saved.
+        """Train the network on the batch; after the first batch, check that it can be saved.
 
         Raises:
             DivergedError: If the loss or a gradient is not finite, with ``on_nan="stop"``.
@@ -324,7 +327,7 @@ class Training(NewSessionPipeline):
         return self.validation_loss
 
     def train_end(self) -> None:
-        """Write the last checkpoint, and report an early stop."""
+        """Write the last checkpoint and report an early stop."""
         self.observers.end()
         if self.stopped and self._leads:
             self.observers.note(self.stopped)
@@ -333,7 +336,7 @@ class Training(NewSessionPipeline):
 
     @property
     def stopped(self) -> str:
-        """Reason why the training ends before its last epoch; empty if it does not."""
+        """Why the training ends before its last epoch; empty if it does not."""
         if self.patience is None or self.epoch_id >= self.epoch_nb:
             return ""
         return self.best.reason_to_stop(self.patience)
@@ -346,7 +349,7 @@ class Training(NewSessionPipeline):
     def save_checkpoint(self) -> Path:
         """Write the network into the session and return the checkpoint's folder.
 
-        If nothing was trained since the last checkpoint, no new one is written.
+        If no batch was trained since the last checkpoint, no new one is written.
 
         Raises:
             DivergedError: If a parameter is not finite, with ``on_nan="stop"``; nothing is written.
@@ -379,7 +382,7 @@ class Training(NewSessionPipeline):
         return self.learner.save(self.session.network_dir, progress, *states, best=best)
 
     def _leave_batch(self, interrupt: Interrupt) -> None:
-        """Write a checkpoint if one is due, and end within an epoch after a signal."""
+        """Write a checkpoint if one is due; after a signal, end within the epoch."""
         every = self._epoch_batches if self.checkpoint_every == "epoch" else self.checkpoint_every
         if every and self._number % every == 0:
             self._save_within_epoch()
@@ -387,14 +390,14 @@ class Training(NewSessionPipeline):
             self._end_early(interrupt)
 
     def _save_within_epoch(self) -> None:
-        """Write a checkpoint, then remove earlier ones within epochs but for the last.
+        """Write a checkpoint, then remove all earlier ones within epochs except the previous one.
 
-        That one is for the case that the new one is damaged on the disk.
+        The previous one is kept in case the new one gets damaged on the disk.
         """
         if not self._leads:
             self.save_checkpoint()
             return
-        if self._within_epochs is None:  # of earlier runs
+        if self._within_epochs is None:  # find those of earlier runs
             name = self.network_config.network_name or checkpoint.NAME
             self._within_epochs = checkpoint.list_within_epochs(self.session.network_dir, name)
         path = self.save_checkpoint()
@@ -408,7 +411,7 @@ class Training(NewSessionPipeline):
         interrupt.end()
 
     def _save_after(self, error: BaseException) -> None:
-        """Save the network trained so far, and note in the error where it is.
+        """Save the network trained so far, and add its location to the error as a note.
 
         Other processes of the group may have failed, so nothing is exchanged with them.
         """
@@ -423,10 +426,10 @@ class Training(NewSessionPipeline):
             last = self.checkpoint_path or "none; save_each_epoch=True writes one after each epoch"
             error.add_note(f"The network could not be saved: {failure} Last checkpoint: {last}.")
         else:
-            how = "from which resume=True (physx train --resume) continues"
+            how = "resume=True (physx train --resume) continues from it"
             if not self._is_resumable:
-                how = "with which another training starts: NetworkConfig.network_dir"
-            error.add_note(f"The network trained so far is {self.checkpoint_path}, {how}.")
+                how = "NetworkConfig.network_dir starts another training from it"
+            error.add_note(f"The network trained so far is {self.checkpoint_path}; {how}.")
 
     @property
     def _is_resumable(self) -> bool:
@@ -443,7 +446,7 @@ class Training(NewSessionPipeline):
         return DivergedError(f"{what}. {_ADVICE}", epoch=epoch, batch=batch)
 
     def _continue_after_nan(self) -> None:
-        """Say once that the training goes on although a loss is not finite."""
+        """Report once that training continues although a loss is not finite."""
         if self._leads and not self._met_nan:
             text = (
                 f"Epoch {self.epoch_id + 1}, batch {self.batch_id + 1}: the loss is "
@@ -471,7 +474,7 @@ class Training(NewSessionPipeline):
         buffer = self._create_buffer()
         network_class.set_seed(self._resumed.seed)
         self.learner = Learner(self.network_config, trains=True, stops_at_nan=self.on_nan == "stop")
-        if start.config.existing_dir is not None:  # a missing dataset leaves no session behind
+        if start.config.existing_dir is not None:  # fail before a session is created
             Dataset.open(start.config.existing_dir).close()
         self.session = start.session or self._open_session()
         dataset = resources.enter_context(open_dataset(self.session, start, self.group))
@@ -497,7 +500,7 @@ class Training(NewSessionPipeline):
         self._prepare_learner(start)
 
     def _begin_at(self, start: Start) -> None:
-        """Begin with the first batch, or where a checkpoint was written."""
+        """Start at the first batch, or where a checkpoint was written."""
         former, last = start.generation, start.checkpoint
         seed = self.group.tell(choose_seed(self.seed) if former is None else former.seed)
         self._resumed = last.progress if last else Progress(0, 0, 0, seed)
@@ -537,7 +540,7 @@ class Training(NewSessionPipeline):
             known = data.normalization()
             was_generated = start.config.existing_dir is None and data.dataset.info.get(GENERATION)
             if last is not None and was_generated:
-                known = last.normalization  # to the last bit
+                known = last.normalization  # bit-identical
             self.learner.bind(fields, known)
         self._load_parameters(last)
         self.learner.join(self.group)
@@ -564,7 +567,7 @@ class Training(NewSessionPipeline):
             yield from self.data.online.announce()
         size = self.batch_size * self.group.size
         if not self.data.produces and size > self.data.num_samples:
-            yield f"batches of {self.data.num_samples:,} samples, as there are no more than these"
+            yield f"batches of {self.data.num_samples:,} samples, because there are no more"
         if self.group.size > 1:
             total, each, count = self.batch_size * self.group.size, self.batch_size, self.group.size
             yield f"batches of {total} samples, {each} in each of {count} processes"
@@ -574,7 +577,7 @@ class Training(NewSessionPipeline):
         if self.epoch_id > self._resumed.epoch:
             yield f"training loss {self.training_loss:.6g}"
         elif self.epoch_id >= self.epoch_nb:
-            yield "nothing was left to train: epoch_nb (--epoch-nb) is the number of all epochs"
+            yield "nothing left to train: epoch_nb (--epoch-nb) is the total number of epochs"
         if not math.isnan(self.validation_loss):
             yield f"validation loss {self.validation_loss:.6g}"
         if not math.isinf(self.best.loss):
@@ -606,7 +609,7 @@ class Training(NewSessionPipeline):
         return describe_training(self.learner, self.environment_config, self.data.dataset)
 
     def _predict(self, batch: Batch) -> Batch:
-        """Answer `Environment.get_prediction`; before the first batch with the step's shapes."""
+        """Answer `Environment.get_prediction`; before the first batch, use the step's shapes."""
         learner, data = self.learner, getattr(self, "data", None)
         if not learner.fields and data is not None:
             known = [name for name, field in data.fields.items() if field.shape is not None]

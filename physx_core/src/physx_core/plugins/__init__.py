@@ -1,7 +1,7 @@
 """Plugins: components of pip-installed packages, selected by the name of their entry point.
 
-A plugin is a module named by an entry point of the group ``physx``. It implements some of the
-hooks in `physx_core.plugins.hookspecs` with the marker `hookimpl`.
+A plugin is a module named by an entry point in the group ``physx``. It implements some of the hooks
+in `physx_core.plugins.hookspecs`, marked with `hookimpl`.
 """
 
 from __future__ import annotations

@@ -7,7 +7,7 @@ from physx_core.plugins.hookspecs import Components, hookimpl
 
 @hookimpl
 def physx_launchers() -> Components:
-    """Return the launchers, which are imported when clients are started."""
+    """Return the launchers, imported when clients are started."""
     return {
         "subprocess": "physx_core.workers.launchers:SubprocessLauncher",
         "manual": "physx_core.workers.launchers:ManualLauncher",
@@ -16,7 +16,7 @@ def physx_launchers() -> Components:
 
 @hookimpl
 def physx_buffers() -> Components:
-    """Return the buffers of trainings while environments generate."""
+    """Return the buffers for training while environments generate."""
     return {
         "stream": "physx_core.buffers.stream:Stream",
         "reservoir": "physx_core.buffers.reservoir:Reservoir",
@@ -27,13 +27,13 @@ def physx_buffers() -> Components:
 
 @hookimpl
 def physx_transformations() -> Components:
-    """Return the transformation of networks that name none."""
+    """Return the default transformation of networks."""
     return {"identity": "physx_core.components.transformation:Transformation"}
 
 
 @hookimpl
 def physx_samplers() -> Components:
-    """Return the samplers, which are imported when a run uses them."""
+    """Return the samplers, imported when a run uses them."""
     return {
         "uniform": "physx_core.samplers.uniform:Uniform",
         "sobol": "physx_core.samplers.sequences:Sobol",

@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING
 
 from physx_core.errors import listed
 
-if TYPE_CHECKING:  # it takes a third of a client's start, and few clients need it
+if TYPE_CHECKING:  # importing it takes a third of a client's start, and few clients need it
     from importlib.metadata import Distribution, EntryPoint
 
 PLUGINS = "physx"
@@ -37,17 +37,17 @@ OFFICIAL = {
 
 
 def find_entries(group: str) -> dict[str, list[EntryPoint]]:
-    """Return the entry points of a group by name: more than one if several packages claim it."""
+    """Return a group's entry points by name; several if several packages claim the name."""
     return _read_entries(_installed())[0][group]
 
 
 def find_unreadable() -> dict[str, str]:
-    """Return the packages whose entry points cannot be read, with what is wrong with them."""
+    """Return the packages whose entry points cannot be read, with the reason."""
     return _read_entries(_installed())[1]
 
 
 def unreadable_hint() -> str:
-    """Return a sentence about packages whose entry points cannot be read, empty without any."""
+    """Return a sentence on packages whose entry points cannot be read; empty if there are none."""
     found = find_unreadable()
     if not found:
         return ""
@@ -59,7 +59,7 @@ def _installed() -> tuple[tuple[str, int], ...]:
 
 
 def _last_change(folder: str) -> int:
-    """Return when a package was last installed into or removed from a folder; 0: no folder."""
+    """Return the time at which a folder's packages last changed; 0 if there is no such folder."""
     try:
         return Path(folder).stat().st_mtime_ns
     except OSError:
@@ -73,7 +73,7 @@ def _read_entries(
     """Read the metadata of all packages, once for both groups; cached until one is installed.
 
     Returns:
-        Group to name to entry points, and the packages that cannot be read.
+        Group to name to entry points, and the unreadable packages with the reason.
     """
     found: list[EntryPoint] = []
     unreadable: dict[str, str] = {}
@@ -93,16 +93,16 @@ def _read_entries(
 
 @functools.lru_cache(maxsize=64)
 def _read_folder(folder: str, last_change: int) -> list[tuple[str, list[EntryPoint], str]]:
-    """Return name, entry points, and what is wrong with them, of each package in a folder."""
+    """Return the name, entry points, and any problem with them, of each package in a folder."""
     from importlib.metadata import distributions
 
     packages: list[tuple[str, list[EntryPoint], str]] = []
     for package in distributions(path=[folder]):
         try:
-            # From the folder's name, as importlib.metadata does it; reading all names takes long.
+            # From the folder's name, like importlib.metadata; reading all metadata is slow.
             name = getattr(package, "_normalized_name", None) or _name_of(package)
             packages.append((name, list(package.entry_points), ""))
-        except Exception as error:  # it is another package's file and may hold anything
+        except Exception as error:  # a foreign package's file, which may contain anything
             packages.append((_name_of(package), [], f"{type(error).__name__}: {error}"))
     return packages
 
@@ -118,24 +118,24 @@ def _by_name(entries: Iterable[EntryPoint]) -> dict[str, list[EntryPoint]]:
 
 
 def owner_of(entry: EntryPoint) -> str:
-    """Return name and version of the distribution that contains an entry point."""
+    """Return the name and version of the distribution that contains an entry point."""
     if entry.dist is None:
         return entry.value
     version = None
-    with contextlib.suppress(Exception):  # its metadata are damaged
+    with contextlib.suppress(Exception):  # its metadata is damaged
         version = entry.dist.version
     return f"{_name_of(entry.dist)} {version or 'without a version'}"
 
 
 def _name_of(package: Distribution) -> str:
-    """Return the name of a package, or where it lies if its metadata do not say it."""
+    """Return a package's name, or its location if the metadata does not contain a name."""
     try:
         return str(package.metadata["Name"] or package.locate_file(""))
-    except Exception:  # its metadata are damaged
+    except Exception:  # its metadata is damaged
         return str(package.locate_file(""))
 
 
 def describe_conflict(kind: str, entries: list[EntryPoint]) -> str:
-    """Return an error message about several packages that claim one name."""
+    """Return the error message for several packages that claim one name."""
     owners = " and ".join(sorted(map(owner_of, entries)))
     return f'The {kind} name "{entries[0].name}" is claimed by {owners}; uninstall one.'

@@ -1,12 +1,12 @@
 """The nine hooks that a plugin may implement.
 
-Each returns a dictionary from a component's name to the component: a class, a function that takes
-the component's keyword arguments and returns it, or a reference ``"package.module:Name"`` that is
+Each returns a dictionary from component names to components: a class, a function that takes the
+component's keyword arguments and returns it, or a reference ``"package.module:Name"`` that is
 imported when the component is first used.
 
-The name of a plugin, and that of a component, consists of letters, digits, "_", "-" and ".", and
-begins with none of the latter two. A component's name may have several such parts with "/" between
-them, as ids of Gymnasium have.
+The names of plugins and components consist of letters, digits, "_", "-", and ".", and do not start
+with "-" or ".". A component's name may consist of several such parts separated by "/", like
+Gymnasium ids.
 """
 
 from __future__ import annotations
@@ -20,14 +20,14 @@ import pluggy
 from physx_core.plugins.entries import PLUGINS
 
 Components = dict[str, type[Any] | Callable[..., Any] | str]
-"""What a hook returns: name to class, to a function that makes the component, or to its reference
-``"package.module:Class"``, which is imported when it is requested."""
+"""The return value of a hook: name to class, to a function that creates the component, or to its
+reference ``"package.module:Class"``, which is imported on request."""
 
 _NAME = r"\w[\w.-]*"
 
 hookspec = pluggy.HookspecMarker(PLUGINS)
 hookimpl = pluggy.HookimplMarker(PLUGINS)
-"""Marks a function of a plugin as the implementation of the hook of its name."""
+"""Marks a plugin's function as the implementation of the hook with the same name."""
 
 KINDS = {
     "environment": "physx_environments",

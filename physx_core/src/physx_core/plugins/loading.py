@@ -1,4 +1,4 @@
-"""Runs a plugin's own code while it is loaded, whatever that does."""
+"""Guards the loading of a plugin against anything that its own code may do."""
 
 from __future__ import annotations
 
@@ -17,31 +17,31 @@ from physx_core.plugins.entries import unreadable_hint
 TIMEOUT_VARIABLE = "PHYSX_IMPORT_TIMEOUT"
 """Environment variable with the time in s that a plugin may take to import."""
 TIMEOUT = 120.0
-"""The same by default: a deep-learning library on a slow disk takes a while."""
+"""Default of that time: a deep-learning library on a slow disk takes a while."""
 _NOTE_TIME = 10.0
 
 
 class _TimeIsUp(BaseException):
-    """The import of a plugin takes too long; nobody else catches it."""
+    """The import of a plugin takes too long; caught only in this module."""
 
 
 @contextlib.contextmanager
 def loading(plugin: str, who: str, doing: str) -> Iterator[None]:
-    """Make whatever goes wrong in a plugin's own code an error that names it.
+    """Convert any failure in a plugin's own code to an error that names the plugin.
 
-    That includes ``sys.exit`` and KeyboardInterrupt, unless a signal raised them. A plugin that
-    takes long is named on standard error; in the main thread it is given up after `TIMEOUT`.
+    This includes ``sys.exit`` and KeyboardInterrupt, unless a signal raised them. A plugin that
+    takes long is reported on standard error; in the main thread, loading stops after `TIMEOUT`.
 
     Args:
         plugin: Name of the plugin.
         who: The plugin and its package, for messages.
-        doing: What fails if this fails, for example "fails to import its module".
+        doing: Description of a failure, for example "fails to import its module".
 
     Raises:
         PluginError: If the plugin raises anything, or takes too long.
     """
     limit = _timeout()
-    text = f"physx: {who} is still loading; it is given up after {limit:g} s, or by Ctrl-C"
+    text = f"physx: {who} is still loading; physx gives up after {limit:g} s, or on Ctrl-C"
     note = threading.Timer(min(_NOTE_TIME, limit / 2), _note, [text])
     note.daemon = True
     note.start()
@@ -56,11 +56,11 @@ def loading(plugin: str, who: str, doing: str) -> Iterator[None]:
             raise PluginError(plugin, f"{who} {doing}: {problem}.") from error
         except BaseException as error:
             if signal.SIGINT in signals and isinstance(error, Exception):
-                raise KeyboardInterrupt from error  # an import may make any other of it
+                raise KeyboardInterrupt from error  # an import may turn it into any other error
             if signals:
                 raise
             text = f"{who} {doing}: {_description(error)}"
-            hint = unreadable_hint()  # others, such as torch, read all metadata at their import
+            hint = unreadable_hint()  # libraries such as torch read all metadata when imported
             raise PluginError(plugin, f"{text.rstrip('.')}. {hint}" if hint else text) from error
 
 
@@ -86,7 +86,7 @@ def _is_main() -> bool:
 
 @contextlib.contextmanager
 def _seen_signals() -> Iterator[list[int]]:
-    """Yield a list to which the numbers of signals are added that arrive meanwhile."""
+    """Yield a list that collects the numbers of signals arriving within the context."""
     seen: list[int] = []
     with contextlib.ExitStack() as stack:
         for number in (signal.SIGINT, signal.SIGTERM) if _is_main() else ():
@@ -106,7 +106,7 @@ def _noting(seen: list[int], before: Any) -> Any:
 
 @contextlib.contextmanager
 def _handled(number: signal.Signals, handle: Any) -> Iterator[None]:
-    """Handle a signal meanwhile; if a plugin sets a handler of its own, that one stays."""
+    """Handle a signal within the context; a handler that a plugin sets itself stays."""
     before = signal.signal(number, handle)
     try:
         yield
@@ -117,7 +117,7 @@ def _handled(number: signal.Signals, handle: Any) -> Iterator[None]:
 
 @contextlib.contextmanager
 def _deadline(limit: float) -> Iterator[None]:
-    """Raise `_TimeIsUp` after `limit` s, unless the alarm clock is somebody else's."""
+    """Raise `_TimeIsUp` after `limit` s, unless the alarm timer is already in use."""
     is_free = _is_main() and signal.getsignal(signal.SIGALRM) is signal.SIG_DFL
     if not is_free or signal.getitimer(signal.ITIMER_REAL)[0]:
         yield
@@ -129,7 +129,7 @@ def _deadline(limit: float) -> Iterator[None]:
             raise _TimeIsUp
 
     with _handled(signal.SIGALRM, ring):
-        signal.setitimer(signal.ITIMER_REAL, limit, 1.0)  # again, if somebody catches everything
+        signal.setitimer(signal.ITIMER_REAL, limit, 1.0)  # repeat in case the first is swallowed
         try:
             yield
         finally:

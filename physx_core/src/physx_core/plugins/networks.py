@@ -1,8 +1,8 @@
 """Resolves networks by reference, including plain classes of a deep-learning library.
 
-A plugin that is named like its library (`torch`) may have a network ``module``, which adapts a
-class of that library. A reference to such a class resolves to this network, with the class as its
-argument ``module``.
+A plugin named after its library (`torch`) may have a network ``module`` that adapts a class of that
+library. A reference to such a class resolves to this network, with the class as its argument
+``module``.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ def resolve_network(reference: Any, arguments: Mapping[str, Any]) -> tuple[Any, 
     """Return the class or factory of a network and the keyword arguments to call it with.
 
     Args:
-        reference: As in `resolve`; also a class derived from one of a plugin's library.
+        reference: As in `resolve`, or a class derived from a class of a plugin's library.
         arguments: The user's keyword arguments.
     """
     found = find("network", reference)
@@ -34,8 +34,8 @@ def resolve_network(reference: Any, arguments: Mapping[str, Any]) -> tuple[Any, 
     if _ADAPTER in arguments:
         raise ConfigError(
             f"{found.__name__} is itself the module, so network_kwargs cannot contain "
-            f'"{_ADAPTER}". If it takes an argument of that name, put all of its own arguments '
-            'into network_kwargs={"module_kwargs": {...}}.'
+            f'"{_ADAPTER}". If it takes an argument of that name, put all its arguments into '
+            'network_kwargs={"module_kwargs": {...}}.'
         )
     named = reference if isinstance(reference, str) else found
     return resolve("network", f"{library}/{_ADAPTER}"), {_ADAPTER: named, **arguments}

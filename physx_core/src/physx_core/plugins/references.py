@@ -1,7 +1,7 @@
 """References: names of components, and how they are resolved.
 
-What the user names may be any code. What a file names may only be components of installed plugins,
-``"plugin/name"``: see `check_recorded`.
+Users may name any code. Files may only name components of installed plugins, ``"plugin/name"``: see
+`check_recorded`.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ if TYPE_CHECKING:
     from physx_core.simulation import Backend
 
 _MOST_VALUES = 10_000
-"""Values in the arguments of a component that a file names."""
+"""Maximum number of values in the arguments of a component that a file names."""
 
 
 @overload
@@ -77,8 +77,8 @@ def resolve(kind: str, reference: Any) -> Any:
 
     Args:
         kind: ``environment``, ``network``, ``optimization``, ``transformation``, ``visualizer``,
-            ``backend``, ``launcher``, ``buffer`` or ``sampler``.
-        reference: ``"plugin/name"``; ``"plugin"`` where it has just one of the kind;
+            ``backend``, ``launcher``, ``buffer``, or ``sampler``.
+        reference: ``"plugin/name"``; ``"plugin"`` if it has only one component of the kind;
             ``"package.module:Class"``; ``"script.py:Class"``; or the class itself.
 
     Returns:
@@ -97,19 +97,19 @@ def resolve(kind: str, reference: Any) -> Any:
 
 
 def locate(kind: str, reference: Any) -> str:
-    """Return the reference by which another process finds a component without reading metadata.
+    """Return a reference with which another process finds a component without reading metadata.
 
-    Reading the metadata of all installed packages takes a good part of a client's start.
+    Reading the metadata of all installed packages is a large part of a client's startup time.
 
     Args:
         kind: See `resolve`.
         reference: See `resolve`.
 
     Returns:
-        ``"package.module:Class"`` if possible; otherwise the reference's own text.
+        ``"package.module:Class"`` if possible; otherwise the reference's text.
 
     Raises:
-        UsageError: If it is a class that no other process can find.
+        UsageError: If it is a class that other processes cannot find.
     """
     text = reference_of(reference)
     if ":" in text:
@@ -135,13 +135,14 @@ def import_component(kind: str, reference: str) -> Any:
 
     Raises:
         ComponentNotFoundError: If the module or script has no object of that name.
-        ReferenceFormError: If it belongs to Python's standard library, which has no components.
+        ReferenceFormError: If the object belongs to Python's standard library, which has no
+            components.
     """
     place, _, name = reference.rpartition(":")
     found = _attribute(kind, _module(kind, place), name, place)
     if _is_standard(found):
         raise ReferenceFormError(
-            f'"{reference}" belongs to Python\'s standard library and is no {kind}.'
+            f'"{reference}" belongs to Python\'s standard library and is not a physx {kind}.'
         )
     return found
 
@@ -154,7 +155,7 @@ def _is_standard(found: Any) -> bool:
 
 
 def check_kind(kind: str, reference: Any, found: Any) -> None:
-    """Check that a reference names a class of its kind, or a function, before it is called.
+    """Check that a reference names a class of the right kind, or a function, before calling it.
 
     Args:
         kind: See `resolve`.
@@ -162,16 +163,18 @@ def check_kind(kind: str, reference: Any, found: Any) -> None:
         found: The object that it names.
 
     Raises:
-        ReferenceFormError: If it does not.
+        ReferenceFormError: If it names anything else.
     """
     base = _base_of(kind)
     if isinstance(found, type) and not issubclass(found, base):
         raise ReferenceFormError(
             f'"{_place_of(reference)}" is a class that is not derived from {base.__name__}, so it '
-            f"is no {kind}."
+            f"is not a physx {kind}."
         )
     if not callable(found) and not isinstance(found, base):
-        raise ReferenceFormError(f'"{reference}" is a {type(found).__name__}, which is no {kind}.')
+        raise ReferenceFormError(
+            f'"{reference}" is a {type(found).__name__}, which is not a physx {kind}.'
+        )
 
 
 def _base_of(kind: str) -> type[Any]:
@@ -191,17 +194,17 @@ def _base_of(kind: str) -> type[Any]:
 def check_recorded(
     kind: str, file: object, reference: Any, arguments: Any, advice: str, *, trust: bool
 ) -> None:
-    """Check that a file names components of installed plugins only, in arguments, too.
+    """Check that a file names only components of installed plugins, in arguments as well.
 
-    Any text with a colon may name code, as in ``"module:Class"``.
+    Any string with a colon may name code, as in ``"module:Class"``.
 
     Args:
         kind: Kind of the component.
         file: Path of the file.
         reference: The reference in the file; None: the user named the component.
-        arguments: Its keyword arguments in the file.
-        advice: How the user names the component instead.
-        trust: Whether the user trusts the file; then it may also name classes.
+        arguments: The component's keyword arguments in the file.
+        advice: How the user can name the component instead.
+        trust: Whether the user trusts the file, which may then also name classes.
 
     Raises:
         UntrustedReferenceError: If it names anything else.
@@ -210,8 +213,8 @@ def check_recorded(
         is_code = isinstance(reference, str) and ":" in reference
         if is_code and not isinstance(find(kind, reference), type):
             raise UntrustedReferenceError(
-                f'{file} names "{reference}", which is no class. A function is not taken from a '
-                f"file, even if you trust it. Name it yourself: {advice}."
+                f'{file} names "{reference}", which is not a class. Functions are not taken from '
+                f"a file, even if you trust it. Name it yourself: {advice}."
             )
         return
     if is_of_plugin(kind, reference):
@@ -220,9 +223,9 @@ def check_recorded(
         if ":" in text:
             raise UntrustedReferenceError(
                 f'{file} has {where} = "{text:.200}", which may be any code. A file may only name '
-                'components of installed plugins, as in "plugin/name". If you know this one, name '
-                f"it yourself: {advice}. If you trust everything that the file names: --trust (in "
-                "Python trust=True)."
+                'components of installed plugins, such as "plugin/name". If you know this one, '
+                f"name it yourself: {advice}. If you trust everything that the file names, use "
+                "--trust (in Python trust=True)."
             )
 
 
@@ -238,7 +241,7 @@ def is_of_plugin(kind: str, reference: Any) -> bool:
 
 
 def _texts(file: object, *values: tuple[str, Any]) -> Iterator[tuple[str, str]]:
-    """Yield all texts in nested plain data, each with the place where it is."""
+    """Yield all strings in nested plain data, each with its location."""
     left = list(values)
     for _ in range(_MOST_VALUES):
         if not left:
@@ -251,15 +254,15 @@ def _texts(file: object, *values: tuple[str, Any]) -> Iterator[tuple[str, str]]:
         elif isinstance(value, (list, tuple)):
             left += [(where, item) for item in value]
     raise UntrustedReferenceError(
-        f"{file} has more than {_MOST_VALUES} values in {values[-1][0]}. If that is right: --trust "
-        "(in Python trust=True)."
+        f"{file} has more than {_MOST_VALUES} values in {values[-1][0]}. If this is intended, use "
+        "--trust (in Python trust=True)."
     )
 
 
 def is_recorded_as(given: Any, recorded: Any) -> bool:
-    """Return whether a component that the user named is the one that a file names.
+    """Return whether the component that the user named is the one that a file names.
 
-    Scripts and modules may lie elsewhere by now, so of ``"module:Class"`` only the class counts.
+    Scripts and modules may have moved, so only the class of ``"module:Class"`` is compared.
     """
     texts = [_place_of(given), _place_of(recorded)]
     if not all(":" in text for text in texts):
@@ -274,7 +277,14 @@ def _place_of(component: Any) -> str:
 
 
 def find(kind: str, reference: Any) -> Any:
-    """Return the object that a reference names, of whatever type it is; see `resolve`."""
+    """Return the object that a reference names, whatever its type; see `resolve`.
+
+    Raises:
+        PluginNotFoundError: If the plugin is not installed.
+        PluginError: If it is installed but broken.
+        ComponentNotFoundError: If the plugin, module or script has no component of that name.
+        ReferenceFormError: If the kind is unknown, or the reference has none of the forms.
+    """
     if kind not in KINDS:
         raise ReferenceFormError(f'"{kind}" is not a kind of component: {", ".join(KINDS)}.')
     if not isinstance(reference, str):
@@ -314,7 +324,7 @@ def _component_of_plugin(kind: str, reference: str) -> Any:
 
 
 def _listed_classes(script: str) -> str:
-    """Return references to a script's classes that derive from others; it is not run."""
+    """Return references to a script's classes that have a base class, without running it."""
     names = ["Class"]
     with contextlib.suppress(OSError, SyntaxError, ValueError):
         tree = ast.parse(Path(script).read_bytes())
@@ -324,17 +334,18 @@ def _listed_classes(script: str) -> str:
 
 
 def _no_plugin(kind: str, plugin_name: str) -> PluginNotFoundError:
-    """Return the error for a plugin that is not installed, with what may have been meant."""
+    """Return the error for a plugin that is not installed, with suggestions."""
     having, meant = [], []
     for name in sorted(available()):
-        with contextlib.suppress(PluginError):  # `physx plugins` shows it
+        with contextlib.suppress(PluginError):  # `physx plugins` shows the error
             components = load(name).components.get(kind, {})
             having += [name] if components else []
             meant += [f'"{name}/{plugin_name}"'] if plugin_name in components else []
     hint = (
         f"Did you mean {' or '.join(meant)}?"
         if meant
-        else f"With components of the kind {kind}: {listed(having)}. {plugin_hint(plugin_name)}"
+        else f"Plugins with a component of kind {kind}: {listed(having)}. "
+        f"{plugin_hint(plugin_name)}"
     )
     return PluginNotFoundError(plugin_name, list(available()), hint)
 
@@ -388,7 +399,7 @@ def _attribute(kind: str, module: ModuleType, name: str, place: str) -> Any:
 
 
 def _classes(kind: str, module: ModuleType) -> list[str]:
-    """Return the names of the classes of a module that may be meant by a reference."""
+    """Return the names of a module's classes that a reference may have meant."""
     from physx_core import components
 
     base = getattr(components, kind.capitalize(), None)

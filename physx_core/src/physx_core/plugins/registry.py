@@ -1,4 +1,4 @@
-"""Lists plugins without importing them, and loads one by its name."""
+"""Lists plugins without importing them, and loads a plugin by name."""
 
 from __future__ import annotations
 
@@ -33,8 +33,8 @@ class PluginInfo:
     """A plugin's metadata, read without importing it.
 
     Attributes:
-        name: Entry-point name, by which it is selected.
-        distributions: Names and versions of the packages that claim the name: normally one.
+        name: Entry-point name, by which users select it.
+        distributions: Names and versions of the packages that claim the name, normally one.
         module: Module that the entry point names.
     """
 
@@ -49,7 +49,7 @@ class Plugin:
 
     Attributes:
         info: Its metadata.
-        components: Kind of component to name to component: a class, a factory or a reference.
+        components: Kind of component to name to component: a class, a factory, or a reference.
     """
 
     info: PluginInfo
@@ -57,7 +57,7 @@ class Plugin:
 
 
 def available() -> dict[str, PluginInfo]:
-    """Return the installed plugins by name, from metadata alone."""
+    """Return the installed plugins by name, from metadata only."""
     return {
         name: PluginInfo(name, tuple(map(owner_of, found)), found[0].value)
         for name, found in find_entries(PLUGINS).items()
@@ -72,7 +72,8 @@ def load(name: str) -> Plugin:
 
     Raises:
         PluginNotFoundError: If no installed package has a plugin of that name.
-        PluginError: If the plugin fails to import, misspells a hook, or is claimed by two packages.
+        PluginError: If the plugin cannot be imported, misspells a hook, or is claimed by several
+            packages.
     """
     found = find_entries(PLUGINS)
     if name not in found:
@@ -117,10 +118,10 @@ def _call(manager: pluggy.PluginManager, hook: str) -> Components:
 
 
 def plugin_hint(name: str) -> str:
-    """Return what to do about a plugin that is not installed."""
+    """Return advice about a plugin that is not installed."""
     if (PLUGINS, name) in OFFICIAL:
         return install_hint(OFFICIAL[PLUGINS, name])
     return unreadable_hint() or (
-        "It is none of physx's own: install the package that contains it. A class without a plugin "
-        'is named "package.module:Class" or "script.py:Class".'
+        "It is not one of physx's own: install the package that contains it. To name a class "
+        'without a plugin, use "package.module:Class" or "script.py:Class".'
     )

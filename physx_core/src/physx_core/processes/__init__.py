@@ -1,4 +1,4 @@
-"""Child processes and temporary folders that go with this process, and signals that end it."""
+"""Child processes and temporary folders that end with this process, and signals that end it."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Child processes and temporary folders that go with this process, and signals that end it."""
+"""Child processes and temporary folders that end with this process, and signals that end it."""
 
 from .child import ChildProcess as ChildProcess
 from .descendants import children as children

@@ -14,19 +14,19 @@ from collections.abc import Mapping, Sequence
 from physx_core.closeable import Closeable
 from physx_core.processes.watchdog import WATCHDOG
 
-# This process may be killed before the watchdog knows of the new one: until then that must wait.
+# The new process waits, as this one may be killed before the watchdog knows about it.
 _WAIT_AND_BEGIN = 'read -r line && exec "$@" </dev/null'
 
 
 class ChildProcess(Closeable):
-    """A process that ends with this one, in whatever way this one ends, even by SIGKILL.
+    """A process that ends with this one, however this one ends, even by SIGKILL.
 
-    It also ends when this object is closed or garbage collected. It leads a process group of its
-    own, which ends with it, and which Ctrl-C in a terminal does not reach. Its standard input is
-    empty. A process forked from this one leaves it alone.
+    It also ends when this object is closed or garbage-collected. It leads its own process group,
+    which ends with it and is not reached by Ctrl-C in a terminal. Its standard input is empty. A
+    process forked from this one leaves it alone.
 
     Attributes:
-        pid: Number of the process and of its group.
+        pid: ID of the process and of its group.
         stderr: Its standard error, if that is a pipe.
     """
 
@@ -44,14 +44,14 @@ class ChildProcess(Closeable):
 
         Args:
             command: Program and arguments.
-            variables: Environment variables that it gets beside those of this process.
-            stdout: As of `subprocess.Popen`.
-            stderr: As of `subprocess.Popen`.
-            pass_fds: As of `subprocess.Popen`.
-            lives_on: Whether it outlives this process and this object, unless it is closed.
+            variables: Environment variables in addition to those of this process.
+            stdout: As in `subprocess.Popen`.
+            stderr: As in `subprocess.Popen`.
+            pass_fds: As in `subprocess.Popen`.
+            lives_on: Whether it outlives this process and this object unless it is closed.
 
         Raises:
-            OSError: If it cannot be started.
+            OSError: If the process cannot be started.
         """
         if shutil.which(command[0]) is None:
             raise FileNotFoundError(errno.ENOENT, "there is no such program", command[0])
@@ -69,45 +69,45 @@ class ChildProcess(Closeable):
             )
             self.pid, self.stderr = self._process.pid, self._process.stderr
             assert self._process.stdin is not None
-            with self._process.stdin as line:  # if it closes without a line, nothing begins
+            with self._process.stdin as line:  # if it closes without a line, nothing is started
                 if not lives_on:
                     WATCHDOG.add(self.pid)
-                    # When the interpreter ends, the watchdog comes after all exit functions.
+                    # When the interpreter exits, the watchdog acts after all exit functions.
                     weakref.finalize(self, _abandon, self._process, self._owner).atexit = False
-                with contextlib.suppress(BrokenPipeError):  # it is gone, which its status says
+                with contextlib.suppress(BrokenPipeError):  # it is gone, as its status shows
                     line.write(b"\n")
 
     def exit_status(self) -> int | None:
         """Return the exit status, negative for a signal; None while the process runs."""
         if not self._is_over and self._is_mine() and self._process.poll() is not None:
             self._is_over = True
-            _signal_group(self.pid, signal.SIGKILL)  # those that it left running
+            _signal_group(self.pid, signal.SIGKILL)  # processes that it left running
             WATCHDOG.remove(self.pid)
         return self._process.returncode
 
     def wait(self, timeout: float | None = None) -> int | None:
-        """Wait until the process ends, for `timeout` s at most; return the `exit_status`."""
+        """Wait until the process ends, for at most `timeout` s; return the `exit_status`."""
         if self._is_mine():
             with contextlib.suppress(subprocess.TimeoutExpired):
                 self._process.wait(timeout)
         return self.exit_status()
 
     def send_signal(self, number: signal.Signals) -> None:
-        """Send a signal to the process and to those that it started."""
+        """Send a signal to the process and those that it started."""
         if self._is_mine() and self._process.returncode is None:
             _signal_group(self.pid, number)
 
     def ask_to_end(self) -> None:
-        """Send SIGTERM, but never a second one, which would end it at once."""
+        """Send SIGTERM unless already sent: a second one would end the process immediately."""
         if not self._is_asked:
             self._is_asked = True
             self.send_signal(signal.SIGTERM)
 
     def close(self, patience: float = 3.0) -> None:
-        """End the process; none of its group is left when this returns.
+        """End the process; when this returns, nothing of its group is left.
 
         Args:
-            patience: Time in s that it gets to exit when it is asked to.
+            patience: Time in s it has to exit after it is asked to.
         """
         try:
             if patience > 0:
@@ -118,7 +118,7 @@ class ChildProcess(Closeable):
             self.wait()
 
     def _is_mine(self) -> bool:
-        """Return whether this process started it, not the one that this was forked from."""
+        """Return whether this process started it, not a process that this one was forked from."""
         return os.getpid() == self._owner
 
 
@@ -128,7 +128,7 @@ def _signal_group(group: int, number: signal.Signals) -> None:
 
 
 def _abandon(process: subprocess.Popen[bytes], owner: int) -> None:
-    """End a process that nobody can refer to any more."""
+    """End a process that is no longer referenced."""
     if os.getpid() == owner and process.returncode is None:
         _signal_group(process.pid, signal.SIGKILL)
         process.wait()

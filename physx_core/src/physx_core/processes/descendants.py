@@ -1,4 +1,4 @@
-"""Finds and kills the processes that this one started, and all of their descendants."""
+"""Finds and kills the processes that this one started and all of their descendants."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from physx_core.processes.watchdog import WATCHDOG
 def kill_descendants() -> None:
     """Kill all descendants of this process, if there is a /proc file system.
 
-    A client that was started by hand may share its process group with other programs of the user,
-    so it cannot kill its whole group as a launched one can.
+    A client started by hand may share its process group with other programs of the user, so unlike
+    a launched one, it cannot kill its whole group.
     """
     WATCHDOG.release()
     while found := descendants_of(os.getpid()):
@@ -24,9 +24,9 @@ def kill_descendants() -> None:
 
 
 def children() -> set[int]:
-    """Return the numbers of this process's children, if there is a /proc file system.
+    """Return the IDs of this process's children, if there is a /proc file system.
 
-    Among them are those that ended but that nobody has waited for.
+    They include zombies: children that have ended but have not been waited for.
     """
     found: set[int] = set()
     for thread in Path("/proc/self/task").glob("*"):
@@ -36,12 +36,12 @@ def children() -> set[int]:
 
 
 def descendants_of(ancestor: int) -> list[int]:
-    """Return the numbers of a process's descendants, if there is a /proc file system."""
+    """Return the IDs of a process's descendants, if there is a /proc file system."""
     children: dict[int, list[int]] = {}
     for process in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
             state, parent = (process / "stat").read_text().rpartition(")")[2].split()[:2]
-            if state not in "ZX":  # not dead already
+            if state not in "ZX":  # not already dead
                 children.setdefault(int(parent), []).append(int(process.name))
     found = children.get(ancestor, [])
     for number in found:  # grows while it is read

@@ -1,4 +1,4 @@
-"""TemporaryFolder: a folder that goes with this process."""
+"""TemporaryFolder: a folder that is removed when this process ends."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ from physx_core.processes.watchdog import WATCHDOG
 
 
 class TemporaryFolder(Closeable):
-    """A folder for temporary files that goes with this process, even if that is killed.
+    """A folder for temporary files that is removed when this process ends, even if it is killed.
 
-    It is also removed when this object is closed or garbage collected. A process forked from this
+    It is also removed when this object is closed or garbage-collected. A process forked from this
     one leaves it alone.
 
     Attributes:
@@ -22,14 +22,14 @@ class TemporaryFolder(Closeable):
     """
 
     def __init__(self, prefix: str) -> None:
-        """Make the folder.
+        """Create the folder.
 
         Args:
-            prefix: Beginning of its name.
+            prefix: Prefix of its name.
         """
         self.path = WATCHDOG.make_folder(prefix)
         self._remove = weakref.finalize(self, _remove, self.path, os.getpid())
-        self._remove.atexit = False  # then the watchdog does it, after all exit functions
+        self._remove.atexit = False  # at exit, the watchdog does it after all exit functions
 
     def close(self) -> None:
         """Remove the folder."""

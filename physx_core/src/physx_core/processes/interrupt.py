@@ -1,4 +1,4 @@
-"""Ends runs in order after Ctrl-C and SIGTERM."""
+"""Ends runs cleanly after Ctrl-C and SIGTERM."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from typing import Any
 from physx_core.errors import PhysxError
 
 _REPETITION = 0.5
-"""Time in s within which a signal is the same one again: schedulers, terminals and ``timeout`` send
-it to a process and to its group."""
+"""Time in s within which a signal counts as a repetition: schedulers, terminals and ``timeout``
+send it both to a process and to its group."""
 
 
 class Terminated(SystemExit):
@@ -25,21 +25,21 @@ class Terminated(SystemExit):
 
 
 class Interrupt:
-    """Whether, and by which signal, a run was asked to end.
+    """Record of whether a run was asked to end, and by which signal.
 
     Attributes:
-        number: The first signal; 0 before it came.
+        number: The first signal; 0 before any.
     """
 
     def __init__(self) -> None:
         self.forget()
 
     def __bool__(self) -> bool:
-        """Return whether the run is to end."""
+        """Return whether the run should end."""
         return self.number != 0
 
     def take(self, number: int, frame: FrameType | None) -> None:
-        """Note the first signal, and raise the exception of a second one."""
+        """Record the first signal; raise the exception at a second one."""
         if self.is_repeated():
             return
         if self.number:
@@ -47,19 +47,19 @@ class Interrupt:
         self.note(number)
 
     def forget(self) -> None:
-        """Be as before any signal."""
+        """Reset to the state before any signal."""
         self.number, self._came = 0, float("-inf")
 
     def note(self, number: int) -> None:
-        """Note a signal."""
+        """Record a signal."""
         self.number, self._came = number, time.monotonic()
 
     def is_repeated(self) -> bool:
-        """Return whether a signal that comes now is the noted one again."""
+        """Return whether a signal that arrives now is a repetition of the recorded one."""
         return time.monotonic() - self._came < _REPETITION
 
     def end(self) -> None:
-        """Raise the exception that the signal ends a run with.
+        """Raise the exception with which the signal ends a run.
 
         Raises:
             KeyboardInterrupt: For Ctrl-C.
@@ -74,10 +74,10 @@ _LAST = Interrupt()
 
 @contextlib.contextmanager
 def deferred_interrupt() -> Iterator[Interrupt]:
-    """Defer the first Ctrl-C or SIGTERM, and yield what tells whether it came.
+    """Defer the first Ctrl-C or SIGTERM, and yield the record of whether it came.
 
-    A second one, half a second later or more, ends the run at once. Outside the main thread, and
-    for a signal that is already handled, nothing changes.
+    A second one, at least half a second later, ends the run immediately. Outside the main thread,
+    and for signals that are already handled, nothing changes.
     """
     interrupt = Interrupt()
     usual: dict[int, tuple[Any, ...]] = {
@@ -92,10 +92,10 @@ def deferred_interrupt() -> Iterator[Interrupt]:
 def raised_at_sigterm() -> Iterator[None]:
     """Raise `Terminated` at SIGTERM, so that everything is closed before the process exits.
 
-    An exception in the middle of an import may become any other: what leaves this context after
-    SIGTERM is `Terminated`, with a note about an error of physx. A further SIGTERM, half a second
-    later or more, is raised again. Outside the main thread, and if SIGTERM is already handled,
-    nothing changes.
+    An exception during an import may turn into any other. After SIGTERM, this context therefore
+    always raises `Terminated`, with a physx error attached as a note. A further SIGTERM, at least
+    half a second later, is raised again. Outside the main thread, and if SIGTERM is already
+    handled, nothing changes.
     """
     with _handled(_raise_first, {signal.SIGTERM: (signal.SIG_DFL,)}) as before:
         if before:
@@ -125,7 +125,7 @@ def _raise(number: int, frame: FrameType | None) -> None:
 def _handled(
     handler: Callable[[int, FrameType | None], None], usual: Mapping[int, tuple[Any, ...]]
 ) -> Iterator[Mapping[int, Any]]:
-    """Handle signals, those that have one of their usual handlers, and yield these."""
+    """Handle those signals that have one of their usual handlers, and yield the latter."""
     before: dict[int, Any] = {}
     if threading.current_thread() is threading.main_thread():
         current = {number: signal.getsignal(number) for number in usual}

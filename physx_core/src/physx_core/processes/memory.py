@@ -1,4 +1,4 @@
-"""Memory that processes share."""
+"""Memory shared between processes."""
 
 from __future__ import annotations
 
@@ -8,13 +8,13 @@ from typing import IO
 
 
 def anonymous_file(name: str) -> IO[bytes]:
-    """Return a file for processes to map that get its descriptor, in memory where that is possible.
+    """Return a file, in memory if possible, that processes can map given its descriptor.
 
-    It has no place in a file system, so it is gone with the last process that has it open, however
-    that ends, and is not limited by the size of ``/dev/shm``.
+    It has no path, so it disappears with the last process that has it open, however that ends, and
+    it is not limited by the size of ``/dev/shm``.
 
     Args:
-        name: What the system shows as its name.
+        name: Name that the system displays for it.
     """
     if hasattr(os, "memfd_create"):
         return os.fdopen(os.memfd_create(name), "r+b", buffering=0)

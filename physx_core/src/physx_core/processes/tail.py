@@ -1,23 +1,23 @@
-"""OutputTail: the last lines that a process wrote."""
+"""OutputTail: the last lines of a process's output."""
 
 from __future__ import annotations
 
 import threading
 from typing import IO
 
-_BYTES = 8192  # of one read
-_LINE_BYTES = 140  # kept for each line
+_BYTES = 8192  # per read
+_LINE_BYTES = 140  # kept per line
 
 
 class OutputTail:
-    """Reads what a process writes to a pipe, and keeps the last lines of it."""
+    """Reads what a process writes to a pipe and keeps the last lines."""
 
     def __init__(self, stream: IO[bytes], lines: int = 60) -> None:
-        """Begin to read.
+        """Start reading.
 
         Args:
-            stream: The pipe; closed at its end.
-            lines: How many lines to keep.
+            stream: The pipe; closed at end of file.
+            lines: Number of lines to keep.
         """
         self._bytes, self._lines = b"", lines
         self._reader = threading.Thread(target=self._read, args=(stream,), daemon=True)
@@ -27,7 +27,7 @@ class OutputTail:
         """Return the last lines.
 
         Args:
-            patience: How long to wait for the rest of them, in s, if the process has ended.
+            patience: How long to wait for the remaining output, in s, if the process has ended.
         """
         self._reader.join(patience)
         lines = self._bytes.decode(errors="replace").splitlines()

@@ -1,4 +1,4 @@
-"""Watchdog: a shell that ends what this process leaves behind when it dies."""
+"""Watchdog: a shell that cleans up what this process leaves behind when it dies."""
 
 from __future__ import annotations
 
@@ -9,9 +9,9 @@ import threading
 from pathlib import Path
 
 _END = "end"
-# Each line names all process groups; the last one counts once the pipe is closed. Processes take a
-# moment to die, in which they may still write into the folder. Whoever ends all processes of a job
-# may signal this one before the others.
+# Each line names all process groups; once the pipe is closed, the last one counts. Processes take a
+# moment to die, during which they may still write to the folder. A scheduler that ends all
+# processes of a job may signal this one before the others.
 _SCRIPT = (
     'trap "" HUP INT TERM; '
     f'while read -r line; do [ "$line" = {_END} ] && exit; groups=$line; done; '
@@ -21,19 +21,19 @@ _SCRIPT = (
 
 
 class Watchdog:
-    """Has a shell kill the process groups, and remove the files, that this process leaves behind.
+    """Uses a shell to kill process groups and remove files that this process leaves behind.
 
-    The shell reads from a pipe to which only this process can write, and which closes when this
-    process ends, even by SIGKILL. A process forked from this one closes it at once, and starts a
-    shell of its own when it needs one. There is a shell as long as there are groups or files.
+    The shell reads from a pipe that only this process can write to and that closes when this
+    process ends, even by SIGKILL. A process forked from this one closes the pipe immediately and
+    starts its own shell when it needs one. The shell exists as long as there are groups or files.
 
     Attributes:
-        lock: Held while a process is started: a process forked in that moment would keep the pipes.
+        lock: Held while a process is started: one forked at that moment would keep the pipes open.
     """
 
     def __init__(self) -> None:
-        """Start with no groups, and no shell."""
-        self.lock = threading.RLock()  # garbage collection may end a process at any moment
+        """Start without groups and without a shell."""
+        self.lock = threading.RLock()  # garbage collection may end a process at any time
         self._groups: set[int] = set()
         self._folder = Path()
         self._shell: subprocess.Popen[bytes] | None = None
@@ -55,14 +55,14 @@ class Watchdog:
                 self.settle()
 
     def make_folder(self, prefix: str) -> Path:
-        """Make a folder for temporary files; after its removal call `settle`."""
+        """Create a folder for temporary files; call `settle` after removing it."""
         with self.lock:
             self._start()
-            self._folder.mkdir(0o700, exist_ok=True)  # somebody may tidy up temporary files
+            self._folder.mkdir(0o700, exist_ok=True)  # a cleanup of /tmp may have removed it
             return Path(tempfile.mkdtemp(prefix=prefix, dir=self._folder))
 
     def settle(self) -> None:
-        """End the shell if there is nothing left to watch over."""
+        """Stop the shell if there is nothing left to watch over."""
         with self.lock:
             if self._groups or self._shell is None:
                 return
@@ -76,7 +76,7 @@ class Watchdog:
             self.release()
 
     def release(self) -> None:
-        """End at once what would be ended after this process."""
+        """Immediately clean up everything that would be cleaned up after this process."""
         with self.lock:
             self._groups.clear()
             shell, self._shell = self._shell, None
@@ -107,7 +107,7 @@ class Watchdog:
             stdout=subprocess.DEVNULL,
             stderr=subprocess.DEVNULL,
             bufsize=0,
-            cwd="/",  # so that it keeps no file system busy
+            cwd="/",  # keeps no file system busy
             start_new_session=True,
         )
 
@@ -121,15 +121,15 @@ class Watchdog:
             try:
                 os.write(self._shell.stdin.fileno(), f"{line}\n".encode())
                 return
-            except BrokenPipeError:  # somebody killed the shell
+            except BrokenPipeError:  # the shell was killed
                 self._shell.communicate()
                 self._shell = self._open_shell()
 
     def _forget(self) -> None:
-        """Leave everything to the parent: this process was forked."""
+        """Leave everything to the parent, as this process was forked."""
         if self._shell is not None and self._shell.stdin is not None:
             self._shell.stdin.close()
-            self._shell.returncode = 0  # it is no child of this process
+            self._shell.returncode = 0  # it is not a child of this process
         self._groups, self._shell, self.lock = set(), None, threading.RLock()
 
 

@@ -1,4 +1,4 @@
-"""Set-up of worker processes: their variables and signals, and their exit status in words."""
+"""Setup of worker processes: environment variables, signals, and descriptions of exit statuses."""
 
 from __future__ import annotations
 
@@ -8,27 +8,27 @@ import os
 import signal
 
 CLIENT_VARIABLE = "PHYSX_CLIENT"
-"""Environment variable that is set in every process that runs environments for another one."""
+"""Environment variable set in every process that runs environments for another process."""
 
 
 def worker_variables() -> dict[str, str]:
     """Return the environment variables of a process that shares the processor cores with others.
 
-    A numerical library must not take all of them for each process.
+    Numerical libraries must not use all cores in each process.
     """
     return {CLIENT_VARIABLE: "1", "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
 
 
 def prepare_worker() -> None:
-    """Leave the end of this process to the one that started it, and say on stderr where it failed.
+    """Leave ending this process to the one that started it, and report failures on stderr.
 
-    That is: Ctrl-C does nothing, and a crash or SIGTERM prints a traceback.
+    Ctrl-C does nothing, and a crash or SIGTERM prints a traceback.
     """
     faulthandler.enable()
     faulthandler.register(signal.SIGTERM, all_threads=False, chain=True)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if hasattr(os, "SCHED_BATCH"):  # when it wakes up, its starter may go on and wake the others
-        with contextlib.suppress(OSError):  # not every container lets it choose
+    if hasattr(os, "SCHED_BATCH"):  # waking it does not preempt its starter, which wakes others
+        with contextlib.suppress(OSError):  # not every container allows it
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 
 

@@ -1,1 +1,1 @@
-"""The core's own samplers of parameters."""
+"""The core's samplers of parameters."""

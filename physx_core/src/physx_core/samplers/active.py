@@ -15,7 +15,7 @@ from physx_core.typing import Array, Index
 
 
 class _Known(NamedTuple):
-    """The sets of which there are losses: numbers (n,), points (n, size), losses (n,)."""
+    """The sets with known losses: numbers (n,), points (n, size), losses (n,)."""
 
     numbers: Index
     points: Array
@@ -23,23 +23,23 @@ class _Known(NamedTuple):
 
 
 class Active(LearningSampler):
-    """Draws sets near known ones whose loss is high, and a share of them from the distributions.
+    """Draws sets near known ones with a high loss, and a share of them from the distributions.
 
-    A known set is drawn with a probability in proportion to its loss over the density of the known
-    sets around it: so how often a region is simulated depends on the loss there, not on how often
-    it was simulated before (adaptive importance sampling). The new set lies in a box around it. All
-    this is in the unit cube, in which the parameters' distributions are uniform.
+    A known set is picked with a probability proportional to its loss divided by the density of
+    known sets around it, so how often a region is simulated depends on the loss there, not on how
+    often it was simulated before (adaptive importance sampling). The new set is drawn from a box
+    around it. All this happens in the unit cube, where the parameters' distributions are uniform.
     """
 
     def __init__(
         self, uniform: float = 0.3, width: float = 0.1, memory: int = 512, delay: int = 1
     ) -> None:
-        """Keep the options.
+        """Store the options.
 
         Args:
             uniform: Share of the sets that are drawn from the parameters' distributions.
-            width: Half the width of the boxes, of the parameters' ranges.
-            memory: Number of sets, up to the latest one, whose losses count.
+            width: Half the width of the boxes, as a fraction of the parameters' ranges.
+            memory: Number of most recent sets whose losses count.
             delay: See `LearningSampler`.
 
         Raises:
@@ -126,7 +126,7 @@ class Active(LearningSampler):
         self._known, self._weights = known, {}
 
     def _weights_after(self, batches: int) -> Array:
-        """Return the sums of the probabilities of the known sets up to each, the last one 1."""
+        """Return the cumulative probabilities of the known sets; the last one is 1."""
         if batches not in self._weights:
             known = self._known[batches]
             near = np.ones((len(known.numbers),) * 2, bool)

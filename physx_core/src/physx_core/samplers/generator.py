@@ -1,4 +1,4 @@
-"""Generator: has a generator of the gest-api standard choose the sets."""
+"""Generator: has a gest-api generator choose the sets."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ _LOSS = "loss"
 
 
 class Generator(LearningSampler):
-    """Has a generator of the gest-api standard choose the sets, as those of libEnsemble and Xopt.
+    """Has a gest-api generator choose the sets, such as those of libEnsemble and Xopt.
 
     The generator gets the parameters' bounds as variables, one for each element (``name_0``,
     ``name_1`` ... if a parameter has a shape), and the objective ``loss``. After each batch it
-    ingests the batch's sets with their mean losses and suggests `points` new ones, of which set k
-    takes the one with number k modulo `points`. Runs are the same if the generator suggests the
-    same after the same losses: give it a seed. They cannot be resumed while environments generate.
+    ingests the batch's sets with their mean losses and suggests `points` new ones; set k takes
+    number k modulo `points`. Runs are reproducible if the generator suggests the same after the
+    same losses: give it a seed. They cannot be resumed while environments generate.
     """
 
     def __init__(
@@ -35,15 +35,15 @@ class Generator(LearningSampler):
         memory: int = 512,
         delay: int = 1,
     ) -> None:
-        """Keep the options.
+        """Store the options.
 
         Args:
             generator: The generator's class, or ``"package.module:Class"``.
-            generator_kwargs: Arguments of its constructor beside the variables and objectives.
-            objective: What it is to do with the loss: ``"MAXIMIZE"`` or ``"EXPLORE"``.
-            points: Number of points that it suggests after each batch: as many as sets are asked
-                for meanwhile, at least.
-            memory: Number of sets, up to the latest one, whose losses it ingests.
+            generator_kwargs: Arguments of its constructor other than variables and objectives.
+            objective: What it does with the loss: ``"MAXIMIZE"`` or ``"EXPLORE"``.
+            points: Number of points that it suggests after each batch: at least as many as sets are
+                requested in the meantime.
+            memory: Number of most recent sets whose losses it ingests.
             delay: See `LearningSampler`.
 
         Raises:
@@ -100,7 +100,7 @@ class Generator(LearningSampler):
     def tell(
         self, batches: int, numbers: Index, values: Sequence[Mapping[str, Any]], losses: Array
     ) -> None:
-        """Have the generator learn from a batch: see `LearningSampler.tell`."""
+        """Make the generator learn from a batch: see `LearningSampler.tell`."""
         results = []
         for number, given, loss in zip(numbers.tolist(), values, losses.tolist(), strict=True):
             result: dict[str, Any] = {_LOSS: loss}
@@ -119,12 +119,12 @@ class Generator(LearningSampler):
             del self._suggested[former]
 
     def state(self, batches: int) -> Array:
-        """Return nothing: a generator's state is its own."""
+        """Return nothing: the generator keeps its own state."""
         return np.zeros(0)
 
     def restore(self, batches: int, state: Array) -> None:
         """Refuse to continue: see `LearningSampler.restore`."""
-        raise ValueError('"physx/generator" cannot be continued')
+        raise ValueError('"physx/generator" cannot be resumed')
 
     def _suggest(self) -> list[dict[str, Any]]:
         points: list[dict[str, Any]] = self._generator.suggest(self._points)

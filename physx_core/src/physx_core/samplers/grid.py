@@ -14,21 +14,21 @@ from physx_core.typing import Array
 
 
 class Grid(Sampler):
-    """All combinations of evenly spaced values, the last parameter varying fastest, over and over.
+    """All combinations of evenly spaced values, the last parameter varying fastest, repeatedly.
 
-    Values are spaced evenly in the parameter's distribution: by their logarithms if it is
-    ``log_uniform``. They include the bounds; a distribution without bounds is cut into parts of
-    equal probability, whose medians they are.
+    Values are spaced evenly in the parameter's distribution: in their logarithms if it is
+    ``log_uniform``. They include the bounds; a distribution without bounds is divided into
+    intervals of equal probability, and the values are their medians.
 
     Attributes:
         count: Number of sets until the grid starts over.
     """
 
     def __init__(self, points: int | Mapping[str, int] = 10) -> None:
-        """Keep the numbers.
+        """Store the numbers of points.
 
         Args:
-            points: Number of values of each element of each parameter, or by parameter's name.
+            points: Number of values for each element of each parameter, or one by parameter name.
         """
         self._points = points
         self.count = 0
@@ -42,7 +42,7 @@ class Grid(Sampler):
                 if name not in names or name not in points:
                     known = nearest(name, names) if name not in names else ""
                     raise ConfigError(
-                        f'"physx/grid": points must name exactly the parameters {names}, and '
+                        f'"physx/grid": points must name exactly the parameters {names}, but '
                         f'"{name}" is {"missing" if name in names else "none of them"}.{known}'
                     )
         self._levels: list[Array] = []

@@ -45,7 +45,7 @@ class _Blocks(Sampler):
 class Sobol(_Blocks):
     """A scrambled Sobol sequence: any number of sets fills the space more evenly than random ones.
 
-    Uses `scipy.stats.qmc.Sobol`. Powers of two of sets are most even.
+    Uses `scipy.stats.qmc.Sobol`. The sets are most even if their number is a power of two.
     """
 
     block = _BLOCK
@@ -56,30 +56,30 @@ class Sobol(_Blocks):
         most = _qmc().Sobol.MAXDIM
         if self.size > most:
             raise ConfigError(
-                f'"physx/sobol" chooses {most} numbers at most, and the environment\'s parameters '
+                f'"physx/sobol" chooses at most {most} numbers, but the environment\'s parameters '
                 f'have {self.size} elements: use "physx/uniform".'
             )
 
     def _points(self, index: int) -> Array:
         first = index * _BLOCK % _LONGEST
         engine = _qmc().Sobol(self.size, scramble=True, rng=self.random(0))
-        if first:  # it takes no 0
+        if first:  # it does not accept 0
             engine.fast_forward(first)
         points: Array = engine.random(_BLOCK)
         return points
 
 
 class LatinHypercube(_Blocks):
-    """Latin hypercubes: of each `points` sets one lies in each of `points` parts of each parameter.
+    """Latin hypercubes: of every `points` sets, each of a parameter's `points` intervals has one.
 
     Uses `scipy.stats.qmc.LatinHypercube`.
     """
 
     def __init__(self, points: int = 100) -> None:
-        """Keep the size.
+        """Store the size.
 
         Args:
-            points: Number of sets in a hypercube; after them the next one begins.
+            points: Number of sets in a hypercube; then the next one begins.
         """
         if type(points) is not int or points < 1:
             raise ConfigError(f'"physx/latin_hypercube": points is {points!r}, not at least 1.')
@@ -88,7 +88,7 @@ class LatinHypercube(_Blocks):
     def begin(self, parameters: Sequence[Parameter], seed: Sequence[int]) -> None:
         """Take the parameters: see `Sampler.begin`."""
         super().begin(parameters, seed)
-        _qmc()  # a missing library is an error before anything is simulated
+        _qmc()  # raises for a missing library before anything is simulated
 
     def _points(self, index: int) -> Array:
         engine = _qmc().LatinHypercube(self.size, rng=self.random(index))

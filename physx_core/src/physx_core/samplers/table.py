@@ -19,18 +19,18 @@ _UNREADABLE = (OSError, ValueError, KeyError, EOFError, MemoryError, zipfile.Bad
 
 
 class Table(Sampler):
-    """The rows of a table, one set each, in their order, over and over.
+    """The rows of a table, one set each, in order, repeatedly.
 
-    A CSV file has a line of names and a column for each parameter; one with several elements has
-    the columns ``name_0``, ``name_1`` ... in C order. An npz file has an array for each parameter,
-    of shape (rows, *parameter's shape). Other columns are left out.
+    A CSV file has a header line and a column for each parameter; one with several elements has the
+    columns ``name_0``, ``name_1`` ... in C order. An npz file has an array for each parameter, of
+    shape (rows, *parameter's shape). Other columns are ignored.
 
     Attributes:
         count: Number of rows.
     """
 
     def __init__(self, file: str | Path) -> None:
-        """Keep the file's path.
+        """Store the file's path.
 
         Args:
             file: A CSV or npz file.

@@ -1,4 +1,4 @@
-"""Backend, a physics engine, and Simulation, a running world in it.
+"""Backend, a physics engine, and Simulation, a world running in it.
 
 States follow the convention of `physx_core.simulation.layout`.
 """
@@ -22,18 +22,18 @@ from physx_core.typing import Records, Vector
 
 @dataclass(frozen=True)
 class RobotInfo:
-    """A robot that a world may name instead of a file, as in ``Robot("cartpole")``.
+    """A robot that a world may refer to by name instead of by file, as in ``Robot("cartpole")``.
 
     Attributes:
         name: Name of the robot.
         path: Its model file.
         joints: Number of its joints' degrees of freedom; a floating base has 6 more.
-        mass: Of all its links, in kg.
+        mass: Total mass of its links, in kg.
         collisions: Kind of its collision shapes: ``"primitives"``, ``"meshes"``, ``"both"`` or
             ``"none"``.
-        warning: Caveat about using it; empty: none.
-        error: Reason why it cannot be loaded, empty if it can. The other values are then 0 and
-            ``"none"``.
+        warning: Caveat about using it; empty if there is none.
+        error: Reason why it cannot be loaded; empty if it can. Otherwise the other values are 0
+            and ``"none"``.
     """
 
     name: str
@@ -57,32 +57,32 @@ class Backend(ABC):
             seed: Seed of the engine's random numbers, if it draws any.
 
         Raises:
-            ModelError: If a robot or mesh cannot be loaded; the message says why.
+            ModelError: If a robot or mesh cannot be loaded; the message gives the reason.
             FeatureNotSupportedError: If the world needs a feature that the engine does not have.
         """
 
     def robots(self) -> Sequence[RobotInfo]:
-        """Return the robots that a world may name instead of a file; none unless overridden."""
+        """Return the robots that a world may refer to by name; none unless overridden."""
         return ()
 
     def robot_path(self, name: str) -> Path | None:
-        """Return the model file of the robot of a name, None if there is none.
+        """Return the model file of a named robot, or None if there is none.
 
-        To be overridden where that is quicker than to describe all robots.
+        Override this where a lookup is faster than describing all robots.
         """
         return next((info.path for info in self.robots() if info.name == name), None)
 
 
 class Simulation(Closeable):
-    """A running world. A context manager; after `close` every call raises `SimulationError`.
+    """A running world; a context manager. After `close`, every call raises `SimulationError`.
 
     A method whose feature is not in `features` raises `FeatureNotSupportedError`.
 
     Attributes:
         engine: Name of the engine.
         period: Length of one physics step, in s.
-        layout: Names and places in the state.
-        features: Features of this simulation: names of `FEATURES`.
+        layout: Names and indices in the state.
+        features: Features of this simulation: names from `FEATURES`.
     """
 
     engine: str = ""
@@ -104,7 +104,7 @@ class Simulation(Closeable):
 
     @abstractmethod
     def set_torques(self, torques: Vector) -> None:
-        """Hold these torques until they are changed; they are clipped at the joints' limits.
+        """Hold these torques until they are changed, clipped to the joints' limits.
 
         Args:
             torques: Shape (joints,), in N m or N.
@@ -116,10 +116,10 @@ class Simulation(Closeable):
 
     @abstractmethod
     def set_commands(self, commands: Vector) -> None:
-        """Hold these commands until they are changed; they are clipped at the joints' limits.
+        """Hold these commands until they are changed, clipped to the joints' limits.
 
         Args:
-            commands: Shape (joints,): torque, velocity, or position, according to each joint's
+            commands: Shape (joints,): torque, velocity, or position, depending on each joint's
                 mode; copied.
 
         Raises:
@@ -127,7 +127,7 @@ class Simulation(Closeable):
         """
 
     def commands(self) -> Vector:
-        """Return the held commands, clipped at the joints' limits, shape (joints,)."""
+        """Return the held commands, clipped to the joints' limits, shape (joints,)."""
         return self.snapshot().commands
 
     @abstractmethod
@@ -142,7 +142,7 @@ class Simulation(Closeable):
         """Call a function before the physics steps whose frame is a multiple of `every`.
 
         It may read everything and set commands and wrenches. Hooks are called in the order in which
-        they were added. Without hooks `step` has no additional cost. Snapshots do not contain them.
+        they were added. Without hooks, `step` has no extra cost. Snapshots do not include hooks.
         """
         raise self._lacks("hooks")
 
@@ -158,7 +158,7 @@ class Simulation(Closeable):
         """Apply a wrench to a body from now on; return its number for `remove_wrench`.
 
         Raises:
-            SimulationError: If there is no body of that name, or it cannot move.
+            SimulationError: If there is no body with that name, or it cannot move.
         """
         raise self._lacks("wrenches")
 
@@ -166,7 +166,7 @@ class Simulation(Closeable):
         """Remove a wrench.
 
         Raises:
-            SimulationError: If no wrench with that number acts.
+            SimulationError: If no wrench with that number is active.
         """
         raise self._lacks("wrenches")
 
@@ -174,15 +174,15 @@ class Simulation(Closeable):
 
     @abstractmethod
     def positions(self, out: Vector | None = None) -> Vector:
-        """Return the positions, shape (nq,), copied to `out` if it is given."""
+        """Return the positions, shape (nq,), copied to `out` if given."""
 
     @abstractmethod
     def velocities(self, out: Vector | None = None) -> Vector:
-        """Return the velocities, shape (nv,), copied to `out` if it is given."""
+        """Return the velocities, shape (nv,), copied to `out` if given."""
 
     @abstractmethod
     def set_state(self, positions: Vector, velocities: Vector) -> None:
-        """Set the state; time goes on. There are no contacts until the next step.
+        """Set the state without resetting the time. There are no contacts until the next step.
 
         Args:
             positions: Shape (nq,).
@@ -196,10 +196,10 @@ class Simulation(Closeable):
     def snapshot(self) -> State:
         """Return everything that `restore` needs to continue exactly from here.
 
-        An engine that begins each step with impulses or contacts of the last one forgets them here,
-        as it does in `restore` and `set_state`: the state alone then determines what follows, bit
-        for bit the same here and wherever the snapshot is restored. It differs from what would have
-        followed without the snapshot within the accuracy of the engine's solver.
+        An engine that warm-starts each step with impulses or contacts of the last one discards them
+        here, as it does in `restore` and `set_state`. The state alone then determines what follows,
+        bit-identical here and wherever the snapshot is restored. It differs from what would have
+        followed without the snapshot, within the accuracy of the engine's solver.
         """
 
     @abstractmethod
@@ -207,33 +207,33 @@ class Simulation(Closeable):
         """Return to a snapshot.
 
         Raises:
-            SimulationError: If the snapshot is of a world with another layout.
+            SimulationError: If the snapshot is of a world with a different layout.
         """
 
     # Measurements ---------------------------------------------------------------------------
 
     def accelerations(self) -> Vector:
-        """Return the change of the velocities in the last step over the period, shape (nv,).
+        """Return the velocity change in the last step divided by the period, shape (nv,).
 
-        In the convention of the velocities, effects of constraints included. 0 before the first
-        step and after `set_state` and `restore`.
+        Uses the convention of the velocities and includes the effects of constraints. 0 before the
+        first step and after `set_state` and `restore`.
         """
         raise self._lacks("accelerations")
 
     def contacts(self) -> Records:
-        """Return the contacts of the last physics step: an array of `CONTACT` records, a copy."""
+        """Return the contacts of the last physics step as a new array of `CONTACT` records."""
         raise self._lacks("contacts")
 
     def joint_wrenches(self) -> Vector:
-        """Return the reactions of joints in the last step, shape (joints, 6): N, then N m."""
+        """Return the joint reactions in the last step, shape (joints, 6): in N, then in N m."""
         raise self._lacks("joint_wrenches")
 
     def raycast(self, begins: Vector, ends: Vector) -> Records:
-        """Return the first hit of each ray: an array of `RAY_HIT` records.
+        """Return the first hit of each ray as an array of `RAY_HIT` records.
 
         Args:
             begins: Start points of the rays, shape (n, 3), in m, in the world frame.
-            ends: End points, likewise.
+            ends: End points of the rays, in the same form.
         """
         raise self._lacks("raycast")
 
@@ -244,14 +244,14 @@ class Simulation(Closeable):
         """Return the poses of links and objects in the world frame, shape (names, 7).
 
         Args:
-            names: Names, which may be static; None: all of `layout.bodies`.
-            positions: Shape (nq,); None: the present ones.
+            names: Body names, static ones included; None: all of `layout.bodies`.
+            positions: Shape (nq,); None: the current ones.
 
         Returns:
-            In each row x, y, z in m and quaternion x, y, z, w, with w not negative.
+            Per row, x, y, z in m and quaternion x, y, z, w, with w not negative.
 
         Raises:
-            SimulationError: If there is no body of that name.
+            SimulationError: If there is no body with one of these names.
         """
 
     @abstractmethod
@@ -261,81 +261,81 @@ class Simulation(Closeable):
         positions: Vector | None = None,
         velocities: Vector | None = None,
     ) -> Vector:
-        """Return the velocities of links' and objects' origins, shape (names, 6).
+        """Return the velocities of the origins of links and objects, shape (names, 6).
 
         Args:
-            names: Names, which may be static; None: all of `layout.bodies`.
-            positions: Shape (nq,); None: the present ones.
-            velocities: Shape (nv,); None: the present ones.
+            names: Body names, static ones included; None: all of `layout.bodies`.
+            positions: Shape (nq,); None: the current ones.
+            velocities: Shape (nv,); None: the current ones.
 
         Returns:
-            In each row the linear velocity in m/s, then the angular velocity in rad/s, both along
-            the world's axes.
+            Per row, the linear velocity in m/s, then the angular velocity in rad/s, both in the
+            world frame.
 
         Raises:
-            SimulationError: If there is no body of that name.
+            SimulationError: If there is no body with one of these names.
         """
 
     def body_accelerations(self, names: Sequence[str] | None = None) -> Vector:
-        """Return the accelerations of links' and objects' origins, shape (names, 6).
+        """Return the accelerations of the origins of links and objects, shape (names, 6).
 
-        They follow from `accelerations` and the present state; before the first step they have only
-        centripetal and Coriolis terms.
+        They follow from `accelerations` and the current state; before the first step they contain
+        only centripetal and Coriolis terms.
 
         Args:
-            names: Names, which may be static; None: all of `layout.bodies`.
+            names: Body names, static ones included; None: all of `layout.bodies`.
 
         Returns:
-            In each row the linear acceleration in m/s², then the angular acceleration in rad/s²,
-            both along the world's axes.
+            Per row, the linear acceleration in m/s², then the angular acceleration in rad/s², both
+            in the world frame.
 
         Raises:
-            SimulationError: If there is no body of that name.
+            SimulationError: If there is no body with one of these names.
         """
         raise self._lacks("accelerations")
 
     def body_motions(self, names: Sequence[str] | None = None) -> Vector:
         """Return poses, velocities, and accelerations of links and objects, shape (names, 19).
 
-        In each row a pose (7) as from `body_poses`, a velocity (6) as from `body_velocities`, and
-        an acceleration (6) as from `body_accelerations`; faster than the three calls.
+        Each row holds a pose (7) as from `body_poses`, a velocity (6) as from `body_velocities`,
+        and an acceleration (6) as from `body_accelerations`; faster than three calls.
         """
         found = self.body_poses(names), self.body_velocities(names), self.body_accelerations(names)
         return np.concatenate(found, axis=1)
 
     def reach(self, name: str, direction: Vector, positions: Vector | None = None) -> float:
-        """Return how far the collision shapes of a robot or object reach along a direction.
+        """Return how far a robot's or object's collision shapes extend along a direction.
 
         Args:
-            name: Of the robot or object, as in `layout.parts`.
-            direction: Shape (3,), of length 1, in the world frame.
-            positions: Shape (nq,); None: the present ones.
+            name: Name of the robot or object, as in `layout.parts`.
+            direction: Unit vector, shape (3,), in the world frame.
+            positions: Shape (nq,); None: the current ones.
 
         Returns:
-            The largest product of the direction with a point of the shapes, in m; -inf if it has no
-            collision shapes.
+            The largest dot product of the direction with a point of the shapes, in m; -inf if there
+            are no collision shapes.
 
         Raises:
-            SimulationError: If nothing of that name moves.
+            SimulationError: If there is no moving robot or object with that name.
         """
         raise self._lacks("contacts")
 
-    # Dynamics of any state, whatever the present one is -------------------------------------
+    # Dynamics of any state, not only the current one ----------------------------------------
 
     @abstractmethod
     def forward_dynamics(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
-        """Return the accelerations, shape (nv,), that torques (nv,) cause in a state.
+        """Return the accelerations, shape (nv,), caused by torques (nv,) in a state.
 
-        Damping, springs, and Coulomb friction of the joints act; contacts and limits do not. All
-        joints are driven by torques here, whatever their mode. Accelerations are the derivatives of
-        the velocities, so those of a base are in its own frame.
+        Joint damping, springs, and Coulomb friction are included; contacts and limits are not. All
+        joints are driven by torques here, regardless of their mode. Accelerations are the time
+        derivatives of the velocities, so those of a base are in its own frame.
         """
 
     @abstractmethod
     def inverse_dynamics(
         self, positions: Vector, velocities: Vector, accelerations: Vector
     ) -> Vector:
-        """Return the torques, shape (nv,), that cause accelerations (nv,) in a state."""
+        """Return the torques, shape (nv,), that produce accelerations (nv,) in a state."""
 
     def mass_matrix(self, positions: Vector) -> Vector:
         """Return the mass matrix, shape (nv, nv)."""
@@ -344,10 +344,10 @@ class Simulation(Closeable):
     def jacobian(
         self, body: str, positions: Vector, point: Sequence[float] = (0.0, 0.0, 0.0)
     ) -> Vector:
-        """Return the Jacobian, shape (6, nv), of a point of a link or object.
+        """Return the Jacobian, shape (6, nv), of a point on a link or object.
 
-        It maps the velocities to the point's linear and the body's angular velocity, both along the
-        world's axes.
+        It maps the velocities to the point's linear and the body's angular velocity, both in the
+        world frame.
 
         Args:
             body: Name of the link or object.
@@ -359,27 +359,27 @@ class Simulation(Closeable):
     def forward_dynamics_derivatives(
         self, positions: Vector, velocities: Vector, torques: Vector
     ) -> tuple[Vector, Vector, Vector]:
-        """Return the derivatives of `forward_dynamics` by positions, velocities, and torques.
+        """Return derivatives of `forward_dynamics` w.r.t. positions, velocities, and torques.
 
         Returns:
-            Three arrays of shape (nv, nv), whose rows are accelerations. Derivatives by the
-            positions are by small motions along the velocities, so a base has six columns, not
-            seven. Coulomb friction is treated as constant.
+            Three arrays of shape (nv, nv), whose rows are accelerations. Derivatives w.r.t.
+            positions are taken along small motions in velocity space, so a base has six columns,
+            not seven. Coulomb friction is treated as constant.
         """
         raise self._lacks("derivatives")
 
     def forward_dynamics_batch(
         self, positions: Vector, velocities: Vector, torques: Vector, *, processes: int = 1
     ) -> Vector:
-        """Return `forward_dynamics` of many states, shape (n, nv); each row is a state.
+        """Return `forward_dynamics` for many states, one per row, shape (n, nv).
 
         Args:
             positions: Shape (n, nq).
             velocities: Shape (n, nv).
             torques: Shape (n, nv).
-            processes: Largest number of processes that share the rows, including this one. The
-                others start when they are first needed and end with the simulation. An engine
-                without them computes all rows in this process, with the same results.
+            processes: Maximum number of processes that share the rows, including this one. The
+                others start on first use and end with the simulation. An engine without parallel
+                batches computes all rows in this process, with the same results.
 
         Raises:
             SimulationError: If an array has the wrong shape, or one of the processes ended.
@@ -397,10 +397,10 @@ class Simulation(Closeable):
         *,
         processes: int = 1,
     ) -> Vector:
-        """Return gradients of weighted sums of `forward_dynamics` of many states.
+        """Return gradients of weighted sums of `forward_dynamics` for many states.
 
-        Row i belongs to ``weights[i] @ forward_dynamics(...)`` in the state whose torques cause
-        ``accelerations[i]``.
+        Row i is the gradient of ``weights[i] @ forward_dynamics(...)`` in the state whose torques
+        cause ``accelerations[i]``.
 
         Args:
             positions: Shape (n, nq); each row is a state.
@@ -410,8 +410,8 @@ class Simulation(Closeable):
             processes: As in `forward_dynamics_batch`.
 
         Returns:
-            Gradients by positions, velocities, and torques, shape (3, n, nv); those by the
-            positions are by small motions, as in `forward_dynamics_derivatives`.
+            Gradients w.r.t. positions, velocities, and torques, shape (3, n, nv); those w.r.t.
+            positions are taken along small motions, as in `forward_dynamics_derivatives`.
 
         Raises:
             SimulationError: If an array has the wrong shape, or one of the processes ended.
@@ -437,4 +437,4 @@ class Simulation(Closeable):
 
 
 Hook = Callable[[Simulation], None]
-"""Function that is called with the simulation before a physics step."""
+"""Function called with the simulation before a physics step."""

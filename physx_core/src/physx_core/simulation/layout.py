@@ -1,10 +1,10 @@
 """Layout of a simulation's state, and the records that simulations return.
 
-Every engine follows one convention, that of Pinocchio: first the robots in the world's
-order, then the objects that move. In each robot a floating base comes first (position x, y, z in m
-and quaternion x, y, z, w; velocity as the base's twist in its own frame: linear in m/s, then
-angular in rad/s), then the joints in the order of the model file's tree. Every joint of one degree
-of freedom is one number, continuous ones too. An object is like a floating base without joints.
+Every engine follows Pinocchio's convention: first the robots in the world's order, then the moving
+objects. In each robot, a floating base comes first (position x, y, z in m and quaternion x, y, z,
+w; velocity as the base's twist in its own frame: linear in m/s, then angular in rad/s), then the
+joints in the order of the model file's tree. Every joint with one degree of freedom is one number,
+even a continuous one. An object is like a floating base without joints.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ CONTACT = np.dtype(
         ("depth", np.float64),
     ]
 )
-"""A contact: the bodies (places in `Layout.names`, `body_a` before `body_b`, so a static one is
-`body_b`); the point, in m; the force on `body_a`, in N (that on `body_b` is opposite); the normal,
-of length 1, from `body_b` to `body_a`; the penetration depth, in m. All in the world frame."""
+"""A contact: the bodies (indices into `Layout.names`, `body_a` before `body_b`, so a static one is
+`body_b`); the point, in m; the force on `body_a`, in N (that on `body_b` is opposite); the unit
+normal from `body_b` to `body_a`; the penetration depth, in m. All in the world frame."""
 
 RAY_HIT = np.dtype(
     [
@@ -40,21 +40,21 @@ RAY_HIT = np.dtype(
         ("fraction", np.float64),
     ]
 )
-"""The first hit of a ray: whether there is one; the body (place in `Layout.names`, -1: none); the
-point in m and the surface normal, in the world frame; the place along the ray, in [0, 1]."""
+"""The first hit of a ray: whether there is one; the body (index into `Layout.names`, -1: none); the
+point in m and the surface normal, in the world frame; the fraction along the ray, in [0, 1]."""
 
 
 @dataclass(frozen=True)
 class Part:
-    """Place of one robot or moving object in the state.
+    """Slices of the state that belong to one robot or moving object.
 
     Attributes:
         name: Name of the robot or object.
         floating: Whether it has a floating base.
-        positions: Its part of the positions.
-        velocities: Its part of the velocities.
-        joints: Its part of the joints, and so of the commands.
-        bodies: Its part of the bodies.
+        positions: Its slice of the positions.
+        velocities: Its slice of the velocities.
+        joints: Its slice of the joints, and thus of the commands.
+        bodies: Its slice of the bodies.
     """
 
     name: str
@@ -77,22 +77,22 @@ class Part:
 
 @dataclass(frozen=True)
 class Layout:
-    """Names and places of everything in a state; fixed when the simulation is built.
+    """Names and indices of everything in a state; fixed when the simulation is built.
 
     Attributes:
         joints: Names of the joints with one degree of freedom, in the state's order. With several
-            robots each name begins with the robot's name and ``/``.
-        bodies: Names of the links, likewise, and of the moving objects.
-        position_index: Place of each joint in the positions, by joint name.
-        velocity_index: Place of each joint in velocities and torques, by joint name.
+            robots, each name is prefixed with the robot's name and ``/``.
+        bodies: Names of the links, prefixed likewise, and of the moving objects.
+        position_index: Index of each joint in the positions, by joint name.
+        velocity_index: Index of each joint in velocities and torques, by joint name.
         nq: Length of the positions: 7 for each floating base and object, 1 for each joint.
         nv: Length of velocities and torques: 6 for each floating base and object, 1 for each joint.
         lower: Lower limits of the joints' positions, shape (joints,), in rad or m; -inf: none.
-        upper: Upper limits, likewise.
+        upper: Upper limits of the joints' positions, in the same form; inf: none.
         max_velocity: Limits of the joints' velocities, shape (joints,), in rad/s or m/s.
         max_torque: Limits of the joints' torques, shape (joints,), in N m or N.
-        parts: Place of each robot and moving object, by name.
-        statics: Names of everything static: ``"ground"``, then the static objects.
+        parts: Slices of each robot and moving object, by name.
+        statics: Names of all static bodies: ``"ground"``, then the static objects.
         modes: Command mode of each joint, as in `JointSettings`.
         units: Unit of each joint's position: rad, or m for a prismatic one.
     """
@@ -114,7 +114,7 @@ class Layout:
 
     @property
     def names(self) -> tuple[str, ...]:
-        """Names of everything that can be touched: the bodies, then the statics."""
+        """Names of everything that can be touched: the bodies, then the static bodies."""
         return (*self.bodies, *self.statics)
 
 
@@ -143,7 +143,7 @@ class State:
         commands: The held commands, shape (joints,).
         frame: Number of physics steps since the simulation was built.
         wrenches: Active wrenches.
-        engine: Name of the engine that it comes from.
+        engine: Name of the engine that it was taken from.
         native: The engine's own representation of its state.
     """
 

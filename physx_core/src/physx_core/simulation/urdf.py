@@ -1,4 +1,4 @@
-"""URDF files: the tree of links and joints, and the shapes on the links."""
+"""URDF files: the tree of links and joints, and the shapes of the links."""
 
 from __future__ import annotations
 
@@ -27,9 +27,9 @@ _SIZES: dict[str, dict[str, int]] = {
 }
 """Attributes that give the size of each kind of shape, and how many numbers each has."""
 _LARGEST = 2**24
-"""Bytes of a URDF file."""
+"""Maximum size of a URDF file, in bytes."""
 _MOST = {"link": 400, "visual": 4000, "collision": 4000}
-"""Elements of a URDF file; engines take time and memory that grow with higher powers of these."""
+"""Maximum number of elements in a URDF file; engines' time and memory grow faster than linearly."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,10 +38,10 @@ class UrdfShape:
 
     Attributes:
         kind: ``box``, ``sphere``, ``capsule``, ``cylinder`` or ``mesh``.
-        size: In m: edges of a box (3,); radius of a sphere (1,); radius and length of the cylinder
-            alone (2,). For a mesh the factors of its lengths (3,).
-        pose: Of its center in the link's frame, a homogeneous matrix of shape (4, 4), in m.
-        mesh: File name of a mesh, as the URDF gives it.
+        size: In m: edges of a box (3,); radius of a sphere (1,); radius and length of the
+            cylindrical part (2,). For a mesh, its scale factors (3,).
+        pose: Pose of its center in the link's frame, a homogeneous matrix of shape (4, 4), in m.
+        mesh: File name of a mesh, as given in the URDF.
     """
 
     kind: str
@@ -51,18 +51,18 @@ class UrdfShape:
 
 
 class UrdfTree:
-    """The links and joints of a URDF file, walked depth first, joints by their names.
+    """The links and joints of a URDF file, walked depth first with joints sorted by name.
 
     Attributes:
         root: Root element of the file.
         links: Names of the links, parents before children, the root link first.
-        elements: Link elements by name, in the order of the file.
+        elements: Link elements by name, in file order.
         joints: Joint elements, in the order of the links that they lead to.
         parents: Joint element that leads to each link, by the link's name; none for the root link.
     """
 
     def __init__(self, root: Element) -> None:
-        """Build the tree of a root element, as `parse_urdf` returns it.
+        """Build the tree of a root element returned by `parse_urdf`.
 
         Raises:
             ModelError: If a name is empty or used twice, or the links do not form a tree; the
@@ -88,7 +88,7 @@ class UrdfTree:
             raise ModelError("it has no link")
         roots = [name for name in links if name not in self.parents]
         if len(roots) != 1:
-            found = f"links {listed(roots)} have no parent" if roots else "its joints form a circle"
+            found = f"links {listed(roots)} have no parent" if roots else "its joints form a cycle"
             raise ModelError(f"it needs exactly one root link, but {found}")
         self.links = roots
         self.joints: list[Element] = []
@@ -100,7 +100,7 @@ class UrdfTree:
             stack.extend(children[child][::-1])
         if len(self.links) != len(links):
             cut_off = links.keys() - set(self.links)
-            raise ModelError(f"links {listed(cut_off)} form a circle apart from the root")
+            raise ModelError(f"links {listed(cut_off)} form a cycle apart from the root")
 
     def shapes(self, link: str, purpose: str) -> list[UrdfShape]:
         """Return the shapes of a link.
@@ -130,10 +130,10 @@ def parse_urdf(path: Path) -> Element:
         why = error.strerror or error
         raise ModelError(f"{path} cannot be read as a URDF file: {why}.") from error
     if b"\0" in text:
-        raise ModelError(f"{path} is UTF-16 or no text; a URDF file is UTF-8.")
+        raise ModelError(f"{path} is UTF-16 or not text; URDF files must be UTF-8.")
     if b"<!DOCTYPE" in text:
         raise ModelError(
-            f"{path} has a DOCTYPE, which URDF files do not need and whose entities may be a bomb."
+            f"{path} has a DOCTYPE, which URDF files do not need and which can hide an XML bomb."
         )
     try:
         root = ElementTree.fromstring(text)  # without a DOCTYPE there are no entities
@@ -155,10 +155,10 @@ def link_of(joint: Element, end: str) -> str:
 
 
 def origin_of(where: str, element: Element) -> Vector:
-    """Return where the ``origin`` of an element puts it, a homogeneous matrix of shape (4, 4).
+    """Return the pose given by an element's ``origin``, a homogeneous matrix of shape (4, 4).
 
     Args:
-        where: Beginning of the message about a value that is not a number.
+        where: Start of the error message for a value that is not a number.
         element: Element of a joint or shape.
 
     Raises:
@@ -176,14 +176,14 @@ def origin_of(where: str, element: Element) -> Vector:
 def numbers_of(
     where: str, element: Element, attribute: str, default: str, count: int
 ) -> list[float]:
-    """Return the numbers of an attribute.
+    """Return the numbers in an attribute.
 
     Args:
-        where: Beginning of the message, as in ``'joint "knee"'``.
+        where: Start of the error message, as in ``'joint "knee"'``.
         element: Element with the attribute.
-        attribute: Its name.
-        default: Its text where it is absent.
-        count: How many numbers there must be.
+        attribute: Name of the attribute.
+        default: Text to use if it is absent.
+        count: Required number of numbers.
 
     Raises:
         ModelError: If they are not `count` finite numbers.
@@ -199,12 +199,12 @@ def numbers_of(
 
 
 def mesh_path(model: Path, name: str, package_dirs: Mapping[str, str | Path]) -> Path | None:
-    """Return the file that a mesh name stands for; None if its package is not found.
+    """Return the file that a mesh name refers to, or None if its package is not found.
 
     Args:
-        model: Path of the URDF file; relative names begin at its folder.
-        name: The name as the URDF gives it: ``package://...``, ``file://...`` or a path.
-        package_dirs: Folder of each package. Other packages are looked for among the folders around
+        model: Path of the URDF file; relative names are relative to its folder.
+        name: The name as given in the URDF: ``package://...``, ``file://...`` or a path.
+        package_dirs: Folder of each package. Other packages are searched for in the folders around
             the URDF file.
     """
     if name.startswith("file://"):
@@ -223,7 +223,7 @@ def _elements_by_name(root: Element, tag: str) -> dict[str, Element]:
     for element in root.findall(tag):
         name = element.get("name", "")
         if not name or name in named:
-            raise ModelError(f'a {tag} has the name "{name}", which is empty or there twice')
+            raise ModelError(f'a {tag} has the name "{name}", which is empty or used twice')
         named[name] = element
     return named
 

@@ -1,4 +1,4 @@
-"""Validation of arrays that callers give to a simulation; each error names the array."""
+"""Validation of arrays that callers pass to a simulation; each error names the array."""
 
 from __future__ import annotations
 
@@ -11,13 +11,13 @@ from physx_core.errors import SimulationError
 from physx_core.typing import Vector
 
 LARGEST = 1e100
-"""Length from which products of vectors overflow."""
+"""Length above which products of vectors overflow."""
 _LARGEST_SQUARE = LARGEST**2
 _FLOAT = np.dtype(np.float64)
 
 
 def finite_vector(name: str, given: Any, length: int) -> Vector:
-    """Return finite numbers as a new vector of a length.
+    """Return finite numbers as a new vector of a given length.
 
     Raises:
         SimulationError: If they are not `length` finite numbers.
@@ -54,10 +54,10 @@ def _numbers(name: str, given: ArrayLike) -> Vector:
 
 
 def overwrite(name: str, target: Vector, given: Any) -> None:
-    """Write finite numbers into a vector; on an error it stays as it is.
+    """Write finite numbers into a vector; on an error it stays unchanged.
 
     Raises:
-        SimulationError: If they are not as many finite numbers as the vector has.
+        SimulationError: If the numbers are not finite, or not as many as the vector has entries.
     """
     fits = type(given) is np.ndarray and given.dtype is _FLOAT and given.shape == target.shape
     if fits and given.dot(given) < _LARGEST_SQUARE:

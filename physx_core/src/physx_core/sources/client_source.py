@@ -37,13 +37,13 @@ _AHEAD_ROWS = 1 << 16
 class ClientSource(Source):
     """Collects rows from clients, and places each by its instance and step.
 
-    Rows are the same as those of `LocalSource`, bit for bit. Requests of the environments are
-    served while waiting for a batch; one for a prediction is held until the batch is requested to
-    which the row belongs that its environment is making. If the services have a method
+    Rows are bit-identical to those of `LocalSource`. Requests of the environments are served while
+    waiting for a batch. A request for a prediction is held until the batch that contains the row
+    being generated is requested. If the services have a method
     ``predict_batch(batch) -> batch``, predictions wait until every instance that owes a row of the
-    batch has requested one, and are computed together in the order of the instances: the same
-    groups in every run, however far the clients run ahead. A network may round these differently
-    from single samples.
+    batch has requested one, and are computed together in the order of the instances, so the groups
+    are the same in every run, however far the clients run ahead. A network may round these
+    differently from single samples.
     """
 
     def __init__(
@@ -65,12 +65,12 @@ class ClientSource(Source):
             services: Serves the environments' requests.
             seed: Seed of all instances.
             run_ahead: Number of rows that each client may generate before they are requested;
-                None: as many as fit in 4 MB. It must be 0 if predictions are applied, or stored
-                rows are replayed.
-            total: Number of rows that will be requested in all, with those to skip, beyond which
-                no client generates any; None: unknown.
+                None: as many as fit in 4 MB. Must be 0 if predictions are applied, or stored rows
+                are replayed.
+            total: Total number of rows that will be requested, including those to skip; clients
+                generate none beyond it. None: unknown.
             accept_all: Whether samples that `check_sample` rejects count like the others.
-            skip: The rows that an earlier run has had: they are generated again, but not returned.
+            skip: The rows that an earlier run already got: generated again, but not returned.
             stripes: Where the clients write the rows themselves; None: `batch` returns them.
         """
         self._written = None if stripes is None else WrittenRows(stripes)
@@ -109,7 +109,12 @@ class ClientSource(Source):
         return next(told, self._opened)
 
     def open(self) -> None:
-        """Start the clients: see `Source.open`."""
+        """Start the clients: see `Source.open`.
+
+        Raises:
+            ConfigError: If the clients write the rows, but the environment has parameters.
+            PhysxError: If an environment or client fails.
+        """
         try:
             self._group.open()
             first = self._group.peer(1).fields
@@ -119,8 +124,8 @@ class ClientSource(Source):
             parameters = [peer.parameters for peer in peers]
             if self._written is not None and any(parameters):
                 raise ConfigError(
-                    "The environment has parameters, and the run records which rows were made with "
-                    "which: it needs the rows. Use DatasetConfig.writers='server'."
+                    "The environment has parameters, and the run records which ones each row was "
+                    "generated with, so it needs the rows. Use DatasetConfig.writers='server'."
                 )
             self.sets.begin(parameters)
         except BaseException:
@@ -173,15 +178,15 @@ class ClientSource(Source):
     def apply(self, prediction: Batch, *, at_once: bool = True) -> None:
         """Pass predictions to the instances: see `Source.apply`.
 
-        An error that an environment raises here is raised by the next call of `batch` or `close`.
+        An error that an environment raises here is raised by the next call to `batch` or `close`.
 
         Args:
             prediction: See `Source.apply`.
-            at_once: Whether the instances get them now; otherwise with the next call of `batch`,
+            at_once: Whether the instances get them now; otherwise with the next call to `batch`,
                 which costs less.
 
         Raises:
-            UsageError: If the clients run ahead, beyond the rows of the last batch.
+            UsageError: If the clients run ahead of the last batch.
         """
         if self._run_ahead != 0:
             raise UsageError("apply() needs ClientSource(run_ahead=0).")
@@ -215,7 +220,7 @@ class ClientSource(Source):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close the source; after an error without waiting for the clients."""
+        """Close the source; after an error, do not wait for the clients."""
         self._failed = self._failed or kind is not None
         super().__exit__(kind, error, trace)
 
@@ -240,7 +245,7 @@ class ClientSource(Source):
     def _end_of_rejected(self, number: int) -> int | None:
         """Return the step before which an instance's rejected rows belong to the last batch.
 
-        None: all of them, as its last row failed.
+        None: all of them do, because its last row failed.
         """
         end = self._asked if self._failed_row is None else self._failed_row
         if self._failed_row is not None and self._failed_row % self.instance_nb == number - 1:
@@ -253,7 +258,7 @@ class ClientSource(Source):
         return (rows - number + self.instance_nb) // self.instance_nb
 
     def _grant(self) -> None:
-        """Permit the clients to generate the requested rows, and some ahead."""
+        """Allow the clients to generate the requested rows, and some ahead."""
         ahead = self._run_ahead
         if ahead is None:
             size = row_bytes(self._table) or _AHEAD_BYTES

@@ -22,7 +22,7 @@ _LOG = logging.getLogger("physx")
 
 
 class LocalSource(Source):
-    """Steps the instances one after the other, without serialization; one copy, into the row."""
+    """Steps the instances one after another, without serialization; one copy, into the row."""
 
     def __init__(
         self,
@@ -40,13 +40,16 @@ class LocalSource(Source):
             services: Serves the environments' requests.
             seed: Seed of all instances.
             accept_all: Whether samples that `check_sample` rejects count like the others.
-            skip: The rows that an earlier run has had: they are generated again, but not returned.
+            skip: The rows that an earlier run already got: generated again, but not returned.
+
+        Raises:
+            ConfigError: If the configuration is for an elastic run, which needs clients.
         """
         if config.is_elastic:
             raise ConfigError(
                 "EnvironmentConfig.min_clients and max_clients are for clients, but the "
-                "environment runs in this process, because of as_tcp_ip_client=False "
-                "or as the only one of a prediction: leave them out."
+                "environment runs in this process (as_tcp_ip_client=False, or the only "
+                "environment of a prediction): leave them out."
             )
         self.instance_nb = config.num_clients
         self._services = services
@@ -80,7 +83,12 @@ class LocalSource(Source):
         self.sets.begin([instance.parameters for instance in self._instances])
 
     def batch(self, size: int, stored: Batch | None = None) -> Batch:
-        """Return the next rows: see `Source.batch`."""
+        """Return the next rows: see `Source.batch`.
+
+        Raises:
+            UsageError: If the first batch has no rows, or there are not `size` stored rows.
+            PhysxError: If an environment fails.
+        """
         if stored is not None:
             check_stored(stored, size)
         if self._config.record_wrong_samples:
@@ -146,7 +154,7 @@ class LocalSource(Source):
         self._open(instance)
 
     def _generate_again(self, size: int) -> None:
-        """Make the rows that an earlier run has had, and forget them."""
+        """Generate the rows that an earlier run already got, and discard them."""
         while self._next < self._skip.rows:
             place = self._next % self.instance_nb
             try:
@@ -182,7 +190,7 @@ class LocalSource(Source):
             self._instances[number % self.instance_nb].apply(sample)
 
     def close(self) -> None:
-        """Close the environments; the first error is raised once all of them are closed."""
+        """Close the environments; the first error is raised once all are closed."""
         with contextlib.ExitStack() as stack:
             for instance in self._instances:
                 stack.callback(instance.close)

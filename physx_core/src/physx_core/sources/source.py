@@ -14,7 +14,7 @@ from physx_core.workers.parameter_sets import ParameterSets
 
 
 class Canceled(BaseException):
-    """A call of `Source.batch` was canceled: the run is over, and nothing of it is kept."""
+    """A call to `Source.batch` was canceled: the run is over, and nothing is kept."""
 
 
 class Source(ABC):
@@ -22,14 +22,13 @@ class Source(ABC):
 
     Row r, counted from 0 over all batches, comes from instance ``r % instance_nb`` (from 0 here),
     regardless of batch sizes and of the speed of the instances. So the seed and the number of
-    instances determine every row. A context manager.
+    instances determine every row. Sources are context managers.
 
     Attributes:
         instance_nb: Number of instances.
-        sets: The sets of parameters that the instances are given; those whose first rows are in the
-            last batch can be taken from it.
-        ignores_predictions: Whether `apply` is known to have no effect; what clients do with
-            predictions is not known.
+        sets: The sets of parameters that the instances get; those whose first rows are in the last
+            batch can be taken from it.
+        ignores_predictions: Whether `apply` is known to have no effect; unknown for clients.
     """
 
     instance_nb: int
@@ -62,12 +61,12 @@ class Source(ABC):
             size: Number of rows; shape of each array: (size, *field shape).
             stored: Stored rows to replay, field name to array of shape (size, *field shape): the
                 instance that generates row i gets a copy of stored row i as `Environment.sample`,
-                a dictionary of arrays. None: nothing is replayed, and it is None. Parameters that
-                it was made with may be among them: see `Instance.step`.
+                a dictionary of arrays. None: nothing is replayed, and `Environment.sample` is None.
+                The parameters of the rows may be among the entries: see `Instance.step`.
 
         Raises:
             WrongSamplesError: If `check_sample` rejects too many consecutive samples.
-            SampleError: If a sample cannot be stored; names the field, instance and step.
+            SampleError: If a sample cannot be stored; it names the field, instance and step.
             PhysxError: If an environment or client fails.
         """
 
@@ -77,8 +76,8 @@ class Source(ABC):
 
         They have the same fields as other rows and are ordered by instance, then by step; a
         rejected row belongs to the batch with its instance's next accepted row. After a
-        `WrongSamplesError` they are all that were rejected before it. Invalid ones, for example
-        with NaN, are left out. Empty if ``record_wrong_samples`` is off.
+        `WrongSamplesError` they are all samples rejected before it. Invalid ones, for example with
+        NaN, are left out. Empty if ``record_wrong_samples`` is off.
         """
 
     @abstractmethod
@@ -86,7 +85,7 @@ class Source(ABC):
         """Pass row i of a prediction to the instance that generated row i of the last batch."""
 
     def cancel(self) -> None:
-        """Have a call of `batch` in another thread end soon, with `Canceled`; `close` follows.
+        """Make a call to `batch` in another thread end soon, with `Canceled`; then call `close`.
 
         Environments in this process finish the call.
         """
@@ -98,7 +97,7 @@ class Source(ABC):
         """Close the environments, and end their clients. Calling it again does nothing."""
 
     def __enter__(self) -> Self:
-        """Open the source; if that fails, errors of closing the environments are suppressed."""
+        """Open the source; if that fails, errors from closing the environments are suppressed."""
         try:
             self.open()
         except BaseException:
@@ -113,7 +112,7 @@ class Source(ABC):
         error: BaseException | None,
         trace: TracebackType | None,
     ) -> None:
-        """Close the source; after an error, errors of closing are suppressed."""
+        """Close the source; after an error, errors from closing are suppressed."""
         with contextlib.suppress(PhysxError) if kind is not None else contextlib.nullcontext():
             self.close()
 
@@ -122,4 +121,6 @@ def check_stored(stored: Batch, size: int) -> None:
     """Check that there is one stored row for each row of a batch."""
     for name, values in stored.items():
         if len(values) != size:
-            raise UsageError(f'{len(values)} stored rows of "{name}" do not make {size} rows.')
+            raise UsageError(
+                f'There are {len(values)} stored rows of "{name}" for a batch of {size} rows.'
+            )

@@ -1,4 +1,4 @@
-"""Checks that a component keeps its contract, for the tests of plugins."""
+"""Checks that a component satisfies its contract, for plugin tests."""
 
 from __future__ import annotations
 

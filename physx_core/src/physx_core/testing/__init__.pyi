@@ -1,4 +1,4 @@
-"""Checks that a component keeps its contract, for the tests of plugins."""
+"""Checks that a component satisfies its contract, for plugin tests."""
 
 from .backend.checks import check_backend as check_backend
 from .buffer import check_buffer as check_buffer

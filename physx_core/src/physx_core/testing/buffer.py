@@ -1,4 +1,4 @@
-"""Checks that a buffer does what physx and its users expect of one."""
+"""Contract checks for buffers."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ def check_buffer(
     timeout: float = TIMEOUT,
     **kwargs: Any,
 ) -> Report:
-    """Check that a buffer keeps the contract of `Buffer`, with 40 batches of 8 rows.
+    """Check that a buffer satisfies the contract of `Buffer`, with 40 batches of 8 rows.
 
     Args:
         component: Its class, a function that returns it, or a reference.
-        expected_failures: Names of checks that may fail, and why.
-        timeout: Time in s after which a check that has not ended has failed.
-        kwargs: Arguments of its constructor.
+        expected_failures: Names of checks that may fail, each with the reason.
+        timeout: Time limit for each check, in s; a check that exceeds it fails.
+        kwargs: Arguments for its constructor.
 
     Raises:
-        UsageError: If there is no check of an expected name, or no other process can find the
-            component or take its arguments.
+        UsageError: If `expected_failures` names an unknown check, or another process cannot find
+            the component or receive its arguments.
     """
     return run_checks(
         "buffer",
@@ -63,7 +63,7 @@ def _begun(subject: Subject, seed: int = _SEED) -> Buffer:
 def _keeping(subject: Subject, seed: int = _SEED) -> Buffer:
     buffer = _begun(subject, seed)
     if not buffer.capacity:
-        raise NotApplicableError("it keeps no rows")
+        raise NotApplicableError("it does not keep rows")
     return buffer
 
 
@@ -91,9 +91,7 @@ def _needs(subject: Subject) -> None:
         buffer.total == needed[-1], f"total is {buffer.total}, but needed() ends at {needed[-1]}"
     )
     backward = [buffer.needed(batch) for batch in reversed(range(_BATCHES))]
-    expect(
-        backward[::-1] == needed, "needed() depends on the order in which batches are asked about"
-    )
+    expect(backward[::-1] == needed, "needed() depends on the order in which batches are queried")
 
 
 def _needs_the_same(subject: Subject) -> None:
@@ -101,7 +99,7 @@ def _needs_the_same(subject: Subject) -> None:
     before = [buffer.needed(batch) for batch in range(_BATCHES)]
     _drawn(buffer, 0, _BATCHES)
     after = [buffer.needed(batch) for batch in range(_BATCHES)]
-    expect(before == after, "needed() is another after batches were drawn")
+    expect(before == after, "needed() is different after batches were drawn")
     other = [_begun(subject, seed=6).needed(batch) for batch in range(_BATCHES)]
     expect(before == other, "needed() depends on the seed")
 
@@ -127,11 +125,11 @@ def _draws(subject: Subject) -> None:
 def _repeats(subject: Subject) -> None:
     first = _drawn(_keeping(subject), 0, _BATCHES)
     again = _drawn(_keeping(subject), 0, _BATCHES)
-    expect_equal(again, first, "with the same seed a second run draws otherwise")
+    expect_equal(again, first, "a second run with the same seed draws differently")
     buffer = _keeping(subject)
     _drawn(buffer, 0, 7)
     buffer.begin(_BATCH, _BATCHES, _SEED)
-    expect_equal(_drawn(buffer, 0, _BATCHES), first, "after a second begin() it draws otherwise")
+    expect_equal(_drawn(buffer, 0, _BATCHES), first, "after a second begin() it draws differently")
 
 
 def _continues(subject: Subject) -> None:
@@ -145,7 +143,9 @@ def _continues(subject: Subject) -> None:
     resumed = _keeping(subject)
     resumed.restore(half, state)
     expect(resumed.arrived == state[0], "restore() does not set the number of arrived rows")
-    expect_equal(_drawn(resumed, half, _BATCHES - half), rest, "after restore() it draws otherwise")
+    expect_equal(
+        _drawn(resumed, half, _BATCHES - half), rest, "after restore() it draws differently"
+    )
 
 
 def _steps_back(subject: Subject) -> None:
@@ -158,12 +158,12 @@ def _steps_back(subject: Subject) -> None:
     expect_equal(
         {"state": undone},
         {"state": before},
-        "state() before the last batch, which a checkpoint needs, is not what it was then",
+        "the state before the last batch, which a checkpoint needs, differs from what it was then",
     )
     other = _keeping(subject)
     other.restore(half, undone)
     expect_equal(
-        _drawn(other, half, 1), wanted, "restored before the last batch it draws otherwise"
+        _drawn(other, half, 1), wanted, "restored to before the last batch, it draws differently"
     )
 
 
@@ -177,7 +177,7 @@ def _refuses(subject: Subject) -> None:
             buffer.restore(3, state)
         except ValueError:
             continue
-        raise AssertionError(f"restore() took {what}; it must raise ValueError")
+        raise AssertionError(f"restore() accepted {what}; it must raise ValueError")
 
 
 def _quiet(subject: Subject) -> None:
@@ -192,7 +192,7 @@ def _quiet(subject: Subject) -> None:
 CHECKS: dict[str, Check] = {
     "refuses unknown options": refuses_unknown_options,
     "needs more rows from batch to batch": _needs,
-    "needs rows by its options alone": _needs_the_same,
+    "needs rows that depend only on its options": _needs_the_same,
     "draws rows that it keeps": _draws,
     "draws the same again": _repeats,
     "continues from a state": _continues,

@@ -1,4 +1,4 @@
-"""Checks that an environment does what physx and its users expect of one."""
+"""Contract checks for environments."""
 
 from __future__ import annotations
 
@@ -37,17 +37,17 @@ def check_environment(
     timeout: float = TIMEOUT,
     **kwargs: Any,
 ) -> Report:
-    """Check that an environment keeps the contract of `Environment`, here and in clients.
+    """Check that an environment satisfies the contract of `Environment`, here and in clients.
 
     Args:
         component: Its class, a function that returns it, or a reference.
-        expected_failures: Names of checks that may fail, and why.
-        timeout: Time in s after which a check that has not ended has failed.
-        kwargs: Arguments of its constructor.
+        expected_failures: Names of checks that may fail, each with the reason.
+        timeout: Time limit for each check, in s; a check that exceeds it fails.
+        kwargs: Arguments for its constructor.
 
     Raises:
-        UsageError: If there is no check of an expected name, or no other process can find the
-            component or take its arguments.
+        UsageError: If `expected_failures` names an unknown check, or another process cannot find
+            the component or receive its arguments.
     """
     return run_checks(
         "environment",
@@ -59,15 +59,15 @@ def check_environment(
 
 
 class Services:
-    """A run without a network, which keeps what the environment saves and draws."""
+    """A run without a network that keeps what the environment saves and draws."""
 
     def __init__(self) -> None:
         self.saved: dict[int, dict[str, Any]] = {}
         self.drawn: list[Event] = []
 
     def predict(self, fields: Sample) -> Sample:
-        """Leave out the check, as the kit has no network of the environment."""
-        raise NotApplicableError("it asks for predictions of a network, which the kit has not")
+        """Skip the check, because the kit has no network for the environment."""
+        raise NotApplicableError("it asks for predictions of a network, which the kit lacks")
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
         """Keep values of an instance."""
@@ -102,7 +102,7 @@ def _rows(
     services: Services | None = None,
     **options: Any,
 ) -> Batch:
-    """Return rows that instances in this process make."""
+    """Return rows that instances in this process generate."""
     config = _config(subject, instances, **options)
     with LocalSource(config, services or Services(), seed) as source:
         found = source.batch(count, stored)
@@ -113,7 +113,7 @@ def _rows(
 def _instance(
     subject: Subject, number: int, instances: int, services: Services
 ) -> Iterator[Instance]:
-    """Yield an instance of several, as a client has it."""
+    """Yield one of several instances, as a client would have it."""
     config = _config(subject, instances)
     instance = Instance(**instance_arguments(config, number, _SEED, accept_all=False))
     try:
@@ -146,13 +146,13 @@ def _steps(subject: Subject) -> None:
                 ) from error
         expect(
             [field.name for field in instance.fields] == list(promised),
-            "it defined other fields after init_database()",
+            "it defined further fields after init_database()",
         )
 
 
 def _repeats(subject: Subject) -> None:
     first = _rows(subject)
-    expect_equal(_rows(subject), first, "a second run with the same seed has other rows")
+    expect_equal(_rows(subject), first, "a second run with the same seed has different rows")
 
 
 def _uses_seed(subject: Subject) -> None:
@@ -160,8 +160,8 @@ def _uses_seed(subject: Subject) -> None:
     own = first.keys() - {field.name for field in ROW_FIELDS}
     if all(np.array_equal(first[name], other[name]) for name in own):
         raise NotApplicableError(
-            "another seed gives the same rows, and so does each client: if that is not meant, draw "
-            "from self.rng"
+            "another seed gives the same rows, and so does each client: if that is not intended, "
+            "draw from self.rng"
         )
 
 
@@ -180,8 +180,8 @@ def _independent(subject: Subject) -> None:
         expect_equal(
             {name: values[mine] for name, values in together.items()},
             buffer.take(),
-            f"instance {number} makes other rows beside a second instance than alone: they share "
-            "something, as an attribute of the class or of the module",
+            f"instance {number} generates different rows next to a second instance than alone: "
+            "they share something, such as an attribute of the class or module",
         )
 
 
@@ -190,14 +190,14 @@ def _over_tcp(subject: Subject) -> None:
     config = EnvironmentConfig(subject.reference, env_kwargs=dict(subject.arguments), num_clients=2)
     with ClientSource(config, Services(), _SEED, total=2 * _ROWS) as source:
         found = source.batch(2 * _ROWS)
-        expect_equal(found, wanted, "the rows of clients differ from those made in this process")
+        expect_equal(found, wanted, "clients' rows differ from those generated in this process")
 
 
 def _draws(subject: Subject) -> None:
     plain = _rows(subject)
     services = Services()
     drawn = _rows(subject, services=services, visualizer="kit")
-    expect_equal(drawn, plain, "with a visualizer it makes other rows than without")
+    expect_equal(drawn, plain, "with a visualizer it generates different rows than without")
     if not services.drawn:
         raise NotApplicableError("it draws nothing")
 
@@ -208,7 +208,7 @@ def _replays(subject: Subject) -> None:
     rows = _rows(subject)
     stored = {name: rows[name] for name in rows if name not in {f.name for f in ROW_FIELDS}}
     first, second = _rows(subject, stored=stored), _rows(subject, stored=stored)
-    expect_equal(second, first, "a second replay of the same rows has other results")
+    expect_equal(second, first, "a second replay of the same rows has different results")
 
 
 def _reads_samples(subject: Subject) -> bool:
@@ -221,7 +221,7 @@ def _reads_samples(subject: Subject) -> bool:
 def _many_steps(subject: Subject) -> None:
     first = _rows(subject, 3, simulations_per_step=2)
     again = _rows(subject, 3, simulations_per_step=2)
-    expect_equal(again, first, "with two simulations for a row, a second run has other rows")
+    expect_equal(again, first, "with two simulations per row, a second run has different rows")
 
 
 def _closes(subject: Subject) -> None:
@@ -242,8 +242,8 @@ def _close(environment: Environment, when: str) -> None:
 
 
 def _quiet(subject: Subject) -> None:
-    """Compare the state of the process before the environment was created, and after."""
-    _rows(subject)  # what is imported then may start threads that stay
+    """Compare the state of the process before and after the environment exists."""
+    _rows(subject)  # imports during the first run may start threads that stay
     with unchanged(subject.before):
         _rows(subject)
 
@@ -253,7 +253,7 @@ def _takes_identity(subject: Subject) -> None:
         made = subject.make(instance_id=number, instance_nb=3, seed=list(_SEED))
         expect(
             (made.instance_id, made.instance_nb) == (number, 3),
-            f"it is instance {made.instance_id} of {made.instance_nb}, though it was told to be "
+            f"it is instance {made.instance_id} of {made.instance_nb}, though it was created as "
             f"{number} of 3",
         )
         made.close()
@@ -266,10 +266,10 @@ CHECKS: dict[str, Check] = {
     "gives the same rows with the same seed": _repeats,
     "gives other rows with another seed": _uses_seed,
     "does not disturb another instance": _independent,
-    "steps several times for a row": _many_steps,
+    "steps several times per row": _many_steps,
     "gives the same rows from clients over TCP": _over_tcp,
     "draws without an effect on its rows": _draws,
     "replays stored rows": _replays,
-    "closes at any time, also twice": _closes,
+    "closes at any time, even twice": _closes,
     "leaves its process as it was": _quiet,
 }

@@ -1,4 +1,4 @@
-"""The checks of each kind of component, by their names."""
+"""The checks of each kind of component, by name."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _MODULES = {
 
 
 def checks_of(kind: str) -> Mapping[str, Check]:
-    """Return the checks of a kind of component by their names, sentences about the component."""
+    """Return the checks of a kind of component by name; names are sentences about the component."""
     module = importlib.import_module(f"physx_core.testing.{_MODULES[kind]}")
     checks: Mapping[str, Check] = module.CHECKS
     return checks

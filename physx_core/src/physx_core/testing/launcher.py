@@ -1,4 +1,4 @@
-"""Checks that a launcher does what physx and its users expect of one."""
+"""Contract checks for launchers."""
 
 from __future__ import annotations
 
@@ -34,11 +34,11 @@ _PROBES = "physx_core.testing.probes"
 _SEED = (5, 0, 0)
 _ROWS = 12
 _PATIENCE = 45.0
-"""Seconds within which clients must have started or ended: a cluster may take a while."""
+"""Seconds within which clients must have started or ended; a cluster may take a while."""
 _LEFT_PATIENCE = 10.0
-"""Seconds within which what belonged to a client that has ended must be gone."""
+"""Seconds within which everything that belonged to an ended client must be gone."""
 _MOMENT = 1.0
-"""Seconds after which a client that was killed with another one has ended."""
+"""Seconds within which a client killed along with another one has ended."""
 _POLL = 0.02
 
 
@@ -49,19 +49,19 @@ def check_launcher(
     timeout: float = TIMEOUT,
     **kwargs: Any,
 ) -> Report:
-    """Check that a launcher keeps the contract of `Launcher`; it starts two clients, repeatedly.
+    """Check that a launcher satisfies the contract of `Launcher`, repeatedly starting two clients.
 
-    What is left is looked for on this machine, and at the connections that the clients made.
+    Leftovers are searched for on this machine and among the connections that the clients made.
 
     Args:
         component: Its class, a function that returns it, or a reference.
-        expected_failures: Names of checks that may fail, and why.
-        timeout: Time in s after which a check that has not ended has failed.
-        kwargs: Arguments of its constructor.
+        expected_failures: Names of checks that may fail, each with the reason.
+        timeout: Time limit for each check, in s; a check that exceeds it fails.
+        kwargs: Arguments for its constructor.
 
     Raises:
-        UsageError: If there is no check of an expected name, or no other process can find the
-            component or take its arguments.
+        UsageError: If `expected_failures` names an unknown check, or another process cannot find
+            the component or receive its arguments.
     """
     return run_checks(
         "launcher",
@@ -73,7 +73,7 @@ def check_launcher(
 
 
 class _Door:
-    """Listens for clients, and answers nothing, or the same text to each."""
+    """Listens for clients and sends nothing, or the same text to each."""
 
     def __init__(self, host: str, answer: bytes = b"") -> None:
         self._socket = socket.create_server((host, 0))
@@ -83,14 +83,14 @@ class _Door:
         self.connections: list[socket.socket] = []
 
     def open_to(self, count: int) -> bool:
-        """Wait for connections; return whether there were so many in time."""
+        """Wait for connections; return whether there were enough in time."""
         until = time.monotonic() + _PATIENCE
         while len(self.connections) < count and time.monotonic() < until:
             self.accept()
         return len(self.connections) >= count
 
     def accept(self) -> None:
-        """Take a connection if there is one."""
+        """Accept a connection if there is one."""
         with contextlib.suppress(TimeoutError):
             connection, _ = self._socket.accept()
             self.connections.append(connection)
@@ -99,7 +99,7 @@ class _Door:
                     connection.sendall(self._answer)
 
     def are_gone(self) -> bool:
-        """Wait for the ends of all connections; return whether they came in time."""
+        """Wait for all connections to end; return whether they ended in time."""
         until = time.monotonic() + _PATIENCE
         for connection in self.connections:
             connection.settimeout(max(until - time.monotonic(), _POLL))
@@ -119,7 +119,7 @@ class _Door:
 
 
 class _Launched(NamedTuple):
-    """Clients that were started, at a door that keeps them waiting."""
+    """Clients that were started, and the door that keeps them waiting."""
 
     launcher: Launcher
     handles: Sequence[ClientHandle]
@@ -166,11 +166,11 @@ def _start(subject: Subject) -> None:
 def _starts(subject: Subject) -> None:
     with _launched(subject, (1, 2, 4)) as run:
         numbers = [handle.instance_id for handle in run.handles]
-        expect(numbers == [1, 2, 4], f"for the instances 1, 2, 4 the handles are of {numbers}")
+        expect(numbers == [1, 2, 4], f"for instances 1, 2, 4 the handles are for {numbers}")
         expect(run.door.open_to(3), f"only {len(run.door.connections)} of 3 clients connected")
         for handle in run.handles:
             status = handle.exit_status()
-            expect(status is None, f"exit_status() of a client that runs is {status}")
+            expect(status is None, f"exit_status() of a running client is {status}")
 
 
 def _hides_token(subject: Subject) -> None:
@@ -182,7 +182,7 @@ def _hides_token(subject: Subject) -> None:
 
 
 def _processes(what: str) -> Iterator[tuple[int, bytes]]:
-    """Yield the number and the environment or command line of every process that we may see."""
+    """Yield the pid and the environment or command line of every process that we may inspect."""
     for process in Path("/proc").glob("[0-9]*"):
         with contextlib.suppress(OSError):
             yield int(process.name), (process / what).read_bytes()
@@ -195,7 +195,7 @@ def _marked(mark: str) -> list[str]:
         if mark.encode() in text and number != own:
             with contextlib.suppress(OSError):
                 words = Path(f"/proc/{number}/cmdline").read_bytes()
-                if words:  # it is not dead
+                if words:  # empty for a dead process
                     found.append(words.replace(b"\0", b" ").decode(errors="replace"))
     return found
 
@@ -223,10 +223,10 @@ def _ends(subject: Subject, how: str) -> None:
             )
         expect(run.door.are_gone(), f"a client is still connected after {how}()")
         _expect_gone(run.token, f"{how}()")
-        for handle in run.handles:  # once more, which must do nothing
+        for handle in run.handles:  # a second time, which must do nothing
             handle.terminate()
             handle.kill()
-            expect(handle.exit_status() is not None, "a client that ended runs again")
+            expect(handle.exit_status() is not None, "a client that had ended is running again")
 
 
 def _terminates(subject: Subject) -> None:
@@ -244,7 +244,7 @@ def _one_of_two(subject: Subject) -> None:
         first.kill()
         expect(first.wait(time.monotonic() + _PATIENCE), "a client has not ended after kill()")
         ended = second.wait(time.monotonic() + _MOMENT)
-        text = f"kill() of a client ended another one, with the status {second.exit_status()}"
+        text = f"kill() of a client ended another one, with status {second.exit_status()}"
         expect(not ended, text)
 
 
@@ -263,11 +263,11 @@ def _tells(subject: Subject) -> None:
             f"it {describe_exit(status)}",
         )
         if type(handle).stderr is ClientHandle.stderr:
-            raise NotApplicableError("it keeps nothing of what clients write: see stderr()")
+            raise NotApplicableError("it does not keep what clients write: see stderr()")
         text = handle.stderr()
         expect(
             "physx client" in text,
-            f"stderr() does not have what the client wrote before it ended, but {text!r}",
+            f"stderr() is not what the client wrote before it ended, but {text!r}",
         )
 
 
@@ -297,7 +297,7 @@ def _same_rows(subject: Subject) -> None:
     config = _config(subject, "Counting")
     with ClientSource(config, Services(), _SEED, total=_ROWS) as source:
         expect_equal(
-            source.batch(_ROWS), _wanted(), "the rows of its clients differ from those made here"
+            source.batch(_ROWS), _wanted(), "its clients' rows differ from those generated here"
         )
 
 
@@ -317,14 +317,14 @@ def _stubborn(subject: Subject) -> None:
     config = _config(subject, "Stubborn", env_kwargs={"mark": mark}, timeout=1.0)
     try:
         with ClientSource(config, Services(), _SEED, total=_ROWS) as source:
-            expect(len(_marked(mark)) >= 2, "the clients' own processes do not run")
+            expect(len(_marked(mark)) >= 2, "the clients' own processes are not running")
             source.batch(_ROWS)
     except ClientError:
         _expect_gone(mark, "the end of a run whose clients hang and ignore SIGTERM")
         return
     except PhysxError as error:
         raise AssertionError(f"a client that hangs is reported as {error}") from error
-    raise AssertionError("a client that hangs gave rows")
+    raise AssertionError("a client that hangs produced rows")
 
 
 def _quiet(subject: Subject) -> None:
@@ -344,9 +344,9 @@ CHECKS: dict[str, Check] = {
     "terminates clients": _terminates,
     "kills clients": _kills,
     "kills one client alone": _one_of_two,
-    "tells how a client ended, and its last words": _tells,
+    "reports how a client ended, and its last output": _tells,
     "runs clients that give the same rows": _same_rows,
     "starts a killed client again": _restarts,
-    "leaves nothing of clients that hang": _stubborn,
+    "cleans up after clients that hang": _stubborn,
     "leaves its process as it was": _quiet,
 }

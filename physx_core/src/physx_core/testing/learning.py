@@ -1,4 +1,4 @@
-"""Fields, batches and learners that the checks of what learns have in common."""
+"""Fields, batches and learners shared by the checks of learning components."""
 
 from __future__ import annotations
 
@@ -28,14 +28,14 @@ SHAPES: Sequence[tuple[tuple[int, ...], tuple[int, ...]]] = (
     ((16, 16, 1), (16, 16, 3)),
     ((8, 8, 8, 1), (8, 8, 8, 3)),
 )
-"""Shapes of inputs and targets that are tried in turn if no fields are given."""
+"""Shapes of inputs and targets to try in turn if no fields are given."""
 SEED = 3
 ROWS = 8
 
 
 @dataclasses.dataclass(frozen=True)
 class Case:
-    """A network and the fields that it is checked with.
+    """A network and the fields to check it with.
 
     Attributes:
         config: The network, with its transformation and optimization.
@@ -48,7 +48,7 @@ class Case:
     def learner(
         self, *, trains: bool = False, seed: int = SEED, normalized: bool = False
     ) -> Learner:
-        """Return a new learner for the fields, as a training creates it."""
+        """Return a new learner for the fields, as a training would create it."""
         type(create_network(self.config)).set_seed(seed)
         made = Learner(self.config, trains=trains)
         made.bind(
@@ -59,7 +59,7 @@ class Case:
 
     @property
     def normalization(self) -> dict[str, Normalization]:
-        """Statistics of the fields, one component of which is constant if there are several."""
+        """Statistics of the fields; if a field has several components, one of them is constant."""
         found = {}
         for number, field in enumerate(self.fields):
             shape = field.shape or ()
@@ -78,7 +78,7 @@ class Case:
             if field.name in names or field.numpy_dtype.kind not in "fc":
                 values = random.standard_normal((rows, *(field.shape or ())))
                 if field.numpy_dtype.kind not in "fc":
-                    values = np.rint(np.abs(values) % 2) % 2  # 0 and 1 are of every type
+                    values = np.rint(np.abs(values) % 2) % 2  # every type can hold 0 and 1
                 batch[field.name] = values.astype(field.numpy_dtype)
         flat = [batch[name].reshape(rows, -1) for name in names]
         inputs = np.concatenate(flat, axis=1)
@@ -122,8 +122,8 @@ def find_case(config: NetworkConfig, fields: Sequence[Field]) -> Case:
             continue
         return case
     raise NotApplicableError(
-        "it accepts none of the fields that were tried: give the fields that it is for (at the "
-        f"first ones it said: {reasons[0]})"
+        "it accepts none of the fields that were tried: specify the fields it is made for (the "
+        f"first error: {reasons[0]})"
     )
 
 

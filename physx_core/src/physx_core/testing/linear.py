@@ -1,4 +1,4 @@
-"""A network in NumPy, for the checks of transformations that name none."""
+"""A NumPy network for checks of transformations that specify none."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class LinearNetwork(Network):
         self._shape: tuple[int, ...] = ()
 
     def bind(self, fields: Mapping[str, Field]) -> None:
-        """Take the shapes of the fields."""
+        """Read the shapes of the fields."""
         super().bind(fields)
         sizes = [
             int(np.prod(fields[name].shape or ())) for name in (*self.net_fields, *self.opt_fields)

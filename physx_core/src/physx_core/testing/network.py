@@ -1,4 +1,4 @@
-"""Checks that a network does what physx and its users expect of one."""
+"""Contract checks for networks."""
 
 from __future__ import annotations
 
@@ -31,7 +31,7 @@ from physx_core.testing.subject import (
 from physx_core.typing import Batch
 
 _TOLERANCE = 1e-4
-"""Of float32, in which sums may be rounded differently for another number of rows."""
+"""For float32, where sums may round differently with a different number of rows."""
 
 
 def check_network(
@@ -42,18 +42,18 @@ def check_network(
     timeout: float = TIMEOUT,
     **kwargs: Any,
 ) -> Report:
-    """Check that a network keeps the contract of `Network`, on the processor.
+    """Check that a network satisfies the contract of `Network`, on the CPU.
 
     Args:
         component: Its class, a function that returns it, or a reference.
-        fields: Fields that it is for, inputs and targets; empty: some shapes are tried.
-        expected_failures: Names of checks that may fail, and why.
-        timeout: Time in s after which a check that has not ended has failed.
-        kwargs: Arguments of its constructor.
+        fields: Its fields, inputs and targets; empty: several shapes are tried.
+        expected_failures: Names of checks that may fail, each with the reason.
+        timeout: Time limit for each check, in s; a check that exceeds it fails.
+        kwargs: Arguments for its constructor.
 
     Raises:
-        UsageError: If there is no check of an expected name, or no other process can find the
-            component or take its arguments.
+        UsageError: If `expected_failures` names an unknown check, or another process cannot find
+            the component or receive its arguments.
     """
     return run_checks(
         "network",
@@ -106,7 +106,7 @@ def _rows_apart(subject: Subject) -> None:
                 values[0],
                 together[name][row],
                 _TOLERANCE,
-                f'"{name}" of a sample alone and among {ROWS} differ',
+                f'"{name}" of a sample alone and in a batch of {ROWS} differ',
             )
 
 
@@ -156,7 +156,7 @@ def _stores(subject: Subject) -> None:
     expect_equal(
         _predict(other, batch),
         _predict(learner, batch),
-        "with parameters that were saved and loaded it predicts otherwise: something that it "
+        "with parameters that were saved and loaded it predicts differently: something that it "
         "needs is not among them",
     )
 
@@ -209,7 +209,7 @@ def _refuses_damaged(subject: Subject) -> None:
                 f"load_parameters() of {what} raised {type(error).__name__}: {error}; it must "
                 "raise CheckpointError"
             ) from error
-        raise AssertionError(f"load_parameters() took {what}")
+        raise AssertionError(f"load_parameters() accepted {what}")
 
 
 def _needs_fields(subject: Subject) -> None:
@@ -220,7 +220,7 @@ def _needs_fields(subject: Subject) -> None:
     except FieldsMismatchError:
         return
     raise AssertionError(
-        f'bind() took fields without "{case.network_fields[0]}", which it reads: call '
+        f'bind() accepted fields without "{case.network_fields[0]}", which it reads: call '
         "super().bind(fields)"
     )
 
@@ -260,15 +260,15 @@ def _quiet(subject: Subject) -> None:
 CHECKS: dict[str, Check] = {
     "refuses unknown options": refuses_unknown_options,
     "predicts each of its fields, in the shape of its target": _predicts,
-    "predicts a sample alone as among others": _rows_apart,
+    "predicts a sample the same alone and in a batch": _rows_apart,
     "predicts the same again": _twice,
     "does not change its inputs": _keeps_inputs,
     "begins with the same parameters for the same seed": _seeded,
     "has finite parameters, and counts them": _finite,
-    "saves and loads all that it predicts with": _stores,
+    "saves and loads everything it predicts with": _stores,
     "saves its parameters without code": _holds_no_code,
     "refuses damaged and missing parameters": _refuses_damaged,
     "refuses fields that it cannot read": _needs_fields,
-    "computes in the type that it is told": _types,
+    "computes in the requested type": _types,
     "leaves its process as it was": _quiet,
 }

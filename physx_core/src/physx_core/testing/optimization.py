@@ -1,4 +1,4 @@
-"""Checks that an optimization does what physx and its users expect of one."""
+"""Contract checks for optimizations."""
 
 from __future__ import annotations
 
@@ -40,21 +40,21 @@ def check_optimization(
     timeout: float = TIMEOUT,
     **kwargs: Any,
 ) -> Report:
-    """Check that an optimization keeps the contract of `Optimization`, on the processor.
+    """Check that an optimization satisfies the contract of `Optimization`, on the CPU.
 
     It trains a network on a linear problem.
 
     Args:
         component: Its class, a function that returns it, or a reference.
-        network: The network that it trains, with loss, optimizer and scheduler.
-        fields: Fields of the network, inputs and targets; empty: some shapes are tried.
-        expected_failures: Names of checks that may fail, and why.
-        timeout: Time in s after which a check that has not ended has failed.
-        kwargs: Arguments of its constructor.
+        network: The network to train, with loss, optimizer and scheduler.
+        fields: Fields of the network, inputs and targets; empty: several shapes are tried.
+        expected_failures: Names of checks that may fail, each with the reason.
+        timeout: Time limit for each check, in s; a check that exceeds it fails.
+        kwargs: Arguments for its constructor.
 
     Raises:
-        UsageError: If there is no check of an expected name, or no other process can find the
-            component or take its arguments.
+        UsageError: If `expected_failures` names an unknown check, or another process cannot find
+            the component or receive its arguments.
     """
     return run_checks(
         "optimization",
@@ -93,7 +93,7 @@ def _learns(subject: Subject) -> None:
     begin, end = float(np.mean(losses[:5])), float(np.mean(losses[-5:]))
     expect(
         end < begin or begin == 0,
-        f"after {_BATCHES} batches of a linear problem the loss is {end:.3g}, and was {begin:.3g}",
+        f"after {_BATCHES} batches of a linear problem the loss is {end:.3g}; it was {begin:.3g}",
     )
 
 
@@ -123,13 +123,13 @@ def _row_losses(subject: Subject) -> None:
         try:
             learner.optimize(batch, by_row=True)
         except ConfigError as error:
-            raise NotApplicableError(f"it has no losses of rows: {error}") from error
+            raise NotApplicableError(f"it has no row losses: {error}") from error
         expect(np.isfinite(learner.row_losses).all(), "the loss of a row is not finite")
         plain.optimize(batch)
     expect_equal(
         parameters_of(learner.network),
         parameters_of(plain.network),
-        "with compute_row_losses() before optimize() it arrives at other parameters",
+        "with compute_row_losses() before optimize() it ends with different parameters",
     )
 
 
@@ -141,7 +141,7 @@ def _repeats(subject: Subject) -> None:
     expect_equal(
         parameters_of(second.network),
         parameters_of(first.network),
-        "a second training on the same batches arrives at other parameters",
+        "a second training on the same batches ends with different parameters",
     )
 
 
@@ -160,8 +160,8 @@ def _resumes(subject: Subject) -> None:
     expect_equal(
         parameters_of(resumed.network),
         parameters_of(whole.network),
-        "a training that is resumed from a checkpoint arrives at other parameters: save_state() "
-        "into state_file must write all that the next steps depend on",
+        "a training resumed from a checkpoint ends with different parameters: save_state() must "
+        "write to state_file everything that the next steps depend on",
     )
 
 
@@ -181,7 +181,7 @@ def _diverges(subject: Subject) -> None:
         after = parameters_of(learner.network)
         if any(not np.array_equal(after[name], before[name]) for name in before):
             raise NotApplicableError(
-                "it does not look at the loss before it changes the parameters; trainings do after"
+                "it does not check the loss before changing the parameters; trainings do afterwards"
             ) from error
         return
     raise AssertionError("a batch with NaN is trained on without a word: its loss must be NaN, too")
@@ -208,10 +208,10 @@ CHECKS: dict[str, Check] = {
     "refuses unknown options": refuses_unknown_options,
     "lowers the loss": _learns,
     "changes parameters in optimize() alone": _steps_once,
-    "computes losses of rows without an effect": _row_losses,
+    "computes row losses without side effects": _row_losses,
     "trains the same again": _repeats,
     "resumes from a checkpoint bit for bit": _resumes,
-    "stops at NaN with the parameters of before": _diverges,
-    "ends epochs, also those without a validation": _epochs,
+    "stops at NaN with the previous parameters": _diverges,
+    "ends epochs, even those without validation": _epochs,
     "leaves its process as it was": _quiet,
 }

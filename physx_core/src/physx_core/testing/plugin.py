@@ -1,4 +1,4 @@
-"""Checks all components of a plugin, or the one that a reference names."""
+"""Checks all components of a plugin, or the one named by a reference."""
 
 from __future__ import annotations
 
@@ -27,31 +27,30 @@ def check_plugin(
     expected_failures: Mapping[str, str] | None = None,
     timeout: float = TIMEOUT,
 ) -> Iterator[Report]:
-    """Check the components that a name stands for, one at each step of the iterator.
+    """Check the components that a name refers to, one per step of the iterator.
 
     Args:
-        name: Name of a plugin, all of whose components are checked; or a reference,
+        name: Name of a plugin, all of whose components are checked, or a reference:
             ``"plugin/name"``, ``"package.module:Class"`` or ``"script.py:Class"``.
-        kind: Kind of component to check; None: all that the name stands for.
-        arguments: Arguments of the constructor, if the name stands for one component.
-        network: For optimizations and transformations: the network that they are checked with;
-            None: one of the same plugin that is created without arguments and names them as its
-            default.
-        fields: Fields of a network; empty: some shapes are tried.
-        expected_failures: Names of checks that may fail, and why.
-        timeout: Time in s after which a check that has not ended has failed.
+        kind: Kind of component to check; None: all that the name refers to.
+        arguments: Constructor arguments, if the name refers to a single component.
+        network: For optimizations and transformations, the network to check them with; None: one of
+            the same plugin that can be created without arguments and names them as its default.
+        fields: Fields of a network; empty: several shapes are tried.
+        expected_failures: Names of checks that may fail, each with the reason.
+        timeout: Time limit for each check, in s; a check that exceeds it fails.
 
     Raises:
         PluginNotFoundError: If the plugin is not installed.
         ComponentNotFoundError: If there is no such component.
-        UsageError: If arguments are given for several components.
+        UsageError: If arguments are given but the name refers to several components.
     """
     found = _components(name, kind)
     if (arguments or expected_failures) and len(found) > 1:
         raise UsageError(
-            f'Arguments and expected failures are those of one component, but "{name}" stands for '
+            f'Arguments and expected failures apply to one component, but "{name}" refers to '
             f"{', '.join(f'{each} {reference}' for each, reference in found)}: name one of them, "
-            "and its kind if need be."
+            "and its kind if needed."
         )
     common = {"expected_failures": expected_failures, "timeout": timeout}
     return (
@@ -86,7 +85,7 @@ _NO_NETWORK = Check(
 
 
 def _components(name: str, kind: str | None) -> list[tuple[str, str]]:
-    """Return the kinds and references of the components that a name stands for."""
+    """Return the kinds and references of the components that a name refers to."""
     kinds = list(KINDS) if kind is None else [kind]
     if kind is not None and kind not in KINDS:
         raise ReferenceFormError(f'"{kind}" is not a kind of component: {", ".join(KINDS)}.')
@@ -109,7 +108,7 @@ def _components(name: str, kind: str | None) -> list[tuple[str, str]]:
 
 
 def _kind_of(reference: str, kinds: Sequence[str]) -> str:
-    """Return the kind of a class, whose base class says it."""
+    """Return the kind of a class, derived from its base class."""
     for kind in kinds:
         made = find(kind, reference)
         if isinstance(made, type):
@@ -121,13 +120,13 @@ def _kind_of(reference: str, kinds: Sequence[str]) -> str:
     if len(kinds) == 1:
         return kinds[0]
     raise ReferenceFormError(
-        f'"{reference}" does not derive from a base class of components, so say of which kind it '
-        f"is: {', '.join(KINDS)}."
+        f'"{reference}" does not derive from a base class of components, so specify its kind: '
+        f"{', '.join(KINDS)}."
     )
 
 
 def _network_of(kind: str, reference: str) -> NetworkConfig | None:
-    """Return a network of the same plugin whose default a component is."""
+    """Return a network of the same plugin that has a component as its default."""
     plugin_name, slash, _ = reference.partition("/")
     if not slash or ":" in reference:
         return None

@@ -1,4 +1,4 @@
-"""Environments that the checks of launchers run in clients."""
+"""Environments that launcher checks run in clients."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from physx_core.fields import Field
 
 
 class Counting(Environment):
-    """Gives random numbers."""
+    """Generates random numbers."""
 
     def create(self) -> None:
         """Do nothing."""
@@ -30,13 +30,13 @@ class Counting(Environment):
 
 
 class Dying(Counting):
-    """Ends its process in the middle of the first life of its second instance."""
+    """Ends its process partway through the first run of its second instance."""
 
     def __init__(self, *, folder: str, **kwargs: Any) -> None:
         """Keep the folder.
 
         Args:
-            folder: Where a file says that it has died already.
+            folder: Where a file records that it has already died.
             kwargs: See `Environment`.
         """
         super().__init__(**kwargs)

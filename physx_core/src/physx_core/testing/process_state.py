@@ -1,4 +1,4 @@
-"""The state of a process, such as signal handlers and locale, which components leave as it is."""
+"""The state of a process, such as signal handlers and locale, which components must not change."""
 
 from __future__ import annotations
 
@@ -23,26 +23,26 @@ _LASTING = (
     "the working directory",
     "the folder of temporary files",
     "the umask",
-    "the handlers of signals",
+    "the signal handlers",
     "the locale",
     "sys.excepthook",
 )
 """What is compared with the state before the component was imported."""
 _PATIENCE = 5.0
-"""Seconds within which threads and processes that were ended must be gone."""
+"""Seconds within which ended threads and processes must be gone."""
 
 
 def process_state() -> dict[str, Any]:
-    """Return what belongs to the whole process, by its name in messages."""
+    """Return process-wide state, by its name in messages."""
     mask = os.umask(0o077)
     os.umask(mask)
-    name, keys, place, *gauss = np.random.get_state(legacy=True)  # noqa: NPY002 - whether it moved
+    name, keys, place, *gauss = np.random.get_state(legacy=True)  # noqa: NPY002 - to see changes
     return {
         "the working directory": _working_directory(),
         _VARIABLES: dict(os.environ),
         "the folder of temporary files": tempfile.tempdir,
         "the umask": mask,
-        "the handlers of signals": {
+        "the signal handlers": {
             number.name: signal.getsignal(number)
             for number in sorted(signal.valid_signals())
             if isinstance(number, signal.Signals)
@@ -55,9 +55,9 @@ def process_state() -> dict[str, Any]:
         ),
         "the state of Python's global random numbers": _python_random(),
         "NumPy's handling of floating-point errors": np.geterr(),
-        "NumPy's way to print": np.get_printoptions(),
+        "NumPy's print options": np.get_printoptions(),
         "the locale": locale.setlocale(locale.LC_ALL),
-        "the filters of warnings": list(warnings.filters),
+        "the warning filters": list(warnings.filters),
         "the recursion limit": sys.getrecursionlimit(),
         "sys.excepthook": sys.excepthook,
         "standard output": sys.stdout,
@@ -67,11 +67,11 @@ def process_state() -> dict[str, Any]:
 
 @contextlib.contextmanager
 def unchanged(before: Mapping[str, Any] | None = None) -> Iterator[None]:
-    """Check that what happens in this context leaves the process as it was.
+    """Check that the code in this context leaves the process unchanged.
 
     Args:
-        before: The state before the component was imported, with which the working directory and
-            the like are compared; None: that at the beginning.
+        before: The state before the component was imported, to compare the working directory and
+            the like with; None: the state on entry.
 
     Raises:
         AssertionError: If something has changed, or a thread or child process is left.
@@ -94,7 +94,7 @@ def unchanged(before: Mapping[str, Any] | None = None) -> Iterator[None]:
 
 
 def _left(find: Callable[[], list[Any]], what: str) -> list[str]:
-    """Wait for things to go; return a sentence about those that do not."""
+    """Wait until nothing is left; return a message about what remains."""
     until = time.monotonic() + _PATIENCE
     while found := find():
         if time.monotonic() > until:
@@ -105,7 +105,7 @@ def _left(find: Callable[[], list[Any]], what: str) -> list[str]:
 
 def _working_directory() -> str:
     try:
-        return str(os.getcwd())  # noqa: PTH109 - a text, to be compared
+        return str(os.getcwd())  # noqa: PTH109 - a string, for comparison
     except FileNotFoundError:
         return "(removed)"
 

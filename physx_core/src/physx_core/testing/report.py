@@ -9,7 +9,7 @@ Status = Literal["passed", "failed", "expected", "skipped"]
 
 
 class NotApplicableError(Exception):
-    """Raised by a check of something that the component does not offer; its text is the reason."""
+    """Raised by a check of something the component does not offer; its message is the reason."""
 
 
 @dataclass(frozen=True)
@@ -18,7 +18,7 @@ class Check:
 
     Attributes:
         name: What was checked, as a sentence.
-        status: ``passed``, ``failed``, ``expected`` (it failed, as was said before), ``skipped``.
+        status: ``passed``, ``failed``, ``expected`` (an announced failure), ``skipped``.
         reason: Why it did not pass; empty if it did.
     """
 
@@ -32,8 +32,8 @@ class Report:
     """The results of all checks of a component.
 
     Attributes:
-        kind: Kind of the component, as ``environment``.
-        component: What was checked: its reference.
+        kind: Kind of the component, such as ``environment``.
+        component: Reference of the checked component.
         checks: The results.
     """
 
@@ -43,23 +43,23 @@ class Report:
 
     @property
     def ok(self) -> bool:
-        """Whether no check failed unexpectedly, and at least one passed."""
+        """Whether no check failed unexpectedly and at least one passed."""
         found = {check.status for check in self.checks}
         return "failed" not in found and "passed" in found
 
     def counts(self) -> dict[str, int]:
-        """Return how many checks there are of each status."""
+        """Return the number of checks with each status."""
         names = get_args(Status)
         return {name: sum(check.status == name for check in self.checks) for name in names}
 
     def to_dict(self) -> dict[str, Any]:
-        """Return the report as plain data: kind, component, ok, counts, and the checks."""
+        """Return the report as plain data: kind, component, ok, counts, and checks."""
         checks = [asdict(check) for check in self.checks]
         named = {"kind": self.kind, "component": self.component, "ok": self.ok}
         return {**named, "counts": self.counts(), "checks": checks}
 
     def findings(self) -> list[Check]:
-        """Return the checks that did not pass; of those left out for one reason a single one."""
+        """Return the checks that did not pass, merging those skipped for the same reason."""
         found: dict[tuple[str, str], list[Check]] = {}
         for check in self.checks:
             if check.status != "passed":
@@ -72,7 +72,7 @@ class Report:
         ]
 
     def __str__(self) -> str:
-        """Return the counts, and a line for each of the `findings`."""
+        """Return the counts and one line for each of the `findings`."""
         lines = [f"{check.status:8}  {check.name}: {check.reason}" for check in self.findings()]
         counts = ", ".join(f"{number} {name}" for name, number in self.counts().items() if number)
         return "\n".join([f"{self.kind} {self.component}: {counts}", *lines])

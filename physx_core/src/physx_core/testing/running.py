@@ -1,6 +1,6 @@
-"""Has the checks of a component run in another process, which a crash or a hang does not outlive.
+"""Runs the checks of a component in another process, so crashes and hangs stay there.
 
-So a check of a component leaves this process exactly as it was, whatever the component does.
+A check therefore leaves this process exactly as it was, whatever the component does.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from physx_core.testing.report import Check, Report, Status
 from physx_core.testing.worker import LENGTH
 
 TIMEOUT = 120.0
-"""Seconds that a check may take, unless it is told otherwise."""
+"""Default time limit of a check, in s."""
 _CREATED = "can be imported and created"
 _MOST_LINES = 4
 _PATIENCE = 5.0
@@ -41,25 +41,25 @@ def run_checks(
     expected_failures: Mapping[str, str] | None = None,
     timeout: float = TIMEOUT,
 ) -> Report:
-    """Run all checks of a kind on a component, and return what they found.
+    """Run all checks of a kind on a component and return the report.
 
     Args:
         kind: Kind of the component.
         component: Its reference, class, or a function that returns it.
-        arguments: Keyword arguments of its constructor.
+        arguments: Keyword arguments for its constructor.
         options: See `Subject.options`.
-        expected_failures: Names of checks that may fail, and why.
-        timeout: Time in s after which a check that has not ended has failed.
+        expected_failures: Names of checks that may fail, each with the reason.
+        timeout: Time limit for each check, in s; a check that exceeds it fails.
 
     Raises:
-        UsageError: If there is no check of an expected name, or no other process can find the
-            component or take its arguments.
+        UsageError: If `expected_failures` names an unknown check, or another process cannot find
+            the component or receive its arguments.
     """
     expected = dict(expected_failures or {})
     left = list(checks_of(kind))
     unknown = expected.keys() - set(left)
     if unknown:
-        raise UsageError(f"There are no checks {sorted(unknown)}. There are: {listed(left)}.")
+        raise UsageError(f"There are no checks {sorted(unknown)}. Available: {listed(left)}.")
     reference = reference_of(component)
     request = {
         "kind": kind,
@@ -86,7 +86,7 @@ def _as_expected(check: Check, expected: Mapping[str, str]) -> Check:
 def plain_options(
     *, fields: Sequence[Field] = (), network: NetworkConfig | None = None
 ) -> dict[str, Any]:
-    """Return options of checks as data that another process can read."""
+    """Return check options as data that another process can read."""
     options: dict[str, Any] = {}
     if fields:
         options["fields"] = [dataclasses.asdict(field) for field in fields]
@@ -96,7 +96,7 @@ def plain_options(
 
 
 def _file_of(component: Any) -> str:
-    """Return the file of a class that may lie in a module that only this process can import."""
+    """Return the file of a class whose module may be importable only in this process."""
     if isinstance(component, str):
         return ""
     file = getattr(sys.modules.get(component.__module__), "__file__", None)
@@ -104,7 +104,7 @@ def _file_of(component: Any) -> str:
 
 
 def _run_some(request: Mapping[str, Any], names: Sequence[str], timeout: float) -> Iterator[Check]:
-    """Yield the results of the first checks, up to the one that ended the process, if one did."""
+    """Yield the results of the checks, up to the one that ended the process, if any."""
     link, theirs = socket.socketpair()
     command = [sys.executable, "-P", "-m", "physx_core.testing.worker", str(theirs.fileno())]
     with link, contextlib.ExitStack() as held:
@@ -158,16 +158,16 @@ def _how_it_ended(process: ChildProcess, tail: OutputTail) -> str:
 
 
 class _Lines:
-    """Reads JSON texts, one a line, from a socket."""
+    """Reads JSON documents, one per line, from a socket."""
 
     def __init__(self, link: socket.socket) -> None:
         self._link, self._bytes = link, b""
 
     def next(self, timeout: float) -> dict[str, Any] | None:
-        """Return the next text; None: the other side is gone.
+        """Return the next document; None if the other side is gone.
 
         Raises:
-            TimeoutError: If none came in time.
+            TimeoutError: If none arrived in time.
         """
         until = time.monotonic() + timeout
         while b"\n" not in self._bytes:

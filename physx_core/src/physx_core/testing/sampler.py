@@ -1,4 +1,4 @@
-"""Checks that a sampler does what physx and its users expect of one."""
+"""Contract checks for samplers."""
 
 from __future__ import annotations
 
@@ -41,19 +41,19 @@ def check_sampler(
     timeout: float = TIMEOUT,
     **kwargs: Any,
 ) -> Report:
-    """Check that a sampler keeps the contract of `Sampler` or `LearningSampler`.
+    """Check that a sampler satisfies the contract of `Sampler` or `LearningSampler`.
 
     Args:
         component: Its class, a function that returns it, or a reference.
-        parameters: What it chooses; empty: four parameters with bounds, one of them with two
-            elements and one of whole numbers.
-        expected_failures: Names of checks that may fail, and why.
-        timeout: Time in s after which a check that has not ended has failed.
-        kwargs: Arguments of its constructor.
+        parameters: What it chooses; empty: four parameters with bounds, one of which has two
+            elements and one whole numbers.
+        expected_failures: Names of checks that may fail, each with the reason.
+        timeout: Time limit for each check, in s; a check that exceeds it fails.
+        kwargs: Arguments for its constructor.
 
     Raises:
-        UsageError: If there is no check of an expected name, or no other process can find the
-            component or take its arguments.
+        UsageError: If `expected_failures` names an unknown check, or another process cannot find
+            the component or receive its arguments.
     """
     return run_checks(
         "sampler",
@@ -109,7 +109,9 @@ def _repeats(subject: Subject) -> None:
     numbers = range(_SETS)
     first = _asked(_begun(subject), numbers)
     expect_equal(
-        _asked(_begun(subject), numbers), first, "with the same seed a second run chooses otherwise"
+        _asked(_begun(subject), numbers),
+        first,
+        "a second run with the same seed chooses differently",
     )
 
 
@@ -119,14 +121,14 @@ def _in_any_order(subject: Subject) -> None:
     expect_equal(
         {name: backward[name] for name in first},
         first,
-        "asked for sets in reverse order it chooses otherwise",
+        "asked for sets in reverse order, it chooses differently",
     )
     sampler = _begun(subject)
     for number in (7, 7, 3, 7):
         expect_equal(
             _asked(sampler, [number]),
             {name: first[name] for name in first if name.endswith(f" of set {number}")},
-            "asked for a set again, or after leaving some out, it chooses otherwise",
+            "asked for a set again, or after skipping some, it chooses differently",
         )
 
 
@@ -142,7 +144,7 @@ def _own(subject: Subject) -> None:
     expect_equal(
         _asked(sampler, [2]),
         _flat(kept, 2),
-        "a set was changed by its user, and asked for again it is no longer what it was",
+        "a set that was changed by its user is different when asked for again",
     )
 
 
@@ -151,12 +153,12 @@ def _begins_again(subject: Subject) -> None:
     first = _asked(sampler, range(_SETS))
     sampler.begin(_parameters(subject), _SEED)
     expect_equal(
-        _asked(sampler, range(_SETS)), first, "after a second begin() it chooses otherwise"
+        _asked(sampler, range(_SETS)), first, "after a second begin() it chooses differently"
     )
 
 
 def _losses(batch: int) -> tuple[list[int], Any]:
-    """Return the sets of a batch and their losses, which are of very different sizes."""
+    """Return the sets of a batch and their losses, which differ widely in magnitude."""
     numbers = [3 * batch + place for place in range(3)]
     return numbers, np.exp(np.sin(1.0 + np.array(numbers, np.float64)) * 3)
 
@@ -191,7 +193,7 @@ def _counts_batches(subject: Subject) -> None:
     expect_equal(
         _after(again, _BATCHES),
         _after(sampler, _BATCHES),
-        "told the same losses, a second run chooses otherwise",
+        "told the same losses, a second run chooses differently",
     )
 
 
@@ -220,14 +222,14 @@ def _continues(subject: Subject) -> None:
             _after(resumed, _BATCHES),
             _after(sampler, _BATCHES),
             f"restored from its state after {'all' if not back else 'all but the last'} of the "
-            "batches it chooses otherwise",
+            "batches, it chooses differently",
         )
         for one in (sampler, resumed):
             _tell(one, _BATCHES)
         expect_equal(
             _after(resumed, _BATCHES + 1),
             _after(sampler, _BATCHES + 1),
-            "restored from its state and told more losses it chooses otherwise",
+            "restored from its state and told more losses, it chooses differently",
         )
 
 
@@ -237,7 +239,7 @@ def _refuses(subject: Subject) -> None:
         sampler.restore(3, np.array([3.0, 1e6, 0.5]))
     except ValueError:
         return
-    raise AssertionError("restore() took numbers that are no state; it must raise ValueError")
+    raise AssertionError("restore() accepted an invalid state; it must raise ValueError")
 
 
 def _quiet(subject: Subject) -> None:
@@ -254,10 +256,10 @@ CHECKS: dict[str, Check] = {
     "chooses every parameter within its bounds": _chooses,
     "chooses the same again": _repeats,
     "chooses the same in any order": _in_any_order,
-    "gives away its sets": _own,
+    "hands out copies of its sets": _own,
     "begins again": _begins_again,
     "learns from counted batches": _counts_batches,
     "continues from a state": _continues,
-    "refuses what is no state": _refuses,
+    "refuses an invalid state": _refuses,
     "leaves its process as it was": _quiet,
 }

@@ -19,13 +19,13 @@ _GRID = np.linspace(0.0, 1.0, 24)
 
 @dataclass(frozen=True)
 class Sample:
-    """An object of a kind.
+    """An object of one kind.
 
     Attributes:
         kind: The kind.
-        given: Options that it is added with.
-        changes: Options that are changed then.
-        needs: Kinds of which an object must be there.
+        given: Options to add it with.
+        changes: Options to change afterwards.
+        needs: Kinds of objects that must already exist.
     """
 
     kind: str
@@ -34,7 +34,7 @@ class Sample:
     needs: tuple[str, ...] = ()
 
     def add(self, factory: Factory) -> None:
-        """Add the object, named as its kind."""
+        """Add the object, named after its kind."""
         for kind in self.needs:
             OBJECTS[kind].add(factory)
         if self.kind == "view":

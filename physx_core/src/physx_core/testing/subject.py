@@ -1,4 +1,4 @@
-"""Subject: the component that is checked, and what its checks need to create it."""
+"""Subject: the component under test and what its checks need to create it."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ class Subject:
     """A component to check.
 
     Attributes:
-        kind: Its kind, as ``environment``.
+        kind: Its kind, such as ``environment``.
         reference: Its reference.
-        arguments: Keyword arguments of its constructor.
+        arguments: Keyword arguments for its constructor.
         options: What else its kind of check needs, as plain data: ``fields`` of a network, the
             ``network`` of an optimization or transformation, the ``parameters`` of a sampler.
-        folder: An empty folder of this check.
+        folder: An empty folder for this check.
         before: State of the process before the component was imported.
     """
 
@@ -41,37 +41,38 @@ class Subject:
     before: Mapping[str, Any] | None = None
 
     def make(self, **more: Any) -> Any:
-        """Return a new component; `more` are further arguments of its constructor."""
+        """Return a new component; `more` holds additional constructor arguments."""
         made = resolve(self.kind, self.reference)
         return made(**self.arguments, **more) if callable(made) else made
 
     @property
     def fields(self) -> list[Field]:
-        """The fields that were given; empty: none were."""
+        """The given fields; empty if there are none."""
         return [Field(**plain) for plain in self.options.get("fields", ())]
 
     @property
     def network(self) -> NetworkConfig | None:
-        """The network that was given; None: none was."""
+        """The given network, or None."""
         plain = self.options.get("network")
         return None if plain is None else from_plain(NetworkConfig, plain)
 
     @property
     def parameters(self) -> list[Parameter]:
-        """The parameters that were given; empty: none were."""
+        """The given parameters; empty if there are none."""
         return [Parameter.from_dict(plain) for plain in self.options.get("parameters", ())]
 
 
 Check: TypeAlias = Callable[[Subject], None]
-"""Raises if the component does not do what the check's name says."""
+"""Raises an exception if the component does not do what the check's name says."""
 
 
 def refuses_unknown_options(subject: Subject, use: Check | None = None) -> None:
-    """Check that a misspelt option is an error, and not swallowed.
+    """Check that a misspelt option is an error instead of being ignored.
 
     Args:
         subject: The component.
-        use: Creates it and begins to use it, where only that uses its options; None: creates it.
+        use: Creates and starts to use it, for components that read options only then; None: creates
+            it.
     """
     arguments = {**subject.arguments, _UNKNOWN: 1}
     try:
@@ -81,8 +82,8 @@ def refuses_unknown_options(subject: Subject, use: Check | None = None) -> None:
             return
         raise
     raise AssertionError(
-        "it takes an option that nobody knows, so a user's misspelling would have no effect: name "
-        "the options, and hand **kwargs to super().__init__()"
+        "it accepts an unknown option, so a user's misspelling would have no effect: name the "
+        "options, and pass **kwargs to super().__init__()"
     )
 
 
@@ -99,11 +100,11 @@ def expect(condition: Any, message: str) -> None:
 
 
 def expect_equal(found: Batch, wanted: Batch, what: str) -> None:
-    """Raise an `AssertionError` unless the arrays are the same, bit for bit.
+    """Raise an `AssertionError` unless the arrays are bit-identical.
 
     Args:
         found: Arrays by name.
-        wanted: What they should be.
+        wanted: The expected arrays.
         what: What differs, for the message: "the rows of the second run differ".
     """
     expect(found.keys() == wanted.keys(), f"{what}: {sorted(found)}, not {sorted(wanted)}")
@@ -126,8 +127,8 @@ def expect_close(found: Any, wanted: Any, relative: float, what: str) -> None:
 
     Args:
         found: Numbers.
-        wanted: What they should be, of the same shape.
-        relative: Largest difference over the largest number, which counts as 1e-9 at least.
+        wanted: The expected numbers, of the same shape.
+        relative: Largest difference relative to the largest number, taken as at least 1e-9.
         what: What differs, for the message.
     """
     one, other = np.asarray(found, np.float64), np.asarray(wanted, np.float64)

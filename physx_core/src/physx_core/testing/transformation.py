@@ -1,4 +1,4 @@
-"""Checks that a transformation does what physx and its users expect of one."""
+"""Contract checks for transformations."""
 
 from __future__ import annotations
 
@@ -39,19 +39,19 @@ def check_transformation(
     timeout: float = TIMEOUT,
     **kwargs: Any,
 ) -> Report:
-    """Check that a transformation keeps the contract of `Transformation`, on the processor.
+    """Check that a transformation satisfies the contract of `Transformation`, on the CPU.
 
     Args:
         component: Its class, a function that returns it, or a reference.
-        network: The network that it is for; None: a linear one in NumPy.
-        fields: Fields of the network, inputs and targets; empty: some shapes are tried.
-        expected_failures: Names of checks that may fail, and why.
-        timeout: Time in s after which a check that has not ended has failed.
-        kwargs: Arguments of its constructor.
+        network: The network to use it with; None: a linear one in NumPy.
+        fields: Fields of the network, inputs and targets; empty: several shapes are tried.
+        expected_failures: Names of checks that may fail, each with the reason.
+        timeout: Time limit for each check, in s; a check that exceeds it fails.
+        kwargs: Arguments for its constructor.
 
     Raises:
-        UsageError: If there is no check of an expected name, or no other process can find the
-            component or take its arguments.
+        UsageError: If `expected_failures` names an unknown check, or another process cannot find
+            the component or receive its arguments.
     """
     return run_checks(
         "transformation",
@@ -74,7 +74,7 @@ def _case(subject: Subject) -> Case:
         if subject.network is not None:
             raise
         raise NotApplicableError(
-            f"it needs a network of its own library: name one ({error})"
+            f"it needs a network from its own library: specify one ({error})"
         ) from error
 
 
@@ -95,7 +95,7 @@ def _inverts_normalized(subject: Subject) -> None:
 
 
 def _invert(case: Case, *, normalized: bool) -> None:
-    """Compare a prediction with itself in physical units as the target: there is no loss."""
+    """Compare a prediction with itself in physical units as target; the two must match."""
     learner = case.learner(normalized=normalized)
     network, transformation = learner.network, learner.transformation
     inputs = _tensors(learner, case.batch(), network.net_fields)
@@ -111,8 +111,8 @@ def _invert(case: Case, *, normalized: bool) -> None:
             predicted[pred],
             wanted[opt],
             _TOLERANCE,
-            f'a target that equals the prediction "{pred}" in physical units is compared as '
-            "another one: transform_before_apply() does not undo transform_before_loss()",
+            f'a target that equals the prediction "{pred}" in physical units compares as '
+            "different: transform_before_apply() does not undo transform_before_loss()",
         )
 
 
@@ -130,7 +130,7 @@ def _normalizes(subject: Subject) -> None:
         given = case.normalization[name]
         expect(
             np.array_equal(item.mean, given.mean) and np.array_equal(item.std, given.std),
-            f'after set_normalization() its normalization of "{name}" is another one',
+            f'after set_normalization() its normalization of "{name}" is a different one',
         )
 
 
@@ -144,7 +144,7 @@ def _again(subject: Subject) -> None:
     found, wanted = (
         {n: np.array(v) for n, v in learner.predict(batch).items()} for learner in (second, first)
     )
-    expect_equal(found, wanted, "after set_normalization() was called again predictions differ")
+    expect_equal(found, wanted, "predictions differ after a second call of set_normalization()")
 
 
 def _keeps(subject: Subject) -> None:
@@ -182,7 +182,7 @@ def _rows(subject: Subject) -> None:
                 np.asarray(values)[0],
                 together[name][row],
                 _TOLERANCE,
-                f'"{name}" of a sample alone and among {ROWS} differ',
+                f'"{name}" of a sample alone and in a batch of {ROWS} differ',
             )
 
 
@@ -198,8 +198,8 @@ CHECKS: dict[str, Check] = {
     "converts predictions back to physical units": _inverts_plain,
     "converts normalized predictions back to physical units": _inverts_normalized,
     "keeps its normalization for checkpoints": _normalizes,
-    "takes a normalization again": _again,
+    "accepts a second normalization": _again,
     "does not change what it transforms": _keeps,
-    "transforms a sample alone as among others": _rows,
+    "transforms a sample the same alone and in a batch": _rows,
     "leaves its process as it was": _quiet,
 }

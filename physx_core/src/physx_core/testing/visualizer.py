@@ -1,4 +1,4 @@
-"""Checks that a visualizer does what physx and its users expect of one."""
+"""Contract checks for visualizers."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from physx_core.testing.subject import Check, Subject, refuses_unknown_options
 Make = Callable[[], Visualizer]
 _DISPLAYS = ("DISPLAY", "WAYLAND_DISPLAY")
 _PATIENCE = 5.0
-"""Seconds within which what a visualizer started must have ended after `close`."""
+"""Seconds after `close` within which everything a visualizer started must have ended."""
 
 
 def check_visualizer(
@@ -34,17 +34,17 @@ def check_visualizer(
     timeout: float = TIMEOUT,
     **kwargs: Any,
 ) -> Report:
-    """Check that a visualizer keeps the contract of `Visualizer`, without a display.
+    """Check that a visualizer satisfies the contract of `Visualizer`, without a display.
 
     Args:
         component: Its class, a function that returns it, or a reference.
-        expected_failures: Names of checks that may fail, and why.
-        timeout: Time in s after which a check that has not ended has failed.
-        kwargs: Arguments of its constructor.
+        expected_failures: Names of checks that may fail, each with the reason.
+        timeout: Time limit for each check, in s; a check that exceeds it fails.
+        kwargs: Arguments for its constructor.
 
     Raises:
-        UsageError: If there is no check of an expected name, or no other process can find the
-            component or take its arguments.
+        UsageError: If `expected_failures` names an unknown check, or another process cannot find
+            the component or receive its arguments.
     """
     return run_checks(
         "visualizer",
@@ -155,7 +155,7 @@ def _outputs(make: Make, folder: Path) -> None:
         path = Path(rest.partition("  (")[0])
         content = any(path.iterdir()) if path.is_dir() else path.is_file() and path.stat().st_size
         if not (what and colon and content):
-            raise AssertionError(f'"{line}" does not name what it left, as "what: PATH"')
+            raise AssertionError(f'"{line}" does not name a file that it left, as "what: PATH"')
 
 
 def _changes_nothing(make: Make, folder: Path) -> None:
@@ -212,7 +212,7 @@ def _leaves_nothing(make: Make, folder: Path) -> None:
     deadline = time.monotonic() + _PATIENCE
     while left := set(threading.enumerate()) - before:
         if time.monotonic() > deadline:
-            raise AssertionError(f"threads run on after close: {[each.name for each in left]}")
+            raise AssertionError(f"threads still run after close: {[each.name for each in left]}")
         time.sleep(0.05)
 
 
@@ -222,7 +222,7 @@ def _outputs_or_none(make: Make, folder: Path) -> None:
 
 
 def _check(check: Callable[[Make, Path], None]) -> Check:
-    """Return a check of a subject, that runs without a display."""
+    """Return a check of a subject that runs without a display."""
 
     def checked(subject: Subject) -> None:
         with _no_display():

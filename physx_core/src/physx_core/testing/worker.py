@@ -1,4 +1,4 @@
-"""Runs checks in a process of its own: ``python -m physx_core.testing.worker DESCRIPTOR``."""
+"""Runs checks in a separate process: ``python -m physx_core.testing.worker DESCRIPTOR``."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ _GIVEN = ("instance_id", "instance_nb", "seed")
 
 
 def main() -> None:
-    """Answer the one request that comes through a socket, line by line."""
+    """Answer the single request that arrives through a socket, line by line."""
     link = socket.socket(fileno=int(sys.argv[1]))
     prepare_worker()
     with link, link.makefile("rb") as incoming:
@@ -37,15 +37,15 @@ def main() -> None:
         sys.path[:] = request["path"]
         for answer in _answers(request):
             link.sendall(json.dumps(answer).encode() + b"\n")
-    # Whatever the component left running must not keep this process from ending.
+    # Nothing that the component left running may keep this process from exiting.
     sys.stdout.flush()
     sys.stderr.flush()
     os._exit(0)
 
 
 def _answers(request: Mapping[str, Any]) -> Iterator[dict[str, str]]:
-    """Yield the name of each check before it runs, and its result then."""
-    tempfile.gettempdir()  # which sets it, if nobody has
+    """Yield the name of each check before it runs, then its result."""
+    tempfile.gettempdir()  # sets tempfile.tempdir if it is not set yet
     subject = Subject(
         request["kind"],
         request["reference"],
@@ -85,11 +85,11 @@ def _found(subject: Subject, file: str) -> Subject:
 
 
 def _what_is_missing(subject: Subject) -> str:
-    """Return which options and libraries the component needs; empty if it has all of them."""
+    """Return which options and libraries the component lacks; empty if it has all of them."""
     made = resolve(subject.kind, subject.reference)
     try:
         parameters = inspect.signature(made).parameters.values() if callable(made) else ()
-    except (TypeError, ValueError):  # not known, for example of a class in C
+    except (TypeError, ValueError):  # unknown, for example for a class in C
         parameters = ()
     needed = [
         parameter.name
@@ -105,16 +105,16 @@ def _what_is_missing(subject: Subject) -> str:
             subject.make()
     except MissingLibraryError as error:
         return str(error)
-    except Exception:  # the checks say what is wrong
+    except Exception:  # the checks report what is wrong
         return ""
     return ""
 
 
 def _run(check: Check, subject: Subject) -> tuple[str, str]:
-    """Return the status of a check, and why it did not pass."""
+    """Return the status of a check and the reason if it did not pass."""
     try:
         check(subject)
-    except Exception as error:  # whatever a component raises is what the report is about
+    except Exception as error:  # anything a component raises belongs in the report
         reason = _not_applicable(error)
         if reason is not None:
             return "skipped", reason
@@ -127,7 +127,7 @@ def _run(check: Check, subject: Subject) -> tuple[str, str]:
 
 
 def _not_applicable(error: BaseException) -> str | None:
-    """Return why a check does not apply, if that is what lies behind an error."""
+    """Return why a check does not apply, if that is what caused an error."""
     seen: BaseException | None = error
     while seen is not None:
         if isinstance(seen, NotApplicableError | MissingLibraryError):

@@ -1,4 +1,4 @@
-"""Environments in processes of their own, stepped over TCP."""
+"""Environments in separate processes, stepped over TCP."""
 
 from __future__ import annotations
 

@@ -13,7 +13,7 @@ from physx_core.workers.client.worker import run_client
 
 
 def main() -> int:
-    """Run the client of the command line; return its exit status."""
+    """Run a client with the command-line options; return its exit status."""
     parser = argparse.ArgumentParser(prog="python -m physx_core.workers", description=__doc__)
     parser.add_argument("--connect", metavar="HOST:PORT", required=True, help="the server")
     parser.add_argument("--instance", type=int, help="number of the instance; any by default")
@@ -27,7 +27,7 @@ def main() -> int:
         sys.stderr.write(f"physx client: {error}\n")
         return 1
     finally:
-        kill_descendants()  # nobody else does if the server is gone too
+        kill_descendants()  # nothing else does if the server is gone too
 
 
 if __name__ == "__main__":

@@ -33,21 +33,21 @@ from physx_core.rows import RejectedSamples
 from physx_core.typing import Batch, Sample
 
 PARAMETER = "parameters/"
-"""Begins the name of an entry of a stored row with the value of a parameter that it was made with;
-no field has such a name."""
+"""Name prefix of a stored row's entries that hold the parameters it was generated with; no field
+name has this prefix."""
 SET = PARAMETER + "/"
-"""Name of the entry with the place of the set in the dataset's record; -1: it is not known."""
+"""Name of the entry with the index of the set in the dataset's record; -1: unknown."""
 _STEPPING = ("reset_parameters", "step", "check_sample", "apply_prediction", "close")
 
 
 class Skip(NamedTuple):
-    """What an earlier run has had of the same instances, with the same seed.
+    """What an earlier run with the same seed already got from the same instances.
 
     Attributes:
-        rows: Number of rows of all instances together.
+        rows: Number of rows from all instances together.
         rejected: Number of rejected samples of each instance; empty: none.
         sets: Record of the sets of parameters; empty: none.
-        begun: Fields ``env_id``, ``episode`` and ``step`` of the rows; empty: not known.
+        begun: Fields ``env_id``, ``episode`` and ``step`` of the rows; empty: unknown.
     """
 
     rows: int = 0
@@ -56,14 +56,14 @@ class Skip(NamedTuple):
     begun: Batch = {}  # noqa: RUF012 - never changed
 
     def rows_of(self, number: int, instance_nb: int) -> int:
-        """Return how many of the rows an instance generated, counted from 1."""
+        """Return how many of the rows an instance generated; instances are numbered from 1."""
         return (self.rows - number + instance_nb) // instance_nb
 
     def last_of(self, number: int, episode: int) -> tuple[int, int]:
         """Return how many rows an instance generated up to the end of an episode.
 
         Returns:
-            The number of rows, and the step of the last of them, -1 if there is none.
+            The number of rows, and the step of the last one, -1 if there is none.
         """
         begun = self.begun
         if not begun:
@@ -77,7 +77,7 @@ class Skip(NamedTuple):
 
 
 NOTHING = Skip()
-"""What a new run has had."""
+"""For a new run: there is no earlier one."""
 
 
 def instance_arguments(
@@ -103,7 +103,7 @@ class Instance(Closeable):
     Attributes:
         instance_id: Number of the instance, counted from 1.
         environment: The environment; None before `open` and after `close`.
-        last_step: Number of the step that made the last sample, counted from 0.
+        last_step: Number of the step that generated the last sample, counted from 0.
         last_episode: Number of the trajectory that the last sample belongs to, counted from 0.
         rejected: The samples that `check_sample` rejected, if they are recorded; else None.
     """
@@ -135,8 +135,8 @@ class Instance(Closeable):
             max_wrong_samples: How many consecutive samples `check_sample` may reject.
             record_wrong: Whether to keep the samples that it rejects in `rejected`.
             accept_all: Whether to ignore the verdict of `check_sample`, as in a replay.
-            first_step: Number of its first step; others were made before.
-            first_episode: Number of its first trajectory; None: the environment's own.
+            first_step: Number of its first step; earlier ones are already done.
+            first_episode: Number of its first trajectory; None: the environment decides.
         """
         self.instance_id = instance_id
         self.environment: Environment | None = None
@@ -182,9 +182,10 @@ class Instance(Closeable):
                 distributions.
 
         Raises:
-            EnvironmentFailedError: If the environment cannot be imported or a method of it raises.
-            UsageError: If the environment's constructor does not pass on what it is given.
-            PhysxError: If the environment raises such an error; it is passed on.
+            EnvironmentFailedError: If the environment cannot be imported or one of its methods
+                raises.
+            UsageError: If the environment's constructor does not pass on its arguments.
+            PhysxError: If the environment raises one; it is raised unchanged.
         """
         environment = self.environment = self._create()
         environment._services, environment._choose_parameters = services, choose
@@ -204,21 +205,21 @@ class Instance(Closeable):
             environment.update_visualization()
 
     def _create(self) -> Environment:
-        """Return the environment, after checking that its constructor has done its part."""
+        """Create the environment, and check that its constructor passed on its arguments."""
         make = self._call("import", resolve, "environment", self._reference)
         name = getattr(make, "__name__", repr(make))
         _check_constructor(name, make, self._arguments)
         environment = self._call("__init__", make, **self._arguments)
         if not isinstance(environment, Environment):
             raise UsageError(
-                f"{self._reference!r} made {environment!r}, which is not an Environment."
+                f"{self._reference!r} returned {environment!r}, which is not an Environment."
             )
         if environment._has_seed is None:
             raise UsageError(f"{name}.__init__() must call super().__init__(**kwargs).")
         given = (environment.instance_id, environment.instance_nb, environment._has_seed)
         if given != (self._arguments["instance_id"], self._arguments["instance_nb"], True):
             raise UsageError(
-                f"{name}.__init__() must hand instance_id, instance_nb and seed to "
+                f"{name}.__init__() must pass instance_id, instance_nb and seed to "
                 "super().__init__(): take **kwargs and call super().__init__(**kwargs)."
             )
         return environment
@@ -227,13 +228,13 @@ class Instance(Closeable):
         """Simulate until `check_sample` accepts a sample; return it without further checks.
 
         Args:
-            stored: A stored row for the environment to replay, or None, with entries `PARAMETER`
-                and `SET` if it is known with which parameters it was made: the environment gets
-                these, if it defines any. It stays the same for all sub-steps, and after a sample
-                that is rejected.
+            stored: A stored row for the environment to replay, or None. If the parameters that it
+                was generated with are known, it has entries `PARAMETER` and `SET`, and an
+                environment that defines parameters gets them. The row stays the same for all
+                sub-steps, and after a rejected sample.
 
         Raises:
-            UsageError: If the environment never looks at the stored row.
+            UsageError: If the environment never reads the stored row.
             WrongSamplesError: If `check_sample` rejects too many consecutive samples.
             UnknownFieldError: If the step sets no data.
             EnvironmentFailedError: If the environment raises.
@@ -262,9 +263,9 @@ class Instance(Closeable):
                 raise self._failure(method, error) from error
             if stored is not None and not environment._has_read_sample:
                 raise UsageError(
-                    f"{type(environment).__name__} never reads Environment.sample, so its samples "
-                    "are new ones in place of the stored ones. In step(), take the state from "
-                    "self.sample (field name to array) if it is not None."
+                    f"{type(environment).__name__} never reads Environment.sample, so it "
+                    "generates new samples instead of replaying the stored ones. In step(), take "
+                    "the state from self.sample (field name to array) if it is not None."
                 )
             self.last_step = environment.step_index
             self.last_episode = environment.sample_episode
@@ -299,7 +300,7 @@ class Instance(Closeable):
                 self._runner = None
 
     def _replay(self, environment: Environment, stored: Sample) -> None:
-        """Give the environment a stored row, and the parameters that it was made with."""
+        """Give the environment a stored row, and the parameters that it was generated with."""
         values = {name: stored[name] for name in stored if name.startswith(PARAMETER)}
         environment.sample = {name: stored[name] for name in stored if name not in values}
         place = int(values.pop(SET))
@@ -308,14 +309,14 @@ class Instance(Closeable):
             self._call("reset_parameters", environment.replay_episode, place, values)
 
     def _simulate_before(self, environment: Environment) -> None:
-        """Run the sub-steps before the step that makes the sample."""
+        """Run the sub-steps before the step that generates the sample."""
         environment.compute_training_data = False
         for _ in range(self._sub_steps):
             self._finish(environment.step())
         environment.compute_training_data = True
 
     def _reject(self, sample: dict[str, Any], wrong: int) -> None:
-        """Keep a sample that `check_sample` rejected, as the `wrong`-th in a row."""
+        """Record a rejected sample, the `wrong`-th in a row; raise if there are too many."""
         if self.rejected is not None:
             self.rejected.add(sample, self.last_episode, self.last_step)
         if wrong > self._max_wrong_samples:
@@ -342,7 +343,7 @@ class Instance(Closeable):
             raise self._failure(method, error) from error
 
     def _failure(self, method: str, error: Exception) -> Exception:
-        """Return the error to raise: one of physx with a note of its place, else one around it."""
+        """Return the error to raise: physx errors get a note, others are wrapped."""
         step = self.environment.step_index if self.environment is not None else -1
         if method not in _STEPPING:
             step = -1
@@ -363,14 +364,14 @@ class Instance(Closeable):
 
 
 def _verdict(accepted: Any) -> bool:
-    """Return what `check_sample` returned as a boolean."""
+    """Return the result of `check_sample` as a boolean."""
     if accepted is None:
         raise UsageError("check_sample() returned None but must return True or False.")
     return bool(accepted)
 
 
 def _warn_of_misspelt_methods(cls: type[Environment]) -> None:
-    """Warn of methods that nobody calls, but whose names are nearly those of optional ones."""
+    """Warn about methods that are never called but whose names resemble optional ones."""
     own = [name for name in dir(cls) if not name.startswith("_") and not hasattr(Environment, name)]
     optional = ("init_visualization", "check_sample", "apply_prediction", "reset_parameters")
     for method in optional:
@@ -388,12 +389,12 @@ def _check_constructor(name: str, make: Any, arguments: Mapping[str, Any]) -> No
     """Check that an environment can be created with the arguments.
 
     Raises:
-        UsageError: If it does not take those that every environment gets.
-        UnknownOptionError: If it does not take one of the user's.
+        UsageError: If it does not accept those that every environment gets.
+        UnknownOptionError: If it does not accept one of the user's.
     """
     try:
         parameters = inspect.signature(make).parameters.values()
-    except (TypeError, ValueError):  # not known, for example of a class in C
+    except (TypeError, ValueError):  # unknown, for example for a class in C
         return
     if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
         return
@@ -402,7 +403,7 @@ def _check_constructor(name: str, make: Any, arguments: Mapping[str, Any]) -> No
     missing = [option for option in ("instance_id", "instance_nb", "seed") if option not in known]
     if missing:
         raise UsageError(
-            f"{name}.__init__() does not take {', '.join(missing)}: it must take **kwargs and hand "
+            f"{name}.__init__() does not take {', '.join(missing)}: it must take **kwargs and pass "
             "them to super().__init__(**kwargs)."
         )
     unknown = arguments.keys() - known

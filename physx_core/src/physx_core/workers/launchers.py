@@ -1,4 +1,4 @@
-"""Launchers of the core: client processes on this machine, or clients started by hand."""
+"""The core's launchers: client processes on this machine, or clients started by hand."""
 
 from __future__ import annotations
 
@@ -37,14 +37,14 @@ class ClientProcess(ClientHandle):
         core: int | None = None,
         ticket: int | None = None,
     ) -> None:
-        """Keep the arguments of the process.
+        """Store the arguments of the process.
 
         Args:
             instance_id: Number of the instance, counted from 1.
             address: The server's ``HOST:PORT``.
             token: Token of the run.
             core: The only processor core that it may use; None: all that this process may use.
-            ticket: What it shows to run the instance in an elastic run.
+            ticket: Ticket that it presents to run the instance, in an elastic run.
         """
         self.instance_id = instance_id
         self._core = core
@@ -58,7 +58,11 @@ class ClientProcess(ClientHandle):
         self._tail: OutputTail | None = None
 
     def start(self) -> None:
-        """Start the process."""
+        """Start the process.
+
+        Raises:
+            ClientError: If it cannot be started.
+        """
         try:
             self._process = ChildProcess(
                 self._command, variables=self._variables, stderr=subprocess.PIPE
@@ -66,7 +70,7 @@ class ClientProcess(ClientHandle):
         except OSError as error:
             raise ClientError(self.instance_id, f"could not be started: {error}.") from error
         if self._core is not None:
-            with contextlib.suppress(ProcessLookupError):  # it has ended already
+            with contextlib.suppress(ProcessLookupError):  # it has already ended
                 os.sched_setaffinity(self._process.pid, {self._core})
         assert self._process.stderr is not None
         self._tail = OutputTail(self._process.stderr)
@@ -87,17 +91,17 @@ class ClientProcess(ClientHandle):
         return self._tail.text(0.0 if self.exit_status() is None else 0.2)
 
     def terminate(self) -> None:
-        """Ask the process and those that it started to exit."""
+        """Ask the process and the processes it started to exit."""
         if self._process is not None:
             self._process.ask_to_end()
 
     def kill(self) -> None:
-        """Kill the process and those that it started."""
+        """Kill the process and the processes it started."""
         if self._process is not None:
             self._process.send_signal(signal.SIGKILL)
 
     def wait(self, until: float) -> bool:
-        """Wait for the end of the process: see `ClientHandle.wait`."""
+        """Wait for the process to end: see `ClientHandle.wait`."""
         return self._process is None or super().wait(until)
 
 
@@ -105,11 +109,11 @@ class SubprocessLauncher(Launcher):
     """Starts each client as a process on this machine."""
 
     def __init__(self, *, affinity: bool = False) -> None:
-        """Keep the options.
+        """Store the options.
 
         Args:
             affinity: Bind each client to one of the processor cores that this process may use, in
-                turn. It helps if there are as many busy clients as cores, and harms if the
+                turn. This helps if there are as many busy clients as cores, and hurts if the
                 environments use several threads.
         """
         self._cores: list[int] = []
@@ -136,24 +140,24 @@ class SubprocessLauncher(Launcher):
 
 
 class ManualLauncher(Launcher):
-    """Starts nothing: clients are started by hand, with ``physx client``, on any machine."""
+    """Starts nothing: users start the clients with ``physx client``, on any machine."""
 
     by_hand = True
 
     def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
-        """Start nothing; the server tells where clients can connect."""
+        """Start nothing; the server announces where clients can connect."""
         return []
 
 
 def describe_states(clients: Iterable[ClientHandle]) -> str:
-    """Return what absent clients wait for, as far as their launcher knows."""
+    """Return what absent clients are waiting for, as far as their launcher knows."""
     found = Counter(client.state() for client in clients)
     del found[""]
     return "".join(f"; {count} of them: {state}" for state, count in found.items())
 
 
 def stop(clients: Iterable[ClientHandle], patience: float) -> None:
-    """End clients and all processes that they started; none is left when this returns.
+    """End clients and all processes they started; none is left when this returns.
 
     Args:
         clients: The clients.

@@ -1,4 +1,4 @@
-"""ParameterSets: the sets of parameters that a source's environments are given."""
+"""ParameterSets: the sets of parameters that a source's environments get."""
 
 from __future__ import annotations
 
@@ -43,26 +43,26 @@ _OF_PARAMETERS = (
 
 
 class ParameterSets:
-    """Has a sampler choose sets, and keeps them until the rows of their episodes are stored.
+    """Gets sets from a sampler, and keeps them until the rows of their episodes are stored.
 
     Set k is for episode ``k // instance_nb`` of instance ``k % instance_nb + 1``.
 
     Attributes:
         instance_nb: Number of instances.
         parameters: The parameters that the environment defines.
-        failures: Number of each set whose simulation failed, and how.
-        count: Number of sets that were found to begin.
+        failures: Set number to description, for each set whose simulation failed.
+        count: Number of sets found so far.
     """
 
     def __init__(
         self, config: EnvironmentConfig, seed: Sequence[int], skip: Skip = NOTHING
     ) -> None:
-        """Create the sampler that is named.
+        """Create the configured sampler.
 
         Args:
             config: Names the sampler, the number of instances, and how many sets may fail.
             seed: Seed of the run.
-            skip: What an earlier run has had, the records of its sets among it.
+            skip: What an earlier run already got, including the record of its sets.
         """
         if config.redraw and config.load_samples:
             raise ConfigError(
@@ -78,21 +78,21 @@ class ParameterSets:
         self.instance_nb = config.num_clients
         self._skip = skip
         self._recorded = {number: row for row, number in enumerate(skip.sets.get("set", ()))}
-        self._surplus = len(self._recorded)  # sets that are recorded already
+        self._surplus = len(self._recorded)  # sets that are already recorded
         self._sampler = None if config.sampler is None else _make_sampler(config, config.sampler)
         self._redraws = [0] * self.instance_nb
         self._waiting: list[dict[int, Mapping[str, Any]]] = [{} for _ in self._redraws]
-        self._stored: dict[int, int] = {}  # number of an instance's present set to its place
+        self._stored: dict[int, int] = {}  # number of an instance's current set to its index
         self._begun: list[dict[str, Any]] = []
         self._needed: Callable[[int], int] | None = None
-        self._values: dict[int, Mapping[str, Any]] = {}  # of the sets that may be told
+        self._values: dict[int, Mapping[str, Any]] = {}  # of the sets whose losses may yet arrive
         self._told, self._newest = 0, -1
         self._changed = threading.Condition()
         self._is_canceled = False
         self._failed: list[int] = []
 
     def begin(self, definitions: Sequence[Sequence[Parameter]]) -> None:
-        """Take what the instances define.
+        """Take the parameters that the instances define.
 
         Args:
             definitions: The parameters of each instance.
@@ -136,7 +136,7 @@ class ParameterSets:
 
     @property
     def learns(self) -> bool:
-        """Whether the sampler learns from losses of a training."""
+        """Whether the sampler learns from training losses."""
         return isinstance(self._sampler, LearningSampler) and bool(self.parameters)
 
     def _read(self, row: int) -> dict[str, Any]:
@@ -145,10 +145,10 @@ class ParameterSets:
         return checked(self.parameters, {p.name: record[p.name][row] for p in self.parameters})
 
     def state(self, batches: int) -> Array | None:
-        """Return what `restore` needs to continue after some batches; None: the sampler learns not.
+        """Return what `restore` needs after some batches; None if the sampler does not learn.
 
         Args:
-            batches: Number of batches: all that were told, or all but the last one.
+            batches: Number of batches: all that the sampler was told of, or all but the last one.
         """
         if not isinstance(self._sampler, LearningSampler) or not self.parameters:
             return None
@@ -156,10 +156,10 @@ class ParameterSets:
             return np.concatenate([[self._newest], self._sampler.state(batches)])
 
     def restore(self, batches: int, state: Array) -> None:
-        """Have the sampler continue after some batches; nothing was chosen yet.
+        """Make the sampler continue after some batches, before anything is chosen.
 
         Raises:
-            ValueError: If it is not a state of this sampler.
+            ValueError: If `state` is not a state of this sampler.
         """
         assert isinstance(self._sampler, LearningSampler)
         if not len(state):
@@ -168,15 +168,15 @@ class ParameterSets:
         self._told, self._newest = batches, int(state[0])
 
     def follow(self, needed: Callable[[int], int]) -> None:
-        """Have the sampler learn from a training.
+        """Make the sampler learn from a training run.
 
         Args:
-            needed: Returns how many rows must have arrived before a batch, which never decreases.
+            needed: Returns how many rows must have arrived before a batch; never decreases.
         """
         self._needed = needed
 
     def tell(self, numbers: Index, losses: Array) -> None:
-        """Have the sampler learn from the next batch of the training.
+        """Make the sampler learn from the next training batch.
 
         Args:
             numbers: Numbers of the sets of the batch's rows.
@@ -198,23 +198,23 @@ class ParameterSets:
             self._changed.notify_all()
 
     def cancel(self) -> None:
-        """Have a call of `choose` that waits for losses end soon, with an error."""
+        """End a call to `choose` that waits for losses soon, with an error."""
         with self._changed:
             self._is_canceled = True
             self._changed.notify_all()
 
     def is_ready(self, row: int) -> bool:
-        """Return whether the losses were told that a set for a row depends on."""
+        """Return whether the losses that a row's set depends on are known."""
         return not self.learns or self._told >= self._batches_for(row)
 
     def _batches_for(self, row: int) -> int:
-        """Return how many batches a set may depend on that is asked for when a row is made."""
+        """Return how many batches a set requested for a row may depend on."""
         sampler, needed = self._sampler, self._needed
         assert isinstance(sampler, LearningSampler)
         if needed is None:
             raise UsageError(
-                f"The sampler {type(sampler).__name__} learns from the losses of a training on the "
-                'samples that environments generate, and there is none here. Use "physx/sobol".'
+                f"The sampler {type(sampler).__name__} learns from training losses on generated "
+                'samples, but nothing is trained here. Use "physx/sobol".'
             )
         end = 1
         while needed(end - 1) <= row:
@@ -225,20 +225,20 @@ class ParameterSets:
     def choose(self, instance_id: int, episode: int, row: int) -> dict[str, Any]:
         """Return the values of the parameters for an episode of an instance.
 
-        If they depend on losses that were not told yet, it waits for them, in a thread beside that
-        of the training.
+        If they depend on losses that are not known yet, this waits for them, in a thread other
+        than the training's.
 
         Args:
             instance_id: The instance.
             episode: The episode.
-            row: Number, among all rows, of the one that the instance is making.
+            row: Index, among all rows, of the one that the instance is generating.
 
         Raises:
             ConfigError: If the sampler fails, or what it chooses does not fit the parameters.
             UsageError: If the sampler learns, but nothing is trained.
         """
         if not self.parameters:
-            raise UsageError("Parameters can be chosen once all instances have defined them.")
+            raise UsageError("Parameters can be chosen only once all instances have defined them.")
         number = self._number(instance_id, episode)
         values = self._ask(number, row)
         self._waiting[instance_id - 1][number] = values
@@ -277,10 +277,10 @@ class ParameterSets:
         )
 
     def redraw(self, instance_id: int, episode: int, error: PhysxError) -> str:
-        """Note that the simulation of an episode failed, and that the next set takes its place.
+        """Record that an episode's simulation failed, and that the next set takes its place.
 
         Returns:
-            What happened, in a sentence.
+            A description for the log.
         """
         self._redraws[instance_id - 1] += 1
         self.fail(instance_id, episode, error)
@@ -291,7 +291,7 @@ class ParameterSets:
         )
 
     def fail(self, instance_id: int, episode: int, error: PhysxError) -> None:
-        """Note that the simulation of an episode failed, if its parameters may be the reason."""
+        """Record that an episode's simulation failed, if its parameters may be the cause."""
         number = self._number(instance_id, episode)
         if isinstance(error, _OF_PARAMETERS) and number in self._waiting[instance_id - 1]:
             self.failures[number] = f"{self._describe(number)}: {str(error).partition(chr(10))[0]}"
@@ -306,7 +306,7 @@ class ParameterSets:
     def note(self, batch: Batch) -> None:
         """Find the sets that begin in a batch of rows, in the order of their first rows.
 
-        A set that failed before its first row comes before the next one of its instance.
+        A set that failed before its first row precedes its instance's next one.
         """
         self._begun, self._failed = [], []
         if not self.parameters:
@@ -330,21 +330,21 @@ class ParameterSets:
         del self._begun[:recorded]
 
     def note_failed(self) -> None:
-        """Find the sets that failed and that no later row follows, at the end of a run."""
+        """At the end of a run, find the failed sets that no later row follows."""
         self._begun, self._failed = [], []
         for waiting in self._waiting:
             for number in [known for known in waiting if known in self.failures]:
                 self._settle(number, waiting)
 
     def pop(self, mode: str) -> tuple[Batch, list[int]]:
-        """Return and clear what was found last.
+        """Return and clear the sets that were found last.
 
         Args:
             mode: Mode of the rows.
 
         Returns:
-            The record of the sets that begin, field name to array; and the places, in the record of
-            the whole run, of earlier sets that failed.
+            The record of the sets that begin, field name to array; and the indices, in the record
+            of the whole run, of earlier sets that failed.
         """
         begun, failed = self._begun, self._failed
         self._begun, self._failed = [], []
@@ -375,11 +375,11 @@ class ParameterSets:
 
 
 def next_step(last_step: int, error: PhysxError) -> int:
-    """Return the number of the first step after those of a simulation that failed.
+    """Return the number of the first step after a failed simulation.
 
     Args:
-        last_step: Step of its last row, -1 if it made none.
-        error: How it failed.
+        last_step: Step of its last row, -1 if it has none.
+        error: Its error.
     """
     return max(last_step, getattr(error, "step", -1)) + 1
 

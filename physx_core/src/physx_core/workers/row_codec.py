@@ -1,4 +1,4 @@
-"""Encoding of rows: field by field, all values of a block of rows, little-endian; their queues."""
+"""Encodes blocks of rows, field by field and little-endian; queues the received ones."""
 
 from __future__ import annotations
 
@@ -13,11 +13,11 @@ from physx_core.net.frames import Kind, pack_header
 from physx_core.typing import Array, Batch
 
 _SMALL = 1 << 14
-"""Bytes up to which rows are copied into one message, which is faster than sending parts."""
+"""Size in bytes up to which rows are copied into one message: faster than sending parts."""
 
 
 def row_bytes(fields: Sequence[Field]) -> int:
-    """Return the bytes of one row of fields with known shapes."""
+    """Return the size in bytes of one row of fields with known shapes."""
     return sum(field.nbytes for field in fields)
 
 

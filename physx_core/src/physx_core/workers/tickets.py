@@ -1,4 +1,4 @@
-"""Tickets: what a worker of an elastic run shows to run an instance; a former one's is refused."""
+"""Tickets: what workers of an elastic run present to run an instance; old ones are refused."""
 
 from __future__ import annotations
 
@@ -21,5 +21,5 @@ def instance_of(ticket: int) -> int:
 
 
 def is_ticket(number: int) -> bool:
-    """Return whether a number is a ticket; the others are those of clients."""
+    """Return whether a number is a ticket; otherwise it is the number of a client."""
     return number >= _INSTANCES

@@ -1,6 +1,7 @@
-"""Batches of forward dynamics that several processes compute in parallel.
+"""Batched forward dynamics, computed by several processes in parallel.
 
-Pinocchio's derivatives hold Python's global lock, so threads cannot compute them in parallel.
+Pinocchio's derivatives hold Python's global interpreter lock, so threads cannot run them in
+parallel.
 """
 
 from __future__ import annotations
@@ -29,21 +30,21 @@ from physx_dart.batch.worker import (
 from physx_dart.pinocchio.algorithms import MoverAlgorithms, PinocchioAlgorithms
 
 _LEAST_ROWS = 16
-"""Least number of rows for which using a process pays off."""
+"""Minimum number of rows for which an additional process pays off."""
 _PATIENCE = 5.0
-"""Time in s that a process which closed its connection may take to exit."""
+"""Time, in s, that a process may take to exit after it closed its connection."""
 
 
 class ParallelAlgorithms(PinocchioAlgorithms):
-    """Algorithms with batches of which this process computes some rows and others the rest.
+    """Algorithms that split the rows of a batch between this process and others.
 
-    The other processes start when they are first needed. They end when this is closed or garbage
+    The other processes start on first use. They end when this object is closed or garbage
     collected, and when this process ends, even if it is killed. A process forked from this one
     computes all rows itself.
     """
 
     def __init__(self, movers: Sequence[MoverAlgorithms], statics: Vector) -> None:
-        """Combine movers with static things, whose poses have the shape (statics, 7)."""
+        """Combine movers with static bodies, whose poses have the shape (statics, 7)."""
         super().__init__(movers, statics)
         self._owner = os.getpid()
         self._workers: list[_Worker] = []
@@ -52,7 +53,7 @@ class ParallelAlgorithms(PinocchioAlgorithms):
         weakref.finalize(self, _end_processes, self._held, self._owner)
 
     def forward_batch(self, q: Vector, v: Vector, tau: Vector, processes: int = 1) -> Vector:
-        """Return `forward_dynamics` of many states, shape (n, nv)."""
+        """Return `forward_dynamics` for many states, shape (n, nv)."""
         shares = self._shares(processes, len(q))
         if shares < 2:
             return super().forward_batch(q, v, tau)
@@ -73,13 +74,13 @@ class ParallelAlgorithms(PinocchioAlgorithms):
         _end_processes(self._held, self._owner)
 
     def _shares(self, processes: int, rows: int) -> int:
-        """Return the number of processes among which rows are shared."""
+        """Return the number of processes to share the rows."""
         return min(processes, rows // _LEAST_ROWS) if os.getpid() == self._owner else 1
 
     def _compute(self, kind: int, states: tuple[Vector, ...], shares: int) -> Vector:
         try:
             return self._compute_shared(kind, states, shares)
-        except BaseException:  # there may be pending replies that nobody waits for
+        except BaseException:  # there may be pending replies that nobody is waiting for
             self.close()
             raise
 
@@ -102,7 +103,7 @@ class ParallelAlgorithms(PinocchioAlgorithms):
         return found
 
     def _start_workers(self, count: int) -> tuple[list[_Worker], SharedRows]:
-        """Return `count` other processes, and the memory that they share."""
+        """Return `count` other processes and their shared memory."""
         if self._memory is None:
             file = self._held.enter_context(anonymous_file("physx_batches"))
             self._memory = SharedRows(file.fileno(), self.nq, self.nv)
@@ -117,11 +118,11 @@ class _Worker:
     """A process that computes rows."""
 
     def __init__(self, file: int, held: contextlib.ExitStack) -> None:
-        """Start it.
+        """Start the process.
 
         Args:
             file: Descriptor of the shared memory.
-            held: Ends the process when it is closed.
+            held: Stack that ends the process when it is closed.
         """
         self._link, theirs = socket.socketpair()
         held.enter_context(self._link)
@@ -131,9 +132,7 @@ class _Worker:
             try:
                 self._process = ChildProcess(command, variables=worker_variables(), pass_fds=passed)
             except OSError as error:
-                raise SimulationError(
-                    f"A process for batches cannot be started: {error}."
-                ) from error
+                raise SimulationError(f"Cannot start a process for batches: {error}.") from error
         held.callback(self._process.close, 0.0)
 
     def ask(self, message: bytes) -> None:
@@ -144,7 +143,7 @@ class _Worker:
             raise self._lost() from None
 
     def wait(self) -> None:
-        """Wait until it has finished its request."""
+        """Wait until the process has finished its request."""
         with contextlib.suppress(ConnectionError):
             if self._link.recv(len(DONE)) == DONE:
                 return

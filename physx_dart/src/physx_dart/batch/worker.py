@@ -1,7 +1,7 @@
-"""Process that computes rows of batches for another one: ``python -m physx_dart.batch.worker``.
+"""Computes rows of batches for another process: ``python -m physx_dart.batch.worker``.
 
-It receives the models once, then requests for rows. The rows and the results are in memory that
-both processes map. It exits when the other process closes the connection or ends.
+This process receives the models once, then requests for rows. Rows and results are in memory mapped
+by both processes. It exits when the other process closes the connection or ends.
 """
 
 from __future__ import annotations
@@ -23,13 +23,13 @@ from physx_dart.pinocchio.algorithms import MoverAlgorithms, PinocchioAlgorithms
 
 FORWARD, GRADIENTS = range(2)
 REQUEST = struct.Struct("<4q")
-"""`FORWARD` or `GRADIENTS`; rows of the batch; the first to compute, and the first after those."""
+"""`FORWARD` or `GRADIENTS`; rows in the batch; first row to compute, and the row after the last."""
 DONE = b"."
-"""Reply to each request."""
+"""The reply to each request."""
 
 
 class SharedRows:
-    """Rows of states and results in a file that several processes map; it grows as needed.
+    """Rows of states and results in a file mapped by several processes, which grows as needed.
 
     Attributes:
         file: Descriptor of the file.
@@ -71,7 +71,7 @@ def compute(algorithms: PinocchioAlgorithms, kind: int, states: tuple[Vector, ..
 
 
 def describe_models(algorithms: PinocchioAlgorithms) -> bytes:
-    """Return a line of text from which `algorithms_of` rebuilds them; it contains no code."""
+    """Return a line of text, free of code, from which `algorithms_of` rebuilds the algorithms."""
     movers = [
         (each.model.saveToString(), each.resistance.table.tolist()) for each in algorithms.movers
     ]
@@ -79,7 +79,7 @@ def describe_models(algorithms: PinocchioAlgorithms) -> bytes:
 
 
 def algorithms_of(line: bytes) -> PinocchioAlgorithms:
-    """Return the algorithms, without bodies, that a line of `describe_models` describes."""
+    """Return the algorithms, without bodies, described by a line from `describe_models`."""
     movers = []
     for text, table in json.loads(line):
         model = pinocchio.Model()

@@ -54,4 +54,4 @@ def _print_table(robots: Sequence[RobotInfo]) -> None:
     numbers = ("dof", "mass [kg]")
     show_table(["name", *numbers, "collisions", ""], rows, numbers=numbers)
     if any(info.warning for info in robots):
-        show('slow: with Robot(collisions="boxes") or "capsules" each mesh is its bounding shape')
+        show('slow: Robot(collisions="boxes") or "capsules" replaces meshes by bounding shapes')

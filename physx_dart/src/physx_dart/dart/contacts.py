@@ -1,4 +1,4 @@
-"""Contacts and ray hits of DART, copied to arrays; DART's own objects never leave this module."""
+"""Contacts and ray hits from DART, copied to arrays; DART's own objects never leave this module."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ class ContactReader:
     """Reads the contacts of a world in DART.
 
     Args:
-        world: The world; it must live as long as this reader.
+        world: The world; it must outlive this reader.
         bodies: DART's bodies in the order of `Layout.names`.
         period: Length of a physics step, in s.
     """
 
     def __init__(self, world: Any, bodies: list[Any], period: float) -> None:
         self._world = world
-        # As long as these Python objects are kept, DART returns the same ones again.
+        # As long as these Python objects are alive, DART keeps returning the same ones.
         self._bodies = {body: place for place, body in enumerate(bodies)}
         self._places: dict[Any, int] = {}
 
     def contacts(self) -> Records:
-        """Return the contacts of the last step: an array of `CONTACT` records."""
+        """Return the contacts of the last step as an array of `CONTACT` records."""
         found = self._world.getLastCollisionResult().getContacts()
         records = np.zeros(len(found), CONTACT)
         bodies_a, bodies_b = records["body_a"], records["body_b"]
@@ -46,7 +46,7 @@ class ContactReader:
         return records
 
     def raycast(self, begins: Vector, ends: Vector) -> Records:
-        """Return the first hit of each ray: an array of `RAY_HIT` records."""
+        """Return the first hit of each ray as an array of `RAY_HIT` records."""
         records = np.zeros(len(begins), RAY_HIT)
         records["body"] = -1
         group = self._world.getConstraintSolver().getCollisionGroup()
@@ -63,7 +63,7 @@ class ContactReader:
         return records
 
     def forget(self) -> None:
-        """Forget DART's objects, which are about to be replaced."""
+        """Drop references to DART's objects, which are about to be replaced."""
         self._places.clear()
 
     def _place(self, collision_object: Any) -> int:

@@ -1,4 +1,4 @@
-"""Creation of DART's skeletons for robots, objects, and the ground, with their shapes."""
+"""Creation of DART skeletons for robots, objects, and the ground, with their shapes."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from physx_core.typing import Vector
 
 WORLD = "world"
 ROOT = "physx root"
-"""Name that stands for a root link `world` in DART, which would drop it."""
+"""Substitute name in DART for a root link named `world`, which DART would drop."""
 GROUND_SIZE = (1000.0, 1000.0, 10.0)
-"""Size of the box that stands for an infinite plane, in m. For a box on a plane DART finds a single
-contact point, for a box on a box all corners."""
+"""Size of the box that represents an infinite plane, in m. For a box on a plane, DART finds a
+single contact point; for a box on a box, all corners."""
 
 _MESH = (
     '<robot name="mesh"><link name="mesh"><collision><geometry><mesh filename="{}"/>'
@@ -47,7 +47,7 @@ def load_skeleton(mover: Mover) -> dynamics.Skeleton:
 
 
 def link_name(link: str) -> str:
-    """Return the name of a link in DART."""
+    """Return a link's name in DART."""
     return ROOT if link == WORLD else link
 
 
@@ -61,7 +61,7 @@ def attach_shapes(skeleton: dynamics.Skeleton, shapes: Sequence[CollisionShape])
 
 
 def static_skeleton(static: Static) -> dynamics.Skeleton:
-    """Return the immobile skeleton of a shape or of the ground."""
+    """Return the immobile skeleton of a static shape or the ground."""
     skeleton = dynamics.Skeleton(static.name)
     joint, body = skeleton.createWeldJointAndBodyNodePair()
     rotation = to_matrix(static.orientation)
@@ -90,7 +90,7 @@ def _ground_boxes(ground: Ground | Stairs) -> list[tuple[Sequence[float], Vector
 
 
 def _axes_along(normal: Vector) -> Vector:
-    """Return a rotation matrix whose last column is a direction."""
+    """Return a rotation matrix whose last column is a given direction."""
     if normal[2] > 1 - 1e-15:
         return np.eye(3)
     other = np.eye(3)[int(np.argmin(np.abs(normal)))]
@@ -134,11 +134,11 @@ def _load_mesh(path: Path) -> Any:
     skeleton = _parse(text, True, str(path))
     for node in skeleton.getBodyNode(0).getShapeNodes():
         return node.getShape()
-    raise ModelError(f"DART does not find a mesh in {path}.")
+    raise ModelError(f"DART finds no mesh in {path}.")
 
 
 def _height_shape(field: HeightField) -> Any:
-    """Return a mesh of a height field, by way of a file, as DART loads meshes from files only."""
+    """Return a height field's mesh, via a file, because DART only loads meshes from files."""
     nx, ny = field.heights.shape
     x0, y0 = field.corner()
     lines = [
@@ -176,7 +176,7 @@ def _parse(text: str, fixed_base: bool, origin: str) -> dynamics.Skeleton:
 
 @contextmanager
 def _capture_messages() -> Iterator[list[str]]:
-    """Collect what native code of this process writes to standard error."""
+    """Collect what native code in this process writes to standard error."""
     messages: list[str] = []
     sys.stderr.flush()
     saved = os.dup(2)
@@ -188,4 +188,4 @@ def _capture_messages() -> Iterator[list[str]]:
             os.dup2(saved, 2)
             os.close(saved)
             file.seek(0)
-            messages.append(" It says: " + file.read().decode(errors="replace").strip())
+            messages.append(" Its output: " + file.read().decode(errors="replace").strip())

@@ -1,7 +1,7 @@
-"""The engine DART. All calls of dartpy are in `physx_dart.dart`.
+"""The engine DART. All calls to dartpy are in `physx_dart.dart`.
 
 DART integrates with semi-implicit Euler: velocities first, then positions with the new velocities;
-the integrator ``rk4`` uses its forward dynamics alone. Damping and springs are implicit; contacts,
+the integrator ``rk4`` only uses its forward dynamics. Damping and springs are implicit; contacts,
 position and velocity limits, servos, and Coulomb friction are constraints of its solver.
 """
 
@@ -41,42 +41,42 @@ _SOLVERS = ("nsgs", "fbf", "dantzig")
 _ISOTROPIC = ("nsgs", "fbf")
 _STATELESS = ("dart", "dantzig")
 """The detector and the solver that keep nothing between steps. With an iterative solver, impulses
-that this detector keeps depend on addresses in memory, so that not even a rerun is the same."""
+kept by this detector depend on memory addresses, so even a rerun differs."""
 _SWEEPS, _TOLERANCE = 50, 1e-6
-"""Most iterations of ``nsgs`` in a step, and the error in m/s that ends them. They begin with the
-impulses of the last step, so that more of them mostly sharpen impacts (docs/contacts.md)."""
+"""Maximum iterations of ``nsgs`` per step, and the error in m/s that ends them. They start from
+the impulses of the last step, so more iterations mostly sharpen impacts (docs/contacts.md)."""
 _RAYS = ("dart", "bullet")
 
 
 class DartBackend(RobotBackend):
     """DART, a simulator of articulated bodies.
 
-    Contact solvers: ``nsgs`` (default) and ``fbf`` with Coulomb's law, by iterations; ``dantzig``,
-    a direct one whose friction is up to 41 % too strong between the axes, and too weak where it
+    Contact solvers: ``nsgs`` (default) and ``fbf``, iterative with Coulomb's law; ``dantzig``, a
+    direct solver whose friction is up to 41 % too strong between the axes, and too weak where it
     holds parts together (docs/contacts.md). Without contacts the default is ``dantzig``, which is
     then exact. Detectors: ``bullet`` (default), ``ode``, ``fcl`` (without capsules), and ``dart``
-    (default for ``dantzig``), with which the other solvers do not repeat bit for bit.
+    (default for ``dantzig``), with which the other solvers are not bit-reproducible.
     """
 
     def build(self, world: World, seed: int | None = None) -> Simulation:
         """Build a simulation; DART is deterministic, so the seed has no effect.
 
         Raises:
-            ModelError: If a robot or mesh cannot be loaded; the message says why.
+            ModelError: If a robot or mesh cannot be loaded; the message gives the reason.
             FeatureNotSupportedError: If the world needs a feature that DART does not have.
-            UnknownOptionError: If there is no detector or solver of that name.
+            UnknownOptionError: If there is no detector or solver with that name.
         """
         return DartSimulation(world)
 
 
 class DartSimulation(RobotSimulation[DartRobot]):
-    """A world of DART."""
+    """A world in DART."""
 
     engine = "dart"
     lacks: ClassVar[frozenset[str]] = frozenset({"armature"})
 
     def __init__(self, world: World) -> None:
-        """Build the world; errors are those of the backend's `build`."""
+        """Build the world; raises the same errors as the backend's `build`."""
         for option, name, known in (
             ("detector", world.detector, tuple(_DETECTORS)),
             ("solver", world.solver, _SOLVERS),
@@ -152,7 +152,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
         """Make the state alone determine what follows.
 
         Iterative solvers start from the impulses of the last step, and some detectors from its
-        contacts. DART keeps these as long as its solver knows the same skeletons.
+        contacts. DART keeps them as long as its solver holds the same skeletons.
         """
         if self._stateless:
             return
@@ -169,26 +169,26 @@ class DartSimulation(RobotSimulation[DartRobot]):
         return self._reader.contacts() if self._kept is None else self._kept.copy()
 
     def raycast(self, begins: Vector, ends: Vector) -> Records:
-        """Return the first hit of each ray: an array of `RAY_HIT` records."""
+        """Return the first hit of each ray as an array of `RAY_HIT` records."""
         self._check_open()
         if "raycast" not in self.features:
             raise self._lacks("raycast")
         first, last = finite_rows("begins", begins, 3), finite_rows("ends", ends, 3)
         if len(first) != len(last):
             raise SimulationError(
-                f"There are {len(first)} start points of rays but {len(last)} end points."
+                f"There are {len(first)} ray start points but {len(last)} end points."
             )
         return self._reader.raycast(first, last)
 
     def forward_dynamics(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
-        """Return the accelerations, shape (nv,), that torques (nv,) cause in a state, by DART."""
+        """Return the accelerations, shape (nv,), caused by torques (nv,), computed by DART."""
         q, v, tau = self._checked_state(positions, velocities, torques=torques)
         return np.concatenate([x.forward(q[i], v[j], tau[j]) for x, i, j in self._slices])
 
     def inverse_dynamics(
         self, positions: Vector, velocities: Vector, accelerations: Vector
     ) -> Vector:
-        """Return the torques, shape (nv,), that cause accelerations (nv,) in a state, by DART."""
+        """Return the torques, shape (nv,), that produce accelerations (nv,), computed by DART."""
         q, v, a = self._checked_state(positions, velocities, accelerations=accelerations)
         return np.concatenate([x.inverse(q[i], v[j], a[j]) for x, i, j in self._slices])
 
@@ -220,7 +220,7 @@ def _new_world(world: World, detector: str, solver: str) -> Any:
 
 
 def _disable_contacts(world: Any, groups: list[list[Any]]) -> None:
-    """Disable contacts between bodies of different groups."""
+    """Disable contacts between bodies in different groups."""
     collisions = world.getConstraintSolver().getCollisionOption().collisionFilter
     solid = [[body for body in bodies if body.getNumShapeNodes()] for bodies in groups]
     for place, bodies in enumerate(solid):

@@ -29,7 +29,7 @@ _ACTUATORS = {
 
 
 class DartRobot(RobotEngine):
-    """A simulated skeleton, and a second one for the dynamics of other states.
+    """A simulated skeleton, plus a second one for the dynamics of other states.
 
     Attributes:
         skeleton: The simulated skeleton.
@@ -54,7 +54,7 @@ class DartRobot(RobotEngine):
         self._read()
 
     def hold(self, commands: Vector) -> None:
-        """Hold commands, shape (joints,), that are within their limits."""
+        """Hold commands, shape (joints,), already clipped to their limits."""
         self._commands = commands
         if self.base or not self._sorted:
             if self._sorted:
@@ -66,7 +66,7 @@ class DartRobot(RobotEngine):
             self.skeleton.setCommands(commands)
 
     def _read(self) -> None:
-        """Read the state from DART; to be called after each change of it."""
+        """Read the state from DART; must be called after each change."""
         self._q, self._v = self.skeleton.getPositions(), self.skeleton.getVelocities()
         self._quaternion: tuple[float, ...] | None = None
         self._twist: Vector | None = None
@@ -78,7 +78,7 @@ class DartRobot(RobotEngine):
         return self._quaternion
 
     def positions(self) -> Vector:
-        """Return the present positions, shape (nq,), as a new vector."""
+        """Return the current positions, shape (nq,), as a new vector."""
         q = self._q if self._sorted else self._q[self._native]
         if not self.base:
             return q.copy()
@@ -87,7 +87,7 @@ class DartRobot(RobotEngine):
         return found
 
     def velocities(self) -> Vector:
-        """Return the present velocities, shape (nv,), as a new vector."""
+        """Return the current velocities, shape (nv,), as a new vector."""
         if self._twist is None:
             v = self._v if self._sorted else self._v[self._native]
             self._twist = self._in_base(v.copy()) if self.base else v
@@ -107,7 +107,7 @@ class DartRobot(RobotEngine):
         return a
 
     def _in_base(self, v: Vector) -> Vector:
-        """Convert a base's twist from DART's: angular, linear, in the world frame."""
+        """Convert a base's twist from DART's form: angular, linear, in the world frame."""
         x, y, z, a, b, c = v[:6].tolist()
         orientation = self._orientation()
         v[:6] = (*rotate_back(orientation, a, b, c), *rotate_back(orientation, x, y, z))
@@ -120,11 +120,11 @@ class DartRobot(RobotEngine):
         self._read()
 
     def native(self) -> tuple[Vector, Vector]:
-        """Return a copy of DART's own state."""
+        """Return a copy of DART's native state."""
         return self._q.copy(), self._v.copy()
 
     def set_native(self, positions: Vector, velocities: Vector) -> None:
-        """Set the state that `native` returned."""
+        """Set a state returned by `native`."""
         self._change = None
         self.skeleton.setPositions(positions)
         self.skeleton.setVelocities(velocities)
@@ -137,7 +137,7 @@ class DartRobot(RobotEngine):
         return math.sqrt(v.dot(v)) if math.isfinite(q.dot(q)) else math.nan
 
     def can_move(self, link: int) -> bool:
-        """Return whether a link, by its place in the model, can move at all."""
+        """Return whether a link, given by its index in the model, can move at all."""
         return self.bodies[link].getNumDependentGenCoords() > 0
 
     def push(self, link: int, force: Vector, torque: Vector, point: Vector, local: bool) -> None:
@@ -151,7 +151,7 @@ class DartRobot(RobotEngine):
         self.skeleton.clearExternalForces()
 
     def run_rk4(self, n: int, period: float) -> None:
-        """Simulate n steps with the classic Runge-Kutta method of fourth order."""
+        """Simulate n steps with the classic fourth-order Runge-Kutta method."""
         torques = np.concatenate([np.zeros(self.base), self._commands])
         for _ in range(n):
             q, twist = self.positions(), self.velocities()
@@ -166,7 +166,7 @@ class DartRobot(RobotEngine):
             self._change = (self.velocities() - twist) / period
 
     def _rk4_acceleration(self, torques: Vector, q: Vector, v: Vector) -> Vector:
-        """Return the derivative of velocities whose linear part is along the world's axes."""
+        """Return the derivative of velocities whose linear part is in the world frame."""
         twist = self._with_base(q, v)
         a = self.forward(q, twist, torques, pushed=True)
         if self.base:
@@ -174,17 +174,17 @@ class DartRobot(RobotEngine):
         return self._with_world(q, a)
 
     def _with_world(self, q: Vector, twist: Vector) -> Vector:
-        """Return velocities or the like with the linear part along the world's axes."""
+        """Return velocities (or the like) with the linear part in the world frame."""
         if not self.base:
             return twist
         return np.concatenate([to_matrix(q[3:7]) @ twist[:3], twist[3:]])
 
     def _with_base(self, q: Vector, v: Vector) -> Vector:
-        """Return the opposite of `_with_world`."""
+        """Return the inverse of `_with_world`."""
         return np.concatenate([v[:3] @ to_matrix(q[3:7]), v[3:]]) if self.base else v
 
     def _moved(self, q: Vector, motion: Vector) -> Vector:
-        """Return positions after a motion: rotations are about the base's own axes."""
+        """Return positions after a motion whose rotation is about the base's own axes."""
         if not self.base:
             return q + motion
         turn = from_rotation_vector(*motion[3:6].tolist())
@@ -201,13 +201,13 @@ class DartRobot(RobotEngine):
     def forward(
         self, positions: Vector, velocities: Vector, torques: Vector, *, pushed: bool = False
     ) -> Vector:
-        """Return the accelerations that torques cause, with joint resistance.
+        """Return the accelerations caused by torques, including joint resistance.
 
         Args:
             positions: Shape (nq,).
             velocities: Shape (nv,).
             torques: Shape (nv,).
-            pushed: Whether the present wrenches act, too.
+            pushed: Whether the current wrenches act, too.
         """
         rotation = self._place(self._shadow, positions, velocities)
         self._shadow.clearExternalForces()
@@ -226,7 +226,7 @@ class DartRobot(RobotEngine):
         return a
 
     def inverse(self, positions: Vector, velocities: Vector, accelerations: Vector) -> Vector:
-        """Return the torques that cause accelerations, with joint resistance."""
+        """Return the torques that produce accelerations, including joint resistance."""
         rotation = self._place(self._shadow, positions, velocities)
         a = accelerations
         if rotation is not None:

@@ -1,8 +1,8 @@
-"""A robot arm that follows trajectories with inverse dynamics learned by a network.
+"""A robot arm that follows trajectories using inverse dynamics learned by a network.
 
-The arm is the Franka Emika Panda of the package ``example-robot-data``: seven joints in rad and
-N m, then two fingers in m and N. A joint controller (proportional and derivative) runs at every
-physics step; the environment adds torques to it.
+The arm is the Franka Emika Panda from the package ``example-robot-data``: seven joints in rad and
+N m, then two fingers in m and N. A joint controller (proportional-derivative) runs at every
+physics step; the environment adds torques to its output.
 """
 
 from __future__ import annotations
@@ -22,48 +22,47 @@ from physx_dart.environments.trajectories import SmoothTrajectory
 
 _ARM = "panda_description/urdf/panda.urdf"
 _JOINTS = 7
-"""Joints of the arm itself, without the fingers."""
+"""Number of joints of the arm itself, without the fingers."""
 _MARGIN = {"excite": 0.25, "track": 0.3}
-"""Share of a joint's range, at either end, that motions avoid: tracked motions lie well within the
-learned range."""
+"""Fraction of a joint's range that motions avoid at each end, so that tracked motions stay well
+within the learned range."""
 _SPEED = 0.7
-"""Largest share of a joint's velocity limit that trajectories use."""
+"""Largest fraction of a joint's velocity limit that trajectories use."""
 _FADE = 2.0
-"""Fade-in time of trajectories to follow, in s."""
+"""Fade-in time of trajectories to track, in s."""
 _SETTLING = 0.2
-"""Time, in s, for which each new motion runs before it is sampled."""
+"""Time, in s, that each new motion runs before sampling starts."""
 
 
 class ArmEnvironment(Environment):
     """A seven-joint arm with two fingers, in one of two tasks.
 
-    ``task="excite"`` generates training data. In each episode the arm moves at random; each sample
-    is the state (q, v, a) at one instant and the torque that acts then, so the state determines the
-    torque by the arm's inverse dynamics.
+    ``task="excite"`` generates training data. In each episode the arm moves randomly; each sample
+    is the state (q, v, a) at one instant and the torque acting at that instant, so the state
+    determines the torque through the arm's inverse dynamics.
 
-    ``task="track"`` is for prediction. The arm follows the trajectory with the number `trajectory`.
-    Each step gives the reference (q, v, a) in the middle of the next control period as ``state``;
-    the torque that the network predicts for it acts during that period in addition to the
-    controller. The first step only gives the first reference; nothing moves in it. Use
-    ``simulations_per_step=1``.
+    ``task="track"`` is for prediction. The arm follows trajectory number `trajectory`. Each step
+    gives the reference (q, v, a) in the middle of the next control period as ``state``; the torque
+    that the network predicts for it acts during that period in addition to the controller. The
+    first step only gives the first reference, without any motion. Use ``simulations_per_step=1``.
 
     Args:
         task: ``"excite"`` or ``"track"``.
         feedforward: The torque added to the controller in the task ``"track"``: ``"network"``,
             ``"none"``, ``"model"`` (the engine's inverse dynamics of the reference: what a
-            perfect network would give) or ``"gravity"`` (the same at rest).
-        trajectory: Number of the trajectory to track; the same number is the same trajectory
+            perfect network would predict) or ``"gravity"`` (the same at rest).
+        trajectory: Number of the trajectory to track; the same number gives the same trajectory
             for any seed, instance and feed-forward.
         period: Length of a physics step, in s.
-        steps_per_sample: Physics steps in each step, which is one control period.
+        steps_per_sample: Physics steps per step; a step is one control period.
         episode_steps: Number of steps after which the task ``"excite"`` draws a new motion.
         amplitude: Largest distance of a motion from its center, in rad.
         frequencies: Lowest and highest frequency of the motions, in Hz.
-        excitation: Factor of the random torques in the task ``"excite"``.
+        excitation: Scale factor of the random torques in the task ``"excite"``.
         stiffness: Proportional gains of the controller, shape (9,).
         damping: Derivative gains of the controller, shape (9,).
-        prediction_field: Name of the network's field with the torque; a prediction with a single
-            field may have any name.
+        prediction_field: Name of the network's torque field; if the prediction has a single field,
+            its name does not matter.
         draw_every: Number of steps between two updates of the viewer.
     """
 
@@ -87,7 +86,7 @@ class ArmEnvironment(Environment):
         draw_every: int = 1,
         **kwargs: Any,
     ) -> None:
-        """Keep the options.
+        """Store the options.
 
         Raises:
             ConfigError: If an option is out of range.
@@ -132,7 +131,7 @@ class ArmEnvironment(Environment):
         self.simulation: Simulation = plugins.resolve("backend", self.backend).build(world)
 
     def init(self) -> None:
-        """Draw the first motion; in the task ``"track"`` move the arm to its start."""
+        """Draw the first motion; in the task ``"track"``, move the arm to its start."""
         if self.task == "track":
             self._motion = self._draw(np.random.default_rng(self.trajectory), _FADE)
             position, velocity, _ = self._motion.at(0.0)
@@ -140,7 +139,7 @@ class ArmEnvironment(Environment):
             self._begin = self.simulation.frame
 
     def init_database(self) -> None:
-        """Define ``state`` (q, v, a) and ``torque``; in the task ``"track"`` three more."""
+        """Define ``state`` (q, v, a) and ``torque``, plus three more in the task ``"track"``."""
         n = len(self.simulation.layout.joints)
         unit = "rad, rad/s, rad/s^2; fingers: m, m/s, m/s^2"
         torque = Field("torque", shape=(n,), unit="N m; fingers: N")
@@ -174,8 +173,8 @@ class ArmEnvironment(Environment):
             prediction: The network's fields, among them the torque, shape (9,), in N m or N.
 
         Raises:
-            ConfigError: If no field has the name `prediction_field`, and there are several; or its
-                shape is another.
+            ConfigError: If there are several fields and none is named `prediction_field`, or the
+                torque has the wrong shape.
         """
         if self.task != "track" or self.feedforward != "network":
             return
@@ -246,7 +245,7 @@ class ArmEnvironment(Environment):
             self.simulation.set_state(sample["position"], v)
 
     def _advance(self, steps: int) -> Vector:
-        """Simulate physics steps with the controller; return the torques of the last one."""
+        """Simulate physics steps with the controller; return the torques of the last step."""
         simulation, limit = self.simulation, self.simulation.layout.max_torque
         times = self._time() + self.period * np.arange(steps, dtype=np.float64)
         positions, velocities, _ = self._motion.along(times)
@@ -268,7 +267,7 @@ class ArmEnvironment(Environment):
         span = layout.upper - layout.lower
         margin = _MARGIN[self.task] * span
         lower, upper = layout.lower + margin, layout.upper - margin
-        # Fading in adds at most 15 / 8 of the amplitude over the fade-in time to the velocity.
+        # Fading in adds at most 15 / 8 * amplitude / fade-in time to the velocity.
         rate = 2 * np.pi * self.frequencies[1] + (1.875 / fade_time if fade_time else 0.0)
         largest = np.minimum(0.5 * (upper - lower), _SPEED * layout.max_velocity / rate)
         largest = np.minimum(largest, self.amplitude) * rng.uniform(0.4, 1.0, len(span))
@@ -281,7 +280,7 @@ class ArmEnvironment(Environment):
     # Drawing --------------------------------------------------------------------------------
 
     def init_visualization(self) -> None:
-        """Add the arm; in the task ``"track"`` also its translucent reference and the error."""
+        """Add the arm; in the task ``"track"``, also its translucent reference and the error."""
         factory = self.factory
         bodies = self.simulation.layout.bodies
         urdf, packages = str(self._robot.urdf), {k: str(v) for k, v in _package_dirs().items()}

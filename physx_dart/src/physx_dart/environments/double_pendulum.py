@@ -1,4 +1,4 @@
-"""A double pendulum that swings freely under smooth random torques."""
+"""A double pendulum that swings under smooth random torques."""
 
 from __future__ import annotations
 
@@ -14,19 +14,19 @@ from physx_core.simulation import Robot, Simulation, World
 from physx_dart.environments.trajectories import SmoothTrajectory
 
 URDF = OWN_ROBOTS / "double_pendulum.urdf"
-"""Two links of 1 kg and 0.5 m, which hang down at zero."""
+"""Two links of 1 kg and 0.5 m that hang down at zero."""
 
 
 class DoublePendulumEnvironment(Environment):
-    """A double pendulum from random initial states.
+    """A double pendulum with random initial states.
 
     Fields: ``state``, the angles and angular velocities of both joints; ``torque``, the torques at
     that instant; ``acceleration``, which follows from both. Without torques
-    (``torque_amplitude=0``) the state alone determines the acceleration.
+    (``torque_amplitude=0``), the state alone determines the acceleration.
 
     Args:
         period: Length of a physics step, in s.
-        steps_per_sample: Physics steps in each step, under a constant torque.
+        steps_per_sample: Physics steps per step, under constant torque.
         episode_steps: Number of steps after which the pendulum is reset.
         torque_amplitude: Largest torque, in N m.
     """
@@ -42,7 +42,7 @@ class DoublePendulumEnvironment(Environment):
         torque_amplitude: float = 1.0,
         **kwargs: Any,
     ) -> None:
-        """Keep the options.
+        """Store the options.
 
         Raises:
             ConfigError: If a number of steps is less than 1.

@@ -14,12 +14,12 @@ from physx_core.typing import Vector
 class SmoothTrajectory:
     """A motion ``center + fade(t) * (sum over k of amplitude_k * sin(rate_k * t + phase_k))``.
 
-    `fade` rises from 0 to 1 with the polynomial 10 s³ - 15 s⁴ + 6 s⁵, so the motion starts at the
+    `fade` rises from 0 to 1 as the polynomial 10 s³ - 15 s⁴ + 6 s⁵, so the motion starts at the
     center, at rest and without acceleration.
 
     Attributes:
         center: Shape (n,), in the joints' units.
-        amplitudes: Amplitude of each sine, shape (terms, n), likewise.
+        amplitudes: Amplitude of each sine, shape (terms, n), in the joints' units.
         rates: Angular frequencies, shape (terms, n), in rad/s.
         phases: Shape (terms, n), in rad.
         fade_time: Duration of the fade-in, in s; 0: none.
@@ -47,7 +47,7 @@ class SmoothTrajectory:
         Args:
             rng: Source of random numbers.
             center: Shape (n,).
-            amplitude: Sum of the sines' amplitudes, shape (n,).
+            amplitude: Sum of the sine amplitudes, shape (n,).
             frequencies: Lowest and highest frequency, in Hz.
             terms: Number of sines.
             fade_time: Duration of the fade-in, in s.
@@ -75,7 +75,7 @@ class SmoothTrajectory:
         return self.center + q, v, a
 
     def _fade(self, times: Vector) -> tuple[Vector, Vector, Vector]:
-        """Return the factor of the fade-in and its two derivatives."""
+        """Return the fade-in factor and its first two derivatives."""
         s = np.clip(times / self.fade_time, 0.0, 1.0)
         return (
             s**3 * (10 - 15 * s + 6 * s**2),

@@ -1,7 +1,7 @@
-"""Pinocchio's algorithms for the robots and objects of a world, whichever engine simulates it.
+"""Pinocchio's algorithms for a world's robots and objects, regardless of the simulating engine.
 
-States follow the convention of `physx_core.simulation.layout`. All results are new arrays of
-float64 in C order, which ``torch.from_numpy`` accepts as they are.
+States follow the convention of `physx_core.simulation.layout`. All results are new C-ordered
+float64 arrays, which ``torch.from_numpy`` accepts directly.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ class MoverAlgorithms:
         model: Pinocchio's model, with gravity and the rotors' inertia.
         data: Workspace of its algorithms.
         frames: Frame of each link.
-        resistance: Resistance of its joints; part of the dynamics.
+        resistance: Resistance of its joints, which is part of the dynamics.
     """
 
     def __init__(self, model: Any, resistance: Resistance, frames: Sequence[int] = ()) -> None:
@@ -48,7 +48,7 @@ class MoverAlgorithms:
 
         Args:
             frame: The frame.
-            out: Shape (19,), along the world's axes.
+            out: Shape (19,), in the world frame.
         """
         model, data = self.model, self.data
         out[:7] = self.pose(frame)
@@ -64,18 +64,18 @@ class MoverAlgorithms:
         return pose
 
     def forward(self, q: Vector, v: Vector, tau: Vector) -> Vector:
-        """Return the accelerations that torques cause, with joint resistance."""
+        """Return the accelerations caused by torques, including joint resistance."""
         resisted = tau - self.resistance.torques(q, v)
         return pinocchio.aba(self.model, self.data, q, v, resisted)
 
     def inverse(self, q: Vector, v: Vector, a: Vector) -> Vector:
-        """Return the torques that cause accelerations, with joint resistance."""
+        """Return the torques that produce accelerations, including joint resistance."""
         return pinocchio.rnea(self.model, self.data, q, v, a) + self.resistance.torques(q, v)
 
     def joint_wrenches(
         self, q: Vector, v: Vector, a: Vector, outer: Mapping[int, Sequence[float]]
     ) -> Vector:
-        """Return the reactions of joints, shape (joints, 6), with external wrenches on links."""
+        """Return the joint reactions, shape (joints, 6), given external wrenches on links."""
         model, data = self.model, self.data
         if outer:
             pinocchio.forwardKinematics(model, data, q)
@@ -101,7 +101,7 @@ class MoverAlgorithms:
         return matrix + np.triu(matrix, 1).T
 
     def jacobian(self, link: int, q: Vector, point: Vector) -> Vector:
-        """Return the Jacobian of a point of a link along the world's axes, shape (6, nv)."""
+        """Return the Jacobian of a point on a link in the world frame, shape (6, nv)."""
         model, data, frame = self.model, self.data, self.frames[link]
         found = pinocchio.computeFrameJacobian(model, data, q, frame, _WORLD_AXES)
         pinocchio.framesForwardKinematics(model, data, q)
@@ -112,7 +112,7 @@ class MoverAlgorithms:
         return found
 
     def derivatives(self, q: Vector, v: Vector, tau: Vector) -> tuple[Vector, Vector, Vector]:
-        """Return the derivatives of `forward` by positions, velocities, and torques."""
+        """Return the derivatives of `forward` w.r.t. positions, velocities, and torques."""
         resisted = tau - self.resistance.torques(q, v)
         found = pinocchio.computeABADerivatives(self.model, self.data, q, v, resisted)
         by_q, by_v, inverse = (np.array(matrix, order="C") for matrix in found)
@@ -122,7 +122,7 @@ class MoverAlgorithms:
         return by_q, by_v, inverse
 
     def forward_batch(self, q: Vector, v: Vector, tau: Vector) -> Vector:
-        """Return `forward` of many states, shape (n, nv); each row is a state."""
+        """Return `forward` for many states, one per row, shape (n, nv)."""
         out = np.zeros((self.model.nv, len(q)), order="F")
         if out.size:
             resisted = tau - self.resistance.torques(q, v)
@@ -131,10 +131,10 @@ class MoverAlgorithms:
         return out.T
 
     def gradients_batch(self, q: Vector, v: Vector, a: Vector, weights: Vector) -> Vector:
-        """Return gradients of ``weights @ accelerations`` of many states, shape (3, n, nv).
+        """Return gradients of ``weights @ accelerations`` for many states, shape (3, n, nv).
 
-        With r(q, v, a) the torques of the inverse dynamics and M its derivative by a, they are
-        x = weights / M by the torques, -x dr/dq by the positions and -x dr/dv by the velocities.
+        With the inverse dynamics torques r(q, v, a) and M their derivative w.r.t. a, they are
+        x = weights / M w.r.t. torques, -x dr/dq w.r.t. positions and -x dr/dv w.r.t. velocities.
         The derivatives of the inverse dynamics take two thirds of the time of those of the forward
         dynamics, and yield M as well.
         """
@@ -160,14 +160,15 @@ class MoverAlgorithms:
 class PinocchioAlgorithms(Algorithms):
     """Pinocchio's algorithms for a world; arrays are not validated.
 
-    Create one with ``PinocchioAlgorithms.of(world)``. Quaternions in positions must have length 1.
+    Create an instance with ``PinocchioAlgorithms.of(world)``. Quaternions in positions must have
+    length 1.
 
     Attributes:
         movers: Algorithms of each robot, then of each moving object.
     """
 
     def __init__(self, movers: Sequence[MoverAlgorithms], statics: Vector) -> None:
-        """Combine movers with static things, whose poses have the shape (statics, 7)."""
+        """Combine movers with static bodies, whose poses have the shape (statics, 7)."""
         self.movers = tuple(movers)
         self._slices: list[tuple[MoverAlgorithms, slice, slice]] = []
         nq = nv = 0
@@ -192,7 +193,7 @@ class PinocchioAlgorithms(Algorithms):
         return cls(movers, static_poses(parts))
 
     def body_poses(self, q: Vector, bodies: Sequence[int]) -> Vector:
-        """Return the poses of bodies, shape (bodies, 7), by their places in `Layout.names`."""
+        """Return the poses of bodies, given as indices into `Layout.names`, shape (bodies, 7)."""
         found = np.empty((len(bodies), 7))
         known: set[int] = set()
         for row, body in zip(found, bodies, strict=True):
@@ -208,16 +209,16 @@ class PinocchioAlgorithms(Algorithms):
         return found
 
     def motions(self, q: Vector, v: Vector, a: Vector, bodies: Sequence[int]) -> Vector:
-        """Return the motions of bodies, shape (bodies, 19), along the world's axes.
+        """Return the motions of bodies in the world frame, shape (bodies, 19).
 
         Args:
             q: Positions.
             v: Velocities.
             a: Accelerations.
-            bodies: Their places in `Layout.names`.
+            bodies: Indices into `Layout.names`.
 
         Returns:
-            In each row the pose (7), velocity (6), and acceleration (6) of the body's origin.
+            One row per body: pose (7), velocity (6), and acceleration (6) of its origin.
         """
         found = np.empty((len(bodies), 19))
         known: set[int] = set()
@@ -234,25 +235,25 @@ class PinocchioAlgorithms(Algorithms):
         return found
 
     def forward_dynamics(self, q: Vector, v: Vector, tau: Vector) -> Vector:
-        """Return the accelerations, shape (nv,), that torques (nv,) cause in a state."""
+        """Return the accelerations, shape (nv,), caused by torques (nv,) in a state."""
         return np.concatenate([x.forward(q[a], v[b], tau[b]) for x, a, b in self._slices])
 
     def inverse_dynamics(self, q: Vector, v: Vector, acceleration: Vector) -> Vector:
-        """Return the torques, shape (nv,), that cause accelerations (nv,) in a state."""
+        """Return the torques, shape (nv,), that produce accelerations (nv,) in a state."""
         slices = self._slices
         return np.concatenate([x.inverse(q[a], v[b], acceleration[b]) for x, a, b in slices])
 
     def joint_wrenches(
         self, q: Vector, v: Vector, a: Vector, outer: Mapping[int, Sequence[float]]
     ) -> Vector:
-        """Return the reactions of joints in a state, shape (joints, 6).
+        """Return the joint reactions in a state, shape (joints, 6).
 
         Args:
             q: Positions.
             v: Velocities.
             a: Accelerations.
-            outer: External wrenches on bodies, by their places: force, then torque about the body's
-                origin, 6 numbers along the world's axes.
+            outer: External wrenches by body index: force, then torque about the body's origin, 6
+                numbers in the world frame.
         """
         found, begin = [], 0
         for each, x, y in self._slices:
@@ -267,7 +268,7 @@ class PinocchioAlgorithms(Algorithms):
         return self._diagonal([each.mass(q[a]) for each, a, _ in self._slices])
 
     def jacobian(self, body: int, q: Vector, point: Vector) -> Vector:
-        """Return the Jacobian, shape (6, nv), of a point of a body, by its place in the layout."""
+        """Return the Jacobian, shape (6, nv), of a point on a body, given by its index."""
         whole = np.zeros((6, self.nv))
         for each, a, b in self._slices:
             if body < len(each.frames):
@@ -279,13 +280,13 @@ class PinocchioAlgorithms(Algorithms):
     def forward_dynamics_derivatives(
         self, q: Vector, v: Vector, tau: Vector
     ) -> tuple[Vector, Vector, Vector]:
-        """Return the derivatives of `forward_dynamics` by positions, velocities, and torques."""
+        """Return derivatives of `forward_dynamics` w.r.t. positions, velocities, and torques."""
         found = [each.derivatives(q[a], v[b], tau[b]) for each, a, b in self._slices]
         by_q, by_v, by_tau = (self._diagonal(blocks) for blocks in zip(*found, strict=True))
         return by_q, by_v, by_tau
 
     def forward_batch(self, q: Vector, v: Vector, tau: Vector, processes: int = 1) -> Vector:
-        """Return `forward_dynamics` of many states, shape (n, nv), computed in this process."""
+        """Return `forward_dynamics` for many states, shape (n, nv), computed in this process."""
         found = [x.forward_batch(q[:, a], v[:, b], tau[:, b]) for x, a, b in self._slices]
         return found[0] if len(found) == 1 else np.concatenate(found, axis=1)
 
@@ -299,7 +300,7 @@ class PinocchioAlgorithms(Algorithms):
         return found
 
     def _diagonal(self, blocks: Any) -> Vector:
-        """Return a matrix with square blocks along its diagonal."""
+        """Return a block-diagonal matrix of square blocks."""
         if len(self.movers) == 1:
             return blocks[0]
         whole = np.zeros((self.nv, self.nv))

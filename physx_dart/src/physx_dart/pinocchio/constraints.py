@@ -15,24 +15,24 @@ from physx_dart.pinocchio.limits import JointConstraints, solve
 from physx_dart.pinocchio.solver import ImpulseSolver
 
 _REACH = 1.0
-"""Margin in rad/s or m/s within which a limit takes part while there are contacts."""
+"""Margin, in rad/s or m/s, within which a limit is included while there are contacts."""
 _MISSED = 1e-9
-"""Excess of a velocity over its bound at which a joint counts as out of its limits."""
+"""Excess of a velocity over its bound at which a joint counts as outside its limits."""
 
 
 class Warmth:
-    """Impulses of a robot's last step, with which the next one begins.
+    """Impulses from a robot's last step, used to warm-start the next one.
 
     Args:
-        points: Upper bound of `ContactPoints.numbers`.
-        rows: Number of rows of its joints.
+        points: Upper bound on `ContactPoints.numbers`.
+        rows: Number of constraint rows of its joints.
     """
 
     def __init__(self, points: int, rows: int) -> None:
         self.points, self.rows = np.zeros((points, 3)), np.zeros(rows)
 
     def forget(self) -> None:
-        """Begin with no impulses."""
+        """Start with no impulses."""
         self.points.fill(0.0)
         self.rows.fill(0.0)
 
@@ -45,7 +45,7 @@ class Constraints:
         inverse: Returns the inverse of its mass matrix, shape (nv, nv).
         touching: Points that touch planes, or None.
         acts: Which rows of the joints act, shape (rows,).
-        impulses: Impulses of these points along their axes, shape (k, 3), once they are known.
+        impulses: Impulses of the touching points along their axes, shape (k, 3), once known.
         nv: Length of its velocities.
     """
 
@@ -60,19 +60,19 @@ class Constraints:
         *,
         touched: bool,
     ) -> None:
-        """Note which rows of the joints act.
+        """Determine which rows of the joints act.
 
-        Contacts may drive joints out of their limits, so limits that are close take part from the
-        beginning, and others as soon as they are violated. Without contacts, as in DART, the limits
-        that the free motion would violate act.
+        Contacts may drive joints out of their limits, so nearby limits are included from the start
+        and others as soon as they are violated. Without contacts, as in DART, only the limits that
+        the free motion would violate act.
 
         Args:
             joints: Constraints of its joints.
-            warmth: Impulses to begin with.
+            warmth: Impulses to start with.
             inverse: Returns the inverse of the mass matrix.
             touching: Points that touch planes.
-            positions: Of the joints, shape (n,).
-            velocities: Of the joints, without constraints.
+            positions: Joint positions, shape (n,).
+            velocities: Joint velocities without constraints, shape (n,).
             touched: Whether it touches anything.
         """
         self.joints, self.inverse, self.touching = joints, inverse, touching
@@ -86,28 +86,28 @@ class Constraints:
         return self.joints.aims(self._bounds)
 
     def rows(self) -> tuple[Indices, Vector, Vector, Vector, Vector]:
-        """Return columns, smallest and largest impulses, aims, and last impulses of all rows."""
+        """Return columns, smallest and largest impulses, targets, and last impulses of all rows."""
         joints = self.joints
         return joints.columns, joints.least, joints.most, self.aims(), self._warmth.rows
 
     def last(self) -> Vector:
-        """Return the last impulses of the points that touch, shape (3 k,)."""
+        """Return the last impulses of the touching points, shape (3 k,)."""
         numbers = slice(0) if self.touching is None else self.touching.numbers
         return self._warmth.points[numbers].ravel()
 
     def add_missed(self, velocities: Vector) -> bool:
-        """Let rows that velocities (nv,) demand act; return whether there are any that did not."""
+        """Activate the rows that velocities (nv,) require; return whether any were inactive."""
         ahead = self.joints.acting(self._bounds, velocities[self.joints.base :], -_MISSED)
         missed = ahead > self.acts
         self.acts |= missed
         return bool(np.count_nonzero(missed))
 
     def forget(self) -> None:
-        """Let the next step begin with no impulses."""
+        """Start the next step with no impulses."""
         self._warmth.forget()
 
     def keep(self, points: Vector, rows: Vector) -> None:
-        """Keep the impulses of the points that touch, and of all rows."""
+        """Store the impulses of the touching points and of all rows."""
         self.impulses = points.reshape(-1, 3)
         self._warmth.points.fill(0.0)
         if self.touching is not None:
@@ -116,7 +116,7 @@ class Constraints:
 
 
 def limited(part: Constraints, v: Vector) -> Vector:
-    """Return the velocities after the impulses of the rows of the joints alone."""
+    """Return the velocities after the impulses of the joint rows only."""
     joints, rows = part.joints, part.acts.nonzero()[0]
     part.forget()
     if not len(rows):
@@ -144,8 +144,8 @@ def constrained(
         v: Velocities that they would have without constraints.
         period: Length of the step, in s.
         solver: The solver.
-        pairs: Points between them, or with static shapes, shape (k,).
-        warm: Impulses of these points to begin with, shape (k, 3).
+        pairs: Contact points between them or with static shapes, k of them.
+        warm: Impulses of these points to start with, shape (k, 3).
     """
     ends = itertools.accumulate((part.nv for part in parts), initial=0)
     spans = [slice(*pair) for pair in itertools.pairwise(ends)]
@@ -167,7 +167,7 @@ def constrained(
     missed = True
     while missed:
         rows = joined([part.acts for part in parts]).nonzero()[0]
-        if len(parts) > 1:  # the solver wants rows with one bound first
+        if len(parts) > 1:  # the solver expects rows with one bound first
             two_sided = np.isinf(least[rows]) == np.isinf(most[rows])
             rows = rows[np.argsort(two_sided, kind="stable")]
         jacobian = np.concatenate([points, unit(len(v)).take(columns[rows], 0)])
@@ -194,7 +194,7 @@ def constrained(
 
 
 def _diagonal(blocks: Sequence[Vector], spans: Sequence[slice]) -> Vector:
-    """Return a matrix with these blocks on its diagonal."""
+    """Return a block-diagonal matrix."""
     if len(blocks) == 1:
         return blocks[0]
     found = np.zeros((spans[-1].stop, spans[-1].stop))
@@ -204,5 +204,5 @@ def _diagonal(blocks: Sequence[Vector], spans: Sequence[slice]) -> Vector:
 
 
 def joined(arrays: Sequence[Any]) -> Any:
-    """Return arrays one after the other."""
+    """Concatenate arrays."""
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)

@@ -1,4 +1,4 @@
-"""Newton's method for impulses of points with friction cones and of rows with bounds."""
+"""Newton's method for impulses of points with friction cones and rows with bounds."""
 
 from __future__ import annotations
 
@@ -11,32 +11,32 @@ import numpy as np
 from physx_core.typing import Vector
 
 _REGULARIZATION = 1e-9
-"""Relative addition to the diagonal, as in DART's solver."""
+"""Relative regularization of the diagonal, as in DART's solver."""
 _STUCK = 1e-14
-"""Response, relative to the largest, below which nothing can move in a direction."""
+"""Response, relative to the largest, below which a direction counts as immobile."""
 _ACCURACY = 1e-9
-"""Of velocities, in m/s, for free velocities of 1 m/s or less."""
+"""Accuracy of velocities, in m/s, for free velocities of 1 m/s or less."""
 
 
 class ContactProblem:
     """The problem of finding the impulses that prevent penetration and keep rows in their bounds.
 
-    A point's impulse is within its friction cone and opposes sliding (Coulomb's law); a row's
-    impulse is within its bounds, and the velocity of a row that is at none of them is 0. Such
-    impulses are fixed points of a step against the velocities followed by a projection onto cones
-    and bounds. This equation is piecewise smooth: Newton's method solves it exactly once it has
-    found which points stick, slide, or separate (P. Alart and A. Curnier, A mixed
+    A point's impulse lies in its friction cone and opposes sliding (Coulomb's law); a row's impulse
+    lies within its bounds, and a row at neither bound has velocity 0. Such impulses are fixed
+    points of a step against the velocities followed by a projection onto the cones and bounds.
+    This equation is piecewise smooth: Newton's method solves it exactly once it has determined
+    which points stick, slide, or separate (P. Alart and A. Curnier, A mixed
     formulation for frictional contact problems prone to Newton like solution methods, Computer
     Methods in Applied Mechanics and Engineering 92, 1991).
 
     Attributes:
         matrix: Velocities for unit impulses, shape (3 k + m, 3 k + m).
-        free: Velocities without impulses minus the wanted ones, shape (3 k + m,): of k points along
+        free: Velocities without impulses minus the target ones, shape (3 k + m,): of k points along
             two tangents and the normal, then of m rows.
         friction: Coefficients of the points, shape (k,).
         least: Smallest impulses of the rows, shape (m,).
-        most: Largest impulses, likewise.
-        accuracy: Error from which impulses count as exact.
+        most: Largest impulses of the rows, shape (m,).
+        accuracy: Error up to which impulses count as exact.
     """
 
     def __init__(
@@ -44,10 +44,11 @@ class ContactProblem:
     ) -> None:
         """Set up the problem, with a diagonal that is slightly larger than that of `response`.
 
-        A direction in which nothing can move, as across a rail, gets no impulse, as any would do.
+        A direction in which nothing can move, such as across a rail, gets no impulse, because any
+        impulse would do.
         """
         self.matrix = regularized(response)
-        # Lists, as operations on short arrays take longer.
+        # Lists, because operations on short arrays take longer.
         rates = self.matrix.diagonal().tolist()
         largest = max(rates, default=0.0) or 1.0
         if min(rates, default=1.0) <= (least_rate := _STUCK * largest):
@@ -59,7 +60,7 @@ class ContactProblem:
         for place in range(0, 3 * len(friction), 3):
             rates[place : place + 3] = [max(rates[place : place + 3])] * 3
         self._rates = np.array(rates)
-        # A step against the velocities, scaled row by row.
+        # A step against the velocities, scaled per row.
         self._unit, self._scaled = unit(len(free)), self.matrix / self._rates[:, None]
         self._back = self._unit - self._scaled
         self._start = -free / self._rates
@@ -73,7 +74,7 @@ class ContactProblem:
         return self._error(projected - impulses)
 
     def newton(self, impulses: Vector, most: int) -> tuple[Vector, float]:
-        """Return the best impulses of at most `most` steps from given ones, and their error."""
+        """Return the best impulses within `most` steps from given ones, and their error."""
         best, least_error = impulses, math.inf
         for _ in range(most):
             projected, slope = self._project(impulses)
@@ -93,9 +94,9 @@ class ContactProblem:
         return math.sqrt(velocities.dot(velocities))
 
     def _project(self, impulses: Vector) -> tuple[Vector, Vector]:
-        """Return impulses (n,) after a step and a projection onto cones and bounds.
+        """Return impulses (n,) after a step and a projection onto the cones and bounds.
 
-        Also return the derivative of the impulses minus these, shape (n, n).
+        Also return the derivative of the given impulses minus these, shape (n, n).
         """
         values = (self._back.dot(impulses) + self._start).tolist()
         unit, slope, place = self._unit, self._scaled.copy(), 0
@@ -126,7 +127,7 @@ class ContactProblem:
 
 
 def regularized(response: Vector) -> Vector:
-    """Return a matrix with a diagonal that is slightly larger."""
+    """Return a matrix with a slightly larger diagonal."""
     return response * _factors(len(response))
 
 
@@ -137,5 +138,5 @@ def _factors(n: int) -> Vector:
 
 @functools.lru_cache(maxsize=100)
 def unit(n: int) -> Vector:
-    """Return the unit matrix, which must not be changed."""
+    """Return the identity matrix, which must not be modified."""
     return np.eye(n)

@@ -1,7 +1,7 @@
 """Contacts of a robot or object with planes and height fields.
 
-A box touches them with its corners, a capsule with the spheres at its ends, a cylinder with three
-points of each rim, one of them the deepest.
+A box touches them with its corners, a capsule with the spheres at its ends, and a cylinder with
+three points on each rim, including the deepest.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from physx_dart.pinocchio.surfaces import Plane, surface_of
 MARGIN = 1e-4
 """Distance, in m, below which a point counts as touching."""
 _RETURN = 0.1
-"""Share of a point's penetration that is corrected in each step."""
+"""Fraction of a point's penetration that is corrected in each step."""
 _FASTEST_RETURN = 1.0
-"""Largest speed of this correction, in m/s."""
+"""Maximum speed of this correction, in m/s."""
 _BOUNCE = 0.1
-"""Approach speed, in m/s, above which things bounce."""
+"""Approach speed, in m/s, above which contacts bounce."""
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _THIRDS = np.array([[1.0, 0.0], [-0.5, 0.75**0.5], [-0.5, -(0.75**0.5)]])
 """Cosines and sines of three directions around a rim."""
@@ -40,13 +40,13 @@ class ContactPoints:
     """Points that touch, or may touch within the next step.
 
     Attributes:
-        numbers: Number of each, by which it is found again in the next step, shape (k,).
-        points: In the world frame, in m, shape (k, 3).
+        numbers: Number of each, which identifies it in the next step, shape (k,).
+        points: Positions in the world frame, in m, shape (k, 3).
         axes: Two tangents and the outward normal of each, as rows, shape (k, 3, 3).
         gaps: Distances, negative inside, in m, shape (k,).
-        friction: Coefficients, shape (k,).
-        restitution: Coefficients, shape (k,).
-        jacobian: Of the points along their axes, shape (3 k, nv).
+        friction: Coefficients of friction, shape (k,).
+        restitution: Coefficients of restitution, shape (k,).
+        jacobian: Jacobian of the points along their axes, shape (3 k, nv).
     """
 
     numbers: Indices
@@ -58,7 +58,7 @@ class ContactPoints:
     jacobian: Vector
 
     def widened(self, span: slice, width: int) -> ContactPoints:
-        """Return the points with a Jacobian of more columns, `span` of which are theirs."""
+        """Return the points with a wider Jacobian, in which `span` holds their columns."""
         if self.jacobian.shape[1] == width:
             return self
         wide = np.zeros((len(self.jacobian), width))
@@ -66,12 +66,12 @@ class ContactPoints:
         return replace(self, jacobian=wide)
 
     def records(self, body_a: Any, body_b: Any, impulses: Vector, period: float) -> Records:
-        """Return them as `CONTACT` records.
+        """Return the points as `CONTACT` records.
 
         Args:
-            body_a: First body of each, place in `Layout.names`.
+            body_a: First body of each, an index into `Layout.names`.
             body_b: Second body of each.
-            impulses: On the first body along the axes, in N s, shape (k, 3).
+            impulses: Impulses on the first body along the axes, in N s, shape (k, 3).
             period: Length of the step, in s.
         """
         records = np.zeros(len(self.gaps), CONTACT)
@@ -82,7 +82,7 @@ class ContactPoints:
         return records
 
     def bias(self, before: Vector, period: float) -> Vector:
-        """Return the bias of the velocities along the axes, shape (3 k,).
+        """Return the velocity bias along the axes, shape (3 k,).
 
         Args:
             before: Velocities before the step, shape (nv,).
@@ -101,7 +101,7 @@ class ContactPoints:
 
 
 class ContactFinder:
-    """Finds the contacts of a robot or object with static things."""
+    """Finds the contacts of a robot or object with static bodies."""
 
     def __init__(
         self,
@@ -153,13 +153,13 @@ class ContactFinder:
         self._restitution = first[:, :, 1] * second[:, :, 1]
 
     def _arrange(self, points: list[Any], rims: list[Any]) -> None:
-        """Collect points, then the centers of rims, in arrays."""
+        """Collect the points, then the rim centers, in arrays."""
         model, anchors, around = self._model, [*points, *rims], len(_THIRDS)
         self._poses = poses_of(self._data)
         moved = supports_of(model)
         joints = np.array([row[0] for row in anchors], np.intp)
         self._joints, self._first_rim = joints, len(points)
-        # A point is a sum of the axes and the origin of its joint.
+        # A point is a combination of its joint's axes plus the joint's origin.
         self._weights = np.zeros((len(anchors), 4 * len(self._poses)))
         for weights, (joint, center, *_) in zip(self._weights, anchors, strict=True):
             weights[4 * joint : 4 * joint + 4] = *center, 1.0
@@ -176,11 +176,11 @@ class ContactFinder:
         return len(self._joints) > 0
 
     def __len__(self) -> int:
-        """Return an upper bound of `ContactPoints.numbers`."""
+        """Return an upper bound on `ContactPoints.numbers`."""
         return self._friction.size
 
     def find(self, q: Vector, v: Vector, period: float) -> ContactPoints | None:
-        """Return the points that touch, or may within the next step; None if there are none.
+        """Return the points that touch or may touch within the next step, or None.
 
         Args:
             q: Positions, shape (nq,).
@@ -221,12 +221,12 @@ class ContactFinder:
         return _together(found) if found else None
 
     def bodies(self, numbers: Indices) -> tuple[Indices, Indices]:
-        """Return links in the robot, and static things, by `ContactPoints.numbers`."""
+        """Return the robot's links and the static bodies for `ContactPoints.numbers`."""
         statics, points = np.divmod(numbers, len(self._links))
         return self._links[points], statics
 
     def _rims(self, points: Vector) -> Vector:
-        """Return three points of each rim, one of them the deepest, shape (3 rims, 3)."""
+        """Return three points on each rim, including the deepest, shape (3 rims, 3)."""
         first = self._first_rim
         turns = self._poses[self._joints[first:], :3].transpose(0, 2, 1)
         axes = turns @ self._rim_axes
@@ -240,7 +240,7 @@ class ContactFinder:
 
 
 def supports_of(model: Any) -> Vector:
-    """Return 1 for each joint (rows) and each velocity (columns) that moves it, otherwise 0."""
+    """Return a matrix with 1 where a velocity (column) moves a joint (row), otherwise 0."""
     moved = np.zeros((model.njoints, model.nv))
     for joint in range(1, model.njoints):
         for each in (each for each in model.supports[joint] if each > 0):
@@ -252,7 +252,7 @@ def supports_of(model: Any) -> Vector:
 def poses_of(data: Any) -> Vector:
     """Return a view of the joints' axes and positions in Pinocchio's memory, shape (n, 4, 3).
 
-    They change with each algorithm that places joints, and live as long as the data.
+    It changes with each algorithm that places joints, and is valid as long as the data exists.
     """
     first, second = data.oMi[0].rotation, data.oMi[1].rotation
     pace = second.__array_interface__["data"][0] - first.__array_interface__["data"][0]
@@ -261,7 +261,7 @@ def poses_of(data: Any) -> Vector:
 
 
 def _together(found: list[ContactPoints]) -> ContactPoints:
-    """Return all points of several surfaces."""
+    """Return the points of several surfaces combined."""
     if len(found) == 1:
         return found[0]
     names = ContactPoints.__slots__
@@ -271,7 +271,7 @@ def _together(found: list[ContactPoints]) -> ContactPoints:
 
 
 def _points(shape: CollisionShape) -> tuple[Vector, float]:
-    """Return the centers of spheres in a shape and their radius; a radius of 0 is a point."""
+    """Return the centers of a shape's spheres and their radius; a radius of 0 means points."""
     if shape.kind == "box":
         return _CORNERS * np.array(shape.size), 0.0
     if shape.kind == "sphere":

@@ -1,4 +1,4 @@
-"""Steps of robots and objects that may touch each other, or static shapes."""
+"""Stepping of robots and objects that may touch each other or static shapes."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from physx_dart.pinocchio.solver import ImpulseSolver
 
 
 class Coupling:
-    """Steps robots whose shapes may touch other shapes; those that do are solved for together."""
+    """Steps robots whose shapes may touch other shapes; those that touch are solved together."""
 
     def __init__(
         self,
@@ -25,12 +25,12 @@ class Coupling:
         solver: ImpulseSolver,
         features: Sequence[str],
     ) -> None:
-        """Find what may touch."""
+        """Determine what may touch."""
         self._robots, self._solver, self._period = robots, solver, parts.world.period
         self._finder = PairFinder(parts, robots, features)
         self._touching: PairPoints | None = None
         self._impulses = np.zeros((0, 3))
-        # Impulses of pairs in the last step, in the world frame, with which the next one begins.
+        # Impulses of pairs in the last step, in the world frame, which warm-start the next one.
         self._warmth = np.zeros((len(self._finder), 3))
 
     def __bool__(self) -> bool:
@@ -38,7 +38,7 @@ class Coupling:
         return len(self._finder) > 0
 
     def forget(self) -> None:
-        """Forget the impulses of the last step."""
+        """Discard the impulses of the last step."""
         self._warmth.fill(0.0)
 
     def step(self) -> None:
@@ -76,7 +76,7 @@ class Coupling:
             first += robot.nv
 
     def contacts(self) -> Records:
-        """Return the contacts of shapes with shapes in the last step."""
+        """Return the contacts between shapes in the last step."""
         touching = self._touching
         if touching is None:
             return np.zeros(0, CONTACT)

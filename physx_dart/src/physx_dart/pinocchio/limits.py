@@ -1,4 +1,4 @@
-"""Impulses of joint limits, motors, and Coulomb friction, given the free motion."""
+"""Impulses from joint limits, motors, and Coulomb friction, given the free motion."""
 
 from __future__ import annotations
 
@@ -14,31 +14,32 @@ from physx_core.typing import Vector
 from physx_dart.pinocchio.contact_problem import regularized, unit
 
 _FASTEST_RETURN = 10.0
-"""Largest speed, in rad/s or m/s, at which a joint returns into its limits, as in DART."""
+"""Maximum speed, in rad/s or m/s, at which a joint returns to within its limits, as in DART."""
 
 
 class JointConstraints:
     """Position and velocity limits, motors, and Coulomb friction of a robot's joints.
 
-    A joint must not leave its limits in the next step, nor exceed its velocity limit; one that is
-    outside returns, whatever its velocity limit. Friction stops a joint and a motor brings it to
-    its target velocity as far as their bounds allow. A motor without bounds ignores the limits.
+    A joint must not leave its limits in the next step, nor exceed its velocity limit; a joint
+    outside its limits returns, regardless of its velocity limit. Friction stops a joint and a motor
+    brings it to its target velocity as far as their bounds allow. A motor without bounds ignores
+    the limits.
 
-    Each constraint is a row: a target velocity and bounds of the impulse. The lower limits of all
+    Each constraint is a row: a target velocity and bounds on the impulse. The lower limits of all
     joints come first, then the upper limits, then friction and motors, if any.
 
     Attributes:
         base: Degrees of freedom of the robot's base.
-        columns: Place of each row's joint in the robot's velocities, shape (rows,).
+        columns: Index of each row's joint in the robot's velocities, shape (rows,).
         least: Smallest impulse of each row, in N m s or N s, shape (rows,).
-        most: Largest impulse of each row.
+        most: Largest impulse of each row, in the same form.
         targets: Target velocities of the motors, shape (n,), in rad/s or m/s.
         acts: Whether there is friction or a motor.
         limits: Whether any joint has limits.
     """
 
     def __init__(self, joints: Sequence[Joint], period: float, base: int) -> None:
-        """Keep the bounds of all joints, the period in s, and the base's degrees of freedom."""
+        """Store the bounds of all joints, the period in s, and the base's degrees of freedom."""
         self.base = base
         modes = np.array([joint.settings.mode for joint in joints], dtype=object)
         lower = np.array([joint.lower for joint in joints])
@@ -75,14 +76,14 @@ class JointConstraints:
         self.most = np.concatenate([nothing + np.inf, nothing, friction, strength])
 
     def safe(self, positions: Vector, velocities: Vector) -> tuple[int, float]:
-        """Return for how many steps no limit can act as long as the speed stays below a bound.
+        """Return for how many steps no limit can act while the speed stays below a bound.
 
         Args:
             positions: Shape (n,).
-            velocities: Likewise.
+            velocities: Shape (n,).
 
         Returns:
-            The number of steps, and the bound of the square of the velocities' norm.
+            The number of steps, and the bound on the squared norm of the velocities.
         """
         if not self.limits:
             return 2**30, math.inf
@@ -99,10 +100,10 @@ class JointConstraints:
         """Return the least velocities of joints, upward for lower and downward for upper limits.
 
         Args:
-            positions: Before the step, shape (n,).
+            positions: Positions before the step, shape (n,).
 
         Returns:
-            Shape (2, n), in rad/s or m/s: mostly negative, as most joints need not move.
+            Shape (2, n), in rad/s or m/s: mostly negative, because most joints need not move.
         """
         needed = self._limits - self._pace * positions
         bounds, (lower, upper) = np.maximum(needed, self._slowest), needed > 0
@@ -112,18 +113,18 @@ class JointConstraints:
     def acting(self, bounds: Vector, velocities: Vector, reach: float) -> NDArray[np.bool_]:
         """Return which rows act, shape (rows,): motors, friction of moving joints, and some limits.
 
-        Limits of joints that are outside always act, as other joints may push them further out.
+        Limits of joints outside them always act, because other joints may push them further out.
 
         Args:
-            bounds: As `bounds` returned them.
-            velocities: After the step, shape (n,).
+            bounds: As returned by `bounds`.
+            velocities: Velocities after the step, shape (n,).
             reach: Margin above its bound at which a velocity makes a limit act.
         """
         acts = self._every.copy()
         limits = acts[: bounds.size].reshape(bounds.shape)
         np.less(self._signs * velocities, bounds + reach, out=limits)
         limits |= bounds > 0
-        if len(self._rubs):  # a joint that rests without friction stays at rest, as in DART
+        if len(self._rubs):  # a joint that is at rest without friction stays so, as in DART
             acts[bounds.size : bounds.size + len(self._rubs)] = velocities[self._rubs] != 0
         return acts
 
@@ -136,26 +137,26 @@ class JointConstraints:
 
 
 def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vector:
-    """Return the impulses that cause a change of velocities as far as their bounds allow.
+    """Return the impulses that cause a velocity change as far as their bounds allow.
 
-    They solve the box-constrained linear complementarity problem by principal pivoting: with blocks
-    of pivots as long as they help, else with single ones, which always terminate (J. J. Judice and
-    F. M. Pires, A block principal pivoting algorithm for large-scale strictly monotone linear
+    They solve the box-constrained linear complementarity problem by principal pivoting: with block
+    pivots as long as they help, otherwise with single pivots, which always terminate (J. J. Judice
+    and F. M. Pires, A block principal pivoting algorithm for large-scale strictly monotone linear
     complementarity problems, Computers & Operations Research 21, 1994).
 
     Args:
-        response: Change of the velocities for unit impulses, shape (n, n), positive definite.
-        change: Wanted change of the velocities, shape (n,).
+        response: Velocity change for unit impulses, shape (n, n), positive definite.
+        change: Desired velocity change, shape (n,).
         least: Smallest impulses, shape (n,), may be -inf.
-        most: Largest impulses, likewise.
+        most: Largest impulses, shape (n,), may be inf.
     """
     n, matrix = len(change), regularized(response)
     alone = change / matrix.diagonal()
     if n == 1:
         return np.minimum(np.maximum(alone, least), most)
-    # Lists, as operations on short arrays take longer.
+    # Lists, because operations on short arrays take longer.
     bounds = list(zip(least.tolist(), most.tolist(), strict=True))
-    # -1: at its least, 1: at its most, 0: between; initially as if the rows were independent.
+    # -1: at the lower bound, 1: at the upper, 0: between; initially as if rows were independent.
     sides = [_side(*each) for each in zip(alone.tolist(), bounds, strict=True)]
     best, blocks = n + 1, 3
     for _ in range(50 * (n + 1)):
@@ -182,14 +183,14 @@ def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vect
 
 
 def _side(impulse: float, bounds: tuple[float, float]) -> int:
-    """Return -1 for an impulse below its bounds, 1 for one above them, otherwise 0."""
+    """Return -1 for an impulse below its bounds, 1 for one above, otherwise 0."""
     return (impulse > bounds[1]) - (impulse < bounds[0])
 
 
 def _pivoted(
     matrix: Vector, change: Vector, sides: list[int], bounds: list[tuple[float, float]]
 ) -> Vector:
-    """Return the impulses (n,) for which rows on a side are at their bounds, and others change."""
+    """Return the impulses (n,) with rows on a side held at their bounds and the rest solved."""
     system, wanted = matrix.copy(), change.copy()
     held = [(place, bounds[place][side > 0]) for place, side in enumerate(sides) if side]
     for place, bound in held:

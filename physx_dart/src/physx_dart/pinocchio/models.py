@@ -30,8 +30,8 @@ def load_model(mover: Mover, gravity: tuple[float, ...], *, armature: Vector) ->
 def load_stepping_model(mover: Mover, gravity: tuple[float, ...], *, armature: Vector) -> Any:
     """Return the model for stepping, whose base translates along the world's axes.
 
-    Its positions are those of `load_model`; the first three velocities of a floating base are along
-    the world's axes, not its own, so that semi-implicit Euler conserves the linear momentum of a
+    Its positions are those of `load_model`. The first three velocities of a floating base are in
+    the world frame, not its own, so that semi-implicit Euler conserves the linear momentum of a
     tumbling body, as in DART; in the base's own frame it would not.
     """
     if mover.fixed_base:
@@ -44,7 +44,7 @@ def load_stepping_model(mover: Mover, gravity: tuple[float, ...], *, armature: V
     place = base.addFrame(frame)
     robot = _parse(mover)
     links = [frame for frame in robot.frames if frame.type == pinocchio.FrameType.BODY]
-    for frame in links:  # appendModel confuses a link and a joint of the same name
+    for frame in links:  # appendModel confuses a link and a joint with the same name
         frame.name = f"{_LINK}{frame.name}"
     model = pinocchio.appendModel(base, robot, place, nowhere)
     for frame in model.frames:
@@ -64,14 +64,14 @@ def _parse(mover: Mover, *root: Any) -> Any:
         raise ModelError(f"Pinocchio cannot load {mover.model.path}: {error}") from error
     if model.nv > _MOST_VELOCITIES:
         raise ModelError(
-            f"{mover.model.path} has {model.nv} degrees of freedom. Pinocchio takes memory that "
-            f"grows with their cube, so there may be {_MOST_VELOCITIES}; use the engine dart."
+            f"{mover.model.path} has {model.nv} degrees of freedom. Pinocchio's memory grows with "
+            f"their cube, so at most {_MOST_VELOCITIES} are allowed; use the engine dart."
         )
     return model
 
 
 def _weld(model: Any, mover: Mover) -> None:
-    """Place the root of a robot with a fixed base."""
+    """Place the root of a fixed-base robot."""
     rotation = to_matrix(mover.orientation)
     base = pinocchio.SE3(rotation, np.array(mover.position))
     for joint in range(1, model.njoints):

@@ -1,4 +1,4 @@
-"""Contacts of shapes with shapes, found by coal: of bodies, links, and static objects.
+"""Contacts between shapes of bodies, links, and static objects, found by coal.
 
 coal finds the patch in which two shapes touch: the points of faces, edges, and corners that lie in
 one plane.
@@ -26,12 +26,12 @@ from physx_dart.pinocchio.robot import PinocchioRobot
 from physx_dart.pinocchio.surfaces import axes_of, moments_of
 
 _TOLERANCE = 1e-4
-"""Distance, in m, from the plane of a patch within which a point belongs to it."""
+"""Distance, in m, from the plane of a patch up to which a point belongs to it."""
 
 
 @dataclass(eq=False, slots=True)
 class _Solid:
-    """A collision shape: place of its robot (None: static), joint, link, body, and pose there."""
+    """A collision shape: index of its robot (None: static), joint, link, body, and pose there."""
 
     owner: int | None
     joint: int
@@ -44,12 +44,12 @@ class _Solid:
 
 @dataclass(eq=False, slots=True)
 class PairPoints:
-    """Points in which shapes touch, or may touch within the next step.
+    """Points where shapes touch, or may touch within the next step.
 
     Attributes:
         pairs: The pair of shapes of each, shape (k,).
-        bodies: Its two bodies, places in `Layout.names`, shape (k, 2).
-        robots: Places of all robots that touch.
+        bodies: Its two bodies, as indices into `Layout.names`, shape (k, 2).
+        robots: Indices of all robots that touch.
         contacts: The points; the Jacobian has a column for each velocity of all robots.
     """
 
@@ -60,7 +60,7 @@ class PairPoints:
 
 
 class PairFinder:
-    """Finds contacts between the shapes of robots and objects, and with static shapes."""
+    """Finds contacts among the shapes of robots and objects, and with static shapes."""
 
     def __init__(
         self, parts: Parts, robots: Sequence[PinocchioRobot], features: Sequence[str]
@@ -79,7 +79,7 @@ class PairFinder:
         self._rows = [slice(*pair) for pair in itertools.pairwise(ends)]
         widths = np.cumsum([0, *(robot.nv for robot in robots)]).tolist()
         self.columns = [slice(*pair) for pair in itertools.pairwise(widths)]
-        # Poses and twists of all joints; the first row is that of static things.
+        # Poses and twists of all joints; the first row is for static bodies.
         self._turns, self._places = np.zeros((ends[-1], 3, 3)), np.zeros((ends[-1], 3))
         self._twists, self._turns[0] = np.zeros((ends[-1], 6)), np.eye(3)
         joints = [0 if s.owner is None else ends[s.owner] + s.joint for s in solids]
@@ -129,7 +129,7 @@ class PairFinder:
                 yield _Solid(None, 0, 0, body, what, turn, np.array(static.position))
 
     def _possible(self, solids: Sequence[_Solid]) -> Iterator[tuple[int, int]]:
-        """Yield the pairs of shapes that may touch: those that can move against each other."""
+        """Yield the pairs of shapes that may touch: those that can move relative to each other."""
         contacts = self._parts.world.contacts
         for (i, a), (j, b) in itertools.combinations(enumerate(solids), 2):
             wanted = contacts == "all" or (contacts == "static" and b.owner is None)
@@ -149,10 +149,10 @@ class PairFinder:
             yield i, j
 
     def find(self, velocities: Sequence[Vector], period: float) -> PairPoints | None:
-        """Return the points that touch, or may within the next step; None if there are none.
+        """Return the points that touch or may touch within the next step, or None.
 
         Args:
-            velocities: That each robot would have without contacts.
+            velocities: Velocities that each robot would have without contacts.
             period: Length of the step, in s.
         """
         self._move(velocities)
@@ -189,7 +189,7 @@ class PairFinder:
             self._motions.append(motions)
 
     def _touch(self, pair: int, margin: float) -> list[tuple[int, Vector, Vector, float]]:
-        """Return pair, point, normal from the second to the first shape, and gap of each point."""
+        """Return the pair, point, normal from second to first shape, and gap of each point."""
         i, j = self._pairs[pair]
         poses, (collide, patch_of) = (self._transforms[i], self._transforms[j]), self._queries[pair]
         self._request.security_margin = margin
@@ -248,12 +248,12 @@ class PairFinder:
 
 
 def _lengths(vectors: Vector) -> Vector:
-    """Return the lengths of rows."""
+    """Return the norms of rows."""
     return np.sqrt(np.einsum("ij,ij->i", vectors, vectors))
 
 
 def _radius(shape: CollisionShape) -> float:
-    """Return the radius of a sphere around a shape, in m."""
+    """Return the radius of a shape's bounding sphere, in m."""
     if shape.kind in ("box", "mesh"):
         return 0.5 * math.hypot(*shape.size)
     if shape.kind == "sphere":
@@ -263,7 +263,7 @@ def _radius(shape: CollisionShape) -> float:
 
 
 def _geometry(shape: CollisionShape) -> Any:
-    """Return a shape for coal; None: a mesh, which touches nothing."""
+    """Return a shape for coal, or None for a mesh, which touches nothing."""
     if shape.kind == "mesh":
         return None
     kinds = {"box": coal.Box, "sphere": coal.Sphere, "capsule": coal.Capsule}

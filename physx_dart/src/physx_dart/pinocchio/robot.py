@@ -1,8 +1,8 @@
-"""A robot or object that is stepped with Pinocchio's algorithms.
+"""A robot or object stepped with Pinocchio's algorithms.
 
-Pinocchio has no simulator, so the step is implemented here, in the same way as DART's:
+Pinocchio has no simulator, so the step is implemented here in the same way as DART's:
 semi-implicit Euler with implicit damping and springs; impulses for contacts, limits, servos, and
-Coulomb friction; and a floating base that is integrated with its velocities in the world frame.
+Coulomb friction; and a floating base integrated with its velocities in the world frame.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ from physx_dart.pinocchio.models import frames_of, load_stepping_model
 from physx_dart.pinocchio.solver import ImpulseSolver
 
 _UNSEEN = 10
-"""Steps between two checks whether a limit might have acted."""
+"""Steps between checks of whether a limit might have acted."""
 
 
 class PinocchioRobot(RobotEngine):
-    """The state of a robot or object, and its steps.
+    """The state of a robot or object, and its stepping.
 
-    Internally, velocities of a floating base are those of `load_stepping_model`.
+    Internally, the velocities of a floating base follow `load_stepping_model`.
     """
 
     def __init__(
@@ -73,14 +73,14 @@ class PinocchioRobot(RobotEngine):
         self._safe_steps, self._bound = 0, 0.0
         # Multiplying two arrays takes half the time of multiplying an array by a number.
         self._periods, self._motion = np.full(self.nv, dt), np.zeros(self.nv)
-        self._twist_source: Vector | None = None  # the velocities that `_twist` was computed from
+        self._twist_source: Vector | None = None  # the velocities from which `_twist` was computed
         self._twist = self._velocities
         self._torques = np.zeros(self.nv)
         self._springs = bool(resists.stiffness.any())
         self._smooth = bool(resists.damping.any() or resists.stiffness.any())
         self._constraints: Constraints | None = None
         self._warmth = Warmth(len(self._contacts), len(self._joints.columns))
-        # Pinocchio computes the upper half of the inverse mass matrix.
+        # Pinocchio only computes the upper triangle of the inverse mass matrix.
         self._upper = np.triu(np.ones((self.nv, self.nv)), 1) + 0.5 * np.eye(self.nv)
 
     # Stepping -------------------------------------------------------------------------------
@@ -100,10 +100,10 @@ class PinocchioRobot(RobotEngine):
                 n -= 1
 
     def _run_free(self, n: int) -> int:
-        """Simulate up to n steps while no limit can act; return how many.
+        """Simulate up to n steps while no limit can act; return how many were simulated.
 
-        Every few steps it is checked whether the joints stayed slow enough for that; if not, those
-        steps are undone.
+        Every few steps, check whether the joints stayed slow enough for that; if not, undo those
+        steps.
         """
         if self._safe_steps <= 0:
             base = self.base
@@ -128,7 +128,7 @@ class PinocchioRobot(RobotEngine):
         return done
 
     def _step_free(self, count: int, torques: Vector) -> None:
-        """Simulate one or more steps in which only torques and wrenches act."""
+        """Simulate one or more steps with only torques and wrenches acting."""
         model, data, more = self.model_in_motion, self.data, self._more
         periods, motion = self._periods, self._motion
         aba, integrate = pinocchio.aba, pinocchio.integrate
@@ -145,7 +145,7 @@ class PinocchioRobot(RobotEngine):
         self._earlier, self._before = earlier, before
 
     def _net_torques(self, q: Vector, v: Vector) -> Vector:
-        """Return the held torques minus those of dampers and of springs at the end of the step."""
+        """Return the held torques minus those of dampers and springs at the end of the step."""
         resists = self.resistance
         torques = self._torques - resists.damping * v
         if not self._springs:
@@ -159,7 +159,7 @@ class PinocchioRobot(RobotEngine):
         self.finish(self.constrained(free))
 
     def free_velocities(self) -> Vector:
-        """Return the velocities (nv,) at the end of the step if there were no constraints."""
+        """Return the velocities (nv,) that the step would end with without constraints."""
         q, v = self._positions, self._velocities
         torques = self._net_torques(q, v) if self._smooth else self._torques
         a = pinocchio.aba(self.model_in_motion, self.data, q, v, torques, *self._more)
@@ -173,7 +173,7 @@ class PinocchioRobot(RobotEngine):
         self._velocities = velocities
 
     def constrained(self, v: Vector) -> Vector:
-        """Return the velocities (nv,) after the impulses of the ground and of the joints."""
+        """Return the velocities (nv,) after the impulses of the ground and the joints."""
         part = self.constraints(v)
         if part.touching is None:
             return limited(part, v)
@@ -183,7 +183,7 @@ class PinocchioRobot(RobotEngine):
         """Return the constraints in a step.
 
         Args:
-            v: Velocities (nv,) without them.
+            v: Velocities (nv,) without constraints.
             touched: Whether it touches more than planes.
         """
         q, base = self._positions, self.base
@@ -205,7 +205,7 @@ class PinocchioRobot(RobotEngine):
         return upper + upper.T
 
     def forget(self) -> None:
-        """Forget the impulses of the last step."""
+        """Discard the impulses of the last step."""
         self._warmth.forget()
 
     def place_joints(self) -> Vector:
@@ -213,7 +213,7 @@ class PinocchioRobot(RobotEngine):
         return pinocchio.computeJointJacobians(self.model_in_motion, self.data, self._positions)
 
     def _step_rk4(self) -> None:
-        """Simulate one step with the classic Runge-Kutta method of fourth order."""
+        """Simulate one step with the classic fourth-order Runge-Kutta method."""
         integrate = functools.partial(pinocchio.integrate, self._model)
         state = self._positions, self._velocities
         self._earlier, self._before = state
@@ -228,8 +228,8 @@ class PinocchioRobot(RobotEngine):
         """Return the contacts of the last step.
 
         Args:
-            first: Place of the robot's first link in `Layout.names`.
-            statics: Place of the first static there.
+            first: Index of the robot's first link in `Layout.names`.
+            statics: Index of the first static body there.
         """
         part = self._constraints
         if part is None or part.touching is None:
@@ -238,7 +238,7 @@ class PinocchioRobot(RobotEngine):
         return part.touching.records(first + links, statics + touched, part.impulses, self._period)
 
     def hold(self, commands: Vector) -> None:
-        """Hold commands, shape (joints,), that are within their limits."""
+        """Hold commands, shape (joints,), already clipped to their limits."""
         self._joints.targets = commands
         torques = commands if self._forces is None else commands * self._forces
         if self.base:
@@ -247,7 +247,7 @@ class PinocchioRobot(RobotEngine):
             self._torques = torques
 
     def can_move(self, link: int) -> bool:
-        """Return whether a link, by its place in the model, can move at all."""
+        """Return whether a link, given by its index in the model, can move at all."""
         return bool(self.model_in_motion.frames[self.frames[link]].parentJoint > 0)
 
     def push(self, link: int, force: Vector, torque: Vector, point: Vector, local: bool) -> None:
@@ -272,14 +272,14 @@ class PinocchioRobot(RobotEngine):
     # State ----------------------------------------------------------------------------------
 
     def positions(self) -> Vector:
-        """Return the present positions, shape (nq,), as a new vector."""
+        """Return the current positions, shape (nq,), as a new vector."""
         q = self._positions.copy()
         if self.base and q[6] < 0:
             q[3:7] *= -1
         return q
 
     def velocities(self) -> Vector:
-        """Return the present velocities, shape (nv,), as a new vector."""
+        """Return the current velocities, shape (nv,), as a new vector."""
         if not self.base:
             return self._velocities.copy()
         if self._twist_source is not self._velocities:
@@ -310,12 +310,12 @@ class PinocchioRobot(RobotEngine):
         return self._positions.copy(), self._velocities.copy()
 
     def set_native(self, positions: Vector, velocities: Vector) -> None:
-        """Set the state that `native` returned."""
+        """Set a state returned by `native`."""
         self._positions, self._velocities = positions.copy(), velocities.copy()
         self._earlier, self._before = self._positions, self._velocities
         self._constraints, self._safe_steps = None, 0
 
     def speed(self) -> float:
         """Return the norm of the velocities; NaN or inf if the state is not finite."""
-        v = self._velocities  # positions come from these, so they are finite if these are
+        v = self._velocities  # positions derive from these, so they are finite if these are
         return math.sqrt(v.dot(v))

@@ -1,6 +1,6 @@
 """The engine Pinocchio: its algorithms and constraint solvers, stepped by `PinocchioRobot`.
 
-All calls of pinocchio are in `physx_dart.pinocchio` and `physx_dart.batch`.
+All calls to pinocchio are in `physx_dart.pinocchio` and `physx_dart.batch`.
 """
 
 from __future__ import annotations
@@ -31,30 +31,30 @@ class PinocchioBackend(RobotBackend):
     """Pinocchio, a library of rigid-body algorithms.
 
     Contact solvers: ``pgs`` (default) and ``admm``, both with a friction cone, for problems that
-    Newton's method does not solve. Contacts with planes and height fields are found with points and
-    spheres (`physx_dart.pinocchio.contacts`), those of shapes with shapes by coal
-    (`physx_dart.pinocchio.pairs`); there is no choice of detectors.
+    Newton's method does not solve. Contacts with planes and height fields are found from points and
+    spheres (`physx_dart.pinocchio.contacts`), contacts between shapes by coal
+    (`physx_dart.pinocchio.pairs`); there is no choice of detector.
     """
 
     def build(self, world: World, seed: int | None = None) -> Simulation:
         """Build a simulation; it is deterministic, so the seed has no effect.
 
         Raises:
-            ModelError: If a robot or mesh cannot be loaded; the message says why.
+            ModelError: If a robot or mesh cannot be loaded; the message gives the reason.
             FeatureNotSupportedError: If the world needs a feature that the engine does not have.
-            UnknownOptionError: If there is no solver of that name.
+            UnknownOptionError: If there is no solver with that name.
         """
         return PinocchioSimulation(world)
 
 
 class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
-    """A world of Pinocchio."""
+    """A world in Pinocchio."""
 
     engine = "pinocchio"
     lacks: ClassVar[frozenset[str]] = frozenset({"mesh_contacts", "raycast"})
 
     def __init__(self, world: World) -> None:
-        """Build the world; errors are those of the backend's `build`."""
+        """Build the world; raises the same errors as the backend's `build`."""
         solver = ImpulseSolver(world.solver or "pgs")
         parts = read_parts(world)
         self._check_features(parts)
@@ -85,7 +85,7 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
             robot.run(n)
 
     def forget(self) -> None:
-        """Make the state alone determine what follows: forget the impulses of the last step."""
+        """Make the state alone determine what follows: discard the impulses of the last step."""
         self._coupling.forget()
         for robot in self._robots:
             robot.forget()

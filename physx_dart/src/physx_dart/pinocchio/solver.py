@@ -1,4 +1,4 @@
-"""Solver for the impulses of contacts, limits, servos, and friction together."""
+"""Solver for the coupled impulses of contacts, limits, servos, and friction."""
 
 from __future__ import annotations
 
@@ -29,23 +29,23 @@ _KINDS = {
     ),
 }
 _FEW, _MANY = (30, 1e-4), (300, 1e-11)
-"""Most iterations of Pinocchio's solvers, and where they stop: errors in m/s and N s."""
+"""Maximum iterations of Pinocchio's solvers, and the errors in m/s and N s at which they stop."""
 _MOST_KNOWN = 1000
-"""Descriptions of problems that are kept; each takes some KiB."""
+"""Number of problem descriptions to keep; each takes a few KiB."""
 _GOOD = 100.0
-"""Error at which an iterated solution is accepted, as a multiple of an exact one's."""
+"""Error at which an iterative solution is accepted, as a multiple of an exact one's."""
 _ENDLESS = 1e6
-"""Finite bound that stands for infinity in Pinocchio's solvers."""
+"""Finite bound used for infinity in Pinocchio's solvers."""
 
 
 class ImpulseSolver:
     """Solves for the impulses of points with friction cones, and of rows with bounds.
 
-    A few iterations of one of Pinocchio's solvers, from the impulses of the last step, mostly show
-    which points stick, slide, or separate; Newton's method then finds the impulses exactly. If it
-    cycles, it begins at zero, then at the results of many iterations of either solver: projected
-    Gauss-Seidel fails for impacts of light links on heavy ones and for jammed joints, ADMM for some
-    problems that the former solves.
+    A few iterations of one of Pinocchio's solvers, starting from the impulses of the last step,
+    usually show which points stick, slide, or separate; Newton's method then finds the impulses
+    exactly. If it cycles, it restarts from zero, then from the results of many iterations of either
+    solver: projected Gauss-Seidel fails for impacts of light links on heavy ones and for jammed
+    joints, ADMM for some problems that Gauss-Seidel solves.
 
     Args:
         name: The solver to try first: ``"pgs"`` (projected Gauss-Seidel) or ``"admm"``.
@@ -74,14 +74,14 @@ class ImpulseSolver:
 
         Args:
             response: Velocities for unit impulses, shape (3 k + m, 3 k + m).
-            free: Velocities without impulses minus the wanted ones, shape (3 k + m,): of k points
+            free: Velocities without impulses minus the target ones, shape (3 k + m,): of k points
                 along two tangents and the normal, then of m rows.
             friction: Coefficients of the points, shape (k,).
             least: Smallest impulses of the rows, shape (m,); rows with one bound come first.
-            most: Largest impulses, likewise.
-            guess: Impulses to begin with, shape (3 k + m,).
+            most: Largest impulses of the rows, shape (m,).
+            guess: Impulses to start with, shape (3 k + m,).
         """
-        # An entry of the response that is not finite makes the diagonal so, too.
+        # A non-finite entry of the response makes the diagonal non-finite, too.
         if not math.isfinite(sum(free.tolist()) + sum(response.diagonal().tolist())):
             raise SimulationError("The state is no longer finite. Use a smaller period.")
         problem = ContactProblem(response, free, friction, least, most)
@@ -97,7 +97,7 @@ class ImpulseSolver:
         return best
 
     def _beginnings(self, problem: ContactProblem, guess: Vector) -> Iterator[Vector]:
-        """Yield impulses for Newton's method to begin with."""
+        """Yield starting impulses for Newton's method."""
         yield self.iterate(problem, self._order[0], _FEW, guess)
         nothing = np.zeros(len(guess))
         yield nothing
@@ -112,8 +112,8 @@ class ImpulseSolver:
         Args:
             problem: The problem.
             name: Name of the solver.
-            limits: Most iterations, and the accuracy at which it stops.
-            guess: Impulses to begin with.
+            limits: Maximum number of iterations, and the accuracy at which it stops.
+            guess: Impulses to start with.
         """
         models, data, signs, flips = self._models(problem)
         delassus = pinocchio.DelassusOperatorDense(problem.matrix * flips)
@@ -125,7 +125,7 @@ class ImpulseSolver:
         return found
 
     def _models(self, problem: ContactProblem) -> tuple[Any, Any, Vector, Vector]:
-        """Return Pinocchio's description of a problem, and the signs of rows and matrix there."""
+        """Return Pinocchio's description of a problem, with the signs of its rows and matrix."""
         least, most = problem.least, problem.most
         key = problem.friction.tobytes(), least.tobytes(), most.tobytes()
         if key in self._known:
@@ -140,7 +140,7 @@ class ImpulseSolver:
             models.append(self._bounds_model(least[one_sided:], most[one_sided:]))
         for model in models:
             data.append(model.createData())
-        # Pinocchio's limits only push upward.
+        # Limits in Pinocchio only push upward.
         signs = np.ones(len(problem.free))
         signs[3 * len(problem.friction) :][np.isinf(least) & np.isfinite(most)] = -1.0
         if len(self._known) >= _MOST_KNOWN:
@@ -156,7 +156,7 @@ class ImpulseSolver:
         return self._points[coefficient]
 
     def _limit(self, length: int) -> Any:
-        """Return a limit constraint of joints of a dummy model."""
+        """Return a joint limit constraint of a dummy model."""
         if length not in self._limits:
             nothing = np.zeros(length)
             model = pinocchio.JointLimitConstraintModel(
@@ -167,7 +167,7 @@ class ImpulseSolver:
         return self._limits[length]
 
     def _bounds_model(self, least: Vector, most: Vector) -> Any:
-        """Return a constraint with bounds: joint friction of a dummy model."""
+        """Return a constraint with bounds: the joint friction of a dummy model."""
         return pinocchio.ConstraintModel(
             pinocchio.JointFrictionConstraintModel(
                 self._chain(len(least)),

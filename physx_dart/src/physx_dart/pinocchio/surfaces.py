@@ -1,4 +1,4 @@
-"""Surfaces of static things: distances of points, with tangents and outward normals."""
+"""Surfaces of static bodies: distances of points, with tangents and outward normals."""
 
 from __future__ import annotations
 
@@ -14,8 +14,8 @@ from physx_core.typing import Vector
 
 _CROSS = np.zeros((3, 9))
 _CROSS[[0, 0, 1, 1, 2, 2], [7, 5, 2, 6, 3, 1]] = -1.0, 1.0, -1.0, 1.0, -1.0, 1.0
-"""Maps a vector to its cross-product matrix, flattened by columns: times a row, it is the cross
-product of the vector and the row."""
+"""Maps a vector to its cross-product matrix, flattened by columns; multiplied by a row, it gives
+the cross product of the vector and the row."""
 
 
 class Surface(ABC):
@@ -23,7 +23,7 @@ class Surface(ABC):
 
     @abstractmethod
     def distances(self, points: Vector) -> tuple[Vector, Vector]:
-        """Return distances of points (n, 3), negative inside, and the axes of the surface there.
+        """Return the distances of points (n, 3), negative inside, and the surface axes there.
 
         Returns:
             Distances in m, shape (n,); two tangents and the outward normal as rows,
@@ -37,7 +37,7 @@ class Surface(ABC):
 
 @dataclass(frozen=True, eq=False)
 class Plane(Surface):
-    """An infinite plane: normal of length 1, and height along it in m."""
+    """An infinite plane: unit normal, and height along it in m."""
 
     normal: Vector
     height: float
@@ -57,13 +57,13 @@ class Plane(Surface):
         return points.dot(self.normal) - self.height, self.axes
 
     def moments(self, points: Vector, axes: Vector) -> Vector:
-        """Return the cross products with the axes of the plane."""
+        """Return the cross products with the plane's axes."""
         return points.dot(self._moments).reshape(-1, 3, 3)
 
 
 @dataclass(frozen=True, eq=False)
 class Heights(Surface):
-    """A height field; distances are to the plane of the triangle below or above."""
+    """A height field; distances are to the plane of the triangle below or above a point."""
 
     field: HeightField
 
@@ -73,13 +73,13 @@ class Heights(Surface):
         grid = (points[:, :2] - self.field.corner()) / spacing
         last = np.array(heights.shape) - 1
         outside = ((grid < 0) | (grid > last)).any(axis=1)
-        # A state that is not finite has distances that are not either, and is reported by the step.
+        # A non-finite state has non-finite distances; the step reports it.
         cell = np.clip(np.floor(np.nan_to_num(grid)), 0, last - 1).astype(np.intp)
         x, y = (grid - cell).T
         i, j = cell.T
         low, high = heights[i, j], heights[i + 1, j + 1]
         along_x, along_y = heights[i + 1, j], heights[i, j + 1]
-        below = x >= y  # the triangle on the side of larger x
+        below = x >= y  # the triangle on the larger-x side
         slope_x = np.where(below, along_x - low, high - along_y)
         slope_y = np.where(below, high - along_x, along_y - low)
         height = low + slope_x * x + slope_y * y
@@ -92,7 +92,7 @@ class Heights(Surface):
 
 
 def surface_of(static: Static) -> Surface | None:
-    """Return the surface of the ground; None for shapes, and for steps on it."""
+    """Return the surface of the ground; None for shapes, including the steps of stairs."""
     what = static.what
     if isinstance(what, HeightField):
         return Heights(what)

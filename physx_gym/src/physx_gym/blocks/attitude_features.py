@@ -15,7 +15,7 @@ _COMPONENTS = {
 
 
 def attitude_space(count: int, *, has_rpy: bool) -> spaces.Dict:
-    """Return the space of attitudes, each feature with a column for each of them.
+    """Return the space of attitudes; each feature has a column for each attitude.
 
     Args:
         count: Number of attitudes.
@@ -33,7 +33,7 @@ def attitude_space(count: int, *, has_rpy: bool) -> spaces.Dict:
 
 
 def attitude_fieldnames(things: Sequence[str], *, has_rpy: bool) -> dict[str, list[list[str]]]:
-    """Return the names of the features' numbers, for the names of what has the attitudes."""
+    """Return the names of the features' numbers, given the names of the things with attitudes."""
     names = {
         name: [[f"{name}.{thing}.{part}" for thing in things] for part in _COMPONENTS[name]]
         for name in ("orientation", "angular_velocity")

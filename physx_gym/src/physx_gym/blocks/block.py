@@ -20,8 +20,8 @@ class Block(SharedArrays, ABC):
     """A part of a pipeline with its own period; a layer puts it on an environment.
 
     Subclasses create spaces and buffers in `connect`, compute in `setup` what depends on the
-    periods, and begin an episode in `begin`. Attributes that hold state from one call to the next
-    are named in `memory`: arrays, which are kept and updated in place, or plain numbers and lists.
+    periods, and begin an episode in `begin`. Attributes that hold state between calls are named in
+    `memory`: arrays, which are kept and updated in place, or plain numbers and lists.
 
     Attributes:
         name: Name within the pipeline.
@@ -29,7 +29,7 @@ class Block(SharedArrays, ABC):
         update_ratio: Period in periods of the environment below; -1: one step of the environment.
         every: Period in physics steps; 0 before the first reset.
         period: The same in s.
-        connected_to: Number of the simulator's build that it is connected to; -1: none yet.
+        connected_to: Number of the simulator build that it is connected to; -1: none yet.
         memory: Names of the attributes that `snapshot` keeps.
     """
 
@@ -62,8 +62,8 @@ class Block(SharedArrays, ABC):
     def refresh_connection(self) -> None:
         """Call `connect` if the simulator has been rebuilt since the last time.
 
-        Layers do so when they are created and at every reset; a constructor may, so that spaces are
-        known before there is a layer.
+        Layers call this when they are created and at every reset; a constructor may too, so that
+        spaces are known before there is a layer.
         """
         builds = self.env.simulator.builds
         if builds != self.connected_to:
@@ -104,7 +104,7 @@ class Block(SharedArrays, ABC):
         """Return the period of the environment below, in s."""
 
     def begin(self) -> None:
-        """Begin an episode; the simulation has its first state, and sensors have measured it."""
+        """Begin an episode; the simulation is in its initial state, which has been measured."""
 
     @property
     def state_space(self) -> gymnasium.Space[Any] | None:
@@ -125,7 +125,7 @@ class Block(SharedArrays, ABC):
         return {name: copy_tree(getattr(self, name)) for name in self.memory}
 
     def restore(self, state: Any) -> None:
-        """Return to a snapshot of an identical block.
+        """Restore a snapshot of an identical block.
 
         Raises:
             SimulationError: If the snapshot is of a different block.
@@ -146,7 +146,7 @@ class Block(SharedArrays, ABC):
 
 
 class ObserverBlock(Block):
-    """Computes features from what the environment below observes.
+    """Computes features from the observations of the environment below.
 
     Attributes:
         observation_space: Space of the features.
@@ -178,7 +178,7 @@ class ObserverBlock(Block):
 
 
 class ControllerBlock(Block):
-    """Computes the action of the environment below from an action of its own.
+    """Computes the action of the environment below from its own action.
 
     Attributes:
         action_space: Space of the block's own actions.

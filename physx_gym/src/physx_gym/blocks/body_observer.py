@@ -19,11 +19,11 @@ if TYPE_CHECKING:
 
 
 class BodyObserver(ObserverBlock):
-    """Estimates the orientations of links from a `MahonyFilter` below and encoders of joints.
+    """Estimates the orientations of links from a `MahonyFilter` below and joint encoders.
 
-    For each link it uses the IMU with the fewest joints in between; these joints need encoders. Its
-    features have a column for each link: ``orientation``, quaternions x, y, z, w in the world;
-    ``angular_velocity``, in rad/s along the link's own axes; with `compute_rpy` also
+    For each link, it uses the IMU with the fewest joints in between; these joints need encoders.
+    Its features have a column for each link: ``orientation``, quaternions x, y, z, w in the world;
+    ``angular_velocity``, in rad/s along the link's own axes; with `compute_rpy`, also
     ``roll_pitch_yaw``, in rad.
 
     Attributes:
@@ -43,7 +43,7 @@ class BodyObserver(ObserverBlock):
 
         Args:
             name: Name within the pipeline.
-            env: The environment below, with a `MahonyFilter` somewhere.
+            env: The environment below, which includes a `MahonyFilter`.
             update_ratio: See `Block`.
             bodies: Names of the links; None: those with an IMU.
             compute_rpy: Whether ``roll_pitch_yaw`` is a feature.
@@ -58,7 +58,11 @@ class BodyObserver(ObserverBlock):
         self.refresh_connection()
 
     def connect(self) -> None:
-        """Find IMUs and encoders."""
+        """Find IMUs and encoders.
+
+        Raises:
+            ConfigError: If there is no `MahonyFilter` below, or a needed encoder is missing.
+        """
         where = f'BodyObserver "{self.name}"'
         found = [getattr(layer, "block", None) for layer in self.env.layers]
         filters = [each for each in found if isinstance(each, MahonyFilter)]

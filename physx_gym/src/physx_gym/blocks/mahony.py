@@ -1,9 +1,9 @@
 """Attitude from angular velocity and acceleration: the explicit complementary filter.
 
 R. Mahony, T. Hamel, J.-M. Pflimlin: "Nonlinear Complementary Filters on the Special Orthogonal
-Group", IEEE Transactions on Automatic Control 53 (5), 2008. An acceleration whose size is not that
-of gravity says little about where up is: its weight is ``1 - 2 * abs(a² / g² - 1)``, at least 0.
-Quaternions are x, y, z, w.
+Group", IEEE Transactions on Automatic Control 53 (5), 2008. An acceleration whose magnitude differs
+from gravity says little about which way is up: its weight is ``1 - 2 * abs(a² / g² - 1)``, at least
+0. Quaternions are x, y, z, w.
 """
 
 from __future__ import annotations
@@ -25,10 +25,10 @@ from physx_core.rotations import (
 from physx_core.typing import Vector
 
 _WEIGHTLESS = 1e-3
-"""Acceleration, in m/s², below which it says nothing about where up is."""
+"""Acceleration, in m/s², below which it says nothing about which way is up."""
 
 _SMALL = 0.0025
-"""Square of an angle, in rad², below which three terms of the tangent's series give it to 1e-9."""
+"""Square of an angle, in rad², below which three terms of the tangent series suffice for 1e-9."""
 
 _UP = np.array([0.0, 0.0, 1.0])
 
@@ -62,7 +62,7 @@ class Gains(NamedTuple):
 
 
 def advance(state: Sequence[float], measured: Sequence[float], gains: Gains) -> tuple[float, ...]:
-    """Return the state of one filter a period later, in plain numbers.
+    """Return the state of one filter one period later, in plain numbers.
 
     Args:
         state: Quaternion, rates without their bias, bias, and last measured rates, in rad/s: 13
@@ -105,7 +105,7 @@ def advance(state: Sequence[float], measured: Sequence[float], gains: Gains) -> 
 
 
 def advance_rows(states: Vector, measured: Vector, gains: Gains) -> Vector:
-    """Return the states of many filters a period later, as `advance`.
+    """Return the states of many filters one period later, like `advance`.
 
     Args:
         states: Shape (n, 13).
@@ -143,7 +143,7 @@ def attitude_from_gravity(ax: float, ay: float, az: float) -> Quaternion:
 def remove_twist(x: float, y: float, z: float, w: float) -> Quaternion:
     """Return a quaternion without its rotation about the vertical.
 
-    Of ``q = twist * tilt`` that is the tilt; up stays the same in the sensor's frame.
+    That is the tilt in ``q = twist * tilt``; up stays the same in the sensor's frame.
     """
     length = math.sqrt(z * z + w * w)
     if length < 1e-12:  # upside down: the twist is undefined

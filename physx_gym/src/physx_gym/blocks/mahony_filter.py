@@ -37,10 +37,10 @@ class MahonyFilter(ObserverBlock):
     """Estimates the attitudes of IMUs from the angular velocities and accelerations they measure.
 
     Its features have a column for each IMU: ``orientation``, quaternions x, y, z, w of the sensors
-    in the world; ``angular_velocity``, the measured one without its estimated bias, in rad/s, along
-    the sensors' axes; with `compute_rpy` also ``roll_pitch_yaw``, in rad. Its state: the estimated
+    in the world; ``angular_velocity``, the measured one minus its estimated bias, in rad/s, along
+    the sensors' axes; with `compute_rpy`, also ``roll_pitch_yaw``, in rad. Its state: the estimated
     biases, in rad/s. Rotation about the vertical is not observable, so it drifts. An acceleration
-    whose square is more than half off that of gravity, as in an impact or a fall, is ignored.
+    whose square differs from gravity's by more than half, as in an impact or a fall, is ignored.
 
     Attributes:
         sensors: Names of the IMUs.
@@ -87,7 +87,11 @@ class MahonyFilter(ObserverBlock):
         self.refresh_connection()
 
     def connect(self) -> None:
-        """Find the IMUs."""
+        """Find the IMUs.
+
+        Raises:
+            ConfigError: If there are none.
+        """
         simulator = self.env.simulator
         self.sensors = tuple(each.name for each in simulator.sensors if type(each) is Imu)
         if not self.sensors:
@@ -146,7 +150,7 @@ class MahonyFilter(ObserverBlock):
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
         """Update the attitudes."""
         state: Any = self._filtered
-        if self._is_first:  # `begin` has used this measurement already
+        if self._is_first:  # `begin` has already used this measurement
             self._is_first = False
             return
         if state.ndim == 1:

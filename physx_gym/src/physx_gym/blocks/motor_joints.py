@@ -31,7 +31,7 @@ class JointEncoders(SharedArrays):
         Args:
             env: The environment that has the sensors.
             joints: Names of the joints.
-            purpose: What needs the encoders, for errors.
+            purpose: What needs the encoders, for error messages.
         """
         encoders = [each for each in env.simulator.sensors if type(each) is Encoder]
         known = [each.joint for each in encoders]
@@ -74,7 +74,7 @@ class MotorJoints(SharedArrays):
         upper: Highest positions.
         max_velocity: Highest velocities, in rad/s or m/s.
         max_torque: Highest torques of the motors' shafts, in N m or N.
-        reduction: Turns of the motor for each turn of the joint.
+        reduction: Turns of the motor per turn of the joint.
         encoders: Encoder measurements of the joints.
     """
 
@@ -83,7 +83,7 @@ class MotorJoints(SharedArrays):
 
         Args:
             env: The environment.
-            purpose: What needs the motors, for errors.
+            purpose: What needs the motors, for error messages.
         """
         motors, layout = env.simulator.motors, env.simulator.layout
         if not motors:

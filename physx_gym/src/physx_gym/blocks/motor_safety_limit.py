@@ -16,15 +16,15 @@ if TYPE_CHECKING:
 
 
 class MotorSafetyLimit(ControllerBlock):
-    """Limits the motors' torques so that soft limits of positions and velocities are respected.
+    """Limits the motors' torques to keep joints within soft limits of positions and velocities.
 
-    The closer a joint is to a soft limit of its position, the slower it may move towards it: its
-    velocity must be between ``-kp * (position - soft_limit)`` of both sides and within
+    The closer a joint is to a soft limit of its position, the slower it may move toward it: its
+    velocity must be between ``-kp * (position - soft_limit)`` for the two limits and within
     `soft_velocity_max`. The torque may be at most ``kd`` times the distance from these velocities;
-    beyond a limit it pushes back. This is the scheme of the PR2's controllers, see
+    beyond a limit, it pushes back. This is the scheme of the PR2's controllers, see
     http://wiki.ros.org/pr2_controller_manager/safety_limits. The motors' own limits apply as well.
 
-    Its action: torques, as those of the environment below.
+    Its action: torques, like that of the environment below.
 
     Attributes:
         joints: The motors' joints.
@@ -49,9 +49,9 @@ class MotorSafetyLimit(ControllerBlock):
             name: Name within the pipeline.
             env: The environment below.
             update_ratio: See `Block`.
-            kp: Velocity for each unit of distance from a soft limit, in 1/s; this and all options
-                below: a number, or one for each motor.
-            kd: Torque at the joint for each unit of velocity, in N m s/rad or N s/m.
+            kp: Velocity per unit of distance from a soft limit, in 1/s; this and all options below:
+                a number, or one for each motor.
+            kd: Torque at the joint per unit of velocity, in N m s/rad or N s/m.
             soft_position_margin: Distance of the soft limits from the joints' limits, in rad or m.
             soft_velocity_max: Highest velocity, in rad/s or m/s.
 

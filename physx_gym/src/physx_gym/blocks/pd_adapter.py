@@ -21,11 +21,11 @@ class PDAdapter(ControllerBlock):
     """Controls a PD controller's targets by position or velocity instead of acceleration.
 
     Its action: positions (`order` 0) or velocities (`order` 1) of the targets, shape (motors,). In
-    each of its periods it sets the constant acceleration that changes the targets' velocities to
-    the desired ones within the period; with `order` 0 these are the velocities that would reach the
-    desired positions in one period. With `is_instantaneous` it works at the controller's own period
-    instead, and moves as fast as the controller's bounds allow: without overshoot to a position,
-    at once to a velocity.
+    each of its periods, it sets the constant acceleration that brings the targets' velocities to
+    the desired ones within the period; with `order` 0, these are the velocities that would reach
+    the desired positions in one period. With `is_instantaneous`, it works at the controller's own
+    period instead, and moves as fast as the controller's bounds allow: to a position without
+    overshoot, to a velocity at once.
 
     Attributes:
         controller: The PD controller below.
@@ -62,7 +62,12 @@ class PDAdapter(ControllerBlock):
         self.refresh_connection()
 
     def connect(self) -> None:
-        """Read the bounds of the controller's targets."""
+        """Read the bounds of the controller's targets.
+
+        Raises:
+            ConfigError: If the environment is not a `ControlledEnv` with a `PDController`, or the
+                deadband is invalid.
+        """
         controller = getattr(self.env, "controller", None)
         if not isinstance(controller, PDController):
             raise ConfigError(

@@ -21,10 +21,10 @@ if TYPE_CHECKING:
 class PDController(ControllerBlock):
     """Drives the motors' joints to targets, whose accelerations are the action.
 
-    In each period the targets move, as described in `Targets`, and the torques of the motors are
+    In each period, the targets move as described in `Targets`, and the torques of the motors are
     ``kp * ((target - position) + kd * (target_velocity - velocity)) / reduction``, clipped to the
-    motors' limits. Positions and velocities are those that encoders measure. An episode begins with
-    the targets at the joints' positions.
+    motors' limits. Positions and velocities are measured by encoders. An episode begins with the
+    targets at the joints' positions.
 
     Its action: accelerations, shape (motors,), in rad/s² or m/s². Its state: positions and
     velocities of the targets, shape (2, motors).
@@ -58,12 +58,12 @@ class PDController(ControllerBlock):
             name: Name within the pipeline.
             env: The environment below.
             update_ratio: See `Block`.
-            kp: Torque at the joint for each unit of position error, in N m/rad or N/m; this and all
+            kp: Torque at the joint per unit of position error, in N m/rad or N/m; this and all
                 options below: a number, or one for each motor.
-            kd: Damping for each unit of `kp`, in s.
+            kd: Damping per unit of `kp`, in s.
             joint_position_margin: Distance of the targets from the joints' limits, in rad or m.
-            joint_velocity_limit: Highest velocity of the targets, in rad/s or m/s; those of joints
-                and motors apply as well.
+            joint_velocity_limit: Highest velocity of the targets, in rad/s or m/s; the limits of
+                joints and motors apply as well.
             joint_acceleration_limit: Highest acceleration of the targets, in rad/s² or m/s²; None:
                 enough to reverse the highest velocity within a step of the environment.
 
@@ -79,7 +79,12 @@ class PDController(ControllerBlock):
         self.refresh_connection()
 
     def connect(self) -> None:
-        """Read the limits of the environment's motors."""
+        """Read the limits of the environment's motors.
+
+        Raises:
+            ConfigError: If the environment's action is not the torques of motors, a joint has no
+                encoder, or neither a velocity nor an acceleration limit, or an option is invalid.
+        """
         where = f'PDController "{self.name}"'
         self.joints = joints = MotorJoints(self.env, where)
         kp, kd = joints.option("kp", self.kp, positive=True), joints.option("kd", self.kd)
@@ -109,12 +114,12 @@ class PDController(ControllerBlock):
         self._rows = (*targets, *self._encoders.values, *self._errors)
 
     def scale_gains(self, position: Any, velocity: Any) -> None:
-        """Multiply the gains, as they were given, by factors from now on.
+        """Multiply the original gains by factors from now on.
 
         Args:
-            position: Factor of the torque for each unit of position error: a number, or one for
-                each motor.
-            velocity: Factor of the torque for each unit of velocity error, likewise.
+            position: Factor of the torque per unit of position error: a number, or one for each
+                motor.
+            velocity: Factor of the torque per unit of velocity error, likewise.
         """
         self._gain_factors = np.array(np.broadcast_arrays(position, velocity), np.float64)
         self._gain_factors = self._gain_factors.reshape(2, -1)

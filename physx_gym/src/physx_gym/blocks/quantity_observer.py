@@ -46,7 +46,11 @@ class QuantityObserver(ObserverBlock):
         self.refresh_connection()
 
     def connect(self) -> None:
-        """Create a buffer of the quantity's current shape."""
+        """Create a buffer of the quantity's current shape.
+
+        Raises:
+            ConfigError: If the quantity is neither a number nor an array of numbers.
+        """
         quantities = self.env.quantities
         quantities.watch(self.quantity)
         value = quantities.get_value(self.quantity)

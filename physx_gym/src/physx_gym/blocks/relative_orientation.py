@@ -27,7 +27,7 @@ from physx_core.typing import Vector
 
 
 class RelativeOrientation:
-    """Computes the orientation of one link from that of another.
+    """Computes one link's orientation from another's.
 
     Attributes:
         joints: Names of the joints between them.

@@ -18,9 +18,9 @@ class Targets(SharedArrays):
 
     In each period the velocity changes first, then the position: ``v += a * dt; q += v * dt``.
     Position, velocity and acceleration stay within bounds, and the velocity is always such that the
-    target can stop before the bound of its position. At the distance d from that bound it is at
-    most ``sqrt(2 * a_max * d) - a_max * dt / 2``: one period of full braking leads from this curve
-    exactly to itself. So a target comes to rest at most ``a_max * dt² / 8`` before a bound.
+    target can stop before the bound of its position. At a distance d from that bound, it is at most
+    ``sqrt(2 * a_max * d) - a_max * dt / 2``: one period of full braking leads from this curve
+    exactly back to it. So a target comes to rest at most ``a_max * dt² / 8`` before a bound.
 
     Attributes:
         state: Negative positions, positions, velocities; shape (3, n).
@@ -36,7 +36,7 @@ class Targets(SharedArrays):
         max_velocity: Vector,
         max_acceleration: Vector,
     ) -> None:
-        """Bound targets, all of shape (n,); only positions and velocities may be unbounded.
+        """Set the bounds, all of shape (n,); only positions and velocities may be unbounded.
 
         Raises:
             ConfigError: If the bounds are reversed, or an acceleration is not bounded.
@@ -77,14 +77,14 @@ class Targets(SharedArrays):
         return low, high
 
     def start(self, positions: Vector, velocities: Vector) -> None:
-        """Begin at the positions and velocities nearest to the given ones within the bounds."""
+        """Begin at the positions and velocities within the bounds nearest to the given ones."""
         self.positions[:] = np.clip(positions, self.lower, self.upper)
         self.state[0] = -self.positions
         self._find_room()
         self.velocities[:] = np.clip(velocities, -self._room[0], self._room[1])
 
     def step(self, acceleration: Vector) -> None:
-        """Move by one period.
+        """Advance by one period.
 
         Args:
             acceleration: Shape (n,), in rad/s² or m/s², within their bounds; the other bounds hold

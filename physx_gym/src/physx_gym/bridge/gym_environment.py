@@ -23,7 +23,7 @@ class GymEnvironment(Environment):
     One sample is one transition: ``observation``, ``action``, ``reward``, ``next_observation``,
     ``terminated`` and ``truncated``. A space of several parts has a field for each, for example
     ``observation_states_agent_q``. Episodes are trajectories: `Dataset.episodes` returns them. When
-    stored samples are loaded, their actions are repeated.
+    stored samples are loaded, their actions are replayed.
     """
 
     def __init__(
@@ -33,10 +33,10 @@ class GymEnvironment(Environment):
 
         Args:
             id: Its id in Gymnasium, ``"package.module:Class"`` or ``"script.py:Class"``.
-            policy: What chooses the actions: ``"random"``, samples of the action space;
-                ``"network"``, the network of the run; or ``"package.module:function"``, which is
-                called with the observation.
-            kwargs: Those of `Environment`; all others are for the Gymnasium environment.
+            policy: What chooses the actions: ``"random"`` samples the action space; ``"network"``
+                is the network of the run; ``"package.module:function"`` is called with the
+                observation.
+            kwargs: Arguments of `Environment`; all others go to the Gymnasium environment.
         """
         own = {
             name: kwargs.pop(name)
@@ -76,7 +76,7 @@ class GymEnvironment(Environment):
         )
 
     def step(self) -> None:
-        """Make one transition; begin a new episode after the end of the last one."""
+        """Generate one transition; start a new episode after the end of the last one."""
         if self._observation is None:
             self._observation, _ = self.env.reset(seed=self._first_seed)
             self._first_seed = None

@@ -15,7 +15,7 @@ def make_env(env: str, options: Mapping[str, Any]) -> gymnasium.Env[Any, Any]:
     """Return a new environment.
 
     Args:
-        env: Its id, for example ``"CartPole-v1"`` or, with a module to import before,
+        env: Its id, for example ``"CartPole-v1"`` or, with a module to import first,
             ``"physx_gym:physx/Ant-v0"``; or the location of its class, ``"package.module:Class"``
             or ``"script.py:Class"``.
         options: Its keyword arguments.

@@ -1,4 +1,4 @@
-"""Environments that have nothing but what Gymnasium's interface has."""
+"""Environments reduced to Gymnasium's interface."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from physx_core.errors import ConfigError
 
 
 class PlainEnv(gymnasium.Env[Any, Any]):
-    """An environment without any members but those of `gymnasium.Env`; see `plain`.
+    """An environment with only the members of `gymnasium.Env`; see `plain`.
 
     Attributes:
         env: The environment.
@@ -57,10 +57,10 @@ class PlainEnv(gymnasium.Env[Any, Any]):
 
 
 def plain(env: gymnasium.Env[Any, Any]) -> PlainEnv:
-    """Return an environment with nothing but the members of `gymnasium.Env`.
+    """Return an environment with only the members of `gymnasium.Env`.
 
-    `PipelineEnv.compute_reward` has the name of a method of goal environments, but other
-    parameters. Checks that tell these environments by that name alone, such as
+    `PipelineEnv.compute_reward` has the name of a method of goal environments, but different
+    parameters. Checks that recognize goal environments by that name alone, such as
     `stable_baselines3.common.env_checker.check_env`, pass with ``plain(env)``. Trainers do not need
     it.
 
@@ -68,8 +68,8 @@ def plain(env: gymnasium.Env[Any, Any]) -> PlainEnv:
         env: An environment, with or without Gymnasium's wrappers.
 
     Raises:
-        ConfigError: If it is not an environment of Gymnasium.
+        ConfigError: If it is not a Gymnasium environment.
     """
     if not isinstance(env, gymnasium.Env):
-        raise ConfigError(f"plain needs an environment of Gymnasium, not {env!r}.")
+        raise ConfigError(f"plain needs a Gymnasium environment, not {env!r}.")
     return PlainEnv(env)

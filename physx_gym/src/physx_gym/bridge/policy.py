@@ -20,13 +20,13 @@ from physx_gym.spaces import SpaceFields
 class Policy:
     """Chooses actions with a trained network.
 
-    The network reads fields of the observation, which `SpaceFields` names with the prefix
-    ``observation``, and predicts those of the action, with the prefix ``action``; for a network
-    with one output and an action of one part the name does not matter. Policies are callable::
+    The network reads fields of the observation, named by `SpaceFields` with the prefix
+    ``observation``, and predicts those of the action, with the prefix ``action``; if the network
+    has one output and the action one part, the name does not matter. Policies are callable::
 
         policy = Policy("sessions/training", env)
         observation, reward, *_ = env.step(policy(observation))
-        env.evaluate(policy.act)                 # where the environment is a `RobotEnv`
+        env.evaluate(policy.act)                 # if the environment is a `RobotEnv`
     """
 
     def __init__(
@@ -41,8 +41,8 @@ class Policy:
 
         Args:
             session: Folder of the session that trained it, or of its checkpoints.
-            env: Environment for whose spaces it is.
-            network: Which checkpoint to load, and other changes; None: the last one.
+            env: Environment whose spaces the policy is for.
+            network: Which checkpoint to load, and other overrides; None: the last checkpoint.
             trust: Whether to import whatever the checkpoint names; see `load_learner`.
 
         Raises:
@@ -67,7 +67,7 @@ class Policy:
                 )
 
     def __call__(self, observation: Any) -> Any:
-        """Return the action for an observation; for a vector environment, those of all."""
+        """Return the action for an observation; for a vector environment, a batch of actions."""
         arrays = self._observations.arrays(observation)
         if self._many:
             predicted = self._learner.predict(arrays)
@@ -81,17 +81,17 @@ class Policy:
 
 
 def single_action(actions: SpaceFields, prediction: Mapping[str, Any]) -> Any:
-    """Return the action that a network's predictions for one sample stand for."""
+    """Return the action given by a network's predictions for one sample."""
     arrays = action_arrays(actions, prediction)
     return actions.value({name: values[0] for name, values in arrays.items()})
 
 
 def action_arrays(actions: SpaceFields, prediction: Mapping[str, Any]) -> dict[str, Array]:
-    """Return the actions that a network's predictions stand for, by field.
+    """Return the actions given by a network's predictions, by field.
 
-    The values of a box are clipped to its bounds. For a choice among n the network gives n values,
-    of which the largest wins, or one value, which is rounded; for `MultiBinary`, values above 0.5
-    count as 1.
+    The values of a box are clipped to its bounds. For a choice among n, the network outputs n
+    values, of which the largest wins, or one value, which is rounded; for `MultiBinary`, values
+    above 0.5 count as 1.
 
     Args:
         actions: The action space.
@@ -123,7 +123,7 @@ def action_arrays(actions: SpaceFields, prediction: Mapping[str, Any]) -> dict[s
 
 
 def _to_actions(space: Any, values: Array) -> Array:
-    """Return the elements of a leaf space that rows of values stand for."""
+    """Return the elements of a leaf space given by rows of values."""
     if isinstance(space, spaces.Discrete):
         count = int(space.n)
         if values.shape[1] == count > 1:

@@ -19,14 +19,14 @@ from physx_gym.bridge.policy import Policy
 from physx_gym.env.robot_env import RobotEnv
 
 SPEED = "x_velocity"
-"""Name, in information, of the velocity in the direction in which a robot is to walk, in m/s."""
+"""Name, in information, of the velocity in the direction of walking, in m/s."""
 SUCCESS = "is_success"
 """Name, in information, of whether the goal of a task is reached."""
 
 
 @dataclass
 class Evaluate:
-    """Run episodes under a saved policy, and show their rewards, lengths, speeds and successes."""
+    """Run episodes under a saved policy, and report rewards, lengths, speeds and success."""
 
     policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
     """Session or checkpoint of the policy's network."""
@@ -37,13 +37,13 @@ class Evaluate:
     episodes: int = 20
     """Number of episodes."""
     seed: int = 10_000
-    """Seed of the first episode; that of each further one is higher by 1."""
+    """Seed of the first episode; each further episode adds 1."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Further options of the environment."""
     json: bool = False
-    """Print JSON, with the figures of each episode, instead of a table."""
+    """Print JSON with the figures of each episode instead of a table."""
     replay: str | None = None
-    """Write a recording of the first episode for the viewer to this file (.rrd)."""
+    """Write a viewer recording of the first episode to this file (.rrd)."""
     film: str | None = None
     """Write a film of the first episode to this file (.mp4, .gif, .webp)."""
     trust: bool = False
@@ -51,7 +51,7 @@ class Evaluate:
 
 
 def run(words: Sequence[str]) -> None:
-    """Print the figures, and write what was asked for."""
+    """Print the figures, and write the requested files."""
     with argument_registry():
         options = tyro.cli(Evaluate, args=words, prog="physx evaluate")
     if options.episodes < 1:
@@ -80,8 +80,8 @@ def evaluate(
 ) -> list[dict[str, float]]:
     """Run an episode for each seed, and return its figures by name.
 
-    ``reward`` is the sum of the rewards and ``length`` the number of steps; if the information of
-    steps tells them, ``speed`` is the mean velocity along x in m/s, and ``success`` is 1 if the
+    ``reward`` is the sum of the rewards and ``length`` the number of steps. If the information of
+    steps contains them, ``speed`` is the mean velocity along x in m/s, and ``success`` is 1 if the
     goal is reached at the end, otherwise 0.
 
     Args:
@@ -138,7 +138,7 @@ def _show_episode(env: gymnasium.Env[Any, Any], act: Any, options: Evaluate) -> 
     """Write a recording and a film of the first episode."""
     base = env.unwrapped
     if not isinstance(base, RobotEnv):
-        raise ConfigError(f"{options.env} is not a RobotEnv, and has no recording of its episodes.")
+        raise ConfigError(f"{options.env} is not a RobotEnv, so its episodes are not recorded.")
     base.evaluate(act, seed=options.seed, enable_stats=False, enable_replay=False)
     if options.replay is not None:
         show(f"recording: {base.replay(path=options.replay)}")

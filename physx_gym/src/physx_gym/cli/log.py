@@ -16,25 +16,25 @@ from physx_gym.telemetry.log_file import read_log
 
 @dataclass
 class ShowLog:
-    """Show logs of episodes: their columns, as a plot, or in the viewer."""
+    """Show logs of episodes: as a table of columns, as a plot, or in the viewer."""
 
     files: Annotated[tuple[str, ...], tyro.conf.Positional, tyro.conf.arg(metavar="FILE...")]
     """The log files."""
     columns: tuple[str, ...] = ()
-    """Only columns whose names begin with one of these; of a replay those that it plots."""
+    """Only columns whose names begin with one of these; in a replay, only these are plotted."""
     plot: str | None = None
     """Write a plot of the columns of all files to this file."""
     replay: str | None = None
-    """Write a recording of all episodes, side by side, for the viewer to this file (.rrd)."""
+    """Write a viewer recording of all episodes, side by side, to this file (.rrd)."""
     ghosts: tuple[str, ...] = ()
-    """Further log files, whose motions the replay draws translucent over the first."""
+    """Further log files whose motions the replay draws translucently over the first."""
     trajectories: tuple[str, ...] = ()
-    """Names of bodies of the first log whose way the replay draws."""
+    """Names of bodies of the first log whose paths the replay draws."""
     contacts: bool = True
-    """Whether the replay draws the forces at contacts."""
+    """Whether the replay draws contact forces."""
     backend: str | None = None
-    """Engine that provides the robots of the replay; by default that of each log, which may only
-    name one of an installed plugin."""
+    """Engine that provides the robots of the replay; by default that of each log, which may name
+    only engines of installed plugins."""
 
 
 def run(words: Sequence[str]) -> None:
@@ -65,7 +65,7 @@ def run(words: Sequence[str]) -> None:
 
 
 def _print_table(log: Log, columns: tuple[str, ...]) -> None:
-    """Print what was recorded, and a line for each column."""
+    """Print a summary of the recording, and a line for each column."""
     rows = len(log.time)
     duration = log.time[-1] - log.time[0] if rows else 0.0
     environment, backend = (log.constants.get(name, "?") for name in ("environment", "backend"))

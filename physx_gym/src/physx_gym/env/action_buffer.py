@@ -1,4 +1,4 @@
-"""Actions: each is checked, clipped, and written into a buffer."""
+"""Checks and clips actions, and writes them into a buffer."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ from physx_gym.spaces import Path, fill, format_path
 
 
 class ActionBuffer(SharedArrays):
-    """A buffer that actions of a space are written into."""
+    """A buffer for actions of a space."""
 
     def __init__(self, space: spaces.Space[Any], buffer: Any) -> None:
         self._space, self._buffer = space, buffer
@@ -26,7 +26,7 @@ class ActionBuffer(SharedArrays):
             self._first, self._end = int(space.start), int(space.start + space.n)
 
     def write(self, action: Any) -> None:
-        """Check an action, and write it into the buffer, clipped to the bounds of its space."""
+        """Check an action, clip it to the bounds of its space, and write it into the buffer."""
         buffer = self._buffer
         kind = type(action)
         if kind is np.int64 or kind is int:
@@ -51,7 +51,7 @@ class ActionBuffer(SharedArrays):
 
 
 def _write(space: spaces.Space[Any], buffer: Any, action: Any, path: Path) -> Any:
-    """Write an action into a buffer; return the buffer, or the action if it has none."""
+    """Write an action into a buffer; return the buffer, or the action if there is none."""
     if isinstance(space, spaces.Dict):
         if not isinstance(action, dict) or set(action) != set(space.spaces):
             keys = list(action) if isinstance(action, dict) else repr(action)
@@ -69,7 +69,7 @@ def _write(space: spaces.Space[Any], buffer: Any, action: Any, path: Path) -> An
         return buffer
     try:
         known = space.contains(action)
-    except Exception:  # a space may raise anything for what is not one of its elements
+    except Exception:  # spaces may raise anything for values they do not contain
         known = False
     if not known:
         raise _error(path, f"is {action!r}, which is not an element of {space}")

@@ -14,17 +14,17 @@ from physx_gym.spaces import copier
 
 
 class ControlLoop(SharedArrays):
-    """What `RobotEnv` keeps of its episode, under a single name: subclasses may use all others.
+    """State of `RobotEnv`'s episode, under a single name: subclasses may use all others.
 
     Attributes:
         is_ready: Whether `step` may be called.
-        reason: Otherwise, why not and what to do.
+        reason: If not, why, and what to do.
         timing: When to command and observe.
         schedule: The ticks of a step.
         builds: Build of the simulator that the spaces belong to.
         episode: Number of episodes since the environment was seeded.
         steps: Number of steps of the episode.
-        is_recorded: Whether everything is recorded, at every tick; otherwise little, at each step.
+        is_recorded: Whether everything is recorded, at every tick; otherwise less, once a step.
         own_checks: Checks of the base environment's observations.
         is_finite: Whether the base environment's observation is known to be free of NaN.
         actions: Accepts actions of the outermost environment.
@@ -46,11 +46,11 @@ class ControlLoop(SharedArrays):
         self.is_recorded = self.is_finite = False
 
     def refuse(self, reason: str) -> None:
-        """Accept no step until the next reset."""
+        """Reject steps until the next reset."""
         self.is_ready, self.reason = False, reason
 
     def connect(self, outermost: PipelineEnv, is_base: bool) -> None:
-        """Take actions from, and check observations of, the outermost environment."""
+        """Take actions from the outermost environment, and check its observations."""
         space = outermost.observation_space
         self.actions = ActionBuffer(outermost.action_space, outermost.action)
         self.checks = self.own_checks if is_base else ObservationChecks(space)

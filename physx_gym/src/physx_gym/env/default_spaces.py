@@ -12,9 +12,9 @@ from physx_gym.simulator.simulator import Simulator
 from physx_gym.spaces import leaves, neutral, value_at
 
 _MARGIN = 0.01
-"""How far positions may exceed their limits within the space, as a fraction of the range."""
+"""How far the space extends beyond the limits of positions, as a fraction of their range."""
 _FAR = 1e9
-"""Bound of unlimited values: engines fail beyond it, and Gymnasium warns of infinite bounds."""
+"""Bound of unlimited values: engines fail beyond it, and Gymnasium warns about infinite bounds."""
 
 
 def action_space_of(simulator: Simulator) -> spaces.Box:
@@ -28,7 +28,7 @@ def observation_space_of(simulator: Simulator, longest: float) -> spaces.Dict:
 
     Args:
         simulator: The simulator.
-        longest: Time at which every episode is over, in s.
+        longest: Time by which every episode is over, in s.
     """
     inside: dict[str, spaces.Space[Any]] = {
         "t": spaces.Box(0.0, longest, (), np.float64),
@@ -58,11 +58,11 @@ def _unbounded(array: Vector) -> spaces.Space[Any]:
 
 
 def allocate_observation(simulator: Simulator) -> tuple[Any, Vector, dict[str, Any]]:
-    """Return a buffer of the default observation.
+    """Allocate a buffer for the default observation.
 
     Returns:
         The index of each observed number in the simulator's values; the memory of the observation,
-        flat and in the order of its space; and the observation, which consists of views of it.
+        flat and in the order of its space; and the observation, which consists of views of that.
     """
     space = observation_space_of(simulator, 1.0)
     numbers = simulator.views_of(np.arange(len(simulator.values), dtype=np.float64))

@@ -14,7 +14,7 @@ from physx_gym.spaces import format_path, leaves, value_at
 
 
 class ObservationChecks(SharedArrays):
-    """Finds NaN in observations of a space, and observations outside of it.
+    """Finds NaN in observations of a space, and observations outside the space.
 
     Attributes:
         space: The space.
@@ -26,8 +26,8 @@ class ObservationChecks(SharedArrays):
 
         Args:
             space: Their space.
-            flat: Memory of the only buffer to be checked, with its leaves in the order of the
-                space; None: any observation.
+            flat: Memory of the only buffer that will be checked, with its leaves in the order of
+                the space; None: any observation.
         """
         self.space = space
         self._leaves = list(leaves(space))
@@ -43,7 +43,7 @@ class ObservationChecks(SharedArrays):
         self._above, self._below = self._within
 
     def _vector(self, observation: Any) -> Any:
-        """Return all numbers of an observation, which are floating, as a vector."""
+        """Return all numbers of a floating-point observation as a vector."""
         if self._flat is not None:
             return self._flat
         if type(observation) is np.ndarray:
@@ -79,7 +79,7 @@ class ObservationChecks(SharedArrays):
         return b"\0" not in self._within.tobytes()  # many times faster than all()
 
     def describe_outside(self, observation: Any) -> str:
-        """Return which number of an observation is first outside of its space, in words."""
+        """Describe the first number of an observation that is outside its space."""
         for path, space in self._leaves:
             part = value_at(observation, path)
             if space.contains(part):
@@ -98,7 +98,7 @@ class ObservationChecks(SharedArrays):
         return "it is not in the space"
 
     def check_form(self, observation: Any) -> None:
-        """Check that an observation has the form of its space, whatever its values."""
+        """Check that an observation has the form of its space, regardless of its values."""
         for path, space in self._leaves:
             try:
                 part = value_at(observation, path)

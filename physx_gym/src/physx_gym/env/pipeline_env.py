@@ -1,4 +1,4 @@
-"""The interface of a pipeline: that of the base environment and of every layer on it."""
+"""The interface shared by a pipeline's base environment and every layer on it."""
 
 from __future__ import annotations
 
@@ -32,20 +32,20 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         observation: The latest observation of this layer.
         action: The latest action of this layer, within the action space.
         simulator: The world, its motors and sensors.
-        robot: Place of the controlled robot in the simulation's state.
+        robot: The controlled robot's part of the simulation's state.
         robot_state: State of the controlled robot.
         stepper_state: Time and physics steps of the episode.
-        is_simulation_running: Whether an episode runs; shape ().
+        is_simulation_running: Whether an episode is running; shape ().
         num_steps: Steps since the last reset; -1 before the first; shape ().
         measurements: The latest measurement: ``t``, ``states``, ``measurements``.
         quantities: Values that rewards and terminations share, computed at most once a step.
         recorder: Records episodes.
         simulation_duration_max: Time, in s, after which an episode is truncated.
         debug: Whether every physics step is recorded.
-        reset_options: The options that `reset` was given.
+        reset_options: The options passed to `reset`.
         viewer_kwargs: Options of the viewer.
-        step_dt: Time of a step, in s.
-        control_dt: Time between two commands, in s; of a layer, between two of its own.
+        step_dt: Duration of a step, in s.
+        control_dt: Time between two commands, in s; for a layer, between two of its own.
         observe_dt: Time between two observations within a step, in s; likewise.
     """
 
@@ -82,13 +82,14 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
 
     @abstractmethod
     def compute_command(self, action: Any, command: Vector) -> None:
-        """Write the action of the layer below, or the command of the motors, in place.
+        """Compute the torques of the motors for an action, and write them in place.
 
-        Called every `control_dt`.
+        Called every `control_dt`. A layer that changes the action writes that of the environment
+        below into ``env.action``, and has it compute the torques.
 
         Args:
             action: The action of this layer.
-            command: Torques of the motors, shape (motors,), in N m or N.
+            command: Torques of the motors, shape (motors,), in N m or N, for every layer.
         """
 
     @abstractmethod
@@ -101,7 +102,7 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
 
     @abstractmethod
     def compute_reward(self, terminated: bool, info: Info) -> float:
-        """Return the reward of this step, of this layer and all below.
+        """Return the reward of this step, from this layer and all below.
 
         Args:
             terminated: Whether this step terminated the episode.
@@ -109,9 +110,9 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         """
 
     def _setup(self) -> None:
-        """Configure the next episode, before its first state is known.
+        """Configure the next episode, before its initial state is known.
 
-        Called at every reset: the base environment's first, then each layer's, from below.
+        Called at every reset: the base environment's first, then each layer's, from the bottom up.
         """
 
     @abstractmethod
@@ -124,11 +125,11 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
 
     @abstractmethod
     def _initialize_buffers(self) -> None:
-        """Prepare for the episode: the simulation runs, but nothing is observed yet."""
+        """Prepare for the episode: the simulation is running, but nothing has been observed."""
 
     @abstractmethod
     def _refresh_buffers(self) -> None:
-        """Update what termination and reward share; called once a step."""
+        """Update what terminations and rewards share; called once a step."""
 
     # The pipeline ----------------------------------------------------------------------------
 
@@ -140,7 +141,7 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
     @property
     @abstractmethod
     def outermost(self) -> PipelineEnv:
-        """The outermost environment of the pipeline that this one is part of."""
+        """The outermost environment of this environment's pipeline."""
 
     @property
     @abstractmethod
@@ -148,7 +149,7 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         """This environment and all below it, the base first."""
 
     def set_wrapper_attr(self, name: str, value: Any, *, force: bool = True) -> bool:
-        """Set an attribute on the first environment that has it, from this one to the base.
+        """Set an attribute on the first environment that has it, from this one down to the base.
 
         Args:
             name: Name of the attribute.
@@ -175,16 +176,16 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         """Start an episode with this environment as the outermost of its pipeline.
 
         Args:
-            seed: Seed of everything that is random from now on; None: continue the sequence.
-            options: For `_setup` of all layers, which find them in `reset_options`.
+            seed: Seed of all randomness from now on; None: continue the sequence.
+            options: For `_setup` of all layers, which can read them from `reset_options`.
 
         Returns:
             The first observation, and information.
 
         Raises:
-            EpisodeError: If the first state already ends the episode.
-            ConfigError: If periods do not fit together.
-            SimulationError: If the first state is invalid.
+            EpisodeError: If the initial state already ends the episode.
+            ConfigError: If the options are not a mapping, or the periods are incompatible.
+            SimulationError: If the initial state is invalid.
         """
 
     @abstractmethod
@@ -192,33 +193,33 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         """Simulate `step_dt` under an action.
 
         Args:
-            action: Clipped to the bounds of the action space before anything sees it.
+            action: The action; clipped to the bounds of the action space before any use.
 
         Returns:
             Observation, reward, whether the episode is terminated, whether it is truncated, and
             information.
 
         Raises:
-            EpisodeError: If no episode runs, it is over, or another layer started it.
+            EpisodeError: If no episode is running, it is over, or another layer started it.
             ActionError: If the action does not have the form of the action space, or is not finite.
             SimulationError: If the simulation, an observation or a reward is no longer finite.
         """
 
     @abstractmethod
     def stop(self) -> None:
-        """End the episode and write what was recorded. To continue, call `reset`."""
+        """End the episode and write its recording. Call `reset` to start the next."""
 
     @property
     @abstractmethod
     def training(self) -> bool:
-        """Whether this is for training; otherwise for evaluation, where episodes are recorded."""
+        """Whether the mode is training; otherwise it is evaluation, which records episodes."""
 
     @abstractmethod
     def train(self, mode: bool = True) -> None:
         """Switch between training and evaluation.
 
         Raises:
-            EpisodeError: If an episode runs.
+            EpisodeError: If an episode is running.
         """
 
     def eval(self) -> None:
@@ -247,7 +248,7 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         verbose: bool = True,
         **kwargs: Any,
     ) -> None:
-        """Play with the keyboard; see `physx_gym.show.interactive.play`."""
+        """Play using the keyboard; see `physx_gym.show.interactive.play`."""
         from physx_gym.show.interactive import play
 
         play(self, enable_travelling, start_paused, enable_is_done, verbose, **kwargs)
@@ -266,12 +267,16 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         """Record arrays from the next reset on.
 
         Args:
-            name: Name of the variable; its columns begin with it.
+            name: Name of the variable; the names of its columns begin with it.
             value: An array of float64 or int64, or nested containers of them. They are read
                 whenever a row is recorded, so keep them and update them in place.
             fieldnames: Names of all numbers, nested like the value; None: numbered.
             namespace: Prefix of the name; None: none.
-            is_eval_only: Whether it is left out in training.
+            is_eval_only: Whether to record it in evaluation only.
+
+        Raises:
+            EpisodeError: If an episode is running in evaluation.
+            ConfigError: If the value or its names are invalid, or a name is already used.
         """
         self.recorder.telemetry.register(
             name, value, fieldnames, namespace, is_eval_only=is_eval_only
@@ -284,9 +289,9 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
 
     @property
     def log_data(self) -> dict[str, Any]:
-        """What was recorded of the running episode, up to now, or of the last one.
+        """The recording of the running episode so far, or of the last one.
 
-        In training that is the state and what sensors measure, once a step; in evaluation
+        In training, that is the state and the sensors' measurements, once a step; in evaluation,
         everything, at every command and observation.
 
         Returns:
@@ -299,7 +304,7 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         """Plot the running episode, or the last one; see `physx_gym.show.plotting.plot`.
 
         Args:
-            enable_block_states: Whether states of blocks are shown too.
+            enable_block_states: Whether to show the states of blocks too.
             kwargs: For `physx_gym.show.plotting.plot`.
         """
         from physx_gym.show.plotting import plot
@@ -315,9 +320,9 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
     # State -----------------------------------------------------------------------------------
 
     def snapshot(self) -> Any:
-        """Return everything that `restore` needs to continue exactly from here; plain data.
+        """Return everything that `restore` needs to continue exactly from here, as plain data.
 
-        It holds the simulation, all random generators, and every layer up to this one.
+        It contains the simulation, all random generators, and every layer up to this one.
         """
         layers = self.layers
         return {
@@ -327,16 +332,16 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
 
     @abstractmethod
     def restore(self, state: Any) -> None:
-        """Return to a snapshot of this environment, or of one that is built alike.
+        """Restore a snapshot of this environment, or of one that is built identically.
 
         Raises:
-            SimulationError: If the snapshot is of another environment.
+            SimulationError: If the snapshot is of a different environment.
         """
 
     def _memory(self) -> Any:
-        """Return what this layer alone keeps from one step to the next, as plain data.
+        """Return what this layer itself keeps from one step to the next, as plain data.
 
-        To be overridden together with `_recall`; None: nothing.
+        Override it together with `_recall`; None: nothing.
         """
         return None
 
@@ -347,12 +352,12 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         """Prepare `_setup` for a memory that `_recall` will get.
 
         Returns:
-            Whether the world has to be set up for it; otherwise it may be fit as it is.
+            Whether the world must be set up again for it; otherwise it may already fit.
         """
         return False
 
     def _constants(self) -> dict[str, Any]:
-        """Return what describes this layer in the log of the episode: plain data."""
+        """Return this layer's description for the episode's log, as plain data."""
         return {}
 
     def _snapshot_own(self) -> dict[str, Any]:
@@ -369,7 +374,7 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
 
 
 def _defines(kind: type, name: str) -> bool:
-    """Return whether a class below `PipelineEnv` has an attribute that can be set."""
+    """Return whether a class derived from `PipelineEnv` defines an attribute that can be set."""
     for each in kind.__mro__:
         if each in (PipelineEnv, SharedArrays, gymnasium.Env, object):
             return False

@@ -32,31 +32,31 @@ from physx_gym.telemetry.episode_recorder import EpisodeRecorder
 class RobotEnv(PipelineEnv):
     """A robot that is controlled step by step, as a Gymnasium environment.
 
-    The observation is the time, the state of the robot, and what its sensors measure; the action is
-    the motors' torques; the reward is 0. Subclasses override what differs: one with another action
-    space overrides `compute_command` too, one with another observation space
-    `refresh_observation`. `_initialize_action_space` and `_initialize_observation_space` are called
-    at construction, and at a reset after `_setup` has changed the simulator's options.
+    By default, the observation is the time, the robot's state and its sensors' measurements, the
+    action is the motors' torques, and the reward is 0. Subclasses override what differs: a new
+    action space also requires `compute_command`, a new observation space `refresh_observation`.
+    `_initialize_action_space` and `_initialize_observation_space` are called at construction, and
+    at a reset after `_setup` has changed the simulator's options.
 
-    Reset: `stop`; the seed; registered forces are removed; `_setup`, then that of the layers;
-    spaces, if the simulator was rebuilt; actions become neutral; `_sample_state`; the simulation
-    starts; `_initialize_buffers`; `_refresh_buffers`; `refresh_observation`; `has_terminated`.
+    Sequence of a reset: `stop`; seeding; removal of registered forces; `_setup`, then that of the
+    layers; spaces, if the simulator was rebuilt; neutral actions; `_sample_state`; start of the
+    simulation; `_initialize_buffers`; `_refresh_buffers`; `refresh_observation`; `has_terminated`.
 
-    Step: the action is checked and clipped; every `control_dt` `compute_command`, every
-    `observe_dt` `refresh_observation` (before a command at the same time); then once
-    `_refresh_buffers`, `refresh_observation`, `has_terminated`, `compute_reward`. All methods are
-    those of the outermost environment. An exception stops the episode.
+    Sequence of a step: the action is checked and clipped; `compute_command` is called every
+    `control_dt`, `refresh_observation` every `observe_dt` (before a command at the same time); then
+    `_refresh_buffers`, `refresh_observation`, `has_terminated` and `compute_reward`, once each. All
+    methods are called on the outermost environment. An exception stops the episode.
     """
 
-    metadata = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012 - as gymnasium has it
+    metadata = {"render_modes": ["human", "rgb_array"]}  # noqa: RUF012 - as in gymnasium
 
     holds_command: ClassVar[bool | None] = None
-    """Whether `compute_command` depends on nothing but the action, so that once a step is enough if
-    nothing observes in between; None: if it is not overridden."""
+    """Whether `compute_command` depends only on the action, so that one call per step is enough if
+    nothing observes in between; None: only if it is not overridden."""
 
     view: ClassVar[Mapping[str, Sequence[float]]] = {}
-    """``eye`` and ``target`` of the camera that `render` shows the world with, in m; by default it
-    shows all objects."""
+    """``eye`` and ``target`` of the camera that `render` uses, in m; by default it shows all
+    objects."""
 
     _left_out: ClassVar[frozenset[str]] = frozenset({"_outermost", "_own_renderer"})
 
@@ -74,15 +74,15 @@ class RobotEnv(PipelineEnv):
         """Create an environment; nothing runs before `reset`.
 
         Args:
-            simulator: A `Simulator`; or a world, or the path or name of a robot, to create one of.
-            step_dt: Time of a step, in s; a multiple of the control and observation periods.
+            simulator: A `Simulator`; or a world, or the path or name of a robot, to create one.
+            step_dt: Duration of a step, in s; a multiple of the control and observation periods.
             simulation_duration_max: Time, in s, after which an episode is truncated.
-            debug: Whether every physics step is recorded, in training too.
+            debug: Whether to record every physics step, even in training.
             render_mode: ``"human"``, ``"rgb_array"``, or None: whichever is possible.
-            engine: Reference of the engine, instead of the simulator's: another way to give the
-                option ``backend``, for trainers with an option of that name.
-            kwargs: Options of `Simulator.build` or `Simulator`, if one is created; all others are
-                those of the next class that an environment with several base classes inherits from.
+            engine: Reference of the engine, instead of the simulator's: an alias of the option
+                ``backend``, for trainers that have an option of that name.
+            kwargs: Options of `Simulator.build` or `Simulator`, if one is created; all others go to
+                the next class in the method resolution order, if there are several base classes.
 
         Raises:
             ConfigError: If an option is invalid.
@@ -123,7 +123,7 @@ class RobotEnv(PipelineEnv):
         self.observation_space = observation_space_of(self.simulator, longest)
 
     def _set_timing(self) -> None:
-        """Determine what is due when in a step."""
+        """Determine when commands and observations are due within a step."""
         simulator = self.simulator
         self._control_loop.timing = timing = StepTiming(
             simulator.period,
@@ -150,7 +150,7 @@ class RobotEnv(PipelineEnv):
         loop.builds = simulator.builds
 
     def _allocate_buffers(self) -> None:
-        """Allocate `action` and `observation`, and check that the subclass fills its own spaces."""
+        """Allocate `action` and `observation`; check that the subclass supports its own spaces."""
         default = observation_space_of(self.simulator, self._control_loop.timing.longest)
         self._flat_observation: Any = None
         if self.observation_space == default:
@@ -175,15 +175,15 @@ class RobotEnv(PipelineEnv):
     # What subclasses may override --------------------------------------------------------------
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
-        """Update `observation` in place: by default it is the measurement.
+        """Update `observation` in place: by default, with the measurement.
 
-        See `PipelineEnv.refresh_observation`. Rely on nothing but `measurement` for the state.
+        See `PipelineEnv.refresh_observation`. Take the state from `measurement` only.
         """
         if self._flat_observation is not None:
             self.simulator.values.take(self._observed_index, None, self._flat_observation, "clip")
 
     def compute_command(self, action: Any, command: Vector) -> None:
-        """Write the torques of the motors, in place: by default the action.
+        """Write the torques of the motors in place: by default, the action.
 
         See `PipelineEnv.compute_command`. Never called before the first step; the motors clip the
         torques.
@@ -191,30 +191,30 @@ class RobotEnv(PipelineEnv):
         command[:] = action
 
     def has_terminated(self, info: Info) -> tuple[bool, bool]:
-        """Return whether the task is over, and whether the episode is to be cut off.
+        """Return whether the task is over, and whether to cut off the episode.
 
-        By default nothing terminates, and an observation outside of its space truncates. Episodes
-        longer than `simulation_duration_max` are truncated in any case. Called after `observation`
-        was updated; see `PipelineEnv.has_terminated`.
+        By default, an episode never terminates, and an observation outside its space truncates it.
+        Episodes longer than `simulation_duration_max` are truncated in any case. Called after
+        `observation` has been updated; see `PipelineEnv.has_terminated`.
 
         Raises:
-            EpisodeError: If no episode runs.
+            EpisodeError: If no episode is running.
         """
         if not self.is_simulation_running:
             raise EpisodeError("has_terminated needs a running episode: call reset first.")
         return False, not self.is_inside()
 
     def is_inside(self) -> bool:
-        """Return whether `observation` is within its space; warn the first time that it is not."""
+        """Return whether `observation` is within its space; warn the first time it is not."""
         loop = self._control_loop
         inside = loop.own_checks.is_inside(self.observation)
         loop.is_finite = inside and loop.own_checks.excludes_nan
         if not inside and not self._has_left_space:
             self._has_left_space = True
             warnings.warn(
-                f"An observation of {type(self).__name__} is outside of its space: "
-                f"{loop.own_checks.describe_outside(self.observation)}. If that is no failure of "
-                "the task, widen the space.",
+                f"An observation of {type(self).__name__} is outside its space: "
+                f"{loop.own_checks.describe_outside(self.observation)}. If that is not a failure "
+                "of the task, widen the space.",
                 stacklevel=2,
             )
         return inside
@@ -229,23 +229,23 @@ class RobotEnv(PipelineEnv):
     def _setup(self) -> None:
         """Configure the next episode.
 
-        Called at every reset before anything of the episode exists. Options of the simulator may be
-        set and forces registered here; `step_dt` is known, `control_dt` and `observe_dt` are those
-        of the previous episode. `reset_options` is what `reset` was given.
+        Called at every reset, before the episode starts. Options of the simulator may be set and
+        forces registered here; `step_dt` is known, `control_dt` and `observe_dt` are those of the
+        previous episode. `reset_options` has the options passed to `reset`.
         """
 
     def _neutral(self) -> Vector:
         """Return the neutral positions of the robot, shape (nq,).
 
-        By default each joint is at 0, or in the middle of its limits if 0 is outside of them, and a
+        By default, each joint is at 0, or in the middle of its limits if 0 is outside them, and a
         floating base is where the world puts it. Called by `_sample_state`.
         """
         return self.simulator.neutral()
 
     def _sample_state(self) -> tuple[Vector, Vector]:
-        """Return the first positions and velocities, of the robot or of the whole world.
+        """Return the initial positions and velocities, of the robot or of the whole world.
 
-        By default the neutral positions at rest; a floating base is moved up or down so that the
+        By default, the neutral positions at rest; a floating base is moved up or down so that the
         lowest collision shape touches the ground. Called once at every reset; draw random numbers
         from `np_random` only.
         """
@@ -264,7 +264,7 @@ class RobotEnv(PipelineEnv):
     def _key_to_action(
         self, key: str | None, obs: Any, reward: float | None, **kwargs: Any
     ) -> Any | None:
-        """Return the action of a key, for `play_interactive`; None: keep the present action.
+        """Return the action for a key, for `play_interactive`; None: keep the present action.
 
         Called before every step.
 
@@ -275,25 +275,25 @@ class RobotEnv(PipelineEnv):
             kwargs: Further options of `play_interactive`.
         """
         raise UsageError(
-            f"{type(self).__name__} cannot be played: override _key_to_action, which returns the "
-            "action of a key."
+            f"{type(self).__name__} cannot be played: override _key_to_action to return the action "
+            "for a key."
         )
 
     def _draw(self, scene: Factory) -> None:
         """Draw what is not simulated, such as a goal, before the first frame.
 
-        Also called at the start of an episode that is recorded, and `_redraw` after its steps, so
-        that replays show it.
+        Also called at the start of a recorded episode, and `_redraw` after each of its steps, so
+        that replays show the drawings.
 
         Args:
             scene: Factory to draw with.
         """
 
     def _redraw(self, scene: Factory) -> None:
-        """Update what `_draw` drew, before every further frame.
+        """Update what `_draw` drew, before every subsequent frame.
 
         Args:
-            scene: Factory that it was drawn with.
+            scene: Factory used by `_draw`.
         """
 
     # The pipeline ------------------------------------------------------------------------------
@@ -305,7 +305,7 @@ class RobotEnv(PipelineEnv):
 
     @property
     def outermost(self) -> PipelineEnv:
-        """The outermost layer of the pipeline on this environment; itself, if there is none."""
+        """The outermost layer on this environment; the environment itself if there is none."""
         found = None if self._outermost is None else self._outermost()
         return self if found is None else found
 
@@ -338,13 +338,17 @@ class RobotEnv(PipelineEnv):
 
     @property
     def training(self) -> bool:
-        """Whether this is for training; see `PipelineEnv.training`."""
+        """Whether the mode is training; see `PipelineEnv.training`."""
         return self._is_training
 
     def train(self, mode: bool = True) -> None:
-        """Switch between training and evaluation; see `PipelineEnv.train`."""
+        """Switch between training and evaluation; see `PipelineEnv.train`.
+
+        Raises:
+            EpisodeError: If an episode is running in the other mode.
+        """
         if bool(mode) is not self._is_training and self.is_simulation_running:
-            raise EpisodeError("An episode runs: call stop() before train() or eval().")
+            raise EpisodeError("An episode is running: call stop() before train() or eval().")
         self._is_training = bool(mode)
 
     # Reset -------------------------------------------------------------------------------------
@@ -358,7 +362,13 @@ class RobotEnv(PipelineEnv):
     def run_reset(
         self, outermost: PipelineEnv, seed: int | None, options: dict[str, Any] | None
     ) -> tuple[Any, Info]:
-        """Start an episode with an outermost environment; see `reset`."""
+        """Start an episode with the given outermost environment; see `reset`.
+
+        Raises:
+            EpisodeError: If the initial state already ends the episode.
+            ConfigError: If the options are not a mapping, or the periods are incompatible.
+            SimulationError: If the initial state is invalid.
+        """
         if options is not None and not isinstance(options, Mapping):
             raise ConfigError(f"The options of reset are {options!r} but must be a mapping.")
         self.stop()
@@ -398,10 +408,10 @@ class RobotEnv(PipelineEnv):
         return loop.copy(outermost.observation), info
 
     def _initialize_seed(self, seed: int | None = None) -> None:
-        """Seed everything that is random: states, errors of sensors, samples of spaces.
+        """Seed all randomness: states, errors of sensors, samples of spaces.
 
         Args:
-            seed: A seed, from 0; None: a random one.
+            seed: A seed of at least 0; None: a random one.
         """
         if seed is None:
             self._np_random, self._np_random_seed = gymnasium.utils.seeding.np_random()
@@ -421,7 +431,7 @@ class RobotEnv(PipelineEnv):
                 space.seed(int(sequence.generate_state(1)[0]))
 
     def _begin_episode(self, outermost: PipelineEnv, loop: ControlLoop) -> Info:
-        """Observe the first state, and prepare the steps."""
+        """Observe the initial state, and prepare for steps."""
         outermost._initialize_buffers()
         outermost._refresh_buffers()
         if self._own_quantities is not None:
@@ -442,13 +452,13 @@ class RobotEnv(PipelineEnv):
         if any(ends):
             word = "terminated" if ends[0] else "truncated"
             raise EpisodeError(
-                f"The episode is {word} at its first state already. Look at _sample_state and "
+                f"The episode is already {word} in its initial state. Look at _sample_state and "
                 f"has_terminated; the first observation is {outermost.observation}."
             )
         return info
 
     def _begin_recording(self, outermost: PipelineEnv, everything: bool, info: Info) -> None:
-        """Start to record: everything, with a file that the information names, or the least."""
+        """Start recording: everything, with a file named in the information, or the minimum."""
         constants: dict[str, Any] = {
             "seed": self.np_random_seed,
             "step_dt": self.step_dt,
@@ -482,7 +492,13 @@ class RobotEnv(PipelineEnv):
         return self.run_step(self, action)
 
     def run_step(self, outermost: PipelineEnv, action: Any) -> Step:
-        """Simulate a step under an action of the outermost environment; see `step`."""
+        """Simulate a step under an action of the outermost environment; see `step`.
+
+        Raises:
+            EpisodeError: If no episode is running, it is over, or another layer started it.
+            ActionError: If the action does not have the form of the action space, or is not finite.
+            SimulationError: If the simulation, an observation or a reward is no longer finite.
+        """
         loop = self._control_loop
         if not loop.is_ready or outermost is not self.outermost:
             raise self._step_error(outermost)
@@ -548,14 +564,14 @@ class RobotEnv(PipelineEnv):
         )
 
     def stop(self) -> None:
-        """End the episode and write what was recorded. To continue, call `reset`."""
+        """End the episode and write its recording. Call `reset` to start the next."""
         if self.is_simulation_running:
             self.recorder.end(keep=self._control_loop.steps > 0)
             self.simulator.stop()
             self._control_loop.refuse("The episode was stopped: call reset().")
 
     def close(self) -> None:
-        """Stop, and free engine and viewer; `reset` brings them back."""
+        """Stop, and free engine and viewer; the environment can still be `reset`."""
         self.stop()
         if self._own_renderer is not None:
             self._own_renderer.close()
@@ -564,9 +580,9 @@ class RobotEnv(PipelineEnv):
         self.simulator.close()
 
     def render(self) -> Any:
-        """Show the world as `render_mode` says, with the options `viewer_kwargs`.
+        """Show the world according to `render_mode`, with the options `viewer_kwargs`.
 
-        Without a mode, a viewer follows it if there is a display; otherwise pictures are rendered.
+        Without a mode, a viewer shows it if there is a display; otherwise, pictures are rendered.
 
         Returns:
             A picture, shape (height, width, 3), uint8; None if a viewer shows the world.
@@ -584,11 +600,15 @@ class RobotEnv(PipelineEnv):
     # State -------------------------------------------------------------------------------------
 
     def restore(self, state: Any) -> None:
-        """Return to a snapshot without layers; see `PipelineEnv.restore`."""
+        """Restore a snapshot without layers; see `PipelineEnv.restore`."""
         self.run_restore(self, state)
 
     def run_restore(self, outermost: PipelineEnv, state: Any) -> None:
-        """Return to a snapshot of a pipeline; see `restore`."""
+        """Restore a snapshot of a pipeline; see `restore`.
+
+        Raises:
+            SimulationError: If the snapshot is of a different environment.
+        """
         layers = outermost.layers
         names = [type(layer).__name__ for layer in layers]
         if not isinstance(state, dict) or state.get("layers") != names or "own" not in state:

@@ -18,10 +18,10 @@ def construct_next(
     """Call the constructor of the next class in the method resolution order of an environment.
 
     Args:
-        kind: The class before.
+        kind: The preceding class.
         env: The environment.
         options: Options of the constructor.
-        known: Options that the class before has taken, beside those that it names.
+        known: Options that the preceding class accepted besides those in its signature.
     """
     order = type(env).__mro__
     place = order.index(kind) + 1
@@ -48,7 +48,7 @@ def _options(kinds: Sequence[type[Any]]) -> list[str]:
 
 _PAIRS = {
     "_sample_state": "positions and velocities",
-    "has_terminated": "whether the episode terminated, and whether it is truncated",
+    "has_terminated": "whether the episode is terminated, and whether it is truncated",
 }
 
 
@@ -71,7 +71,7 @@ def metadata_of(kind: type[Any], step_dt: float) -> dict[str, Any]:
 
 
 def check_pair(env: Any, method: str, found: Any) -> tuple[Any, Any]:
-    """Return what a method returned, if it is a pair."""
+    """Return a method's result after checking that it is a pair."""
     if not isinstance(found, (tuple, list)) or len(found) != 2:
         raise ConfigError(
             f"{type(env).__name__}.{method} returned {found!r} but must return {_PAIRS[method]}."

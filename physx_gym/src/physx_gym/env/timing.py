@@ -24,7 +24,7 @@ class StepTiming:
         observe_dt: Time between two observations, in s.
         tick: Greatest number of physics steps that divides all three.
         last: Physics steps after which an episode is truncated.
-        longest: Time at which every episode is over, in s.
+        longest: Time by which every episode is over, in s.
     """
 
     def __init__(
@@ -38,10 +38,10 @@ class StepTiming:
         """Convert times to physics steps.
 
         Args:
-            period: Time of a physics step, in s.
-            step_dt: Time of a step, in s.
-            control_period: Time between two commands, in s; None: a step.
-            observe_period: Time between two observations, in s; None: as between two commands.
+            period: Duration of a physics step, in s.
+            step_dt: Duration of a step, in s.
+            control_period: Time between two commands, in s; None: one step.
+            observe_period: Time between two observations, in s; None: the control period.
             duration: Time after which an episode is truncated, in s.
         """
         self.step = steps_of("step_dt", step_dt, period)
@@ -65,7 +65,7 @@ class StepTiming:
         """Return the ticks of a step; at its start the observation is up to date.
 
         Args:
-            is_held: Whether one command and one observation a step make no difference.
+            is_held: Whether one command and one observation per step are enough.
             every_physics_step: Whether every physics step is a tick.
         """
         control, observe = (self.step,) * 2 if is_held else (self.control, self.observe)

@@ -16,12 +16,13 @@ HEIGHT = 1.0
 
 
 class AcrobotEnv(OneMotorEnv):
-    """Swing two links of 1 m above a bar 1 m over the shoulder: ``physx/Acrobot-v0``.
+    """Swing two 1 m links above a bar 1 m over the shoulder: ``physx/Acrobot-v0``.
 
     Only the elbow is driven. Action: a torque of -1, 0 or 1 N m; or, if `continuous`, any number
     in between. Observation, shape (6,): cosine and sine of the shoulder's angle, which is 0 if the
     link hangs down, and of the elbow's, then both velocities in rad/s. Reward: -1 for every step,
-    but 0 for the last. It terminates above the bar, and is truncated after 500 steps of 0.2 s.
+    but 0 for the last. An episode terminates above the bar, and is truncated after 500 steps of
+    0.2 s.
 
     The task is that of R. S. Sutton, "Generalization in reinforcement learning", 1996.
     """

@@ -21,18 +21,19 @@ FARTHEST = 1000.0
 
 
 class AntEnv(RobotEnv):
-    """Walk along the x axis on four legs of two joints: ``physx/Ant-v0``.
+    """Walk along the x axis on four two-joint legs: ``physx/Ant-v0``.
 
     Action, shape (8,): torques of the joints, as fractions of 60 N m. Observation, shape (27,):
     height of the torso in m; its orientation, a quaternion x, y, z, w; the joints' positions in
     rad; velocity of the torso in its own frame, in m/s and rad/s; the joints' velocities. Reward:
-    mean velocity along x in the step, in m/s, plus 0.5 while it is healthy, minus 0.005 times
-    the sum of the squared actions; ``info["reward"]`` has the parts. It is healthy while the torso
-    is between 0.1 and 1 m high, and not upside down; its radius is 0.2 m, so that it may lie on the
-    ground. Otherwise it terminates; it is truncated after 1000 steps of 50 ms.
+    mean velocity along x in the step, in m/s, plus 0.5 while the ant is healthy, minus 0.005 times
+    the sum of the squared actions; ``info["reward"]`` has the parts. The ant is healthy while its
+    torso is between 0.1 and 1 m high, and not upside down; the torso's radius is 0.2 m, so it may
+    lie on the ground. An episode terminates when the ant is no longer healthy, and is truncated
+    after 1000 steps of 50 ms.
 
     The task is that of J. Schulman et al., "High-dimensional continuous control using generalized
-    advantage estimation", 2015, with another robot. Options are named as those of Gymnasium's
+    advantage estimation", 2015, with another robot. Options have the same names as in Gymnasium's
     ``Ant-v5``.
     """
 
@@ -55,11 +56,11 @@ class AntEnv(RobotEnv):
             backend: Reference of the engine.
             forward_reward_weight: Weight of the velocity along x.
             ctrl_cost_weight: Weight of the sum of the squared actions.
-            healthy_reward: Reward for a step after which it is healthy.
-            terminate_when_unhealthy: Whether an episode terminates when it is not.
-            healthy_z_range: Heights of the torso between which it is healthy, in m.
-            reset_noise_scale: Half the range from which the joints' first positions are drawn, in
-                rad, and standard deviation of the first velocities, in m/s and rad/s.
+            healthy_reward: Reward for a step after which the ant is healthy.
+            terminate_when_unhealthy: Whether an episode terminates when the ant is not healthy.
+            healthy_z_range: Heights of the torso between which the ant is healthy, in m.
+            reset_noise_scale: Half the range from which the joints' initial positions are drawn, in
+                rad, and standard deviation of the initial velocities, in m/s and rad/s.
             exclude_current_positions_from_observation: Whether the observation leaves out x and y
                 of the torso, which otherwise come first.
             options: Options of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
@@ -114,7 +115,7 @@ class AntEnv(RobotEnv):
         self._place, self._before = memory
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
-        """Observe the state, without the position on the ground unless that is asked for."""
+        """Observe the state, without the position on the ground unless requested."""
         state = measurement["states"]["agent"]
         self.observation[:-14], self.observation[-14:] = state["q"][self._first_seen :], state["v"]
 
@@ -130,7 +131,7 @@ class AntEnv(RobotEnv):
         return bool(upright and self._lowest <= height <= self._highest)
 
     def has_terminated(self, info: Info) -> tuple[bool, bool]:
-        """Return whether it is no longer healthy."""
+        """Return whether the ant is no longer healthy."""
         return self._terminates and not self.is_healthy, not self.is_inside()
 
     def compute_reward(self, terminated: bool, info: Info) -> float:

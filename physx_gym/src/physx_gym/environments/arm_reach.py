@@ -28,7 +28,7 @@ _REST = np.array([0.0, -0.5, 0.0, -2.0, 0.0, 1.6, 0.0])
 class ArmReachEnv(GoalTask):
     """Reach for a point with the hand of a Franka Panda: ``physx/ArmReach-v0``.
 
-    Needs the robots of ``physx-dart[robots]``. Action, shape (7,): velocities of the joints, as
+    Requires the robots of ``physx-dart[robots]``. Action, shape (7,): velocities of the joints, as
     fractions of 1.5 rad/s; a controller follows them and compensates gravity. Observation, shape
     (20,): positions and velocities of the joints, in rad and rad/s; position of the hand, and
     vector from there to the point, in m. Reward: minus the distance in m, minus a hundredth of the
@@ -121,7 +121,7 @@ class ArmReachEnv(GoalTask):
         command += weight
 
     def has_terminated(self, info: Info) -> tuple[bool, bool]:
-        """Return no termination: the hand is to stay at the point."""
+        """Return no termination: the hand must stay at the point."""
         return False, not self.is_inside()
 
     def compute_reward(self, terminated: bool, info: Info) -> float:
@@ -137,5 +137,5 @@ class ArmReachGoalEnv(GoalEnv, ArmReachEnv):
 
     Observation: a dictionary of ``"observation"``, shape (17,): positions and velocities of the
     joints, in rad and rad/s, and position of the hand, in m; ``"achieved_goal"``, shape (3,): the
-    latter again; and ``"desired_goal"``, shape (3,), the point. Reward: see `GoalEnv`.
+    hand's position again; and ``"desired_goal"``, shape (3,): the point. Reward: see `GoalEnv`.
     """

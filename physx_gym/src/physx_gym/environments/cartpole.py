@@ -20,9 +20,9 @@ class CartpoleEnv(OneMotorEnv):
 
     Action: push to the left, not at all, or to the right, with 10 N; or, if `continuous`, the push
     as a fraction of that. Observation, shape (4,): position of the cart in m, angle of the pole in
-    rad, and their velocities. Reward: 1 for every step. It terminates if the pole leans by more
-    than 12 degrees or the cart is more than 2.2 m away, and is truncated after 500 steps of 20 ms,
-    each a single step of the physics, as in Gymnasium's CartPole-v1.
+    rad, and their velocities. Reward: 1 for every step. An episode terminates if the pole leans by
+    more than 12 degrees or the cart is more than 2.2 m away, and is truncated after 500 steps of
+    20 ms, each a single physics step, as in Gymnasium's CartPole-v1.
 
     The task is that of A. G. Barto, R. S. Sutton and C. W. Anderson, "Neuronlike adaptive elements
     that can solve difficult learning control problems", 1983.
@@ -45,7 +45,7 @@ class CartpoleEnv(OneMotorEnv):
         self.observation[:2], self.observation[2:] = state["q"], state["v"]
 
     def has_terminated(self, info: Info) -> tuple[bool, bool]:
-        """Return whether the pole fell or the cart left."""
+        """Return whether the pole has fallen or the cart has gone too far."""
         place, angle, _, _ = self.observation.tolist()
         return abs(place) > FARTHEST or abs(angle) > STEEPEST, False
 

@@ -1,4 +1,4 @@
-"""Tasks with a goal, and their versions that learn from goals reached by chance."""
+"""Tasks with a goal, and their versions for hindsight experience replay."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ _REWARD_TYPES = ("sparse", "dense")
 
 
 class GoalTask(RobotEnv):
-    """An environment whose observation ends with the vector from what is achieved to the goal.
+    """An environment whose observation ends with the vector from the achieved position to the goal.
 
     Attributes:
-        ACHIEVED: Where in the observation the position that is achieved is.
-        CLOSE: Distance from the goal below which it is reached, in m.
+        ACHIEVED: Slice of the observation that contains the achieved position.
+        CLOSE: Distance from the goal below which it counts as reached, in m.
         goal: The goal of the episode, shape (dimensions,), in m.
     """
 
@@ -40,17 +40,17 @@ class GoalTask(RobotEnv):
 class GoalEnv(GoalTask):
     """Observes goals as Gymnasium-Robotics' ``GoalEnv`` does, so that hindsight can replace them.
 
-    To be the first base class, before that of a `GoalTask`. The observation is a dictionary of
+    It must be the first base class, before that of a `GoalTask`. The observation is a dictionary of
     ``"observation"``, that of the task without the vector to the goal, ``"achieved_goal"`` and
-    ``"desired_goal"``. The reward depends on the two goals alone, and no episode terminates.
+    ``"desired_goal"``. The reward depends only on the two goals, and no episode terminates.
     """
 
     def __init__(self, *, reward_type: str = "sparse", **options: Any) -> None:
         """Create the environment.
 
         Args:
-            reward_type: ``"sparse"``: -1 as long as the goal is not reached, then 0; ``"dense"``:
-                minus the distance from the goal, in m.
+            reward_type: ``"sparse"``: 0 while the goal is reached, otherwise -1; ``"dense"``: minus
+                the distance from the goal, in m.
             options: Options of the task.
 
         Raises:
@@ -58,7 +58,7 @@ class GoalEnv(GoalTask):
         """
         if reward_type not in _REWARD_TYPES:
             raise ConfigError(
-                f"reward_type is {reward_type!r} but is one of {listed(_REWARD_TYPES)}."
+                f"reward_type is {reward_type!r} but must be one of {listed(_REWARD_TYPES)}."
             )
         self._is_sparse = reward_type == "sparse"
         super().__init__(**options)
@@ -81,7 +81,7 @@ class GoalEnv(GoalTask):
         return self._flat
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
-        """Observe what the task does, and both goals."""
+        """Observe what the task observes, and both goals."""
         super().refresh_observation(measurement)
         self.observation["observation"][:] = self._flat[: -len(self.goal)]
         self.observation["achieved_goal"][:] = self._flat[self.ACHIEVED]
@@ -95,7 +95,7 @@ class GoalEnv(GoalTask):
         return self.compute_terminated(achieved, desired, info), truncated
 
     def compute_reward(self, *given: Any) -> Any:
-        """Return the reward of this step, or those of other goals.
+        """Return the reward of this step, or rewards for other goals.
 
         Args:
             given: Whether the step terminated the episode, and its information, as in
@@ -112,11 +112,11 @@ class GoalEnv(GoalTask):
         return self._rate(achieved, desired)
 
     def compute_terminated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> bool:
-        """Return that no goal terminates an episode: it is to be held."""
+        """Return False: no goal terminates an episode, as it must be held."""
         return False
 
     def compute_truncated(self, achieved_goal: Any, desired_goal: Any, info: Any) -> bool:
-        """Return that no goal truncates an episode."""
+        """Return False: no goal truncates an episode."""
         return False
 
     def _rate(self, achieved: Any, desired: Any) -> Any:

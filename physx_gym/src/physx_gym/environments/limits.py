@@ -1,4 +1,4 @@
-"""Bounds of observations that hold whatever the simulation does."""
+"""Bounds of observations that hold in any simulation."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ _MARGIN = 1.1
 _OVERSHOOT = 3.0
 """The same for velocities, which may briefly overshoot a joint's limit."""
 FASTEST = 100.0
-"""Bound of velocities without a limit of their own, in m/s or rad/s."""
+"""Bound of velocities that have no limit, in m/s or rad/s."""
 
 
 def box(*bounds: ArrayLike) -> spaces.Box:
@@ -26,7 +26,7 @@ def box(*bounds: ArrayLike) -> spaces.Box:
 def joint_positions(simulator: Simulator) -> Vector:
     """Return bounds of the joints' positions: the larger of their limits, with a margin.
 
-    An engine may stop a joint at its limit only after the physics step in which it passes that.
+    An engine may stop a joint only after the physics step in which it passes its limit.
     """
     layout, joints = simulator.layout, simulator.robot.joints
     farthest = np.maximum(np.abs(layout.lower[joints]), np.abs(layout.upper[joints]))

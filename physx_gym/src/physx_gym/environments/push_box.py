@@ -31,10 +31,10 @@ class PushBoxEnv(GoalTask):
     between moving bodies. Action, shape (2,): forces along x and y, as fractions of 20 N.
     Observation, shape (15,): position and velocity of the stick; position of the box, cosine and
     sine of its heading, its linear and angular velocity; vectors from the stick to the box and from
-    the box to the goal; in m, m/s and rad/s. Reward: minus the box's distance from the goal and a
-    quarter of the stick's from the place behind the box, 18 cm from its middle, where it pushes it
-    towards the goal, in m; 10 more when the box is within 8 cm of the goal, which terminates. It is
-    truncated after 200 steps of 50 ms, or if the box is out of reach.
+    the box to the goal; in m, m/s and rad/s. Reward: minus the box's distance from the goal, minus
+    a quarter of the stick's distance from the point 18 cm behind the box's center, from which it
+    pushes the box toward the goal, in m; plus 10 when the box is within 8 cm of the goal, which
+    terminates the episode. It is truncated after 200 steps of 50 ms, or if the box is out of reach.
     """
 
     ACHIEVED, CLOSE = slice(4, 6), 0.08
@@ -96,7 +96,7 @@ class PushBoxEnv(GoalTask):
         scene.update_lines("goal", positions=self._goal_circle())
 
     def _goal_circle(self) -> Vector:
-        """Return points on a circle around the goal, in which the center of the box must be."""
+        """Return points on the circle around the goal that the center of the box must be in."""
         angles = np.linspace(0.0, 2 * math.pi, 33)
         around = self.CLOSE * np.stack([np.cos(angles), np.sin(angles)], axis=1)
         return np.insert(self.goal + around, 2, 0.01, axis=1)
@@ -137,14 +137,14 @@ class PushBoxGoalEnv(GoalEnv, PushBoxEnv):
 
     Observation: a dictionary of ``"observation"``, shape (13,): that of `PushBoxEnv` up to the
     vector from the stick to the box; ``"achieved_goal"``, shape (2,): the position of the box, in
-    m; and ``"desired_goal"``, shape (2,). Reward: see `GoalEnv`. It does not terminate.
+    m; and ``"desired_goal"``, shape (2,). Reward: see `GoalEnv`. Episodes do not terminate.
     """
 
 
 def _away_from(
     random: np.random.Generator, place: Vector, nearest: float, farthest: float
 ) -> Vector:
-    """Return a random point within the gantry's reach at a distance from a place, in m."""
+    """Return a random point within the gantry's reach, at a given distance from a place, in m."""
     while True:
         angle, distance = random.uniform(-math.pi, math.pi), random.uniform(nearest, farthest)
         point = place + distance * np.array([math.cos(angle), math.sin(angle)])

@@ -28,16 +28,17 @@ _UP = np.array([[0.0, 0.0, 1.0]])
 class QuadrupedEnv(RobotEnv):
     """Walk along the x axis with a Unitree A1: ``physx/Quadruped-v0``.
 
-    Needs the robots of ``physx-dart[robots]``. Action, shape (12,): target positions of the joints,
-    as fractions of 0.4 rad from a standing pose; a controller of 40 N m/rad and 1 N m s/rad follows
-    them, 200 times a second. Observation, shape (47,): the vertical in the frame of the trunk;
-    linear and angular velocity of the trunk in its frame, in m/s and rad/s; the joints' positions,
-    from the standing pose, in rad, and velocities; the last action; cosine and sine of the heading,
-    the angle from the x axis to the trunk's. Reward: up to 2 for a forward velocity of `speed`, up
-    to 0.5 for going straight, up to 0.5 for a heading of 0, 0.25 for staying up, minus costs of
-    torques and of abrupt actions; ``info["reward"]`` has the parts, ``info["x_velocity"]`` the mean
-    velocity along the x axis in the step, in m/s. It terminates if the trunk is below 0.12 m or
-    leans by more than 1 rad, and is truncated after 1000 steps of 20 ms.
+    Requires the robots of ``physx-dart[robots]``. Action, shape (12,): target positions of the
+    joints, as fractions of 0.4 rad from a standing pose; a controller with gains of 40 N m/rad and
+    1 N m s/rad follows them, 200 times a second. Observation, shape (47,): the vertical in the
+    frame of the trunk; linear and angular velocity of the trunk in its frame, in m/s and rad/s; the
+    joints' positions relative to the standing pose, in rad, and velocities; the last action; cosine
+    and sine of the heading, the angle from the x axis to the trunk's. Reward: up to 2 for a forward
+    velocity of `speed`, up to 0.5 for going straight, up to 0.5 for a heading of 0, 0.25 for
+    staying up, minus costs of torques and abrupt actions; ``info["reward"]`` has the parts,
+    ``info["x_velocity"]`` the mean velocity along the x axis in the step, in m/s. An episode
+    terminates if the trunk is below 0.12 m or leans by more than 1 rad, and is truncated after 1000
+    steps of 20 ms.
     """
 
     def __init__(self, *, backend: Any = BACKEND, speed: float = 0.6, **options: Any) -> None:
@@ -119,7 +120,7 @@ class QuadrupedEnv(RobotEnv):
         command -= DAMPING * state.v[6:]
 
     def has_terminated(self, info: Info) -> tuple[bool, bool]:
-        """Return whether the robot fell."""
+        """Return whether the robot has fallen."""
         low = self.robot_state.q[2] < LOWEST
         return bool(low or self.observation[2] < STEEPEST), not self.is_inside()
 

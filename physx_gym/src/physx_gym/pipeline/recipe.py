@@ -1,4 +1,4 @@
-"""Pipelines from plain data: tables, in code or in a file, of an environment and its layers."""
+"""Pipelines from plain data: tables, in code or a file, describe an environment and its layers."""
 
 from __future__ import annotations
 
@@ -19,10 +19,9 @@ from physx_gym.pipeline.tables import build, check_table, find, find_environment
 
 @dataclass(frozen=True)
 class Recipe:
-    """Makes environments that are whole pipelines; see `build_pipeline`.
+    """A callable that creates whole pipelines; see `build_pipeline`.
 
-    Calling it makes one. It is plain data, so it can be pickled, and registered with Gymnasium as
-    an entry point.
+    It is plain data, so it can be pickled, and registered with Gymnasium as an entry point.
 
     Attributes:
         env_config: Table of the environment.
@@ -33,10 +32,10 @@ class Recipe:
     layers_config: tuple[Mapping[str, Any], ...] = ()
 
     def __call__(self, *, backend: Any = None, **options: Any) -> Any:
-        """Return a new environment: the topmost layer, or the environment if there are no layers.
+        """Return a new pipeline: the topmost layer, or the environment if there are no layers.
 
         Args:
-            backend: Engine to use instead of the one in the tables; None: theirs.
+            backend: Engine to use instead of the one in the tables; None: the latter.
             options: Options of the environment that replace those in its table.
         """
         table, layers = copy.deepcopy((self.env_config, self.layers_config))
@@ -60,19 +59,19 @@ class Recipe:
 def build_pipeline(
     env_config: Mapping[str, Any], layers_config: Sequence[Mapping[str, Any]] = ()
 ) -> Recipe:
-    """Return a callable that makes environments as tables describe them.
+    """Return a callable that creates the pipeline described by tables.
 
-    Classes are given by themselves, as ``"package.module:Class"``, or, if physx provides them, by
-    their names alone. Within options, a table with a ``cls`` stands for the part that it describes,
-    for example a reward.
+    A class is given as the class itself, as ``"package.module:Class"``, or, if physx provides it,
+    by its name alone. Within options, a table with a ``cls`` is replaced by the part that it
+    describes, for example a reward.
 
     Args:
-        env_config: ``{"cls": ..., "kwargs": {...}}``; ``cls`` may be an id that is registered with
+        env_config: ``{"cls": ..., "kwargs": {...}}``; ``cls`` may be an id registered with
             Gymnasium.
         layers_config: Layers, the lowest first: each ``{"block": {"cls": ..., "name": ...,
             "kwargs": {...}}, "wrapper": {"cls": ..., "kwargs": {...}}}``. A block without a wrapper
-            gets an `ObservedEnv` or a `ControlledEnv`, and without a name that of its class; a
-            wrapper does not need a block.
+            gets an `ObservedEnv` or a `ControlledEnv`; one without a name is named after its class.
+            A wrapper does not need a block.
 
     Raises:
         UnknownOptionError: If a table has an unknown key.
@@ -89,7 +88,7 @@ def build_pipeline(
 
 
 def load_pipeline(path: str | Path) -> Recipe:
-    """Return a callable that makes environments as a TOML or JSON file describes them.
+    """Return a callable that creates the pipeline described by a TOML or JSON file.
 
     The file has the tables ``env_config`` and ``layers_config`` of `build_pipeline`.
 
@@ -122,7 +121,7 @@ def _read_json(path: Path) -> Any:
 
 
 def _check_layer(where: str, layer: Any) -> None:
-    """Check the table of a layer, and that the classes that it names exist."""
+    """Check the table of a layer, and that the classes it names exist."""
     check_table(where, layer, ("block", "wrapper"), "")
     if not layer:
         raise ConfigError(f"{where} has neither a block nor a wrapper.")

@@ -25,11 +25,11 @@ _MODULES = {
         "physx_core",
     ),
 }
-"""Where each kind of part is looked up by its name alone."""
+"""Where each kind of part is looked up if only its name is given."""
 
 
 def find(kind: str, reference: Any) -> Callable[..., Any]:
-    """Return the class or function that makes a part of a pipeline.
+    """Return the class or function that creates a part of a pipeline.
 
     Args:
         kind: ``environment``, ``block``, ``wrapper``, or ``component`` for everything else.
@@ -44,8 +44,8 @@ def find(kind: str, reference: Any) -> Callable[..., Any]:
         found = _find_by_name(kind, reference)
     if not callable(found):
         raise ConfigError(
-            f"{reference!r} does not make a valid {kind}: give a class, its name, or its location, "
-            'as in "package.module:Class".'
+            f"{reference!r} is not a valid {kind}: give a class, its name, or its location, as in "
+            '"package.module:Class".'
         )
     maker: Callable[..., Any] = found
     return maker
@@ -65,10 +65,10 @@ def _find_by_name(kind: str, name: str) -> Any:
 
 
 def find_environment(reference: Any) -> tuple[Callable[..., Any], dict[str, Any]]:
-    """Return what makes an environment, and the options that it is registered with.
+    """Return what creates an environment, and the options that it is registered with.
 
     Args:
-        reference: As in `find`, or an id that is registered with Gymnasium.
+        reference: As in `find`, or an id registered with Gymnasium.
     """
     if not isinstance(reference, str) or reference not in gymnasium.registry:
         return find("environment", reference), {}
@@ -82,7 +82,7 @@ def build(where: str, kind: str, table: Mapping[str, Any], *args: Any, **given: 
     """Return the part that a table describes.
 
     Args:
-        where: What errors call the table.
+        where: Name of the table in error messages.
         kind: See `find`.
         table: The table.
         args: First arguments of the part.
@@ -122,10 +122,10 @@ def check_table(where: str, table: Any, known: Iterable[str], required: str = "c
 def check_call(
     where: str, maker: Callable[..., Any], args: tuple[Any, ...], options: Mapping[str, Any]
 ) -> None:
-    """Check that a class or function takes some arguments."""
+    """Check that a class or function accepts some arguments."""
     try:
         signature = inspect.signature(maker)
-    except (TypeError, ValueError):  # implemented in C: it reports its own mistakes
+    except (TypeError, ValueError):  # implemented in C: it reports its own errors
         return
     name = getattr(maker, "__name__", repr(maker))
     parameters = signature.parameters.values()

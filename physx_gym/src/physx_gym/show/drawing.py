@@ -50,7 +50,7 @@ class WorldDrawing:
         view: Mapping[str, Sequence[float]] | None = None,
         look: Mapping[str, Any] | None = None,
     ) -> None:
-        """Keep the world; `add` draws it.
+        """Store the world; `add` draws it.
 
         Args:
             factory: Factory to draw with.
@@ -59,7 +59,7 @@ class WorldDrawing:
             layout: Order of the bodies.
             title: Title of the window; None: that of another world drawn with the factory.
             follow: Whether the camera follows the first robot whose base floats.
-            view: Place of the camera: see `Factory.set_view`; None: where it shows everything.
+            view: Camera position: see `Factory.set_view`; None: one that shows everything.
             look: Color and alpha of everything that moves; None: its own.
         """
         self._look = look or {}

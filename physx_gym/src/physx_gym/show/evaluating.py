@@ -29,8 +29,8 @@ def evaluate(
 ) -> tuple[list[float], list[Info]]:
     """Run one episode in evaluation mode, then return to the previous mode.
 
-    It ends when it is terminated or truncated, at the horizon, or with Ctrl-C. The policy is called
-    once more with the final state, so that it can keep what it saw.
+    It ends when it is terminated or truncated, at the horizon, or on Ctrl-C. The policy is called
+    once more with the final state, so that it can record it.
 
     Args:
         env: The outermost environment of the pipeline; wrappers around it are not used.
@@ -38,11 +38,11 @@ def evaluate(
         seed: Seed of the episode; None: continue the sequence.
         horizon: Longest time to simulate, in s; None: until the episode ends.
         enable_stats: Whether to print the number of steps and the total reward.
-        enable_replay: Whether to replay it afterwards; None: if there is a display.
+        enable_replay: Whether to replay it afterward; None: if there is a display.
         kwargs: For the replay.
 
     Returns:
-        Rewards of all steps, and information: one more, as the first is that of the reset.
+        Rewards of all steps, and information: one more, as the first is from the reset.
     """
     _check(policy_fn)
     steps = math.inf
@@ -75,7 +75,7 @@ def evaluate(
     if enable_replay or (enable_replay is None and has_display()):
         try:
             env.replay(**kwargs)
-        except Exception as error:  # a viewer that fails does not spoil the evaluation
+        except Exception as error:  # a failing viewer does not invalidate the evaluation
             warnings.warn(f"The episode cannot be replayed: {error}", stacklevel=3)
     return rewards, infos
 
@@ -88,6 +88,6 @@ def _check(policy_fn: Any) -> None:
         if callable(policy_fn) and isinstance(error, ValueError):
             return  # implemented in C, without a signature
         raise ConfigError(
-            "The policy is called with observation, previous action, reward, terminated, truncated "
-            f"and information, and returns an action; {policy_fn!r} cannot be: {error}."
+            "A policy must accept observation, previous action, reward, terminated, truncated and "
+            f"information, and return an action; {policy_fn!r} does not: {error}."
         ) from error

@@ -21,7 +21,7 @@ Picture = NDArray[np.uint8]
 def write_film(pictures: Iterable[Picture], path: Path, frame_rate: float) -> Path:
     """Write pictures as a film; all but ``.mp4`` are looping animations.
 
-    Each picture is rendered while the one before it is written.
+    Each picture is rendered while the previous one is written.
 
     Args:
         pictures: At least one, each of shape (height, width, 3).
@@ -69,7 +69,7 @@ def _write_mp4(pictures: Iterator[Picture], path: Path, frame_rate: float) -> No
     except ImportError as error:
         raise MissingLibraryError("A film as .mp4", "av", "film", "physx-gym") from error
     first = next(pictures)
-    high, wide = (size - size % 2 for size in first.shape[:2])  # the format has no odd sizes
+    high, wide = (size - size % 2 for size in first.shape[:2])  # odd sizes are not supported
     with av.open(str(path), "w") as file:
         stream = file.add_stream("libx264", rate=Fraction(frame_rate).limit_denominator(1000))
         stream.width, stream.height, stream.pix_fmt = wide, high, "yuv420p"

@@ -1,4 +1,4 @@
-"""Playing: an environment controlled with the keyboard, in real time."""
+"""Interactive play: an environment controlled with the keyboard in real time."""
 
 from __future__ import annotations
 
@@ -24,10 +24,10 @@ class Keyboard:
     """Keys pressed in a terminal, whose settings are restored when the ``with`` block ends."""
 
     def __init__(self, descriptor: int | None = None) -> None:
-        """Keep the terminal.
+        """Store the terminal.
 
         Args:
-            descriptor: File descriptor of the terminal; None: that of the standard input.
+            descriptor: File descriptor of the terminal; None: that of standard input.
         """
         self._given = descriptor
         self._descriptor = -1
@@ -35,7 +35,7 @@ class Keyboard:
         self._bytes = b""
 
     def __enter__(self) -> Self:
-        """Make the terminal pass on keys immediately."""
+        """Make the terminal deliver keys immediately."""
         try:
             import termios
             import tty
@@ -95,8 +95,8 @@ def _length(read: bytes) -> int:
 
 def _terminal_error() -> UsageError:
     return UsageError(
-        "Playing needs a terminal for the keys: start the script in one, on Linux or macOS, and do "
-        "not redirect its input."
+        "Playing needs a terminal for keyboard input: run the script in one, on Linux or macOS, "
+        "and do not redirect its input."
     )
 
 
@@ -115,8 +115,7 @@ def play(
 
     Args:
         env: The outermost environment of the pipeline; wrappers around it are not used.
-        enable_travelling: Whether the viewer's camera follows a robot whose base floats; None: it
-            does.
+        enable_travelling: Whether the viewer's camera follows a robot whose base floats; None: yes.
         start_paused: Whether to start paused.
         enable_is_done: Whether the end of an episode ends the game; otherwise the next one begins.
         verbose: Whether to print what happens.
@@ -134,7 +133,7 @@ def play(
 
 
 def _viewer(env: Playable, follow: bool | None) -> Renderer | None:
-    """Return a viewer, if there is a display; in the mode ``"human"`` the environment has one."""
+    """Return a viewer if there is a display; in the mode ``"human"``, the environment has one."""
     if env.render_mode == "human" or not has_display():
         return None
     return Renderer(env.layers[0], mode="human", follow=follow is not False)
@@ -190,7 +189,7 @@ class _Game:
         return last, False
 
     def _wait(self, due: float) -> float:
-        """Wait until a time; return it, or the present one if that is much later."""
+        """Wait until a time; return it, or the current time if that is much later."""
         now = time.monotonic()
         time.sleep(max(0.0, due - now))
         return max(due, now - 0.2)

@@ -37,11 +37,11 @@ class Playable(Protocol):
 
     @property
     def render_mode(self) -> str | None:
-        """How the environment shows itself."""
+        """How the environment is rendered."""
 
     @property
     def training(self) -> bool:
-        """Whether it is for training; otherwise for evaluation."""
+        """Whether the mode is training; otherwise it is evaluation."""
 
     @property
     def layers(self) -> tuple[Any, ...]:

@@ -38,7 +38,7 @@ def plot(
 
     Args:
         logs: Logs, their files, or values of `RobotEnv.log_data`; one or several.
-        enable_block_states: Whether states of blocks are shown too.
+        enable_block_states: Whether to show the states of blocks too.
         compare: More logs. All are drawn into the same plots, each with its own line style.
         columns: Prefixes of the names of the columns to plot: one or several.
         path: File to write, for example ``.png`` or ``.pdf``.
@@ -123,7 +123,7 @@ def _rank(title: str) -> int:
 
 
 def _figure(count: int, show: bool) -> Figure:
-    """Return a figure with plots; without a window system if it is not shown."""
+    """Return a figure with plots; one that is not shown does not need a window system."""
     try:
         from matplotlib.figure import Figure
     except ImportError as error:

@@ -43,14 +43,14 @@ def open_viewer(title: str, instances: int = 1, **options: Any) -> Visualizer:
 
 
 class Renderer:
-    """Shows an environment as its ``render_mode`` says, with the options ``viewer_kwargs``.
+    """Shows an environment according to its ``render_mode``, with the options ``viewer_kwargs``.
 
     ``"rgb_array"`` renders pictures without a window, ``"human"`` opens a viewer; None opens a
     viewer if there is a display, and renders pictures otherwise.
     """
 
     def __init__(self, env: Drawable, mode: str | None = None, *, follow: bool = True) -> None:
-        """Keep the environment; the viewer is opened at the first frame.
+        """Store the environment; the viewer is opened at the first frame.
 
         Args:
             env: The environment to show.

@@ -1,4 +1,4 @@
-"""Drawings of a replay beside the world: the environment's own, contacts, ways, and plots."""
+"""Drawings of a replay besides the world: the environment's own, contacts, paths, and plots."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from physx_core.typing import Vector
 from physx_gym.show.plotting import Groups, label_of
 from physx_gym.telemetry.episode_log import Log
 
-_LONG = 0.5  # of a strong force's arrow, as a part of the size of what moves
+_LONG = 0.5  # length of a strong force's arrow, as a fraction of the size of what moves
 _THIN = 0.006  # radius of an arrow, likewise
-_STRONG = 95  # percentile of the forces that is as long
+_STRONG = 95  # percentile of the forces whose arrow has that length
 _SHORT = 0.2  # m, the smallest size of what moves
 
 
 def row_at(times: Vector, time: float) -> int:
-    """Return the last row up to a time; the first, if there is none."""
+    """Return the last row up to a time; the first if there is none."""
     return max(int(np.searchsorted(times, time + 1e-9, "right")) - 1, 0)
 
 
@@ -36,7 +36,7 @@ class Scene:
         self._begin = float(log.time[0])
 
     def draw(self, time: float) -> None:
-        """Draw it as it is at a time after the start, in s."""
+        """Draw its state at a time after the start, in s."""
         try:
             for each in self._added:
                 self._kinds[each["name"]] = each["kind"]
@@ -63,7 +63,7 @@ class Contacts:
         Args:
             factory: Factory to draw with.
             log: The log.
-            size: Of what moves, in m.
+            size: Size of what moves, in m.
         """
         self._factory = factory
         contacts = log.contacts[np.isfinite(log.contacts).all(axis=1)]
@@ -92,27 +92,27 @@ class Contacts:
 
 
 class Line:
-    """Draws the way of a body."""
+    """Draws the path of a body."""
 
     def __init__(self, factory: Factory, body: str, points: Vector) -> None:
         self._factory, self._body, self._points = factory, body, points
         self._is_drawn = False
 
     def draw(self, time: float) -> None:
-        """Draw the whole way."""
+        """Draw the whole path."""
         if not self._is_drawn:
-            self._factory.add_lines(f"way of {self._body}", self._points, color="gold")
+            self._factory.add_lines(f"path of {self._body}", self._points, color="gold")
         self._is_drawn = True
 
 
 def _short(group: str, robot: str) -> str:
-    """Return the title of a group: the parts of its name that say something, as tabs are narrow."""
+    """Return the title of a group: the informative parts of its name, as tabs are narrow."""
     parts = [part for part in group.split(".") if part not in ("state", "sensor", robot)]
     return ".".join(parts)
 
 
 class Plots:
-    """Plots groups of columns; those of different units apart."""
+    """Plots groups of columns, with separate plots for different units."""
 
     def __init__(self, factory: Factory, log: Log, groups: Groups) -> None:
         self._factory = factory

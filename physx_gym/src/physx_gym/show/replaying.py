@@ -24,8 +24,8 @@ from physx_gym.telemetry.episode_log import Log
 from physx_gym.telemetry.log_file import Source, as_logs
 
 _FRAMES, _FRAMES_PER_ROW = 10_000, 100
-_POINTS = 1000  # of a drawn way, about
-_LESS_TELLING = ("state.a", "motor.command")  # columns that are plotted only if they are wanted
+_POINTS = 1000  # of a drawn path, approximately
+_LESS_TELLING = ("state.a", "motor.command")  # columns that are plotted only if requested
 _GHOST = {"color": "skyblue", "alpha": 0.35}
 
 
@@ -43,23 +43,23 @@ def replay(
     ghosts: Source | Trajectory | Sequence[Source | Trajectory] = (),
     **viewer: Any,
 ) -> Path | None:
-    """Show episodes side by side, all from their start: the motion, and plots beside it.
+    """Show episodes side by side, all from their start: their motions and plots.
 
-    What `RobotEnv._draw` drew is drawn again. Without a path they are shown in a viewer's window.
+    What `RobotEnv._draw` drew is drawn again. Without a path, they are shown in a viewer's window.
 
     Args:
         logs: Logs, their files, or values of `RobotEnv.log_data`; one or several.
-        compare: More of them.
+        compare: More logs.
         path: Recording to write for the viewer, ``.rrd``.
         record_video_path: Film to write: ``.mp4``, ``.gif``, ``.webp`` or ``.png``.
         frame_rate: Frames per simulated second. The viewer plays 30 per second.
         backend: Reference of the engine that provides the robots; None: the log's.
         plots: Whether to plot the columns of the logs, or prefixes of the names of those to plot;
             a film has no plots.
-        contacts: Whether to draw the forces at contacts as arrows, on one scale in each log.
-        trajectories: Names of bodies of the first log whose way is drawn as a line.
-        ghosts: Logs, or trajectories in the world of the first log, that are drawn translucent over
-            it.
+        contacts: Whether to draw contact forces as arrows, with one scale for each log.
+        trajectories: Names of bodies of the first log whose paths are drawn as lines.
+        ghosts: Logs, or trajectories in the world of the first log, that are drawn translucently
+            over it.
         viewer: Options of the viewer, as in ``RobotEnv.viewer_kwargs``.
 
     Returns:
@@ -67,7 +67,7 @@ def replay(
 
     Raises:
         LogError: If a log cannot be read, or contains no states, or there is nothing to plot.
-        SimulationError: If there is no body of a name in `trajectories`.
+        SimulationError: If `trajectories` names an unknown body.
         PluginNotFoundError: If the viewer is not installed.
         VisualizerError: If the viewer cannot be opened, or cannot draw.
         ConfigError: If an option is invalid.
@@ -108,7 +108,7 @@ def replay(
 
 
 def _groups(logs: Sequence[Log], plots: Any) -> Groups:
-    """Return the columns to plot: those wanted, by default the most telling ones."""
+    """Return the columns to plot: those requested, by default the most informative ones."""
     groups = groups_of(logs, None if plots is True else plots, enable_block_states=False)
     if plots is not True:
         return groups
@@ -133,7 +133,7 @@ def _picture(shown: Visualizer) -> Picture:
 
 
 class _Body:
-    """Everything of a world in motion, at the times of its states."""
+    """A world in motion, at the times of its states."""
 
     def __init__(
         self, label: str, states: Trajectory, world: World, engine: Backend, **drawn: Any
@@ -209,7 +209,7 @@ class _Motion:
         self._ghosts.append(_Body(label, states, world, engine, **drawn))
 
     def add_lines(self, bodies: Sequence[str]) -> None:
-        """Draw the ways of bodies."""
+        """Draw the paths of bodies."""
         names = [bodies] if isinstance(bodies, str) else list(bodies)
         if not names:
             return
@@ -220,14 +220,14 @@ class _Motion:
         ]
 
     def count_frames(self, frame_rate: float) -> int:
-        """Return how many frames show it, checking that a few rows do not claim to be an age."""
+        """Return how many frames show it, rejecting a few rows that claim a huge duration."""
         rows, duration = len(self._body.times), float(self._body.times[-1])
         count = 1 + duration * frame_rate + 1e-9
         most = max(_FRAMES, _FRAMES_PER_ROW * rows)
         if not count <= most:
             raise LogError(
-                f'The log "{self._log.label}" has {rows} rows of {duration:.4g} s in '
-                f"all, which would be more than {most} frames. Lower the frame_rate."
+                f'The log "{self._log.label}" has {rows} rows that cover {duration:.4g} s, '
+                f"which would take more than {most} frames. Lower the frame_rate."
             )
         return int(count)
 
@@ -260,7 +260,7 @@ def _backend(log: Log, given: Any) -> Backend:
     if not is_told and not (isinstance(reference, str) and ":" not in reference):
         raise LogError(
             f"The log {log.path} is of the engine {reference!r}, which is not an installed plugin. "
-            'If you trust it, name it: --backend REFERENCE (in Python replay(..., backend="...")).'
+            'If you trust it, name it: --backend REFERENCE (in Python, replay(..., backend="...")).'
         )
     found: Backend = plugins.resolve("backend", reference)
     return found

@@ -25,7 +25,7 @@ from physx_core.simulation import (
 from physx_core.typing import Vector
 
 _KINDS = {"ContactSensor": "Contact", "EffortSensor": "Effort", "ForceTorqueSensor": "ForceTorque"}
-"""Names of kinds of sensors in measurements, where they differ from the names of the classes."""
+"""Names of kinds of sensors in measurements, where they differ from the class names."""
 
 
 def default_motors(layout: Layout, part: Part) -> tuple[Motor, ...]:
@@ -61,8 +61,8 @@ EquipmentState = tuple[MotorState | None, SensorState | None]
 class Equipment:
     """Motors and sensors on a simulation.
 
-    Motors whose torque depends on the command alone, and sensors without memory, run only when the
-    control loop commands and reads them; the others also before every physics step.
+    Motors whose torque depends only on the command, and sensors without memory, run only when the
+    control loop commands and reads them; the others also run before every physics step.
 
     Attributes:
         motors: The motors; None: the robot has none.
@@ -115,8 +115,8 @@ class Equipment:
         """Start from the simulation's present state.
 
         Args:
-            random: Generator of the errors of the sensors.
-            reading_period: Measurements are read at multiples of so many physics steps.
+            random: Generator of the sensors' errors.
+            reading_period: Measurements are read at multiples of this number of physics steps.
         """
         if self._memoryless:
             self._direct.begin()
@@ -127,7 +127,7 @@ class Equipment:
             self._hook(reading_period)
 
     def _hook(self, reading_period: int) -> None:
-        """Let sensors measure before physics steps too, if that makes a difference."""
+        """Have sensors measure before physics steps too, if that makes a difference."""
         sensors = self.sensors
         if sensors is None:
             return
@@ -159,7 +159,7 @@ class Equipment:
             out[:] = self._seen
 
     def by_kind(self, values: Vector) -> dict[str, Vector]:
-        """Return views of an array of the sensors' values: for each kind (values, sensors)."""
+        """Return views of an array of sensor values: for each kind, shape (values, sensors)."""
         found, begin = {}, 0
         sensors = self.sensor_list
         for kind in dict.fromkeys(type(sensor) for sensor in sensors):
@@ -178,7 +178,7 @@ class Equipment:
     def restore(
         self, state: EquipmentState, random: np.random.Generator, reading_period: int
     ) -> None:
-        """Return to a snapshot, with a generator that is in its state of then; see `begin`."""
+        """Restore a snapshot, with a generator already in its state of that time; see `begin`."""
         motors, sensors = state
         if self.motors is not None and motors is not None:
             self.motors.restore(motors)
@@ -189,7 +189,7 @@ class Equipment:
 
 
 class _DirectMotors:
-    """Motors whose torque depends on nothing but the command."""
+    """Motors whose torque depends only on the command."""
 
     def __init__(self, simulation: Simulation, motors: Sequence[Motor]) -> None:
         self._simulation, layout = simulation, simulation.layout
@@ -197,7 +197,7 @@ class _DirectMotors:
         self._places = np.array(places, np.intp)
         self._most = np.array([motor.max_torque for motor in motors])
         weakest = float(self._most.min(initial=np.inf))
-        self._never_cut = weakest * weakest  # commands of a smaller squared length are not cut
+        self._never_cut = weakest * weakest  # commands of a smaller squared norm are not clipped
         self._reduction = np.array([motor.reduction for motor in motors])
         self._geared = bool((self._reduction != 1.0).any())
         self._commands = simulation.commands()
@@ -234,9 +234,9 @@ class _DirectMotors:
 
 
 def _lookup(layout: Layout, sensors: Sequence[Sensor]) -> Any:
-    """Return the places of the measured values in positions and velocities.
+    """Return the indices of the measured values in positions and velocities.
 
-    None: sensors measure something else, or with errors.
+    None if sensors measure anything else, or with errors.
     """
     found = []
     for sensor in sensors:
@@ -251,7 +251,7 @@ def _lookup(layout: Layout, sensors: Sequence[Sensor]) -> Any:
 
 
 def _is_memoryless(motor: Motor) -> bool:
-    """Return whether a motor's torque depends on nothing but the command."""
+    """Return whether a motor's torque depends only on the command."""
     frictions: Any = (motor.viscous, motor.dry)
     has_friction = any(any(each) for each in frictions)
     is_limited = math.isfinite(motor.max_velocity)

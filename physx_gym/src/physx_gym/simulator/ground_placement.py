@@ -13,8 +13,8 @@ def offset_to_ground(
 ) -> Vector:
     """Return the translation, shape (3,) in m, that puts a robot or object on the ground.
 
-    On a plane it is along the normal; on stairs and height fields vertical, to the highest point
-    within the horizontal extent of the robot or object.
+    On a plane, it is along the normal; on stairs and height fields, it is vertical, to the highest
+    point within the horizontal extent of the robot or object.
 
     Args:
         simulation: Simulation of a world with this ground.

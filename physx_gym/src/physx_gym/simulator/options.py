@@ -10,7 +10,7 @@ from physx_core.errors import ConfigError, UnknownOptionError
 from physx_core.simulation import Motor, Sensor, World
 
 _NAMES = frozenset({"name", "joint", "urdf", "package_dirs", "joints", "feet", "path", "heights"})
-"""Fields that identify a thing rather than configure it: these are not options."""
+"""Fields that identify a thing rather than configure it; these are not options."""
 _PARTS = ("robots", "objects")
 
 

@@ -50,7 +50,7 @@ class Engine:
     Attributes:
         simulation: The engine's simulation.
         equipment: The motors and sensors on it.
-        part: Place of the controlled robot in the state.
+        part: The controlled robot's part of the state.
         first: The state right after building.
     """
 
@@ -63,16 +63,16 @@ class Engine:
 class Simulator(SharedArrays, Closeable):
     """A world ready to run, whose engine is built when it is first needed.
 
-    It can be pickled and copied, even while it runs: the copy builds an engine of its own and
-    continues from the same state.
+    It can be pickled and copied, even while running: the copy builds its own engine and continues
+    from the same state.
 
     Attributes:
         world: The simulated world, without the rotors that the motors add.
         backend: Reference of the engine.
-        control_period: Time between two commands, in s; None: a step of the environment.
-        observe_period: Time between two observations, in s; None: as between two commands.
+        control_period: Time between two commands, in s; None: one step of the environment.
+        observe_period: Time between two observations, in s; None: the control period.
         builds: How often the engine has been built.
-        is_simulation_running: Whether an episode runs; shape ().
+        is_simulation_running: Whether an episode is running; shape ().
         stepper_state: Time and number of physics steps.
         values: All measured values: time, positions, velocities, sensors.
         positions: Of the whole world, shape (nq,); a view of `values`.
@@ -185,7 +185,7 @@ class Simulator(SharedArrays, Closeable):
             self._motors = default_motors(simulation.layout, part)
         if self._given_sensors is None:
             self._sensors = default_sensors(simulation, part, self._motors)
-        random = np.random.default_rng(0)  # biases are drawn again at each start
+        random = np.random.default_rng(0)  # biases are redrawn at each start
         equipment = Equipment(simulation, world, self._motors, self._sensors, random)
         self._sensors = equipment.sensor_list
         self._engine = Engine(simulation, equipment, part, simulation.snapshot())
@@ -230,13 +230,13 @@ class Simulator(SharedArrays, Closeable):
             backend: Reference of the engine.
 
         Raises:
-            EpisodeError: If an episode runs.
+            EpisodeError: If an episode is running.
         """
         self._check_stopped("change_backend")
         self.backend, self._stale = backend, True
 
     def prepare(self) -> None:
-        """Build the engine now, unless it is built."""
+        """Build the engine now, unless it is already built."""
         self._built()
 
     @property
@@ -272,12 +272,12 @@ class Simulator(SharedArrays, Closeable):
 
     @property
     def robot(self) -> Part:
-        """Place of the controlled robot in the state."""
+        """The controlled robot's part of the state."""
         return self._built().part
 
     @property
     def period(self) -> float:
-        """Time of a physics step, in s."""
+        """Duration of a physics step, in s."""
         return self.world.period
 
     def max_commands(self) -> Vector:
@@ -289,8 +289,8 @@ class Simulator(SharedArrays, Closeable):
     def neutral(self) -> Vector:
         """Return the robot's neutral positions, shape (nq,).
 
-        Joints are at 0, or in the middle of their limits if 0 is outside of them; a floating base
-        is where the world puts it.
+        Joints are at 0, or in the middle of their limits if 0 is outside them; a floating base is
+        where the world puts it.
         """
         engine = self._built()
         found: Vector = engine.first.positions[engine.part.positions].copy()
@@ -338,13 +338,13 @@ class Simulator(SharedArrays, Closeable):
         }
 
     def set_options(self, options: Mapping[str, Any]) -> None:
-        """Change options; those that are left out stay. The engine is rebuilt if necessary.
+        """Change options; omitted ones stay the same. The engine is rebuilt if necessary.
 
         Args:
             options: In the form that `get_options` returns.
 
         Raises:
-            EpisodeError: If an episode runs.
+            EpisodeError: If an episode is running.
             UnknownOptionError: If there is no option of that name.
             ConfigError: If a value is out of range.
         """
@@ -369,11 +369,11 @@ class Simulator(SharedArrays, Closeable):
             self._stale = True
 
     def seed(self, seed: Any) -> None:
-        """Seed the errors of the sensors, from the next start on."""
+        """Seed the sensors' errors, from the next start on."""
         self._random = np.random.default_rng(seed)
 
     def set_reading_period(self, steps: int) -> None:
-        """Declare that measurements are only read at multiples of so many physics steps.
+        """Declare that measurements are only read at multiples of a number of physics steps.
 
         Sensors then measure no more often than that, unless it makes a difference.
         """
@@ -382,7 +382,7 @@ class Simulator(SharedArrays, Closeable):
     # Forces ----------------------------------------------------------------------------------
 
     def register_force(self, wrench: Wrench, begin: float = 0.0) -> None:
-        """Apply a force during the next episode; to be called in `RobotEnv._setup`.
+        """Apply a force during the next episode; call this in `RobotEnv._setup`.
 
         `RobotEnv.reset` first removes all forces registered before. To push a robot during an
         episode, use ``simulation.apply_wrench``.
@@ -392,7 +392,7 @@ class Simulator(SharedArrays, Closeable):
             begin: Time from the start of the episode, in s, rounded to a physics step.
 
         Raises:
-            EpisodeError: If an episode runs.
+            EpisodeError: If an episode is running.
             ConfigError: If it is not a `Wrench`, or begins before the episode.
             ComponentNotFoundError: If the world has no body of that name.
         """
@@ -409,7 +409,7 @@ class Simulator(SharedArrays, Closeable):
         """Remove all registered forces.
 
         Raises:
-            EpisodeError: If an episode runs.
+            EpisodeError: If an episode is running.
         """
         self._check_stopped("remove_all_forces")
         self._forces = []
@@ -424,7 +424,7 @@ class Simulator(SharedArrays, Closeable):
             velocities: Likewise, shape (nv,).
 
         Raises:
-            EpisodeError: If an episode runs already.
+            EpisodeError: If an episode is already running.
             SimulationError: If the state has the wrong size or is not finite.
         """
         self._check_stopped("start")
@@ -451,7 +451,7 @@ class Simulator(SharedArrays, Closeable):
         """Simulate a number of physics steps, then measure.
 
         Raises:
-            EpisodeError: If no episode runs.
+            EpisodeError: If no episode is running.
             SimulationError: If the state is no longer finite.
         """
         engine, stepper = self._engine, self.stepper_state
@@ -464,7 +464,7 @@ class Simulator(SharedArrays, Closeable):
         self._measure(engine)
 
     def _step_to_forces(self, engine: Engine, steps: int) -> int:
-        """Simulate up to the last force that begins within these steps; return the rest."""
+        """Simulate up to the last force that begins within these steps; return the steps left."""
         stepper = self.stepper_state
         while self._pending and self._pending[0][0] < stepper.iter + steps:
             ahead = self._pending[0][0] - stepper.iter
@@ -501,7 +501,7 @@ class Simulator(SharedArrays, Closeable):
     # State -----------------------------------------------------------------------------------
 
     def snapshot(self) -> dict[str, Any]:
-        """Return everything that `restore` needs to continue exactly from here; plain data."""
+        """Return everything that `restore` needs to continue exactly from here, as plain data."""
         engine = self._built()
         return {
             "simulation": engine.simulation.snapshot(),
@@ -519,7 +519,7 @@ class Simulator(SharedArrays, Closeable):
         }
 
     def restore(self, state: Mapping[str, Any]) -> None:
-        """Return to a snapshot.
+        """Restore a snapshot.
 
         Raises:
             SimulationError: If the snapshot is of another simulator.
@@ -560,13 +560,13 @@ class Simulator(SharedArrays, Closeable):
     def _check_stopped(self, method: str) -> None:
         if self.is_simulation_running:
             raise EpisodeError(
-                f"{method} cannot be called during an episode: call stop() first, or do it in "
-                "_setup, which reset calls."
+                f"{method} cannot be called during an episode: call stop() first, or call it in "
+                "_setup, which reset runs."
             )
 
 
 def make_simulator(thing: Any, options: Mapping[str, Any]) -> tuple[Simulator, dict[str, Any]]:
-    """Return a simulator of a world, or of the file or name of a robot, and the other options."""
+    """Return a simulator of a world, or of a robot's file or name, and the remaining options."""
     if isinstance(thing, Simulator):
         return thing, dict(options)
     make: Any = Simulator if isinstance(thing, World) else Simulator.build
@@ -581,7 +581,7 @@ def make_simulator(thing: Any, options: Mapping[str, Any]) -> tuple[Simulator, d
 
 
 def simulator_options(thing: Any) -> set[str]:
-    """Return the names of the options of a simulator that `make_simulator` makes of a thing."""
+    """Return the names of the simulator options that `make_simulator` accepts for a thing."""
     if isinstance(thing, Simulator):
         return set()
     takers: list[Any] = [Simulator, *(() if isinstance(thing, World) else (Simulator.build,))]
@@ -609,15 +609,15 @@ def _positive_or_none(option: str, value: float | None) -> float | None:
 
 
 def _whole(kind: str, given: Any, first: Vector, part: slice) -> Vector:
-    """Return a vector of the whole world, given that of the robot or the whole one."""
+    """Return a vector of the whole world, given one of the robot or of the whole world."""
     vector = np.asarray(given, np.float64)
     if vector.shape == first.shape:
         return vector
     length = part.stop - part.start
     if vector.shape != (length,):
         raise SimulationError(
-            f"The first {kind} have the shape {vector.shape}, but need ({length},) for the robot, "
-            f"or {first.shape} for the whole world."
+            f"The initial {kind} have the shape {vector.shape}, but need ({length},) for the "
+            f"robot, or {first.shape} for the whole world."
         )
     whole = first.copy()
     whole[part] = vector

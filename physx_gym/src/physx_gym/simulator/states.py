@@ -19,7 +19,7 @@ class StepperState:
 
     Attributes:
         t: Time since its start, in s.
-        dt: Time of a physics step, in s.
+        dt: Duration of a physics step, in s.
         iter: Physics steps since its start.
     """
 

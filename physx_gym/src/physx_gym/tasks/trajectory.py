@@ -66,7 +66,7 @@ class Trajectory:
         """Return positions (nq,) and velocities (nv,) at a time, in s.
 
         Raises:
-            ConfigError: If the time is beyond the trajectory and `beyond` is ``"raise"``, or if
+            ConfigError: If the time is outside the trajectory and `beyond` is ``"raise"``, or if
                 there is more than one floating base in the positions.
         """
         first, last = float(self.times[0]), float(self.times[-1])
@@ -93,7 +93,7 @@ class Trajectory:
 
     @property
     def _has_floating_base(self) -> bool:
-        """Whether it is of a robot whose base floats."""
+        """Whether it is the motion of a robot whose base floats."""
         more = self.positions.shape[1] - self.velocities.shape[1]
         if more > 1:
             raise ConfigError(

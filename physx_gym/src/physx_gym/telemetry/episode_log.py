@@ -42,7 +42,7 @@ class Log:
         constants: Description of the episode: the world, the layout of its state, options, seed,
             units of columns, what was drawn, contacts.
         variables: The columns by name, each of shape (rows,); ``"time"`` is the first.
-        path: The file of the log; None: none.
+        path: The file of the log; None if there is none.
     """
 
     constants: Mapping[str, Any]
@@ -64,7 +64,7 @@ class Log:
     def contacts(self) -> NDArray[np.float64]:
         """Contacts after each step, shape (contacts, 7).
 
-        In each row the time in s, the point in m, and the force in N, in the world frame.
+        Each row has the time in s, the point in m, and the force in N, in the world frame.
         """
         return np.asarray(self.constants.get("contacts", np.zeros((0, 7))), np.float64)
 
@@ -77,12 +77,12 @@ class Log:
         """Return a column.
 
         Raises:
-            LogError: If there is none of that name.
+            LogError: If there is no column of that name.
         """
         if name not in self.variables:
             raise LogError(
                 f'The log {self._where} has no column "{name}".{nearest(name, self.variables)} '
-                f"It has {len(self.variables)}."
+                f"It has {len(self.variables)} columns."
             )
         return self.variables[name]
 
@@ -119,7 +119,7 @@ class Log:
     def world(self) -> World:
         """Return the simulated world, rebuilt from its description.
 
-        The files of robots and meshes are taken from where they were, or else from beside the log.
+        Files of robots and meshes are loaded from their paths, or else from the log's folder.
 
         Raises:
             LogError: If the log does not contain a valid world.
@@ -169,6 +169,6 @@ class Log:
 
 
 def _texts(texts: Iterable[str]) -> NDArray[np.bytes_]:
-    """Return strings as an array of fixed width, which HDF5 stores contiguously."""
+    """Return strings as a fixed-width array, which HDF5 stores contiguously."""
     found = [text.encode() for text in texts]
     return np.array(found, f"S{max(1, *map(len, found), 1)}")

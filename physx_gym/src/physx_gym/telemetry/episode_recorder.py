@@ -17,9 +17,9 @@ from physx_gym.telemetry.telemetry import Telemetry
 
 
 class EpisodeRecorder:
-    """Records episodes: registered variables, what is measured, and in evaluation all the rest.
+    """Records episodes: registered variables, measurements, and in evaluation everything else.
 
-    Files whose path is not given lie in a temporary folder that is removed by `close`.
+    Files without a given path are in a temporary folder that `close` removes.
 
     Attributes:
         telemetry: The registered variables and the recorded rows.
@@ -31,17 +31,17 @@ class EpisodeRecorder:
         self._folder = LogFolder()
         self._scene = EpisodeScene()
         self._reward = np.zeros(())
-        self._action: tuple[Any, Any] | None = None  # of another type, and its recorded copy
+        self._action: tuple[Any, Any] | None = None  # if of another type, with its recorded copy
         self._in_detail = False
         self._described: dict[str, Any] = {}
         self._described_when: tuple[Any, ...] = ()
 
     def begin_training(self, name: str, constants: Mapping[str, Any]) -> None:
-        """Start an episode of which only what is measured, and registered for it, is recorded.
+        """Start an episode that records only measurements and variables registered for training.
 
         Args:
             name: Name of the environment.
-            constants: Description of the environment, beside that of its simulator.
+            constants: Description of the environment, besides that of its simulator.
         """
         self._in_detail, self._action = False, None
         self.telemetry.begin(None, self._describe(name, constants), training=True)
@@ -49,13 +49,13 @@ class EpisodeRecorder:
     def begin(
         self, name: str, action: Any, path: Any, constants: Mapping[str, Any], draw: Draw
     ) -> str:
-        """Start an episode of which everything is recorded, and written to a file at its end.
+        """Start an episode that records everything, and writes it to a file at its end.
 
         Args:
             name: Name of the environment.
             action: Buffer of the action; recorded if it is a single array of numbers.
             path: Path of the file; None: one in the temporary folder.
-            constants: Description of the environment, beside that of its simulator.
+            constants: Description of the environment, besides that of its simulator.
             draw: Draws what is not simulated.
 
         Returns:
@@ -73,7 +73,7 @@ class EpisodeRecorder:
         return str(file)
 
     def _describe(self, name: str, constants: Mapping[str, Any]) -> dict[str, Any]:
-        """Register the simulator, and return the description of it and of the environment."""
+        """Register the simulator; return its and the environment's description."""
         simulator = self._simulator
         now = simulator.builds, simulator.control_period, simulator.observe_period
         if now != self._described_when:
@@ -95,18 +95,18 @@ class EpisodeRecorder:
         )
 
     def _register_reward(self) -> None:
-        """Register the reward, which is that of the step before the row."""
+        """Register the reward: that of the step before each row."""
         self._reward[()] = 0.0
         self.telemetry.register("step", self._reward, namespace="reward")
 
     def end_step(self, reward: float, redraw: Draw) -> None:
-        """Record what a step led to: its reward, what is drawn, and contacts."""
+        """Record the results of a step: its reward, drawings, and contacts."""
         self._reward[()] = reward
         if self._in_detail and self.telemetry.is_recording:
             self._scene.record(self._simulator.stepper_state.t, redraw, self._simulator.simulation)
 
     def rewind(self, time: float) -> None:
-        """Discard what was recorded from a time, in s, on."""
+        """Discard everything recorded from a time, in s, onward."""
         self.telemetry.rewind(time)
         self._scene.rewind(time)
 
@@ -119,7 +119,7 @@ class EpisodeRecorder:
         self.telemetry.record(self._simulator.stepper_state.t)
 
     def data(self) -> dict[str, Any]:
-        """Return what was recorded, the present state included; see `Telemetry.log_data`."""
+        """Return the recording, including the present state; see `Telemetry.log_data`."""
         if self.telemetry.is_recording:
             self.record()
             self._describe_scene()
@@ -130,7 +130,7 @@ class EpisodeRecorder:
             self.telemetry.describe(self._scene.describe())
 
     def end(self, *, keep: bool) -> None:
-        """End the episode, if one is recorded.
+        """End the episode, if one is being recorded.
 
         Args:
             keep: Whether to record the last state and write the file.

@@ -12,14 +12,14 @@ from physx_core.components import Factory
 from physx_core.simulation import Simulation
 from physx_core.typing import Vector
 
-_MOST_NUMBERS = 1_000_000  # of all changes: a log's description has to be readable
-_WITHOUT = ("view", "time")  # kinds of events that replays make themselves
+_MOST_NUMBERS = 1_000_000  # in all changes: a log's description must stay readable
+_WITHOUT = ("view", "time")  # kinds of events that replays generate themselves
 
 Draw = Callable[[Factory], None]
 
 
 class EpisodeScene:
-    """Records what is drawn at the start of an episode, what changes, and forces at contacts."""
+    """Records an episode's initial drawings, their changes, and contact forces."""
 
     def __init__(self) -> None:
         self._factory = Factory()
@@ -30,7 +30,7 @@ class EpisodeScene:
         self._contacts: list[Vector] = []
 
     def begin(self, draw: Draw) -> None:
-        """Start over with what is drawn first."""
+        """Start over with the initial drawings."""
         EpisodeScene.__init__(self)
         draw(self._factory)
         for event in self._factory.take_events():
@@ -44,7 +44,7 @@ class EpisodeScene:
 
         Args:
             time: Since the start of the episode, in s.
-            redraw: Updates what was drawn.
+            redraw: Updates the drawings.
             simulation: The simulation after the step.
         """
         redraw(self._factory)
@@ -72,13 +72,13 @@ class EpisodeScene:
         return key in self._known and bool(np.array_equal(value, self._known[key]))
 
     def rewind(self, time: float) -> None:
-        """Discard what was recorded after a time, in s."""
+        """Discard everything recorded after a time, in s."""
         self._changes = [change for change in self._changes if change[0] <= time]
         self._contacts = [block for block in self._contacts if block[0, 0] <= time]
         self._remember()
 
     def _remember(self) -> None:
-        """Note what every object is like at the end of what was recorded."""
+        """Store the state of every object at the end of the recording."""
         first = ((each["name"], each["values"]) for each in self._added)
         later = ((name, values) for _, name, values in self._changes)
         self._known = {
@@ -88,7 +88,7 @@ class EpisodeScene:
         }
 
     def describe(self) -> Mapping[str, Any]:
-        """Return what a log says about it: ``scene`` and ``contacts``.
+        """Return its entries in a log: ``scene`` and ``contacts``.
 
         ``contacts`` has a row for each contact: time in s, point in m, force in N, both (3,) in the
         world frame.

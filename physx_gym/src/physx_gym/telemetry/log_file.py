@@ -48,13 +48,13 @@ def as_logs(sources: Source | Sequence[Source], more: Sequence[Source] = ()) -> 
 
     Args:
         sources: One or several.
-        more: Several.
+        more: Any number of further ones.
     """
     several = isinstance(sources, Sequence) and not isinstance(sources, str)
     given: Any = sources if several else [sources]
     logs = [_log(each) for each in (*given, *more)]
     if not logs:
-        raise LogError("There is no log: pass one or several.")
+        raise LogError("No log was given: pass at least one.")
     return logs
 
 
@@ -93,7 +93,7 @@ class _Reader:
             if dtype in self._file:
                 self._table(dtype, variables, units)
         if next(iter(variables), None) != TIME:
-            raise self._error("does not start with the column of the time")
+            raise self._error("does not start with the time column")
         if len({len(each) for each in variables.values()}) != 1:
             raise self._error("has columns of different lengths")
         apart: dict[str, Any] = {"units": units}
@@ -116,7 +116,7 @@ class _Reader:
         units |= {name: unit for name, unit in zip(names, own, strict=True) if unit}
 
     def _item(self, group: Any, name: str) -> Any:
-        """Return a member of a group; links to other places are not followed."""
+        """Return a member of a group; links are not followed."""
         import h5py
 
         if not isinstance(group, h5py.Group) or name not in group:
@@ -128,13 +128,13 @@ class _Reader:
     def _values(self, group: Any, name: str, dtype: str | None, axes: int) -> Any:
         """Return a dataset that is contiguous within this file.
 
-        So nothing is decompressed, and nothing larger than the file is allocated.
+        This way, nothing is decompressed, and nothing larger than the file is allocated.
         """
         import h5py
 
         item = self._item(group, name)
         if not isinstance(item, h5py.Dataset) or item.shape is None or item.ndim != axes:
-            raise self._error(f'has no array of {axes} axes as "{name}"')
+            raise self._error(f'has no {axes}-dimensional array "{name}"')
         if dtype is not None and item.dtype != np.dtype(dtype):
             raise self._error(f'has numbers of type {item.dtype} in "{name}"')
         if item.chunks is not None or item.is_virtual or item.external:
@@ -147,7 +147,7 @@ class _Reader:
     def _texts(self, group: Any, name: str) -> list[str]:
         texts = self._values(group, name, None, 1)
         if texts.dtype.kind != "S" or texts.dtype.itemsize > _NAMES_WIDTH:
-            raise self._error(f'has no strings as "{name}"')
+            raise self._error(f'has no strings in "{name}"')
         return [text.decode() for text in texts.tolist()]
 
     def _error(self, what: str) -> LogError:

@@ -1,4 +1,4 @@
-"""Worlds and options as JSON-compatible data, and back without executing anything from it."""
+"""Converts worlds and options to JSON-compatible data, and back without executing any of it."""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ _KINDS = {
         *(Box, Capsule, Cylinder, Mesh, Sphere),
     )
 }
-"""Classes of which a world's description consists, by name."""
+"""Classes that make up a world's description, by name."""
 _KIND = "kind"
 _DEPTH = 32
 
@@ -41,8 +41,8 @@ _DEPTH = 32
 def to_plain(value: Any) -> Any:
     """Return nested data as dictionaries, lists, strings and numbers.
 
-    A dataclass becomes a dictionary of its fields, with its class as ``kind``; any other object its
-    ``repr``. Paths of robots and meshes become absolute.
+    A dataclass becomes a dictionary of its fields, with its class as ``kind``; any other object
+    becomes its ``repr``. Paths of robots and meshes become absolute.
     """
     if value is None or isinstance(value, (bool, int, float, str)):
         return value
@@ -69,7 +69,7 @@ def to_plain(value: Any) -> Any:
 
 
 def _absolute(urdf: str | Path) -> str | Path:
-    """Return the absolute path of a URDF file; a robot's name stays as it is."""
+    """Return the absolute path of a URDF file; a robot's name is returned unchanged."""
     path = Path(urdf)
     is_path = isinstance(urdf, Path) or path.suffix.lower() == ".urdf" or path.is_file()
     return path.absolute() if is_path else urdf
@@ -86,8 +86,8 @@ def world_of(value: Any, where: str, folder: Path | None = None) -> World:
 
     Args:
         value: The plain data.
-        where: Where the data is from, for errors.
-        folder: Where files are looked for that are not in their place any more.
+        where: Where the data is from, for error messages.
+        folder: Where to look for files that are no longer at their paths.
     """
     try:
         world = _build(value, _DEPTH, folder)
@@ -99,7 +99,7 @@ def world_of(value: Any, where: str, folder: Path | None = None) -> World:
 
 
 def _build(value: Any, depth: int, folder: Path | None) -> Any:
-    """Return the descriptions that nested data stands for; lists become tuples."""
+    """Return the descriptions that nested data represents; lists become tuples."""
     if depth == 0:
         raise ValueError("the data is nested too deeply.")
     if isinstance(value, Mapping):
@@ -119,7 +119,7 @@ def _build(value: Any, depth: int, folder: Path | None) -> Any:
 
 
 def _located(path: Any, folder: Path | None) -> Any:
-    """Return a file's path, or that of the file of its name in a folder if it is only there."""
+    """Return a file's path, or that of a file of the same name in a folder if it is only there."""
     if folder is None or not isinstance(path, str) or Path(path).is_file():
         return path
     if not Path(path).suffix:  # a robot's name

@@ -1,4 +1,4 @@
-"""The columns that every log has, and the description of the simulator beside them."""
+"""The columns and the description of the simulator that every log has."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ _SENSED = {
 }
 """Units of measured quantities that do not depend on the type of a joint."""
 _EFFORTS = {"rad": "N m", "m": "N"}
-"""Unit of what drives a joint, by the unit of its position."""
+"""Unit of a joint's torque or force, by the unit of its position."""
 
 
 def register_simulator(telemetry: Telemetry, simulator: Simulator) -> None:
     """Register the state of the world, the sensors, and the commands and torques of the motors.
 
-    What is measured is recorded in training too. To be called whenever the simulator was built: it
-    has new arrays.
+    Measurements are recorded in training too. Call this whenever the simulator has been built, as
+    it then has new arrays.
     """
     layout, state = simulator.layout, simulator.robot_state
     positions, velocities = state_names(layout)
@@ -63,7 +63,7 @@ def register_simulator(telemetry: Telemetry, simulator: Simulator) -> None:
 
 
 def _unit_of(quantity: str, kind: str, joint: str) -> str:
-    """Return the unit of what a kind of sensor measures, perhaps at a joint whose unit is given."""
+    """Return the unit of what a kind of sensor measures, given the unit of its joint, if any."""
     if quantity == "torque":
         return "N m" if kind == "ForceTorque" else _EFFORTS.get(joint, "")
     known = {"position": joint, "velocity": f"{joint}/s" if joint else ""}

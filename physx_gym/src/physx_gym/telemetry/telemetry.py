@@ -16,7 +16,7 @@ from physx_gym.telemetry.episode_log import TIME, Log
 from physx_gym.telemetry.variables import WORD, Variable, words_of
 
 MOST_IN_TRAINING = 100_000
-"""Number of rows of an episode that are kept in training: the latest."""
+"""Number of latest rows of an episode that are kept in training."""
 
 
 class Telemetry:
@@ -66,24 +66,29 @@ class Telemetry:
         registered before the last episode replaces that variable.
 
         Args:
-            name: Name of the variable, which begins the names of its columns.
-            value: An array of float64 or int64, or dictionaries and sequences of such, nested.
+            name: Name of the variable, with which the names of its columns begin.
+            value: An array of float64 or int64, or nested dictionaries and sequences of those.
             fieldnames: Name of each number, nested likewise, with a sequence of strings for each
                 array; None: the keys and indices that lead to it.
             namespace: Prefix of the name.
-            is_eval_only: Whether it is left out in training.
+            is_eval_only: Whether to record it in evaluation only.
             unit: Unit of all its numbers, or a sequence of units.
+
+        Raises:
+            EpisodeError: If an episode is being recorded in evaluation.
+            ConfigError: If the value, its names or its units are invalid, or a name is already
+                used.
         """
         if self.is_recording and not self._is_training:
             raise EpisodeError(
-                f'The variable "{name}" cannot be registered while an episode runs: register it '
+                f'The variable "{name}" cannot be registered during an episode: register it '
                 "before reset, or call stop first."
             )
         variable = Variable.of(name, value, fieldnames, namespace, unit, is_eval_only)
         known = self._variables.get(variable.name)
         if known is not None and variable.name in self._new and not variable.is_same(known):
             raise ConfigError(
-                f'A variable "{variable.name}" is registered already. Choose another name, or a '
+                f'A variable "{variable.name}" is already registered. Choose another name, or a '
                 "namespace."
             )
         self._check_columns(variable)
@@ -99,19 +104,23 @@ class Telemetry:
         for name in (name for names in variable.columns for name in names):
             if name in taken:
                 raise ConfigError(
-                    f'The variable "{variable.name}" has a number "{name}", but that is the name '
-                    f"of a number of {taken[name]}."
+                    f'The variable "{variable.name}" has a number "{name}", but that name is '
+                    f"already used by {taken[name]}."
                 )
-            taken[name] = f'"{variable.name}" too'
+            taken[name] = f'"{variable.name}" itself'
 
     def renew(self) -> None:
-        """Let new arrays replace the variables registered so far, as after an episode."""
+        """Allow new arrays to replace the variables registered so far, as after an episode."""
         self._new = set()
 
     def unregister(self, name: str) -> None:
-        """Remove a variable, if there is one of a name with namespace."""
+        """Remove the variable of a name with namespace, if there is one.
+
+        Raises:
+            EpisodeError: If an episode is being recorded.
+        """
         if self.is_recording:
-            raise EpisodeError(f'The variable "{name}" cannot be removed while an episode runs.')
+            raise EpisodeError(f'The variable "{name}" cannot be removed during an episode.')
         self._variables.pop(name, None)
         self._fieldnames.pop(name, None)
         self._new.discard(name)
@@ -150,7 +159,7 @@ class Telemetry:
     def record(self, time: float) -> None:
         """Record a row: copies of all variables as they are now.
 
-        A second row of the same time replaces the first.
+        A second row with the same time replaces the first.
 
         Args:
             time: Time since the start of the episode, in s.
@@ -159,12 +168,12 @@ class Telemetry:
             self._table.record(time)
 
     def rewind(self, time: float) -> None:
-        """Discard the rows from a time, in s, on."""
+        """Discard the rows from a time, in s, onward."""
         if self.is_recording:
             self._table.rewind(time)
 
     def end(self) -> None:
-        """End the episode and write its file; nothing happens if none is being recorded."""
+        """End the episode and write its file; do nothing if none is being recorded."""
         if not self.is_recording:
             return
         self.is_recording, self._new = False, set()
@@ -172,7 +181,7 @@ class Telemetry:
             self.log.write(self._path)
 
     def discard(self) -> None:
-        """End the episode without a file; nothing happens if none is being recorded."""
+        """End the episode without a file; do nothing if none is being recorded."""
         if self.is_recording:
             self._path = None
             self.end()
@@ -189,7 +198,7 @@ class Telemetry:
 
     @property
     def log(self) -> Log:
-        """Copy of what was recorded of the running episode, up to now, or of the last one."""
+        """Copy of the recording of the running episode so far, or of the last one."""
         constants = {**self._constants, "units": self._table.units}
         return Log(constants, self._table.columns(), self._path)
 
@@ -210,7 +219,7 @@ class _Table:
 
         Args:
             variables: The variables.
-            most: Number of rows that are kept, the latest; None: all.
+            most: Number of latest rows to keep; None: all.
         """
         self._variables = variables
         self.units = {TIME: "s"}
@@ -232,7 +241,7 @@ class _Table:
         return len(self._times)
 
     def restart(self, variables: Sequence[Variable], most: int | None) -> bool:
-        """Discard all rows, if the variables are the same; return whether they are."""
+        """Discard all rows if the variables are the same; return whether they are."""
         known = self._variables
         is_same = len(known) == len(variables) and most == self._times.maxlen
         if not is_same or any(a is not b for a, b in zip(known, variables, strict=True)):
@@ -252,7 +261,7 @@ class _Table:
             self._rows.append(words.tobytes())
 
     def rewind(self, time: float) -> None:
-        """Discard the rows from a time on."""
+        """Discard the rows from a time onward."""
         while self._times and self._times[-1] >= time:
             self._times.pop()
             self._rows.pop()

@@ -30,7 +30,7 @@ class Variable(SharedArrays):
         arrays: The arrays in the order of the columns.
         columns: Names of the columns of each array.
         units: Units of the columns; empty if unknown.
-        is_eval_only: Whether it is left out in training.
+        is_eval_only: Whether it is recorded in evaluation only.
     """
 
     name: str
@@ -57,7 +57,7 @@ class Variable(SharedArrays):
                 raise ConfigError(f"The name of a variable must be a string, not {text!r}.")
         full = f"{namespace}.{name}" if namespace else name
         if not name:
-            raise ConfigError("A variable of the telemetry needs a name.")
+            raise ConfigError("A telemetry variable needs a name.")
         arrays = dict(leaves(value))
         names = {path: _names(full, path, each, fieldnames) for path, each in arrays.items()}
         size = sum(each.size for each in names.values())
@@ -75,7 +75,7 @@ class Variable(SharedArrays):
         )
 
     def is_same(self, other: Variable) -> bool:
-        """Return whether the other one has the same arrays under the same names."""
+        """Return whether another variable has the same arrays under the same names."""
         same = len(self.arrays) == len(other.arrays) and self.columns == other.columns
         pairs = zip(self.arrays, other.arrays, strict=True) if same else ()
         return same and all(_memory(mine) == _memory(its) for mine, its in pairs)
@@ -111,7 +111,7 @@ def _check_array(where: str, value: Any) -> None:
     if value.dtype.name not in TYPES or not value.dtype.isnative:
         raise ConfigError(
             f'"{where}" is an array of {value.dtype}; only float64 and int64 can be recorded. '
-            "Keep the numbers in an array of one of them, and register that."
+            "Keep the numbers in an array of one of these types, and register that."
         )
 
 
@@ -137,7 +137,7 @@ def _flatten(fieldnames: Any, name: str, array: Array) -> Sequence[str]:
 # Memory -------------------------------------------------------------------------------------
 
 WORD = np.dtype(np.int64)
-"""Type that numbers are copied as: 8 bytes, whatever they mean."""
+"""Type that numbers are copied as: 8 bytes, regardless of their meaning."""
 
 
 def words_of(arrays: Iterable[Array]) -> list[NDArray[np.int64]]:
@@ -161,7 +161,7 @@ def _flat_views(array: Array) -> Iterator[NDArray[np.int64]]:
 
 
 def _join(first: NDArray[np.int64], second: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """Return two views as one, if they are adjacent in the memory of one array."""
+    """Return two views as one if they are adjacent in the memory of one array."""
     owner, step = _owner(first), WORD.itemsize
     if _owner(second) is not owner or not owner.flags.c_contiguous or owner.itemsize != step:
         return None

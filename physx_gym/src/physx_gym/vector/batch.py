@@ -15,20 +15,20 @@ from physx_core import Field
 from physx_core.typing import Array, Batch
 
 INFO_BYTES = 512
-"""Room for the info of an environment."""
+"""Bytes reserved for the info of an environment."""
 COMMAND = -1
-"""Entry of a queue that stands for a command, which the worker receives as a message."""
+"""Entry of a queue that represents a command, which the worker receives as a message."""
 END = -1
-"""What `SharedBatch.asked` is set to when a worker is to end."""
+"""Value of `SharedBatch.asked` that tells a worker to exit."""
 NEVER = 1 << 62
 """A number of entries that is never reached."""
 SPIN_TIME = 1e-3
-"""How long a process looks for what it waits for before it sleeps, in s."""
+"""How long a process polls for what it waits for before it sleeps, in s."""
 
 
 @dataclass
 class EnvArrays:
-    """Arrays of environments: what they are told, and what they answer.
+    """Arrays of environments: their inputs and their results.
 
     Attributes:
         first: Number of the first environment.
@@ -56,26 +56,26 @@ class EnvArrays:
 _Layout: TypeAlias = tuple[tuple[int, ...], Any]
 
 _COUNTERS = ("asked", "done", "idle", "sent")
-_LINE = 64  # bytes of a processor's cache line: counters of several writers lie on different ones
+_LINE = 64  # bytes of a processor's cache line: different writers use different ones
 
 
 class SharedBatch(EnvArrays):
     """Arrays of all environments, and a queue for each worker, in memory that processes share.
 
-    The rows of an environment belong to its worker from when it is asked for a step until that is
-    done, and otherwise to the process with the vector environment. A queue is a ring: the entry of
-    number n, counted from 0 since the start, stands at ``n % capacity``. It is the place of an
-    environment among the worker's own, which is to be stepped, or `COMMAND`.
+    The rows of an environment belong to its worker from the request for a step until that step is
+    done, and otherwise to the process with the vector environment. A queue is a ring: entry n,
+    counted from 0 since the start, is at ``n % capacity``. It is the index, among the worker's own
+    environments, of the one to step, or `COMMAND`.
 
     Attributes:
         capacity: Number of entries that fit into a queue.
         queues: Shape (workers, capacity).
         asked: For each worker, how many entries its queue has had, or `END`.
         done: For each worker, how many of them it has finished.
-        idle: For each worker, whether it sleeps, and has to be woken.
+        idle: For each worker, whether it sleeps and must be woken.
         sent: For each worker, how many messages it has sent.
-        awaited: How many entries all workers together have to finish before the process with the
-            vector environment has to be woken; `NEVER` if it does not sleep. One element.
+        awaited: How many entries all workers together must finish before the process with the
+            vector environment must be woken; `NEVER` if it does not sleep. One element.
     """
 
     def __init__(
@@ -97,7 +97,7 @@ class SharedBatch(EnvArrays):
             has_finals: Whether last observations are kept.
         """
         count, workers = sum(shares), len(shares)
-        self.capacity = max(shares) + 1  # a command beside a step of each environment
+        self.capacity = max(shares) + 1  # a command besides a step of each environment
         arrays = _map(
             file,
             {
@@ -122,7 +122,7 @@ class SharedBatch(EnvArrays):
             {each.name: arrays[f"final {each.name}"] for each in observations if has_finals},
             *(arrays[name] for name in ("rewards", "terminated", "truncated", "kinds", "infos")),
         )
-        # A memoryview reads and writes a number in half the time that an array takes.
+        # A memoryview reads and writes a number in half the time an array takes.
         self.asked, self.done, self.idle, self.sent = (
             memoryview(cast(Any, arrays[name][:, 0])) for name in _COUNTERS
         )

@@ -27,19 +27,19 @@ _ENVIRONMENT = "physx_gym.vector.share_environment:ShareEnvironment"
 class ClientWorkers:
     """The interface of `Workers`, with clients of a run in place of processes that share memory.
 
-    Entries are sent when their results are waited for: all that were asked for, in one message to
-    each client.
+    Entries are sent when their results are awaited: all requested ones, in one message to each
+    client.
 
     Attributes:
-        is_open: Whether the clients run.
+        is_open: Whether the clients are running.
         asked: For each worker, how many entries its queue has had.
-        messages: What workers sent beside their results and errors: their numbers, and frames.
+        messages: What workers sent besides their results and errors: their numbers, and frames.
     """
 
     def __init__(
         self, batch: SharedBatch, setup: Mapping[str, Any], config: Mapping[str, Any]
     ) -> None:
-        """Start the clients, and wait until all environments are made.
+        """Start the clients, and wait until all environments have been created.
 
         Args:
             batch: Arrays of all environments.
@@ -105,7 +105,7 @@ class ClientWorkers:
         """End the clients; none is left when this returns.
 
         Args:
-            orderly: Raise what environments raise as they are closed.
+            orderly: Whether to raise what environments raise as they are closed.
         """
         if not self.is_open:
             return
@@ -115,7 +115,7 @@ class ClientWorkers:
                 self._source.close()
 
     def _execute(self) -> None:
-        """Have the workers execute their queues, and take the results."""
+        """Have the workers execute their queues, and store the results."""
         room = max(map(len, self._queues))
         entries = np.zeros((len(self._queues), room), np.int64)
         for row, queue in zip(entries, self._queues, strict=True):
@@ -144,14 +144,14 @@ class ClientWorkers:
         self._orders = [b""] * len(self._queues)
 
     def _shares_of(self, array: Array) -> Array:
-        """Return a row for each client, with the values of its environments, then zeros."""
+        """Return a row for each client, with the values of its environments, padded with zeros."""
         found = np.zeros((len(self._slices), self._most, *array.shape[1:]), array.dtype)
         for row, mine in zip(found, self._slices, strict=True):
             row[: mine.stop - mine.start] = array[mine]
         return found
 
     def _take(self, instance_id: int, messages: Sequence[Any]) -> None:
-        """Take over the messages of a worker."""
+        """Store the messages of a worker."""
         for kind, content, number in messages:
             frame = Frame(Kind(kind), number, bytearray(content))
             if frame.kind is Kind.ERROR:
@@ -174,13 +174,13 @@ class ClientWorkers:
 
 
 class _Mail:
-    """The services of the clients' run: they take messages."""
+    """Services for the clients of the run: they receive messages."""
 
     def __init__(self, take: Any) -> None:
         self._take = take
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
-        """Take the messages of a worker."""
+        """Receive the messages of a worker."""
         self._take(instance_id, values["messages"])
 
     def load_parameters(self, instance_id: int) -> dict[str, Any]:

@@ -13,13 +13,13 @@ from physx_core.net import decode
 from physx_core.typing import Array
 
 LENGTH = 8
-"""Bytes of the length in front of an encoded value."""
+"""Size of the length in front of an encoded value, in bytes."""
 
 
 class InfoKind(enum.IntEnum):
-    """The form of an info; a positive number is that of the layout of which it is a record.
+    """The form of an info; a positive number is the number of its record layout.
 
-    A worker counts its layouts from 1, and sends each before it uses it.
+    A worker numbers its layouts from 1, and sends each before it uses it.
     """
 
     NONE = 0
@@ -55,7 +55,7 @@ def unpack(data: Array) -> Any:
 
 
 class _Entry(NamedTuple):
-    """An entry of an info: a number of some type, or a dictionary with entries of its own."""
+    """An entry of an info: a number of some type, or a dictionary with its own entries."""
 
     name: str
     kind: type[Any]
@@ -63,7 +63,7 @@ class _Entry(NamedTuple):
 
 
 class InfoLayout:
-    """Names and types of infos that hold only numbers, and dictionaries of them.
+    """Names and types of infos that hold only numbers and dictionaries of them.
 
     Attributes:
         names: Pairs of a name and the name of its type, or the pairs of a dictionary.

@@ -1,4 +1,4 @@
-"""Rows: what a client sends after a step, and the environments' arrays that lie in it."""
+"""Rows: what a client sends after a step, and the environments' arrays in them."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from physx_core.typing import Array, Batch
 from physx_gym.vector.batch import INFO_BYTES, EnvArrays
 
 ROW = "row"
-"""Name of the field that holds the bytes of a row, whatever is in them."""
+"""Name of the field that holds the bytes of a row."""
 _FINAL = "final "
 
 
@@ -21,7 +21,7 @@ class RowLayout:
 
     Attributes:
         dtype: Type of a record.
-        field: The row as a field of bytes. Rows of clients with fewer environments end with zeros.
+        field: The row as a field of bytes. Rows of clients with fewer environments are zero-padded.
     """
 
     def __init__(self, observations: Sequence[Field], share: int, *, has_finals: bool) -> None:
@@ -49,7 +49,7 @@ class RowLayout:
         self.field = Field(ROW, (share * self.dtype.itemsize,), "uint8")
 
     def arrays(self, row: Array, actions: Batch, first: int) -> EnvArrays:
-        """Return the arrays that lie in a row.
+        """Return the arrays in a row.
 
         Args:
             row: Bytes of whole records.
@@ -64,7 +64,7 @@ class RowLayout:
 
 
 def copy_results(source: EnvArrays, target: EnvArrays) -> None:
-    """Copy the results of a client's environments to where those of all environments lie."""
+    """Copy the results of a client's environments into the arrays of all environments."""
     for theirs, ours in _pairs(source, target):
         first = source.first - target.first
         ours[first : first + len(theirs)] = theirs

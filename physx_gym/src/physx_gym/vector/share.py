@@ -28,10 +28,10 @@ class Share:
     def __init__(
         self, setup: Mapping[str, Any], batch: EnvArrays, send: Callable[[Kind, bytes, int], None]
     ) -> None:
-        """Keep what to run; `create` makes the environments.
+        """Store what to run; `create` creates the environments.
 
         Args:
-            setup: What the worker was told.
+            setup: What the worker received.
             batch: Arrays of these environments, and perhaps of others.
             send: Sends a message to the process with the vector environment: kind, content, number.
         """
@@ -42,7 +42,7 @@ class Share:
         first = self._first - batch.first
         mine = slice(first, first + self._count)
         self._infos = batch.infos[mine]
-        # A memoryview writes a number in half the time that an array takes.
+        # A memoryview writes a number in half the time an array takes.
         self._rewards, self._terminated, self._truncated, self._kinds = (
             memoryview(cast(Any, array[mine]))
             for array in (batch.rewards, batch.terminated, batch.truncated, batch.kinds)
@@ -56,18 +56,18 @@ class Share:
         self._due: list[tuple[int | None, dict[str, Any] | None] | None] = [None] * self._count
         self._steps = [0] * self._count
         self._layouts: dict[str, int] = {}
-        self._layout: InfoLayout | None = None  # the one that was used last, and its number
+        self._layout: InfoLayout | None = None  # the one used last, and its number
         self._layout_number = 0
         self._left_out: set[str] = set()
 
     def create(self) -> None:
-        """Make the environments."""
+        """Create the environments."""
         for place in range(self._count):
             if not self._attempt("__init__", place, self._make):
                 return
 
     def step(self, place: int) -> None:
-        """Step an environment; or reset it, if that is due."""
+        """Step an environment, or reset it if that is due."""
         is_due = self._due[place] is not None
         try:
             if is_due:
@@ -107,7 +107,7 @@ class Share:
             self._attempt("close", place, lambda place: self._envs[place].close())
 
     def _attempt(self, method: str, place: int, function: Callable[[int], None]) -> bool:
-        """Call a function of a place; return whether it succeeded, and otherwise send why not."""
+        """Call a function for an environment; return whether it succeeded; if not, send why."""
         try:
             function(place)
         except Exception as error:
@@ -118,7 +118,7 @@ class Share:
     def _report(self, error: Exception, method: str, place: int) -> None:
         env = self._first + place
         known = error if isinstance(error, PhysxError) else self._wrap(error, method, place)
-        known.add_note(f"in {method}() of environment {env} of the vector, counted from 0")
+        known.add_note(f"in {method}() of environment {env} of the vector environment (from 0)")
         self._send(Kind.ERROR, encode_error(known), env)
 
     def _wrap(self, error: Exception, method: str, place: int) -> EnvironmentFailedError:
@@ -139,8 +139,8 @@ class Share:
             if [field.to_dict() for field in space.fields] != setup[name]:
                 raise ConfigError(
                     f"The {name} of this environment, {space.space}, differ in shape or type from "
-                    "those of another one that was made from the same arguments. A vector "
-                    "environment needs the same in all."
+                    "those of another one that was created with the same arguments. In a vector "
+                    "environment, they must be the same in all."
                 )
 
     def _step(self, place: int) -> None:
@@ -172,7 +172,7 @@ class Share:
         self._terminated[place], self._truncated[place] = terminated, truncated
 
     def _put_info(self, place: int, info: Mapping[str, Any]) -> None:
-        """Write an info; entries that cannot be sent are only named."""
+        """Write an info; of entries that cannot be sent, only the names are sent."""
         if not info:
             self._kinds[place] = _NO_INFO
             return
@@ -201,7 +201,7 @@ class Share:
         return True
 
     def _pack_info(self, place: int, info: dict[str, Any]) -> None:
-        """Write an info of any kind; send it, if it does not fit or there is more to say."""
+        """Write an info of any kind; send it if it does not fit or entries are left out."""
         left_out: list[str] = []
         try:
             encoded = encode(info)

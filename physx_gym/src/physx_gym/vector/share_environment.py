@@ -21,13 +21,13 @@ ENTRIES, COUNT, ORDER, ORDER_SIZE = "entries", "count", "order", "order_size"
 
 
 class ShareEnvironment(Environment):
-    """Each step executes entries that the vector environment sends, as a worker does.
+    """An environment whose steps execute entries from the vector environment, as a worker does.
 
-    What it sends beside the results are the parameters that it saves.
+    What it sends besides the results are the parameters that it saves.
     """
 
     def __init__(self, *, setup: Mapping[str, Any], **kwargs: Any) -> None:
-        """Keep what to run.
+        """Store what to run.
 
         Args:
             setup: What the vector environment runs, with its ``shares``.
@@ -38,7 +38,7 @@ class ShareEnvironment(Environment):
         self._messages: list[tuple[Kind, bytes, int]] = []
 
     def create(self) -> None:
-        """Make the environments."""
+        """Create the environments."""
         setup = self._setup
         shares: Sequence[int] = setup["shares"]
         number = setup["number"]

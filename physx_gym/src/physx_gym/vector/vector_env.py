@@ -35,19 +35,19 @@ _LOG = logging.getLogger("physx")
 
 
 class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
-    """A vector environment whose environments are stepped in processes of their own.
+    """A vector environment whose environments are stepped in separate processes.
 
-    ``gymnasium.make_vec("physx/Ant-v0", num_envs=8, num_processes=2)`` creates one. `step` does
-    what that of Gymnasium's `AsyncVectorEnv` does. `send` and `recv` do not wait for all of them:
-    while the results of `batch_size` environments are looked at, the others go on.
+    ``gymnasium.make_vec("physx/Ant-v0", num_envs=8, num_processes=2)`` creates one. `step` behaves
+    like that of Gymnasium's `AsyncVectorEnv`. `send` and `recv` do not wait for all environments:
+    while the results of `batch_size` environments are processed, the others continue.
 
-    With ``launcher="cluster/ray"`` the processes run wherever that launcher starts them.
+    With ``launcher="cluster/ray"``, the processes run wherever that launcher starts them.
 
-    Observations, rewards and ends are written to shared memory by the processes. These end with the
-    vector environment, or with this process, however that ends. If an environment raises, the error
-    has its traceback; if a process ends, it says how and where. Either ends the vector environment.
+    The processes write observations, rewards and ends to shared memory. They exit with the vector
+    environment or with this process, however it ends. If an environment raises, the error has its
+    traceback; if a process exits, the error says how and where. Either ends the vector environment.
 
-    Infos may hold plain values and arrays; others are left out, and a warning names them.
+    Infos may hold plain values and arrays; other entries are left out, and a warning names them.
 
     Attributes:
         batch_size: Number of environments whose results `recv` returns.
@@ -84,15 +84,15 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
             autoreset_mode: What happens after the end of an episode.
             copy: Whether the results of `reset` and `step` are copies; otherwise observations are
                 views of the shared memory, valid until the next call.
-            timeout: Longest duration of a step of an environment, in s. To make and to close its
-                environments, a process has this long too, and at least a minute.
-            launcher: Launcher that starts the processes, as ``"cluster/ray"``; None: they are
-                started here, and share memory with this process. Through a launcher they are
-                clients, on any machine, and `recv` waits for all environments that owe a result.
+            timeout: Longest duration of a step of an environment, in s. To create and to close its
+                environments, a process has the same time, but at least a minute.
+            launcher: Launcher that starts the processes, such as ``"cluster/ray"``; None: they are
+                started here, and share memory with this process. Started by a launcher, they are
+                clients, on any machine, and `recv` waits for all pending results.
             launcher_kwargs: Keyword arguments of the launcher.
             ip_address: Address at which clients reach this process, if the launcher knows none.
-            restarts: How often a launcher's process that ends is started again. It repeats all
-                actions, so its environments must be deterministic; the actions are kept for it.
+            restarts: How often to restart a launcher's process that exits. The new one repeats all
+                actions, so its environments must be deterministic; the actions are kept for this.
 
         Raises:
             ConfigError: If a value is out of range, or values of a space do not have a fixed shape.
@@ -113,10 +113,10 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         self._starts, shares = starts, [stop - start for start, stop in pairwise(starts)]
         self._worker_of = np.repeat(np.arange(workers), shares).tolist()
         self._all = np.arange(num_envs)
-        # The environments that owe a result, by worker, in the order in which it delivers them.
+        # The environments with pending results, by worker, in the order in which it delivers them.
         self._owed: list[deque[int]] = [deque() for _ in range(workers)]
         self._owes = np.zeros(num_envs, np.bool_)
-        self._next = 0  # the worker whose results are taken first
+        self._next = 0  # the worker to take results from first
         self._infos = _Infos(workers)
         fields = self._observations.fields, self._actions.fields
         setup = {
@@ -145,7 +145,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         weakref.finalize(self, self._workers.close, orderly=False).atexit = False
 
     def _describe(self, name: str, options: Mapping[str, Any]) -> None:
-        """Take over spaces and metadata from a single environment, which is closed again."""
+        """Copy spaces and metadata from a single environment, which is then closed."""
         env = make_env(name, options)
         self.single_observation_space = env.observation_space
         self.single_action_space = env.action_space
@@ -165,9 +165,9 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin new episodes; return observations and infos.
+        """Start new episodes; return observations and infos.
 
-        Results that environments still owe are dropped.
+        Pending results are dropped.
 
         Args:
             seed: Environment i gets ``seed + i``; or a seed for each.
@@ -195,7 +195,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
 
         Raises:
             ActionError: If the actions do not have the shape of the space.
-            UsageError: If environments owe results of `send`.
+            UsageError: If results of `send` are pending.
             PhysxError: If an environment raises, or a process fails.
         """
         self.send(actions)
@@ -208,7 +208,12 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> None:
-        """Begin new episodes as `reset` does, without waiting; `recv` returns the observations."""
+        """Start new episodes as `reset` does, without waiting; `recv` returns the observations.
+
+        Raises:
+            ConfigError: If the number or type of the seeds, or the mask, is wrong.
+            PhysxError: If an environment raises, or a process fails.
+        """
         count = self.num_envs
         options = dict(options or {})
         mask = np.asarray(options.pop("reset_mask", np.ones(count, np.bool_)))
@@ -231,7 +236,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         self._ask(np.flatnonzero(mask))
 
     def send(self, actions: Any, env_ids: Any = None) -> None:
-        """Have environments begin a step; `recv` returns the results.
+        """Have environments start a step; `recv` returns the results.
 
         Args:
             actions: A batch of actions, one for each of these environments.
@@ -240,7 +245,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         Raises:
             ActionError: If the actions do not have the shape of the space.
             ConfigError: If the numbers are not those of different environments.
-            UsageError: If one of the environments still owes the result of its last step.
+            UsageError: If the result of one environment's last step is still pending.
             PhysxError: If a process has ended.
         """
         self._open()
@@ -248,37 +253,37 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         owing = ids[self._owes[ids]]
         if len(owing):
             raise UsageError(
-                f"Environment {owing[0]} still owes the result of its last step: take it with "
-                "recv() before it gets another action, or begin anew with reset()."
+                f"The result of environment {owing[0]} is still pending: call recv() before "
+                "sending it another action, or start over with reset()."
             )
         for name, array in self._action_arrays(actions, len(ids)).items():
             self._batch.actions[name][slice(None) if ids is self._all else ids] = array
         self._ask(ids if ids is self._all else np.sort(ids))
 
     def recv(self) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
-        """Wait for the results of `batch_size` environments, or of all that owe some, if fewer.
+        """Wait for the results of `batch_size` environments, or for all pending ones, if fewer.
 
-        They are taken in the order in which the processes deliver them, from one after the other,
-        so none is passed over.
+        They are taken in the order in which the processes deliver them, from each process in turn,
+        so that none is neglected.
 
         Returns:
-            What `step` returns, for these environments in the order of their numbers. These are
+            What `step` returns, for these environments in the order of their numbers, which are in
             ``infos["env_id"]``. After a reset, rewards are 0.
 
         Raises:
-            UsageError: If no environment owes a result.
+            UsageError: If no result is pending.
             PhysxError: If an environment raises, or a process fails.
         """
         self._open()
         ids = self._take(self.batch_size)
         if not len(ids):
-            raise UsageError("No environment owes a result: call send() or async_reset() first.")
+            raise UsageError("No result is pending: call send() or async_reset() first.")
         observations, *results, infos = self._results(ids)
         return observations, *results, {**infos, "env_id": ids}
 
     @property
     def owing(self) -> int:
-        """How many environments owe a result."""
+        """Number of environments whose result is pending."""
         return int(self._owes.sum())
 
     def _ask(self, ids: Array) -> None:
@@ -293,11 +298,11 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
                 workers.ask(number, mine - self._starts[number])
 
     def _take(self, count: int) -> Array:
-        """Wait for `count` results, or all that are owed; return their environments, in order."""
+        """Wait for `count` results, or all pending ones; return their environments, in order."""
         workers, owed = self._open(), [len(each) for each in self._owed]
         count = min(count, sum(owed))
         done = workers.wait(sum(workers.asked) - sum(owed) + count)
-        if count == sum(owed):  # no need to know whose come first
+        if count == sum(owed):  # no need to know which come first
             taken = np.flatnonzero(self._owes)
             for each in self._owed:
                 each.clear()
@@ -412,7 +417,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
             UsageError: If it is `reset`, `step` or `close`, or a result cannot be sent.
         """
         if name in FORBIDDEN:
-            raise UsageError(f'call("{name}") would bypass this object: use {name}() itself.')
+            raise UsageError(f'call("{name}") would bypass this object: call {name}() directly.')
         arguments = [(name, list(args), kwargs)] * len(self._owed)
         return tuple(chain.from_iterable(self._open().command("call", arguments)))
 
@@ -458,7 +463,7 @@ def _check(
     """Check the arguments of a vector environment."""
     if os.environ.get(CLIENT_VARIABLE):
         raise UsageError(
-            "A worker imported the script that defines its environment, and the script made a "
+            "A worker imported the script that defines its environment, and the script created a "
             'vector environment. Put that under  if __name__ == "__main__":'
         )
     if workers < 1 or not 1 <= batch_size <= num_envs:
@@ -474,7 +479,7 @@ def _check(
 
 
 class _Infos:
-    """What is needed to read infos: the layouts that workers told, and infos that did not fit."""
+    """What is needed to read infos: the workers' layouts, and infos that did not fit."""
 
     def __init__(self, workers: int) -> None:
         self._layouts: list[dict[int, InfoLayout]] = [{} for _ in range(workers)]
@@ -483,7 +488,7 @@ class _Infos:
         self._left_out: set[str] = set()
 
     def learn(self, messages: Sequence[tuple[int, Frame]]) -> None:
-        """Take over what workers sent; warn of entries that they left out."""
+        """Store what workers sent; warn about entries that they left out."""
         for worker, frame in messages:
             value = decode(frame.payload)
             if frame.kind is Kind.FIELDS:
@@ -497,7 +502,7 @@ class _Infos:
                 self._warn(value["left_out"])
 
     def common(self, kind: int) -> InfoLayout | None:
-        """Return the layout of a number, if all workers that told it mean the same."""
+        """Return the layout of a number, if it is the same for all workers that sent one."""
         return self._common.get(kind)
 
     def info(self, env: int, worker: int, kind: int, data: Array) -> dict[str, Any]:

@@ -1,8 +1,8 @@
 """Worker of a vector environment: ``python -m physx_gym.vector.worker LINK MEMORY``.
 
-It receives what to run, and then steps its share of the environments as its queue says: see
-`SharedBatch`. Commands, errors, and infos that do not fit are messages on the link. It exits when
-the process with the vector environment says so, or is gone.
+It receives what to run, then steps its share of the environments in the order of its queue: see
+`SharedBatch`. Commands, errors, and infos that do not fit are sent as messages over the link. It
+exits when the process with the vector environment tells it to, or is gone.
 """
 
 from __future__ import annotations
@@ -63,7 +63,7 @@ class Worker:
         self._share = Share(setup, self._batch, self._send)
 
     def run(self) -> None:
-        """Create the environments, and step them until the end."""
+        """Create the environments, and step them until told to exit."""
         share = self._share
         try:
             share.create()
@@ -88,7 +88,7 @@ class Worker:
         return int(self._queue[self._done % self._batch.capacity])
 
     def _wait(self) -> int:
-        """Wait until there are entries to execute; return how many there have been in all."""
+        """Wait until there are entries to execute; return how many there have been in total."""
         asked, number, done = self._batch.asked, self._number, self._done
 
         def has_more() -> bool:
@@ -104,7 +104,7 @@ class Worker:
         return int(asked[number])
 
     def _finish(self) -> None:
-        """Say that an entry is done."""
+        """Report that an entry is done."""
         batch = self._batch
         self._done += 1
         order()
@@ -118,13 +118,13 @@ class Worker:
         self._batch.sent[self._number] += 1
 
     def _command(self) -> Mapping[str, Any]:
-        """Return the next command; wait for it."""
+        """Wait for the next command, and return it."""
         while not self._commands:
             self._receive()
         return self._commands.popleft()
 
     def _receive(self) -> None:
-        """Read at least one message, and keep it if it is a command; the others only wake."""
+        """Read at least one message; keep commands, as others only wake this process."""
         while True:
             frame = self._reader.read(self._link)
             if frame is not None and frame.kind is Kind.REQUEST:
@@ -134,7 +134,7 @@ class Worker:
 
 
 def main() -> None:
-    """Run the worker of the command line."""
+    """Run the worker with the arguments from the command line."""
     prepare_worker()
     try:
         with contextlib.suppress(EOFError, ConnectionError):  # the other process is gone

@@ -1,4 +1,4 @@
-"""Workers: the processes of a vector environment, from their start to their end."""
+"""Workers: the processes of a vector environment, from start to exit."""
 
 from __future__ import annotations
 
@@ -38,22 +38,22 @@ _LAST_WORDS_TIME = 0.3
 _EXIT_TIME = 5.0
 _GRACE = 0.5
 _MAKE_TIME = 60.0
-"""Shortest time that processes have to make their environments, and to close them, in s."""
+"""Shortest time limit for processes to create their environments, and to close them, in s."""
 
 
 class Workers:
-    """Processes that execute the entries of their queues; one that fails ends all of them.
+    """Processes that execute the entries of their queues; if one fails, all are ended.
 
     Attributes:
-        is_open: Whether the processes run.
+        is_open: Whether the processes are running.
         asked: For each worker, how many entries its queue has had.
-        messages: What workers sent beside their results and errors: their numbers, and frames.
+        messages: What workers sent besides their results and errors: their numbers, and frames.
     """
 
     def __init__(
         self, batch: SharedBatch, file: int, setup: Mapping[str, Any], timeout: float
     ) -> None:
-        """Start the processes, and wait until all environments are made.
+        """Start the processes, and wait until all environments have been created.
 
         Args:
             batch: The shared memory.
@@ -67,7 +67,7 @@ class Workers:
         self._links: list[_Link] = []
         self._by_file: dict[int, int] = {}
         self._poll = select.poll()
-        self._spins = has_core_for_each(len(self._shares) + 1)  # this process is one more
+        self._spins = has_core_for_each(len(self._shares) + 1)  # including this process
         self._errors: dict[int, PhysxError] = {}
         self._received = [0] * len(self._shares)
         self.is_open = True
@@ -85,7 +85,7 @@ class Workers:
                 self._by_file[link.socket.fileno()] = number
                 self._poll.register(link.socket, select.POLLIN)
             for number, message in enumerate(messages):
-                self.ask(number, [COMMAND])  # to make the environments
+                self.ask(number, [COMMAND])  # to create the environments
                 self._send(number, message)
             self.wait(sum(self.asked))
         except BaseException:
@@ -113,7 +113,7 @@ class Workers:
 
         Args:
             name: Name of the command.
-            arguments: What each worker gets with it.
+            arguments: The argument for each worker.
 
         Returns:
             The answer of each worker; None if it has none.
@@ -145,7 +145,7 @@ class Workers:
 
         Raises:
             ClientError: If a worker ends, or an entry takes too long.
-            PhysxError: If environments raise; that of the first one.
+            PhysxError: If environments raise: the error of the first one.
         """
         batch = self._batch
 
@@ -178,14 +178,14 @@ class Workers:
         """End the processes; none is left when this returns.
 
         Args:
-            orderly: Wait until they have closed their environments, and raise what these raise;
-                otherwise they get a moment for it.
+            orderly: Whether to wait until they have closed their environments, and raise what these
+                raise; otherwise they get only a moment to do so.
         """
         if not self.is_open:
             return
         self.is_open = False
         try:
-            if os.getpid() == self._owner:  # a process forked from it leaves them alone
+            if os.getpid() == self._owner:  # a forked process leaves them alone
                 self._end(orderly)
         finally:
             for link in self._links:
@@ -194,7 +194,7 @@ class Workers:
             raise self._errors[min(self._errors)]
 
     def _sleep(self, is_done: Callable[[], bool]) -> None:
-        """Sleep until something is done; notice workers that end, or hang."""
+        """Sleep until something is done; detect workers that exit or hang."""
         batch = self._batch
         seen, since = list(batch.done), [time.monotonic()] * len(self._links)
         looked = since[0]
@@ -228,7 +228,7 @@ class Workers:
         return False
 
     def _send(self, number: int, message: bytes) -> None:
-        """Send a worker a message for which it waits."""
+        """Send a worker a message that it is waiting for."""
         link = self._links[number]
         link.socket.settimeout(self._timeout)
         try:
@@ -246,7 +246,7 @@ class Workers:
         raise error
 
     def _end(self, orderly: bool) -> None:
-        """Have the processes end, and kill those that do not."""
+        """Ask the processes to exit, and kill those that do not."""
         running = set(range(len(self._links)))
         self._timeout = max(self._timeout, _MAKE_TIME) if orderly else _GRACE
         until = time.monotonic() + self._timeout
@@ -270,7 +270,7 @@ class Workers:
                 link.process.close(_LAST_WORDS_TIME)
 
     def _end_of(self, number: int) -> ClientError:
-        """Return the error for a worker that has ended."""
+        """Return the error for a worker that has exited."""
         link, doing = self._links[number], self._describe_entry(number)
         status = link.process.wait(_EXIT_TIME)
         how = "closed its link" if status is None else describe_exit(status)
@@ -280,10 +280,10 @@ class Workers:
     def _silence_of(self, number: int) -> ClientError:
         """Return the error for a worker whose entry takes too long."""
         link, doing = self._links[number], self._describe_entry(number)
-        link.process.ask_to_end()  # it writes where it was
+        link.process.ask_to_end()  # it then writes where it was
         link.process.wait(_LAST_WORDS_TIME)
         text = (
-            f"sent nothing for {self._timeout:g} s {doing}. If that takes so long, raise timeout."
+            f"sent nothing for {self._timeout:g} s {doing}. If it needs more time, raise timeout."
         )
         return ClientError(number + 1, text, stderr=link.tail.text(_LAST_WORDS_TIME))
 
@@ -294,11 +294,11 @@ class Workers:
             f"environment {first}" if count == 1 else f"environments {first} to {first + count - 1}"
         )
         if not self.is_open:
-            return f"while it closed {mine}"
+            return f"while closing {mine}"
         if not done:
-            return f"while it made {mine}"
+            return f"while creating {mine}"
         if done == self.asked[number]:
-            return f"while it waited, with {mine}"
+            return f"while waiting, with {mine}"
         entry = int(self._batch.queues[number][done % self._batch.capacity])
         return f"in a call of {mine}" if entry == COMMAND else f"in environment {first + entry}"
 
@@ -314,7 +314,7 @@ class _Link:
         socket: The connection; non-blocking.
         reader: Reads its frames.
         process: The process.
-        tail: What it wrote to its standard error last.
+        tail: The end of its standard error output.
     """
 
     def __init__(self, number: int, file: int) -> None:
@@ -342,5 +342,5 @@ class _Link:
 
     def ring(self) -> None:
         """Wake the worker if it sleeps."""
-        with contextlib.suppress(OSError):  # it is gone, or has enough to wake up for
+        with contextlib.suppress(OSError):  # it is gone, or already has something to wake up for
             self.socket.send(_BELL)

@@ -28,11 +28,11 @@ _WITH_LAUNCHER = "godot-rl"
 
 @dataclass
 class Serve:
-    """Let other processes drive an environment, until Ctrl-C.
+    """Serve an environment to other processes, until Ctrl-C.
 
-    Clients of the protocol physx need a token. It is the content of --token-file, which is created
-    if it does not exist; or of the environment variable PHYSX_TOKEN; or of a new file that is
-    removed at the end.
+    Clients of the protocol physx need a token: the content of --token-file, which is created if it
+    does not exist, else the environment variable PHYSX_TOKEN, else a new file that is removed at
+    the end.
     """
 
     environment: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENVIRONMENT")]
@@ -40,19 +40,19 @@ class Serve:
     protocol: str = "physx"
     """"physx", "godot-gym", "godot-rl", or "package.module:Class"."""
     address: str = "127.0.0.1"
-    """Address to listen at; for godot-rl that of the trainer."""
+    """Address to listen at; for godot-rl, the trainer's address."""
     port: int | None = None
-    """Port; by default 9090 for godot-gym, the trainer's 11008 for godot-rl, or any free one."""
+    """Port; by default 9090 for godot-gym, the trainer's 11008 for godot-rl, else any free one."""
     num_worlds: int = 1
-    """How many worlds to serve on one connection."""
+    """Number of worlds to serve on one connection."""
     token_file: Annotated[Path | None, tyro.conf.arg(metavar="FILE")] = None
-    """File with the token of the protocol physx, readable by its owner alone."""
+    """File with the token of the protocol physx, readable only by its owner."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Arguments of the environment."""
     options: dict[str, Any] = field(default_factory=dict)
     """The protocol's own options, for example clients=serve for godot-gym."""
     write_launcher: Annotated[Path | None, tyro.conf.arg(metavar="FILE.x86_64")] = None
-    """Only for godot-rl: write a file for the trainer's env_path, and exit."""
+    """Only for godot-rl: write a launcher file for the trainer's env_path, and exit."""
 
 
 def run(words: Sequence[str]) -> None:
@@ -87,7 +87,7 @@ def run(words: Sequence[str]) -> None:
 
 @contextlib.contextmanager
 def _printed_log() -> Iterator[None]:
-    """Print the log of services."""
+    """Print the log of the services."""
     handler = logging.StreamHandler()
     handler.setFormatter(logging.Formatter("physx serve: %(message)s"))
     before = LOG.level
@@ -109,12 +109,12 @@ def _print_address(chosen: Serve, service: Service, token_file: str | None) -> N
         print(f"token: {place}", flush=True)
         given = f', token_file="{token_file}"' if token_file else ""
         print(f'  physx_remote.connect("{host}:{port}"{given})', flush=True)
-    print("Ctrl-C ends it.", flush=True)
+    print("Press Ctrl-C to stop.", flush=True)
 
 
 @contextlib.contextmanager
 def _token_file(given: Path | None) -> Iterator[str | None]:
-    """Yield the file with the token, None if it is in the environment; remove a generated one."""
+    """Yield the file with the token, None if it is in the environment; remove a generated file."""
     if given is None and TOKEN_VARIABLE in os.environ:
         yield None
     elif given is not None:
@@ -132,7 +132,7 @@ def _token_file(given: Path | None) -> Iterator[str | None]:
 
 
 def _write_token(path: Path) -> None:
-    """Write a new token into a new file that only its owner may read."""
+    """Write a new token to a new file that only its owner can read."""
     opened = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_EXCL, 0o600)
     with os.fdopen(opened, "w", encoding="ascii") as file:
         file.write(secrets.token_hex(32) + "\n")
@@ -144,7 +144,7 @@ def _write_launcher(chosen: Serve) -> None:
             f"--write-launcher is for trainers of godot-rl: add --protocol {_WITH_LAUNCHER}."
         )
     if chosen.options.keys() - {"action_repeat"}:
-        raise UsageError("A launcher keeps the option action_repeat only.")
+        raise UsageError("A launcher only supports the option action_repeat.")
     path = write_launcher(
         chosen.write_launcher or "",
         chosen.environment,

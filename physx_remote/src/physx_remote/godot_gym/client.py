@@ -1,4 +1,4 @@
-"""Clients of godot-gym: for services of physx, and for Godot applications that use the addon."""
+"""Clients of godot-gym, for physx services and for Godot applications with the addon."""
 
 from __future__ import annotations
 
@@ -26,14 +26,14 @@ from physx_remote.serving.spaces import (
 )
 
 Parts = dict[str, dict[str, Any] | None]
-"""The parts ``agent`` and ``world`` of an answer; None for an absent one."""
+"""The parts ``agent`` and ``world`` of an answer; None if absent."""
 
 
 class GodotGymClient(Closeable):
-    """Sends requests to a server of godot-gym and waits for the answers. A context manager.
+    """Sends requests to a godot-gym server and waits for the answers. A context manager.
 
     Attributes:
-        messages: Messages of the answers; None until the first answer if none were given.
+        messages: Messages of the answers; None until the first answer if none were passed.
     """
 
     def __init__(
@@ -51,7 +51,7 @@ class GodotGymClient(Closeable):
             options: See `ConnectOptions`.
 
         Raises:
-            ConfigError: If the messages are not of godot-gym's form.
+            ConfigError: If the messages do not have godot-gym's form.
             RemoteError: If nothing answers at the address.
         """
         self.messages = None if messages is None else Messages(messages)
@@ -65,20 +65,20 @@ class GodotGymClient(Closeable):
                 JSON data or arrays.
 
         Raises:
-            RequestError: If the request holds values that JSON cannot.
-            RemoteError: If the server reports an error, is gone, or does not answer in time.
+            RequestError: If the request contains values that JSON cannot represent.
+            RemoteError: If the server reports an error, disconnects, or does not answer in time.
         """
         return self.request_bytes(json.dumps(request, default=_to_list).encode())
 
     def request_bytes(self, request: bytes) -> Parts:
-        """Send a request already encoded as JSON; see `request`."""
+        """Send a request that is already encoded as JSON; see `request`."""
         body = self._link.exchange(request)
         if self.messages is None:
             self.messages = Messages.of_fields()
         return self.messages.read(body)
 
     def step(self, action: Any, requested_observation: Mapping[str, Any]) -> Parts:
-        """Have the agent act, and return the requested data."""
+        """Send an action to the agent, and return the requested data."""
         return self.request({"action": action, "observation": requested_observation})
 
     def reset(
@@ -88,12 +88,12 @@ class GodotGymClient(Closeable):
         seed: int | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> Parts:
-        """Begin an episode, and return the requested data.
+        """Start an episode, and return the requested data.
 
         Args:
-            requested_observation: Object with any of ``agent`` and ``world``.
-            seed: Seed of the episode; only services of physx use it.
-            options: Options of the reset; only services of physx use them.
+            requested_observation: Dictionary with any of ``agent`` and ``world``.
+            seed: Seed of the episode; only physx services use it.
+            options: Options of the reset; only physx services use them.
         """
         value = {"seed": seed, "options": options}
         given = {name: item for name, item in value.items() if item is not None}
@@ -104,18 +104,18 @@ class GodotGymClient(Closeable):
         self.request({"config": config})
 
     def set_time_speed(self, speed: float | None) -> None:
-        """Set how many times faster than real time to run; None: unlimited, only in physx."""
+        """Set the speed as a multiple of real time; None: unlimited, only in physx."""
         self.configure({"environment": {"time_speed": speed}})
 
     def set_repeat_action(self, frames: int) -> None:
-        """Set how many physics frames an action lasts."""
+        """Set the number of physics frames per action."""
         self.configure({"environment": {"repeat_action": frames}})
 
     def describe(self) -> dict[str, Any]:
         """Return the server's description of its messages and spaces; empty if it has none.
 
         Raises:
-            RemoteProtocolError: If the description is not one of physx.
+            RemoteProtocolError: If the description is not in physx's format.
         """
         body = self._link.exchange(b'{"observation": {"environment": ["description"]}}')
         text = read_extension(body, DESCRIPTION)
@@ -140,16 +140,16 @@ class GodotGymClient(Closeable):
         return description
 
     def close(self) -> None:
-        """End the connection; calling it again does nothing."""
+        """Close the connection; calling it again does nothing."""
         self._link.close()
 
 
 class GodotGymEnv(gymnasium.Env[Any, Any]):
-    """An environment behind a server of godot-gym.
+    """An environment served by a godot-gym server.
 
-    Services of physx describe their messages and spaces. For another server give them, and override
-    the interpretation of its data: `observation_of`, `reward_of`, `ended_of` and `info_of`. By
-    default the agent's fields are the observation, and the world's fields ``reward``,
+    physx services describe their messages and spaces. For other servers, pass them, and override
+    the interpretation of the data: `observation_of`, `reward_of`, `ended_of` and `info_of`. By
+    default, the agent's fields are the observation, and the world's fields ``reward``,
     ``terminated`` (or ``done``) and ``truncated`` have their usual meaning.
 
     Attributes:
@@ -171,23 +171,23 @@ class GodotGymEnv(gymnasium.Env[Any, Any]):
         time_speed: float | None = None,
         **options: Unpack[ConnectOptions],
     ) -> None:
-        """Connect, and ask the server for the messages and spaces that are not given.
+        """Connect, and request from the server the messages and spaces that were not passed.
 
         Args:
             address: Host and port.
             messages: See `GodotGymClient`.
             observation_space: Space of the observations; None: the server's, or unbounded arrays
-                in the shapes of the agent's fields.
+                with the shapes of the agent's fields.
             action_space: Space of the actions; None: the server's.
-            requested_observation: Object with any of ``agent`` and ``world``; None: all fields of
-                both by name.
-            repeat_action: How many physics frames an action lasts; None: unchanged.
-            time_speed: How many times faster than real time to run; None: unchanged.
+            requested_observation: Dictionary with any of ``agent`` and ``world``; None: all fields
+                of both, by name.
+            repeat_action: Number of physics frames per action; None: unchanged.
+            time_speed: Speed as a multiple of real time; None: unchanged.
             options: See `ConnectOptions`.
 
         Raises:
             ConfigError: If an argument has the wrong type.
-            RemoteError: If nothing answers, or the server does not describe what is not given.
+            RemoteError: If nothing answers, or the server does not describe what was not passed.
         """
         _check_given(observation_space, action_space, requested_observation)
         self.client = GodotGymClient(messages, address, **options)
@@ -213,20 +213,20 @@ class GodotGymEnv(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode; only services of physx use the seed and the options.
+        """Start an episode; only physx services use the seed and the options.
 
         Raises:
-            RemoteError: If the server reports an error, is gone, or does not answer in time.
+            RemoteError: If the server reports an error, disconnects, or does not answer in time.
         """
         super().reset(seed=seed)
         data = self.client.reset(self.requested_observation, seed=seed, options=options)
         return self.observation_of(data), self.info_of(data)
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Act.
+        """Step the environment.
 
         Raises:
-            RemoteError: If the server reports an error, is gone, or does not answer in time.
+            RemoteError: If the server reports an error, disconnects, or does not answer in time.
         """
         acted = json.dumps(to_json(self.action_space, action)).encode()
         data = self.client.request_bytes(b'{"action": ' + acted + self._rest)
@@ -235,16 +235,16 @@ class GodotGymEnv(gymnasium.Env[Any, Any]):
         return self.observation_of(data), reward, terminated, truncated, info
 
     def close(self) -> None:
-        """End the connection; calling it again does nothing."""
+        """Close the connection; calling it again does nothing."""
         self.client.close()
 
     # Interpretation of the data ---------------------------------------------------------------
 
     def observation_of(self, data: Parts) -> Any:
-        """Return the observation in an answer.
+        """Return the observation from an answer.
 
         Raises:
-            RemoteProtocolError: If a field of the observation is not in the answer.
+            RemoteProtocolError: If the answer lacks a field of the observation.
         """
         agent = data["agent"] or {}
         try:
@@ -252,20 +252,20 @@ class GodotGymEnv(gymnasium.Env[Any, Any]):
         except KeyError as error:
             raise RemoteProtocolError(
                 f"The answer lacks the field {error} of the observation; it has {list(agent)}. "
-                "Override observation_of, or give requested_observation."
+                "Override observation_of, or pass requested_observation."
             ) from None
         parts = zip(self._names, self._observations.leaves, values, strict=True)
         return self._observations.join(_to_leaf(name, leaf, value) for name, leaf, value in parts)
 
     def reward_of(self, data: Parts) -> float:
-        """Return the reward in an answer."""
+        """Return the reward from an answer."""
         try:
             return float((data["world"] or {}).get("reward", 0.0))
         except NONSENSE as error:
             raise _unexpected("reward_of", error) from error
 
     def ended_of(self, data: Parts) -> tuple[bool, bool]:
-        """Return whether the episode is terminated, and whether it is truncated."""
+        """Return whether the episode was terminated, and whether it was truncated."""
         world = data["world"] or {}
         ended = world.get("terminated", world.get("done", False))
         try:
@@ -274,7 +274,7 @@ class GodotGymEnv(gymnasium.Env[Any, Any]):
             raise _unexpected("ended_of", error) from error
 
     def info_of(self, data: Parts) -> dict[str, Any]:
-        """Return the info in an answer: ``info``, and the world's other fields by name."""
+        """Return the info from an answer: ``info``, and the world's other fields by name."""
         world = data["world"] or {}
         others = {n: v for n, v in world.items() if n not in OUTCOME and n != "done"}
         text = world.get("info")
@@ -286,19 +286,19 @@ class GodotGymEnv(gymnasium.Env[Any, Any]):
     # ----------------------------------------------------------------------------------------
 
     def _description(self, messages: Any, observation: Any, action: Any) -> dict[str, Any]:
-        """Return the server's description, if anything is missing."""
+        """Return the server's description if anything was not passed; otherwise it is empty."""
         if messages is not None and observation is not None and action is not None:
             return {}
         told = self.client.describe()
         if messages is None and not (told.get("messages") or {}).get("agent"):
             raise RemoteError(
-                "The server does not describe its messages. Give messages=: the module that protoc "
+                "The server does not describe its messages. Pass messages=: the module that protoc "
                 "generated for its application, or Messages.of_fields(agent=..., world=...)."
             )
         return told
 
     def _space(self, kind: str, told: Mapping[str, Any]) -> Space:
-        """Return a space that was not given."""
+        """Return a space that was not passed."""
         plain = told.get("spaces", {}).get(kind)
         if plain is not None:
             return build_space(plain)
@@ -306,7 +306,7 @@ class GodotGymEnv(gymnasium.Env[Any, Any]):
         fields = {name: field for name, field in declared.items() if isinstance(field, Field)}
         if not fields or any(field.shape is None for field in fields.values()):
             raise RemoteError(
-                f"The server does not describe its {kind}s: give {kind}_space=, a Gymnasium space."
+                f"The server does not describe its {kind}s: pass {kind}_space=, a Gymnasium space."
             )
         try:
             parts = {name: _unbounded(field) for name, field in fields.items()}
@@ -326,7 +326,7 @@ class GodotGymEnv(gymnasium.Env[Any, Any]):
 
 
 def _to_list(value: Any) -> Any:
-    """Return a NumPy array or number as data for JSON."""
+    """Return a NumPy array or number as JSON data."""
     if isinstance(value, (np.ndarray, np.generic)):
         return value.tolist()
     raise RequestError(f"A request takes JSON data and arrays; {value!r:.80} is neither.")
@@ -343,7 +343,7 @@ def _unbounded(field: Field) -> Space:
 
 def _unexpected(method: str, error: BaseException) -> RemoteProtocolError:
     return RemoteProtocolError(
-        f"The answer has other values than {method} expects: {error}. Override {method}."
+        f"The answer does not have the values that {method} expects: {error}. Override {method}."
     )
 
 
@@ -358,12 +358,12 @@ def _to_leaf(name: str, leaf: Space, value: Any) -> Any:
     except NONSENSE as error:
         raise RemoteProtocolError(
             f'The field "{name}" of the observation does not fit {leaf}: {error}. Override '
-            "observation_of, or give observation_space."
+            "observation_of, or pass observation_space."
         ) from error
 
 
 def _check_given(observation_space: Any, action_space: Any, requested: Any) -> None:
-    """Check the spaces and the requested observation; each may be None."""
+    """Validate the spaces and the requested observation; each may be None."""
     for option, space in (("observation", observation_space), ("action", action_space)):
         if space is not None and not isinstance(space, gymnasium.Space):
             raise ConfigError(f"{option}_space is {space!r:.80}, which is not a gymnasium.Space.")

@@ -23,13 +23,13 @@ Errors = Literal["tell", "close"]
 class Communication(SocketService):
     """Serves JSON requests of clients, one at a time.
 
-    A request is answered exactly once: with the message passed to `put_message`, or with an empty
-    one. A request that cannot be carried out is logged, and answered with the part ``error`` of
-    `physx_remote.godot_gym.messages`; the environment goes on.
+    Each request is answered exactly once: with the message passed to `put_message`, or with an
+    empty one. A request that cannot be carried out is logged, and answered with the part ``error``
+    of `physx_remote.godot_gym.messages`; the environment keeps running.
 
     Attributes:
         got_connection: Signal with a request, a dictionary. A connected function may return a
-            generator, which yields how long to wait before it goes on, in s.
+            generator that yields the time in s until it resumes.
     """
 
     def __init__(
@@ -43,23 +43,23 @@ class Communication(SocketService):
         patience: float | None = None,
         max_clients: int = 256,
     ) -> None:
-        """Keep the options.
+        """Store the options.
 
         Args:
-            clients: Treatment of a second client while one is served, which is from its first
-                request until it leaves: ``"queue"``, it waits; ``"refuse"``, it is closed at once;
-                ``"serve"``, its requests are answered in turn with those of the first.
-            reply: ``"always"``, or ``"observation-only"``: only requests with an observation are
-                answered, as in the first version of the protocol.
+            clients: What happens to a second client while one is being served (from its first
+                request until it leaves). ``"queue"``: it waits; ``"refuse"``: it is disconnected;
+                ``"serve"``: the requests of all clients are answered in turn.
+            reply: ``"always"``, or ``"observation-only"``: answer only requests with an
+                observation, as in the first version of the protocol.
             request_framing: ``"framed"``, or ``"bare-json"``: requests have no length prefix, as in
                 the first version.
-            errors: ``"tell"``, or ``"close"``: a request that cannot be carried out ends the
+            errors: ``"tell"``, or ``"close"``: a request that cannot be carried out closes the
                 connection.
-            max_request: Longest request in bytes; a client that sends a longer one is closed.
-            patience: How long a client may be silent, in s, while another waits; None: forever.
-            max_clients: How many clients may be connected; further ones are closed at their first
-                request. There may be as many connections without any whole request besides, or 32;
-                where another comes, one of those is closed.
+            max_request: Longest request in bytes; clients that send longer ones are disconnected.
+            patience: Time in s that a client may be silent while another waits; None: forever.
+            max_clients: Maximum number of clients; further ones are disconnected at their first
+                request. In addition, as many connections that have not sent a whole request are
+                kept, but at least 32; if another arrives, one of them is closed.
 
         Raises:
             ConfigError: If a value is out of range.
@@ -77,9 +77,9 @@ class Communication(SocketService):
                 raise ConfigError(f"{name} is {value!r} but must be one of {known}.")
         for name, number in (("max_request", max_request), ("max_clients", max_clients)):
             if type(number) is not int or number < 1:
-                raise ConfigError(f"{name} is {number!r} but must be a whole number, at least 1.")
+                raise ConfigError(f"{name} is {number!r} but must be an integer of at least 1.")
         if patience is not None and (type(patience) not in (int, float) or not patience > 0):
-            raise ConfigError(f"patience is {patience!r} but must be a number of s above 0.")
+            raise ConfigError(f"patience is {patience!r} but must be a positive number of seconds.")
         self.got_connection = Signal()
         self._clients, self._reply, self._errors = clients, reply, errors
         self._framing, self._max_request, self._patience = request_framing, max_request, patience
@@ -94,7 +94,7 @@ class Communication(SocketService):
 
     @property
     def is_abandoned(self) -> bool:
-        """Whether the client left whose request is being carried out.
+        """Whether the client whose request is being carried out has left.
 
         A client that has shut down sending may still read; it counts as gone once another waits.
         """
@@ -104,21 +104,21 @@ class Communication(SocketService):
         return any(other.body is not None for other in self.connections if other is not asking)
 
     def start_server(self, port: int, address: str = "127.0.0.1") -> None:
-        """Begin to listen.
+        """Start listening.
 
         Args:
             port: Port; 0: any free one.
-            address: Address of this machine. There is no authentication: anyone who reaches it can
-                drive the environment.
+            address: Address of this machine. There is no authentication: anyone who can reach it
+                can drive the environment.
 
         Raises:
-            UsageError: If it listens already, or is closed.
-            ConfigError: If the port or address is not valid.
+            UsageError: If it is already listening, or was closed.
+            ConfigError: If the port or address is invalid.
             RemoteError: If it cannot listen there.
         """
         check_address(address, port)
         if self.is_listening:
-            raise UsageError(f"The server listens already, at {self.address}.")
+            raise UsageError(f"The server is already listening at {self.address}.")
         if self._over:
             raise UsageError(
                 "A closed environment cannot be served again: create another environment."
@@ -133,18 +133,18 @@ class Communication(SocketService):
         return self.poll(timeout)
 
     def put_message(self, message: Any = None) -> None:
-        """Answer the request that is being carried out.
+        """Answer the current request.
 
         Args:
             message: A protobuf message, or its bytes; None: no data were requested.
 
         Raises:
-            UsageError: If no request is being carried out, or it is answered already.
+            UsageError: If there is no current request, or it was already answered.
         """
         if self._asking is None:
-            raise UsageError("put_message() answers a request, but there is none.")
+            raise UsageError("put_message() answers the current request, but there is none.")
         if self._answered:
-            raise UsageError("This request is answered already.")
+            raise UsageError("This request was already answered.")
         self._answered = True
         if message is None:
             if self._reply == "observation-only":
@@ -161,7 +161,7 @@ class Communication(SocketService):
         return kind(self._max_request)
 
     def on_open(self, connection: RequestConnection) -> None:
-        """Close a further client, or log that it waits."""
+        """Close another client's connection, or log that the client waits."""
         if self._served is None or self._clients == "serve":
             self.log.info(connection.name, "%s connected", connection.name)
         elif self._clients == "refuse" and not self._served.ended:
@@ -171,7 +171,7 @@ class Communication(SocketService):
             self.log.info(name, "%s waits until %s leaves", name, served)
 
     def on_close(self, connection: RequestConnection) -> None:
-        """Make room for the next client."""
+        """Free the place for the next client."""
         if connection is self._served:
             self.log.info(connection.name, "%s left", connection.name)
             self._served = None
@@ -212,7 +212,7 @@ class Communication(SocketService):
         text = str(error) if expected else f"{type(error).__name__}: {error}"
         cause = None if expected else error
         name = connection.name
-        self.log.error(name, "A request of %s failed: %s", name, text, cause=cause)
+        self.log.error(name, "A request from %s failed: %s", name, text, cause=cause)
         if self._answered:
             return
         if self._errors == "close":
@@ -221,7 +221,7 @@ class Communication(SocketService):
             self.put_message(encode_extension(ERROR, text))
 
     def _look_for_silence(self) -> None:
-        """Close a silent client that keeps others waiting."""
+        """Disconnect a silent client that keeps others waiting."""
         patience, served = self._patience or 0.0, self._served
         self.after(patience / 4, self._look_for_silence)
         others = any(c is not served for c in self.connections)

@@ -1,4 +1,4 @@
-"""PhysicsFramesTimer, which counts physics frames, and Signal, a list of callbacks."""
+"""PhysicsFramesTimer, which counts physics frames; Signal, a list of callbacks."""
 
 from __future__ import annotations
 
@@ -7,18 +7,18 @@ from typing import Any, Self
 
 
 class Signal:
-    """Functions to call on an event, in the order of their connection."""
+    """Functions to call on an event, in the order in which they were connected."""
 
     def __init__(self) -> None:
         self._functions: list[Callable[..., Any]] = []
 
     def connect(self, function: Callable[..., Any]) -> None:
-        """Add a function, unless it is connected already."""
+        """Add a function unless it is already connected."""
         if function not in self._functions:
             self._functions.append(function)
 
     def disconnect(self, function: Callable[..., Any]) -> None:
-        """Remove a function, if it is connected."""
+        """Remove a function if it is connected."""
         if function in self._functions:
             self._functions.remove(function)
 
@@ -28,18 +28,18 @@ class Signal:
 
 
 class PhysicsFramesTimer:
-    """Counts physics frames and emits a signal when more have begun than its limit.
+    """Counts physics frames and emits a signal when more frames have started than its limit.
 
     Within `RLEnvironment._step`, ``yield timer.start()`` in a generator or ``await timer.start()``
     in a coroutine waits for it while physics runs.
 
     Attributes:
-        timer_end: Signal without arguments, emitted when a frame beyond the limit begins.
+        timer_end: Signal without arguments, emitted when a frame beyond the limit starts.
         is_started: Whether it is counting.
     """
 
     def __init__(self, limit: int = 4) -> None:
-        """Set the limit; `start` begins to count.
+        """Set the limit; `start` starts counting.
 
         Args:
             limit: Number of frames until the end, 0 or more.
@@ -54,12 +54,12 @@ class PhysicsFramesTimer:
         self._limit = limit
 
     def start(self) -> Self:
-        """Restart from 0; return the timer itself."""
+        """Restart from 0; return this timer."""
         self._count, self.is_started = 0, True
         return self
 
     def step(self) -> None:
-        """Count the frame that begins."""
+        """Count a frame at its start."""
         if not self.is_started:
             return
         self._count += 1

@@ -18,20 +18,20 @@ from physx_remote.serving.worlds import Worlds
 class GymnasiumScene(RLEnvironment):
     """Serves one Gymnasium environment as an `RLEnvironment`.
 
-    ``action`` makes `repeat_action` steps of the environment, 1 unless configured, or fewer if the
-    episode ends; their rewards are added up. The agent's data are the leaves of the observation, in
-    the fields of `observation_fields`. The world's data are ``reward``, ``terminated``,
-    ``truncated`` and ``info`` of the last action. ``reset`` takes an object with ``seed`` and
-    ``options``. Nothing resets by itself: the last observation of an episode stays until then.
+    ``action`` makes `repeat_action` steps of the environment, 1 by default, or fewer if the episode
+    ends; their rewards are summed. The agent's data are the leaves of the observation, in the
+    fields of `observation_fields`. The world's data are ``reward``, ``terminated``, ``truncated``
+    and ``info`` of the last action. ``reset`` takes an object with ``seed`` and ``options``. There
+    is no automatic reset: the last observation of an episode remains until the client resets.
     """
 
     def __init__(self, worlds: Worlds) -> None:
-        """Take the only world."""
+        """Wrap the only world."""
         super().__init__()
         if worlds.num_worlds != 1:
             raise UsageError(
-                f'The protocol "godot-gym" serves one world, and there are {worlds.num_worlds}. '
-                'The protocol "physx" serves several.'
+                f'The protocol "godot-gym" serves one world, but there are {worlds.num_worlds}. '
+                'Use the protocol "physx" for several.'
             )
         self.worlds = worlds
         self.repeat_action = 1
@@ -61,7 +61,7 @@ class GymnasiumScene(RLEnvironment):
             yield 0.0
 
     def _reset(self) -> None:
-        """Begin an episode."""
+        """Start an episode."""
         agent, outcome = self._parts()
         value = self.reset_request if isinstance(self.reset_request, dict) else {}
         seed, options = value.get(self.SEED_KEY), value.get("options")
@@ -71,7 +71,7 @@ class GymnasiumScene(RLEnvironment):
         outcome.set(0.0, False, False, info)
 
     def close(self) -> None:
-        """End all connections and close the environment."""
+        """Close all connections and the environment."""
         super().close()
         self.worlds.close()
 
@@ -94,17 +94,17 @@ class _GymnasiumAgent(RLAgent):
         self._tree, self._names = tree, observation_fields(tree)
 
     def get_data(self, request: Any, storage: Any) -> None:
-        """Write the whole observation, whatever names are requested."""
+        """Write the whole observation, regardless of the requested names."""
         if self.observation is None:
             raise RequestError("There is no observation yet: reset first.")
         fill(storage, **dict(zip(self._names, self._tree.split(self.observation), strict=True)))
 
 
 class _GymnasiumWorld(RLEnvWorld):
-    """The outcome of the last action in a Gymnasium environment.
+    """The result of the last action in a Gymnasium environment.
 
     Attributes:
-        is_running: Whether an episode has begun and is not over.
+        is_running: Whether an episode has started and is not over.
     """
 
     def __init__(self) -> None:
@@ -112,7 +112,7 @@ class _GymnasiumWorld(RLEnvWorld):
         self._values: dict[str, Any] = {}
 
     def set(self, reward: float, terminated: bool, truncated: bool, info: Any) -> None:
-        """Keep the outcome of an action."""
+        """Store the result of an action."""
         self.is_running = not (terminated or truncated)
         text = json.dumps(to_json_data(info)) if info else ""
         self._values = dict(zip(OUTCOME, (reward, terminated, truncated, text), strict=True))

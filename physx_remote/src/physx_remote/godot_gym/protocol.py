@@ -1,4 +1,4 @@
-"""GodotGym: requests as JSON and answers as protobuf, compatible with godot_gym_api."""
+"""GodotGym: JSON requests and protobuf answers, compatible with godot_gym_api."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ class GodotGym(Protocol):
     name: ClassVar[str] = "godot-gym"
 
     def __init__(self, **options: Any) -> None:
-        """Keep the options of `Communication`; without any an `RLEnvironment` uses its own."""
+        """Store the options of `Communication`; without any, an `RLEnvironment` uses its own."""
         known = Communication.__init__.__kwdefaults__ or {}
         check_names(f'The protocol "{self.name}"', options, known)
-        Communication(**options)  # checks the values
+        Communication(**options)  # validates the values
         self._options = options
 
     def service(self, worlds: Worlds | Scene, *, address: str, port: int) -> GodotGymService:
@@ -34,7 +34,7 @@ class GodotGym(Protocol):
             raise UsageError(f"{type(environment).__name__} is not an RLEnvironment.")
         if environment.communication.is_listening:
             raise UsageError(
-                f"This {type(environment).__name__} is or was served already: create another one."
+                f"This {type(environment).__name__} was already served: create a new one."
             )
         if self._options:
             environment.communication.close()
@@ -65,12 +65,12 @@ class GodotGymService(Service):
     """
 
     def __init__(self, environment: RLEnvironment) -> None:
-        """Take the environment."""
+        """Store the environment."""
         self.environment = environment
 
     @property
     def address(self) -> tuple[str, int]:  # type: ignore[override]
-        """Host and port where it really listens."""
+        """Host and port at which it listens."""
         return self.environment.communication.address
 
     def poll(self, timeout: float | None = 0.0) -> bool:
@@ -78,5 +78,5 @@ class GodotGymService(Service):
         return self.environment._process(timeout)
 
     def close(self) -> None:
-        """End all connections and close the environment."""
+        """Close all connections and the environment."""
         self.environment.close()

@@ -1,4 +1,4 @@
-"""Requests of godot-gym: their boundaries in a stream, parsing and validation."""
+"""Requests of godot-gym: finding them in a stream, parsing and validation."""
 
 from __future__ import annotations
 
@@ -35,28 +35,28 @@ def parse_request(body: bytes) -> dict[str, Any]:
 
 
 def as_object(key: str, value: Any) -> dict[str, Any]:
-    """Return a value that must be a JSON object."""
+    """Return a value after checking that it is a JSON object."""
     if not isinstance(value, dict):
         raise RequestError(f'The value of "{key}" must be a JSON object, not {value!r:.60}.')
     return value
 
 
 def as_count(key: str, value: Any, least: int = 0) -> int:
-    """Return a number of physics frames or steps."""
+    """Return a number of physics frames or steps, after validating it."""
     if not _is_number(value) or value != int(value) or value < least:
         raise RequestError(f"{key} must be an integer of at least {least}, not {value!r:.60}.")
     return int(value)
 
 
 def as_seed(value: Any) -> int:
-    """Return a seed."""
+    """Return a seed after validating it."""
     if isinstance(value, bool) or not isinstance(value, int) or value < 0:
         raise RequestError(f"A seed must be a non-negative integer, not {value!r:.60}.")
     return value
 
 
 def as_speed(value: Any) -> float | None:
-    """Return how many times faster than real time to run; None: as fast as possible."""
+    """Return a speed as a multiple of real time, after validating it; None: unlimited."""
     if value is None:
         return None
     if not _is_number(value) or value <= 0:
@@ -76,7 +76,7 @@ class JsonReader(BufferReader):
     """Splits a stream of JSON objects without length prefixes."""
 
     def __init__(self, limit: int) -> None:
-        """Begin before an object.
+        """Start before an object.
 
         Args:
             limit: Size of the longest accepted object in bytes.
@@ -87,7 +87,7 @@ class JsonReader(BufferReader):
         self._in_text = False
 
     def take(self) -> bytes | None:
-        """Return the next whole object, or None until more has arrived."""
+        """Return the next complete object; None if it has not arrived yet."""
         if self._depth == 0:
             space = len(self.buffer) - len(self.buffer.lstrip())
             del self.buffer[:space]
@@ -112,7 +112,7 @@ class JsonReader(BufferReader):
         while (found := _PARTS.search(self.buffer, self._looked)) is not None:
             mark, end = found.group(), found.end()
             if mark == b"\\":
-                if end == len(self.buffer):  # the escaped character has not arrived
+                if end == len(self.buffer):  # the escaped character has not arrived yet
                     self._looked = found.start()
                     return
                 end += 1

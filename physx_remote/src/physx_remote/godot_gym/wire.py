@@ -1,4 +1,4 @@
-"""The fields in which Gymnasium environments travel over godot-gym."""
+"""The fields that represent Gymnasium environments in godot-gym."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ _RESERVED = {"env_id", "episode", "step"}
 
 
 def observation_fields(tree: SpaceTree) -> list[str]:
-    """Return the names of the fields that carry the leaves of an observation.
+    """Return the names of the fields for the leaves of an observation.
 
-    The field of a space without parts is ``observation``. A part is named by its keys, joined by
-    ``__``, if that gives every part a valid and distinct name, and by its number otherwise.
+    A space without parts has the single field ``observation``. Parts are named by their keys,
+    joined by ``__``, if all of these names are valid and distinct; otherwise by their numbers.
     """
     if tree.is_leaf:
         return [OBSERVATION]

@@ -1,4 +1,4 @@
-"""Agents: worlds as a trainer of godot-rl sees them."""
+"""Agents: worlds as the agents of a godot-rl trainer."""
 
 from __future__ import annotations
 
@@ -14,7 +14,7 @@ from physx_remote.serving.json_data import to_json_data
 from physx_remote.serving.worlds import Worlds
 
 Answer: TypeAlias = Generator[float, None, dict[str, Any]]
-"""Work that yields now and then how long to wait before it goes on, in s; returns the answer."""
+"""Work that yields the time in s until it resumes, and returns the answer."""
 _Moved: TypeAlias = tuple[dict[str, Any], float, bool, dict[str, Any]]
 
 _POLICY = "shared_policy"
@@ -22,22 +22,22 @@ _NOT_CALLED = ("close", "reset", "step")
 
 
 class Agents:
-    """Worlds as the agents of a trainer, one agent each.
+    """Worlds as the agents of a trainer, one agent per world.
 
-    An agent whose episode ends begins the next one at once, and its answer holds the first
-    observation of the new episode. The last observation of the old one is in its info as
-    ``terminal_observation``, beside ``terminated``, ``truncated`` and ``TimeLimit.truncated``.
+    When an agent's episode ends, the next one starts immediately, and the answer contains the first
+    observation of the new episode. The last observation of the old one is in the info as
+    ``terminal_observation``, along with ``terminated``, ``truncated`` and ``TimeLimit.truncated``.
 
     Attributes:
         requests: Type of a message to the method that answers it.
     """
 
     def __init__(self, worlds: Worlds, action_repeat: int, seed: int | None) -> None:
-        """Take the worlds.
+        """Store the worlds.
 
         Args:
-            worlds: One for each agent.
-            action_repeat: Steps of the environment in one step of the trainer.
+            worlds: One world per agent.
+            action_repeat: Environment steps per step of the trainer.
             seed: Seed of the first episodes; None: unseeded.
         """
         self._worlds = worlds
@@ -65,7 +65,7 @@ class Agents:
         }
 
     def _reset(self, message: dict[str, Any]) -> Answer:
-        """Begin new episodes everywhere; the key ``seed`` is an extension of physx."""
+        """Start new episodes in all worlds; the key ``seed`` is an extension of physx."""
         seed = message.get("seed")
         if seed is not None:
             if type(seed) is not int or seed < 0:
@@ -75,7 +75,7 @@ class Agents:
         return {"type": "reset", "obs": [seen for seen, _ in begun], "info": [i for _, i in begun]}
 
     def _begin_episodes(self) -> Generator[float, None, list[tuple[Any, Any]]]:
-        """Begin new episodes everywhere; return each agent's observation and info."""
+        """Start new episodes in all worlds; return each agent's observation and info."""
         self._is_begun = False
         seed, self._seed = self._seed, None
         begun = []
@@ -91,7 +91,7 @@ class Agents:
         actions = self._read(message.get("action"))
         if not self._is_begun:
             yield from self._begin_episodes()
-        self._is_begun = False  # after a failure the worlds are no longer in step
+        self._is_begun = False  # after a failure, the worlds are no longer in step
         answer: dict[str, Any] = {"type": "step", "obs": [], "reward": [], "done": [], "info": []}
         for world, action in enumerate(actions):
             seen, reward, is_done, told = yield from self._move(world, action)
@@ -103,7 +103,7 @@ class Agents:
         return answer
 
     def _move(self, world: int, action: Any) -> Generator[float, None, _Moved]:
-        """Repeat one agent's action, and begin its next episode if this one ends."""
+        """Repeat one agent's action, and start its next episode if this one ends."""
         reward, terminated, truncated, left = 0.0, False, False, self._action_repeat
         while left and not (terminated or truncated):
             moved = self._call_in(world, self._worlds.step, world, action)
@@ -123,7 +123,7 @@ class Agents:
         return seen, reward, is_done, told
 
     def _read(self, given: Any) -> list[Any]:
-        """Return the agents' actions; all are checked before any agent moves."""
+        """Return the agents' actions; all are validated before any agent moves."""
         count = self._worlds.num_worlds
         if not isinstance(given, list) or len(given) != count:
             has = len(given) if isinstance(given, list) else type(given).__name__
@@ -143,7 +143,7 @@ class Agents:
         if not isinstance(name, str) or not name.isidentifier() or name.startswith("_"):
             raise RequestError(f'"method" is {name!r}, which is not the name of a public method.')
         if name in _NOT_CALLED:
-            raise RequestError(f'"{name}" has a message of its own and cannot be called.')
+            raise RequestError(f'"{name}" has its own message type and cannot be called.')
         methods = [self._method(environment, name) for environment in self._worlds.environments]
         returns = []
         for world, method in enumerate(methods):
@@ -161,7 +161,7 @@ class Agents:
         raise RequestError(f'{self._worlds.name} has no method "{name}".{nearest(name, known)}')
 
     def _call_in(self, world: int, function: Callable[..., Any], *arguments: Any) -> Any:
-        """Call the environment's code; its errors name the agent."""
+        """Call the environment's code; errors name the agent."""
         try:
             return function(*arguments)
         except Exception as error:
@@ -170,7 +170,7 @@ class Agents:
 
 
 def _seed_of(seed: int | None, world: int) -> int | None:
-    """Return the seed of one world: that of world 0 is the seed itself."""
+    """Return the seed of one world; world 0 gets the seed itself."""
     if seed is None or world == 0:
         return seed
     return int(np.random.SeedSequence(seed, spawn_key=(world,)).generate_state(1)[0])

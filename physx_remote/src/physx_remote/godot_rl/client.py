@@ -29,19 +29,19 @@ from physx_remote.serving.connect_options import ConnectOptions
 from physx_remote.serving.spaces import NONSENSE, Space, check_shape
 
 VERSION = {"major_version": "0", "minor_version": "7"}
-"""Version of the protocol in the handshake."""
+"""Version of the protocol sent in the handshake."""
 
 
 class _Incoming(RequestLink):
-    """The connection of an application that connects to an address."""
+    """The connection of an application, which connects to this side."""
 
     def _connected(self, address: tuple[str, int], patience: float) -> socket.socket:
         try:
             listener = socket.create_server(address)
         except (OSError, OverflowError) as error:
             raise RemoteError(
-                f"Cannot listen at {self.name}: {error}. A running trainer, or another program, "
-                "may have the port."
+                f"Cannot listen at {self.name}: {error}. Another program, such as a running "
+                "trainer, may be using the port."
             ) from error
         with listener:
             listener.settimeout(patience)
@@ -50,17 +50,17 @@ class _Incoming(RequestLink):
             except TimeoutError as error:
                 raise RemoteTimeoutError(
                     f"No application connected to {self.name} within {patience:g} s. Start it with "
-                    "this port, or give a longer connect_timeout."
+                    "this port, or set a longer connect_timeout."
                 ) from error
 
 
 class GodotRLVectorEnv(VectorEnv[Any, Any, Any], Closeable):
     """The agents of an application that connects to an address: the trainer's side of godot-rl.
 
-    Observations and actions are dictionaries by the application's keys; a single key ``obs`` or
-    ``action`` is left out. Agents whose episode ends go on with the next one by themselves. If the
-    application sends them, as services of physx do, terminated and truncated are distinguished and
-    ``final_obs`` is in the infos; otherwise an episode that is done counts as terminated.
+    Observations and actions are dictionaries with the application's keys; a single key ``obs`` or
+    ``action`` is dropped. An agent whose episode ends starts the next one automatically. If the
+    application sends both, as physx services do, terminated and truncated are distinguished and
+    ``final_obs`` is in the infos; otherwise, an episode that is done counts as terminated.
     """
 
     def __init__(
@@ -98,15 +98,16 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any], Closeable):
     def reset(
         self, *, seed: Any = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin new episodes everywhere.
+        """Start new episodes in all worlds.
 
         Args:
-            seed: Seed of the application; only services of physx use it.
+            seed: Seed of the application; only physx services use it.
             options: Must be empty.
 
         Raises:
             UsageError: If there are options, or the seed is not an integer.
-            RemoteError: If the application reports an error, is gone, or does not answer in time.
+            RemoteError: If the application reports an error, disconnects, or does not answer in
+                time.
         """
         if options:
             raise UsageError(f"godot-rl takes no reset options: {list(options)}.")
@@ -117,16 +118,17 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         return self._batch(observations), self._merge(each)
 
     def reset_each(self, seed: int | None) -> tuple[list[Any], list[dict[str, Any]]]:
-        """Begin new episodes everywhere; return each agent's observation and info."""
+        """Start new episodes in all worlds; return each agent's observation and info."""
         told = self._ask({"type": "reset"} | ({} if seed is None else {"seed": seed}), "reset")
         seen = _each(told, "obs", self.num_envs)
         return [self._observation(one) for one in seen], self._infos(told)
 
     def step(self, actions: Any) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
-        """Have all agents act.
+        """Step all agents.
 
         Raises:
-            RemoteError: If the application reports an error, is gone, or does not answer in time.
+            RemoteError: If the application reports an error, disconnects, or does not answer in
+                time.
         """
         by_name = isinstance(self.single_action_space, spaces.Dict)
         entries = actions if by_name else {ACTION: actions}
@@ -136,17 +138,17 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         return self._batch(observations), rewards, terminated, truncated, self._merge(each)
 
     def plain_actions(self, entries: Mapping[str, Any]) -> dict[str, Any]:
-        """Return actions by the application's keys as numbers and lists of numbers."""
+        """Return actions with the application's keys as numbers and lists of numbers."""
         parts = self._acted.items()
         return {n: np.asarray(entries[n], space.dtype).tolist() for n, space in parts}
 
     def step_each(
         self, acted: list[dict[str, Any]]
     ) -> tuple[list[Any], Array, Array, Array, list[dict[str, Any]]]:
-        """Have all agents act.
+        """Step all agents.
 
         Args:
-            acted: Each agent's action by the application's keys, as numbers and lists of numbers.
+            acted: Each agent's action with the application's keys, as numbers and lists of numbers.
 
         Returns:
             Each agent's observation, reward, terminated, truncated and info.
@@ -170,14 +172,20 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any], Closeable):
             raise RemoteProtocolError(f"The application sent an invalid reward: {error}.") from None
 
     def call(self, name: str, *args: Any, **kwargs: Any) -> tuple[Any, ...]:
-        """Call a method without arguments of all agents, and return their answers."""
+        """Call a method without arguments for all agents, and return their results.
+
+        Raises:
+            UsageError: If there are arguments.
+            RemoteError: If the application reports an error, disconnects, or does not answer in
+                time.
+        """
         if args or kwargs:
             raise UsageError("godot-rl can only call methods without arguments.")
         told = self._ask({"type": "call", "method": name}, "call")
         return tuple(_each(told, "returns", self.num_envs, object))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """Have the application end, and end the connection."""
+        """Close the application and the connection."""
         try:
             self._link.tell(b'{"type": "close"}')
         except RemoteError:
@@ -216,7 +224,7 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any], Closeable):
                 infos = self._add_info(infos, info, agent)
         except NONSENSE as error:
             raise RemoteProtocolError(
-                f"The infos of the agents do not fit together: {error}."
+                f"The infos of the agents are incompatible: {error}."
             ) from error
         return infos
 
@@ -239,10 +247,10 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any], Closeable):
 
 
 class GodotRLEnv(gymnasium.Env[Any, Any]):
-    """The one agent of an application that connects to an address: see `GodotRLVectorEnv`.
+    """The only agent of an application that connects to an address: see `GodotRLVectorEnv`.
 
     Attributes:
-        agents: The vector environment that holds it.
+        agents: The vector environment that contains it.
     """
 
     def __init__(
@@ -254,7 +262,7 @@ class GodotRLEnv(gymnasium.Env[Any, Any]):
 
         Args:
             address: Host and port where the application is expected.
-            options: Those of `GodotRLVectorEnv`.
+            options: Options of `GodotRLVectorEnv`.
 
         Raises:
             RemoteError: As for `GodotRLVectorEnv`, or if the application has several agents.
@@ -271,7 +279,13 @@ class GodotRLEnv(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode: see `GodotRLVectorEnv.reset`."""
+        """Start an episode: see `GodotRLVectorEnv.reset`.
+
+        Raises:
+            UsageError: If there are options.
+            RemoteError: If the application reports an error, disconnects, or does not answer in
+                time.
+        """
         super().reset(seed=seed)
         if options:
             raise UsageError(f"godot-rl takes no reset options: {list(options)}.")
@@ -279,7 +293,7 @@ class GodotRLEnv(gymnasium.Env[Any, Any]):
         return observations[0], infos[0]
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Act; at the end of an episode the observation is its last one."""
+        """Step the agent; at the end of an episode, the observation is its last one."""
         entries = action if isinstance(self.action_space, spaces.Dict) else {ACTION: action}
         told = self.agents.step_each([self.agents.plain_actions(entries)])
         observations, rewards, terminated, truncated, infos = told
@@ -287,12 +301,12 @@ class GodotRLEnv(gymnasium.Env[Any, Any]):
         return seen, float(rewards[0]), bool(terminated[0]), bool(truncated[0]), infos[0]
 
     def close(self) -> None:
-        """Have the application end, and end the connection."""
+        """Close the application and the connection."""
         self.agents.close()
 
 
 def _each(told: Mapping[str, Any], key: str, count: int, kind: Any = dict) -> list[Any]:
-    """Return an answer's values of all agents, checked to be of a type."""
+    """Return an answer's values for all agents, after checking their type."""
     values = told.get(key)
     is_list = isinstance(values, list) and len(values) == count
     if not is_list or not all(isinstance(value, kind) for value in values or ()):
@@ -324,7 +338,7 @@ def _spaces(told: Mapping[str, Any], key: str, count: int, make: Any) -> dict[st
             check_shape(space.shape or (), count)
     except NONSENSE as error:
         raise RemoteProtocolError(
-            f"The {key} {reprlib.repr(each)} is not valid: {error!r}."
+            f"The {key} {reprlib.repr(each)} is invalid: {error!r}."
         ) from error
     return parts
 

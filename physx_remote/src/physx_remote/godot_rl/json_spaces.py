@@ -14,7 +14,7 @@ from physx_core.errors import ActionError, ConfigError, listed
 from physx_remote.serving.spaces import Leaf, Path, Space, SpaceTree, check_shape
 
 IMAGE = "2d"
-"""Mark of an image's key; the value is bytes in hexadecimal."""
+"""Mark in an image's key; the value is bytes in hexadecimal."""
 
 OBSERVATION, ACTION = "obs", "action"
 """Keys of the values of spaces without parts."""
@@ -24,7 +24,7 @@ _LARGEST = sys.float_info.max
 
 
 def _key(path: Path, root: str) -> str:
-    """Return the key of a part: names joined by dots, numbers by underscores."""
+    """Return the key of a part: names are joined by dots, numbers by underscores."""
     key = ""
     for step in path:
         if isinstance(step, int):
@@ -38,12 +38,12 @@ def _key(path: Path, root: str) -> str:
 
 
 class ObservationWriter:
-    """Converts observations of a space to data for JSON.
+    """Converts observations of a space to JSON data.
 
-    Vectors become lists of numbers; images, which are arrays of uint8 with three axes, become
-    hexadecimal text, with ``_2d`` appended to keys that do not contain ``2d``. The parts of nested
-    spaces become separate entries. A space without parts is the entry ``obs``, or ``camera_2d`` if
-    it is an image.
+    Vectors become lists of numbers; images (arrays of uint8 with three axes) become hexadecimal
+    text, and ``_2d`` is appended to keys that do not contain ``2d``. The parts of nested spaces
+    become separate entries. A space without parts is the entry ``obs``, or ``camera_2d`` if it is
+    an image.
 
     Attributes:
         description: The entries in ``env_info``.
@@ -62,7 +62,7 @@ class ObservationWriter:
             self._writers.append(write)
 
     def write(self, observation: Any) -> dict[str, Any]:
-        """Return an observation as data for JSON."""
+        """Return an observation as JSON data."""
         values = self._tree.split(observation)
         parts = zip(self.description, self._writers, values, strict=True)
         return {name: write(value) for name, write, value in parts}
@@ -80,7 +80,7 @@ def _describe_observation(
     if IMAGE in name:
         raise ConfigError(
             f'The part "{name}" of the observation is not an image (uint8 with three axes), but '
-            f'godot-rl takes every name with "{IMAGE}" for one. Give it another name.'
+            f'godot-rl treats every name with "{IMAGE}" as one. Rename the part.'
         )
     if isinstance(space, spaces.Discrete):
         start = int(space.start)
@@ -90,7 +90,7 @@ def _describe_observation(
 
 
 def _bounds(space: Any) -> dict[str, float]:
-    """Return the common bounds of all components; empty if there are none."""
+    """Return the common bounds of all components; empty if there are no finite ones."""
     if isinstance(space, spaces.Box):
         if not math.prod(space.shape):
             return {}
@@ -119,7 +119,7 @@ class ActionReader:
 
     Continuous actions are between -1 and 1. They are clipped to that range and scaled to the bounds
     of the space; if a bound is infinite, the number itself is the action. Discrete actions are
-    numbers from 0. Spaces of several discrete numbers become entries ``NAME_0``, ``NAME_1`` and so
+    numbers from 0. Spaces of several discrete numbers become entries ``NAME_0``, ``NAME_1``, and so
     on; the parts of nested spaces become separate entries. A space without parts is the entry
     ``action``.
 
@@ -230,7 +230,7 @@ def observation_space_of(name: str, entry: Mapping[str, Any]) -> Space:
 
 
 def action_space_of(name: str, entry: Mapping[str, Any]) -> Space:
-    """Return the space of an entry of the actions; raises as `observation_space_of` does."""
+    """Return the space of an entry of the actions; raises the same as `observation_space_of`."""
     size = int(entry["size"])
     if entry["action_type"] == "discrete":
         return spaces.Discrete(size)

@@ -1,7 +1,7 @@
 """The command ``physx-godot-rl``, and launcher files with which a trainer starts it.
 
-``GodotEnv(env_path=FILE)`` runs a file whose name ends with ``.x86_64`` and passes it the flags of
-a Godot application. `write_launcher` writes such a file for any environment.
+``GodotEnv(env_path=FILE)`` runs a file whose name ends with ``.x86_64``, with the flags of a Godot
+application. `write_launcher` writes such a file for any environment.
 """
 
 from __future__ import annotations
@@ -27,14 +27,14 @@ COMMAND = "physx-godot-rl"
 
 USAGE = f"""usage: {COMMAND} ENVIRONMENT [FLAGS]
 
-Connects an environment to a trainer of godot-rl that listens on this machine, and serves it until
-the trainer ends. ENVIRONMENT: "gym/CartPole-v1", "toy/spring", "script.py:Class" ...
+Connects an environment to a godot-rl trainer that listens on this machine, and serves it until the
+trainer exits. ENVIRONMENT: "gym/CartPole-v1", "toy/spring", "script.py:Class" ...
 
-  --port=N            where the trainer listens; {PORT} unless given
+  --port=N            port at which the trainer listens, {PORT} by default
   --env_seed=N        seed of the first episodes
-  --action_repeat=N   steps of the environment in one step of the trainer; 1 unless given
-  --num_worlds=N      agents, each with a world of its own; 1 unless given
-  --timeout=S         how long to keep trying to reach the trainer, in s; 60 unless given
+  --action_repeat=N   environment steps per step of the trainer, 1 by default
+  --num_worlds=N      number of agents, each with its own world, 1 by default
+  --timeout=S         time in s to keep trying to reach the trainer, 60 by default
   --NAME=VALUE        any other name: an argument of the environment
   --headless, --disable-render-loop, --fixed-fps N, --speedup=X
                       accepted because godot-rl passes them, without effect: no window is opened,
@@ -55,7 +55,7 @@ _NUMBERS = {
 
 
 def parse_flags(words: Sequence[str]) -> dict[str, Any]:
-    """Parse the flags that godot-rl passes to an application; the last of each name counts.
+    """Parse the flags that godot-rl passes to an application; the last one of each name counts.
 
     Args:
         words: ``--name=value``, ``--name value`` for a known name, or ``--name``.
@@ -107,21 +107,21 @@ def write_launcher(
     action_repeat: int = 1,
     env_kwargs: Mapping[str, Any] | None = None,
 ) -> Path:
-    """Write a file for godot-rl's ``env_path``; the flags it is started with take precedence.
+    """Write a file for godot-rl's ``env_path``; flags passed at its start take precedence.
 
     Args:
-        path: Where to write it; the name must end with ``.x86_64``.
-        environment: Reference of the environment, or its class.
+        path: File to write; the name must end with ``.x86_64``.
+        environment: Reference or class of the environment.
         num_worlds: Number of agents.
-        action_repeat: Steps of the environment in one step of the trainer.
+        action_repeat: Environment steps per step of the trainer.
         env_kwargs: Arguments of the environment: numbers, booleans and strings.
 
     Returns:
         The absolute path.
 
     Raises:
-        ConfigError: If godot-rl could not start a file of this name.
-        UsageError: If another process cannot import the class.
+        ConfigError: If godot-rl cannot start a file with this path.
+        UsageError: If other processes cannot import the class.
     """
     path = Path(path).absolute()
     if path.suffix != SUFFIX or " " in str(path):

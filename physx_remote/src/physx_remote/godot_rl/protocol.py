@@ -1,7 +1,7 @@
 """GodotRL: the protocol of godot_rl_agents; the service is the application that a trainer drives.
 
-The trainer listens and the application connects to it. Each message is a 4-byte length and a JSON
-object with a ``type``. Each agent of the trainer is one world.
+The trainer listens and the application connects to it. Each message is a 4-byte length followed by
+a JSON object with a ``type``. Each agent of the trainer is one world.
 """
 
 from __future__ import annotations
@@ -43,7 +43,7 @@ _RETRY = 0.05
 
 
 class GodotRL(Protocol):
-    """Lets a trainer of godot_rl_agents drive worlds."""
+    """Serves worlds to a trainer of godot_rl_agents."""
 
     name: ClassVar[str] = "godot-rl"
 
@@ -56,14 +56,14 @@ class GodotRL(Protocol):
         max_request: int = MAX_REQUEST,
         **options: Any,
     ) -> None:
-        """Check the options.
+        """Validate the options.
 
         Args:
-            action_repeat: Steps of the environment in one step of the trainer; rewards are added,
-                and the end of an episode ends it.
+            action_repeat: Environment steps per step of the trainer; rewards are summed, and the
+                end of an episode ends the step.
             seed: Seed of the first episodes: world 0 gets the seed itself, the others get seeds
-                derived from it. None: no seed.
-            timeout: How long to keep trying to reach the trainer, in s.
+                derived from it. None: unseeded.
+            timeout: Time in s to keep trying to reach the trainer.
             max_request: Longest accepted message in bytes.
             options: Must be empty.
         """
@@ -87,20 +87,20 @@ class GodotRL(Protocol):
         """Connect to a trainer and return the service of the worlds.
 
         Args:
-            worlds: One world for each agent of the trainer.
+            worlds: One world per agent of the trainer.
             address: Address where the trainer listens.
             port: Port where the trainer listens; 0: 11008.
         """
         if not isinstance(worlds, Worlds):
             raise RemoteError(
-                f'The protocol "{self.name}" serves Gymnasium environments and environments of '
-                f"physx, whose spaces are known; {type(worlds).__name__} is neither."
+                f'The protocol "{self.name}" serves Gymnasium and physx environments, whose spaces '
+                f"are known; {type(worlds).__name__} is neither."
             )
         agents = Agents(worlds, self.action_repeat, self.seed)
         trainer = _connect_to_trainer(address, port or PORT, self.timeout)
         try:
             return _GodotRLService(worlds, agents, trainer, self.max_request)
-        except OSError as error:  # the trainer is gone
+        except OSError as error:  # the trainer has disconnected
             trainer.close()
             raise RemoteError(f"The trainer at {address} disconnected at once: {error}.") from error
 
@@ -118,7 +118,7 @@ class GodotRL(Protocol):
 
 
 def _connect_to_trainer(address: str, port: int, timeout: float) -> socket.socket:
-    """Return a socket connected to a trainer, which may begin to listen a little later."""
+    """Return a socket connected to a trainer, which may start listening a little later."""
     deadline = time.monotonic() + timeout
     while True:
         left = max(deadline - time.monotonic(), _RETRY)
@@ -135,28 +135,28 @@ def _connect_to_trainer(address: str, port: int, timeout: float) -> socket.socke
             reason = None
         if time.monotonic() + _RETRY > deadline:
             raise RemoteError(
-                f"No trainer of godot-rl listens at {address} port {port} after {timeout:g} s of "
-                f"trying ({reason}). In godot-rl the trainer listens and the environment connects: "
-                f"start the trainer first, for example GodotEnv(port={port}), or let it start the "
-                "environment, with a launcher file as its env_path."
+                f"No godot-rl trainer is listening at {address} port {port}, after {timeout:g} s "
+                f"of trying ({reason}). In godot-rl, the trainer listens and the environment "
+                f"connects: start the trainer first, for example GodotEnv(port={port}), or have it "
+                "start the environment, with a launcher file as its env_path."
             ) from reason
         time.sleep(_RETRY)
 
 
 def _met_itself(connected: socket.socket) -> bool:
-    """Return whether a socket is connected to itself: the system chose the target as its port."""
+    """Return whether a socket is connected to itself: its own port happens to be the target."""
     with contextlib.suppress(OSError):
         return bool(connected.getsockname() == connected.getpeername())
     return False
 
 
 class _GodotRLService(SocketService):
-    """Serves agents to a trainer; ends when the trainer closes it or is gone."""
+    """Serves agents to a trainer; ends when the trainer closes it or disconnects."""
 
     def __init__(
         self, worlds: Worlds, agents: Agents, trainer: socket.socket, max_request: int
     ) -> None:
-        """Take the worlds and the trainer's connection."""
+        """Store the worlds, and serve the trainer's connection."""
         super().__init__()
         self._worlds, self._agents = worlds, agents
         self._max_request = max_request
@@ -175,18 +175,18 @@ class _GodotRLService(SocketService):
         return goes_on
 
     def close(self) -> None:
-        """End the connection and close the worlds, after the current request."""
+        """Close the connection and the worlds, after the current request."""
         super().close()
         if self._released:
             self._worlds.close()
 
     def on_close(self, connection: RequestConnection) -> None:
-        """End with the trainer."""
-        self.log.info(connection.name, "The trainer at %s is gone", connection.name)
+        """End when the trainer disconnects."""
+        self.log.info(connection.name, "The trainer at %s has disconnected", connection.name)
         self.close()
 
     def on_fault(self, connection: RequestConnection, error: PhysxError) -> None:
-        """End with the error: the trainer does not learn of it."""
+        """End with the error, which is not reported to the trainer."""
         super().on_fault(connection, error)
         raise RemoteError(f"The trainer at {connection.name} is lost: {error}") from error
 
@@ -221,7 +221,7 @@ class _GodotRLService(SocketService):
             self._send(connection, told)
 
     def _refuse(self, connection: RequestConnection, error: Exception) -> None:
-        """Report an error in the log and to the trainer, which ends at the unknown message."""
+        """Report an error in the log and to the trainer, which exits at the unknown message."""
         text = "; ".join([str(error), *getattr(error, "__notes__", [])])
         is_foreign = not isinstance(error, (RemoteError, ActionError))
         cause = error if is_foreign else None

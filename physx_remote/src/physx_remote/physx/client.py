@@ -1,4 +1,4 @@
-"""PhysxClient drives the worlds of a service; PhysxEnv is one of them as a gymnasium.Env."""
+"""PhysxClient, which drives the worlds of a service; PhysxEnv, one of them as a gymnasium.Env."""
 
 from __future__ import annotations
 
@@ -33,10 +33,10 @@ _FLOAT, _BOOL = np.dtype(np.float64), np.dtype(np.bool_)
 
 
 class Outcomes(NamedTuple):
-    """Outcomes of a request in some worlds; the caller owns the arrays.
+    """Results of a request in some of the worlds; the caller owns the arrays.
 
     Attributes:
-        arrays: The arrays by their names on the wire, each with a leading axis of these worlds.
+        arrays: The arrays by their names in the protocol, each with a leading axis of worlds.
         infos: Info of each world.
     """
 
@@ -45,14 +45,14 @@ class Outcomes(NamedTuple):
 
 
 class PhysxClient(Closeable):
-    """Drives the worlds of a service, any of them with one request. A context manager.
+    """Drives the worlds of a service, any number of them per request. A context manager.
 
     Attributes:
-        name: What is served.
-        num_worlds: How many worlds there are.
-        has_snapshots: Whether the state of a world can be kept and restored.
+        name: Name of the environments.
+        num_worlds: Number of worlds.
+        has_snapshots: Whether the state of a world can be saved and restored.
         render_mode: How the worlds are rendered; None: not at all.
-        metadata: Metadata of a Gymnasium environment.
+        metadata: Metadata of the Gymnasium environment.
         observations: Space of one world's observations, as arrays.
         actions: Space of one world's actions, as arrays.
     """
@@ -65,8 +65,8 @@ class PhysxClient(Closeable):
             options: See `TokenOptions`.
 
         Raises:
-            ConfigError: If no token is given.
-            RemoteError: If nothing answers, another client acts already, or the tokens differ.
+            ConfigError: If there is no token.
+            RemoteError: If nothing answers, another client is already acting, or the tokens differ.
         """
         self._link = PhysxLink(address, ACT, **options)
         told = read_introduction(self._link)
@@ -80,7 +80,7 @@ class PhysxClient(Closeable):
 
     @property
     def timeout(self) -> float | None:
-        """How long an answer may take from now on, in s; None: forever."""
+        """Time limit for answers from now on in s; None: no limit."""
         return self._link.timeout
 
     @timeout.setter
@@ -96,15 +96,15 @@ class PhysxClient(Closeable):
         seeds: Sequence[int | None] | None = None,
         options: Mapping[str, Any] | None = None,
     ) -> Outcomes:
-        """Begin new episodes.
+        """Start new episodes.
 
         Args:
             worlds: Numbers of the worlds; None: all.
-            seeds: A seed for each of them; None: none.
+            seeds: A seed for each of them; None: unseeded.
             options: Options of each reset, plain values.
 
         Raises:
-            PhysxError: If a world raises, or the service is gone or does not answer in time.
+            PhysxError: If a world raises, or the service disconnects or does not answer in time.
         """
         self.ask_reset(worlds, seeds, options)
         return self.outcomes(len(worlds) if worlds is not None else self.num_worlds)
@@ -113,22 +113,22 @@ class PhysxClient(Closeable):
         """Step worlds in order. If one raises, the worlds after it are not stepped.
 
         Args:
-            actions: Arrays as ``client.actions.stack(...)`` returns them.
+            actions: Arrays returned by ``client.actions.stack(...)``.
             worlds: Numbers of the worlds; None: all.
 
         Raises:
-            PhysxError: If a world raises, or the service is gone or does not answer in time.
+            PhysxError: If a world raises, or the service disconnects or does not answer in time.
         """
         self.ask_step(actions, None if worlds is None else np.array(worlds, np.int64))
         return self.outcomes(len(worlds) if worlds is not None else self.num_worlds)
 
     def snapshot(self, world: int = 0) -> int:
-        """Keep a world's state at the service and return the number of the snapshot.
+        """Save a world's state in the service and return the number of the snapshot.
 
-        It is kept until it is forgotten or this client leaves.
+        It is kept until it is deleted with `forget`, or this client leaves.
 
         Raises:
-            PhysxError: If the environment has no snapshots, or too many are kept.
+            PhysxError: If the environment has no snapshots, or there are already too many.
         """
         number = self.ask({"do": "snapshot", "world": world})
         if type(number) is not int:
@@ -136,10 +136,10 @@ class PhysxClient(Closeable):
         return number
 
     def restore(self, snapshot: int, world: int = 0) -> Outcomes:
-        """Restore a snapshot, of any world, into a world.
+        """Restore a snapshot, taken in any world, in a world.
 
         Returns:
-            The outcome that was the last one when the snapshot was taken.
+            The last result at the time of the snapshot.
 
         Raises:
             PhysxError: If the snapshot does not exist.
@@ -148,22 +148,22 @@ class PhysxClient(Closeable):
         return self.outcomes(1)
 
     def forget(self, snapshot: int) -> bool:
-        """Forget a snapshot; return whether it existed."""
+        """Delete a snapshot; return whether it existed."""
         return bool(self.ask({"do": "forget", "snapshot": snapshot}))
 
     def render(self, world: int = 0) -> Any:
-        """Return what a world renders.
+        """Return the rendering of a world.
 
         Raises:
-            PhysxError: If it raises, or what it renders cannot be sent.
+            PhysxError: If rendering raises, or its result cannot be sent.
         """
         return self.ask({"do": "render", "world": world})
 
     def close(self) -> None:
-        """End the connection; calling it again does nothing."""
+        """Close the connection; calling it again does nothing."""
         self._link.close()
 
-    # Requests and answers apart, for several requests at a time ------------------------------
+    # Requests and answers separately, for several concurrent requests ------------------------
 
     def ask_reset(
         self,
@@ -210,8 +210,8 @@ class PhysxClient(Closeable):
         if new:
             self._left_out |= new
             LOG.warning(
-                "Infos of these names are left out because they hold more than plain values and "
-                "arrays: %s.",
+                "Infos with these names are omitted because they contain more than plain values "
+                "and arrays: %s.",
                 ", ".join(sorted(new)),
             )
         return Outcomes(arrays, infos)
@@ -226,7 +226,7 @@ class PhysxClient(Closeable):
         self._link.send(pack_value(Kind.REQUEST, request, "request", self._number))
 
     def _answer(self, number: int) -> tuple[Any, Any]:
-        """Return the notes that came with an answer, None without any, and the answer."""
+        """Return the notes sent with an answer, None if there are none, and the answer."""
         notes = None
         while True:
             frame = self._link.receive()
@@ -242,7 +242,7 @@ class PhysxClient(Closeable):
 
 
 class PhysxEnv(gymnasium.Env[Any, Any]):
-    """One world of a service. Closing it ends the connection.
+    """One world of a service. Closing it closes the connection.
 
     Attributes:
         client: The connection, which other worlds may share.
@@ -250,7 +250,7 @@ class PhysxEnv(gymnasium.Env[Any, Any]):
     """
 
     def __init__(self, client: PhysxClient, world: int = 0) -> None:
-        """Take a world.
+        """Use a world.
 
         Args:
             client: The connection.
@@ -272,25 +272,25 @@ class PhysxEnv(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode.
+        """Start an episode.
 
         Args:
             seed: Seed of the world.
             options: Options of the environment, plain values.
 
         Raises:
-            PhysxError: The world raised, or the service is gone or too late.
+            PhysxError: If the world raises, or the service disconnects or does not answer in time.
         """
         super().reset(seed=seed)
         outcomes = self.client.reset(self._worlds, seeds=[seed], options=options)
         return self.client.observations.row(outcomes.arrays, 0), outcomes.infos[0]
 
     def step(self, action: Any) -> tuple[Any, float, bool, bool, dict[str, Any]]:
-        """Act.
+        """Step the world.
 
         Raises:
             ActionError: If the action does not have the structure, shapes or types of the space.
-            PhysxError: The world raised, or the service is gone or too late.
+            PhysxError: If the world raises, or the service disconnects or does not answer in time.
         """
         client = self.client
         client.ask_step(client.actions.stack(action, one=True), self._number)
@@ -304,34 +304,34 @@ class PhysxEnv(gymnasium.Env[Any, Any]):
         )
 
     def render(self) -> Any:
-        """Return what the world renders."""
+        """Return the rendering of the world."""
         return self.client.render(self.world)
 
     def snapshot(self) -> int:
-        """Keep the world's state: see `PhysxClient.snapshot`."""
+        """Save the world's state: see `PhysxClient.snapshot`."""
         return self.client.snapshot(self.world)
 
     def restore(self, state: int) -> Any:
-        """Restore a snapshot; return the observation of that moment."""
+        """Restore a snapshot; return its observation."""
         outcomes = self.client.restore(state, self.world)
         return self.client.observations.row(outcomes.arrays, 0)
 
     def close(self) -> None:
-        """End the connection; calling it again does nothing."""
+        """Close the connection; calling it again does nothing."""
         self.client.close()
 
 
 class Introduction(NamedTuple):
-    """What a service says of itself.
+    """A service's description of itself.
 
     Attributes:
         observations: Space of one world's observations, as arrays.
         actions: Space of one world's actions, as arrays.
-        name: What is served.
-        num_worlds: How many worlds there are.
-        has_snapshots: Whether the state of a world can be kept and restored.
+        name: Name of the environments.
+        num_worlds: Number of worlds.
+        has_snapshots: Whether the state of a world can be saved and restored.
         render_mode: How the worlds are rendered; None: not at all.
-        metadata: Metadata of a Gymnasium environment.
+        metadata: Metadata of the Gymnasium environment.
     """
 
     observations: SpaceArrays
@@ -344,10 +344,10 @@ class Introduction(NamedTuple):
 
 
 def read_introduction(link: PhysxLink) -> Introduction:
-    """Return what the service of a connection says of itself, after checking it.
+    """Return the validated description of the service at the other end of a connection.
 
     Raises:
-        RemoteProtocolError: If it is nonsense; the connection is closed.
+        RemoteProtocolError: If it is invalid; the connection is then closed.
     """
     told = link.introduction
     try:
@@ -377,7 +377,7 @@ def read_introduction(link: PhysxLink) -> Introduction:
 
 
 def fit_outcome(arrays: Mapping[str, Any], count: int) -> bool:
-    """Return whether rewards and ends that were received are those of `count` worlds."""
+    """Return whether received rewards and flags are valid for `count` worlds."""
     return is_array(arrays[REWARD], _FLOAT, (count,)) and all(
         is_array(arrays[name], _BOOL, (count,)) for name in (TERMINATED, TRUNCATED)
     )

@@ -1,4 +1,4 @@
-"""LatestState: the last transition of each world, as arrays that can be sent as they are."""
+"""LatestState: the last transition of each world, as arrays that can be sent unchanged."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from physx_remote.serving.worlds import Transition
 
 
 class LatestState:
-    """The last observation, reward, end and info of each world.
+    """The last observation, reward, flags and info of each world.
 
     Attributes:
         arrays: The arrays by name, each with a leading axis of worlds.
@@ -40,7 +40,7 @@ class LatestState:
         self.infos: list[dict[str, Any]] = [{} for _ in range(count)]
 
     def put(self, world: int, transition: Transition) -> None:
-        """Keep the transition of a world."""
+        """Store the transition of a world."""
         observation, reward, terminated, truncated, info = transition
         try:
             self._observations.put(self._parts, world, observation)
@@ -55,7 +55,7 @@ class LatestState:
         self.known[world] = True
 
     def rows(self, worlds: Sequence[int]) -> dict[str, Array]:
-        """Return the rows of some worlds; the arrays themselves if it is all of them."""
+        """Return the rows of some worlds; the arrays themselves for all of them."""
         if len(worlds) == len(self.known) and worlds == [*range(len(worlds))]:
             return self.arrays
         if len(worlds) == 1:
@@ -69,7 +69,7 @@ class LatestState:
         return {name: array[world].copy() for name, array in self.arrays.items()}
 
     def paste(self, world: int, rows: dict[str, Array]) -> None:
-        """Set a world's rows to those that `copy` returned."""
+        """Set a world's rows to a copy returned by `copy`."""
         for name, value in rows.items():
             self.arrays[name][world] = value
         self.known[world], self.infos[world] = True, {}

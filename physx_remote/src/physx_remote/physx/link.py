@@ -1,4 +1,4 @@
-"""PhysxLink: a client's authenticated connection; all waits are bounded."""
+"""PhysxLink: a client's authenticated connection with bounded waits."""
 
 from __future__ import annotations
 
@@ -39,16 +39,16 @@ _BACKLOG = 1 << 16
 class PhysxLink(ClientConnection):
     """A connection to a service of the protocol physx.
 
-    After any failure it is closed, so that a late answer is not taken for that of another request.
+    It is closed after any failure, so a late answer is never mistaken for that of another request.
 
     Attributes:
         name: The service as ``host:port``.
-        timeout: How long an answer may take, in s; None: forever.
+        timeout: Time limit for an answer in s; None: no limit.
         introduction: The service's description of itself.
     """
 
     _server: ClassVar[str] = "service"
-    _advice: ClassVar[str] = "Give a longer timeout if its steps take that long."
+    _advice: ClassVar[str] = "Set a longer timeout if its steps take that long."
 
     def __init__(
         self,
@@ -67,9 +67,9 @@ class PhysxLink(ClientConnection):
             address: Host and port.
             role: `ACT` or `OBSERVE`.
             token: See `TokenOptions`, also for the options below.
-            token_file: File that holds the token.
-            timeout: How long an answer may take, in s; None: forever.
-            connect_timeout: How long to keep trying to connect, in s.
+            token_file: File with the token.
+            timeout: Time limit for an answer in s; None: no limit.
+            connect_timeout: Time in s to keep trying to connect.
             max_answer: Size of the longest accepted answer in bytes.
         """
         super().__init__(address)
@@ -77,8 +77,8 @@ class PhysxLink(ClientConnection):
         found = find_token(token_file, token)
         if found is None:
             raise ConfigError(
-                f"A client of {self.name} needs the token of the service: set {TOKEN_VARIABLE}, or "
-                "give token_file=, the file that holds it, or token=."
+                f"A client of {self.name} needs the service's token: set {TOKEN_VARIABLE}, or pass "
+                "token_file=, the file that contains it, or token=."
             )
         try:
             self._reader = self._meet(address, found, role, connect_timeout)
@@ -101,7 +101,7 @@ class PhysxLink(ClientConnection):
         *,
         encrypted: bool = False,
     ) -> FrameReader:
-        """Connect, and authenticate both sides by the token."""
+        """Connect, and authenticate both sides with the token."""
         until = time.monotonic() + patience
         self._socket = self._reach(lambda left: _open_socket(address, role, left), patience)
         try:
@@ -124,18 +124,18 @@ class PhysxLink(ClientConnection):
         except SilentPeerError as error:
             raise RemoteTimeoutError(
                 f"{self.name} did not answer within {patience:.3g} s. It may be stopped, or speak "
-                "another protocol; give a longer connect_timeout if it is busy for that long."
+                "another protocol; set a longer connect_timeout if it is busy for that long."
             ) from error
         except UnansweredError as error:
             raise RemoteClosedError(
-                f"{self.name} did not answer like a service of physx: {error} It may have "
-                "closed the connection because it has another token, because too many clients are "
-                "connected, or because it speaks another protocol."
+                f"{self.name} did not answer like a physx service: {error} It may have closed the "
+                "connection because its token differs, because too many clients are connected, or "
+                "because it speaks another protocol."
             ) from error
         except ConnectionRefusedByPeerError as error:
             raise RemoteError(
                 f"{self.name} cannot be trusted: it does not know this client's token, or is not "
-                "a service of this version of physx. Give the token of the service: "
+                "a service of this version of physx. Set the service's token: "
                 f"{TOKEN_VARIABLE}, token_file= or token=. ({error})"
             ) from error
 
@@ -147,17 +147,17 @@ class PhysxLink(ClientConnection):
         except RemoteError:
             raise
         except PhysxError as error:
-            raise RemoteError(f"{self.name} refuses: {error}") from error
+            raise RemoteError(f"{self.name} refused: {error}") from error
         if not isinstance(told, dict) or told.get("service") != SERVICE:
             raise RemoteError(
-                f"{self.name} does not serve environments; it may be the server of a run, for "
-                "physx client."
+                f"{self.name} does not serve environments; it may be the server of a run, which is "
+                "for physx client."
             )
         if told.get("version") != VERSION:
             raise RemoteError(
                 f"The service at {self.name} speaks version {told.get('version')} of the protocol, "
-                f"this client version {VERSION}. Install the same version of physx-core on both "
-                "sides."
+                f"but this client speaks version {VERSION}. Install the same version of physx-core "
+                "on both sides."
             )
         return told
 
@@ -176,7 +176,7 @@ class PhysxLink(ClientConnection):
         """Return the next message.
 
         Args:
-            patience: How long to wait, in s; None: as long as an answer may take.
+            patience: Time to wait in s; None: as long as an answer may take.
         """
         limit = self.timeout if patience is None else patience
         frame = self.look(limit)
@@ -185,10 +185,10 @@ class PhysxLink(ClientConnection):
         return frame
 
     def look(self, patience: float | None) -> Frame | None:
-        """Return the next message, or None if there is none in time.
+        """Return the next message; None if there is none in time.
 
         Args:
-            patience: How long to wait, in s; None: forever.
+            patience: Time to wait in s; None: forever.
         """
         self._check_open()
         until, left = None, patience
@@ -225,13 +225,13 @@ class PhysxLink(ClientConnection):
         raise refusal
 
     def nonsense(self, what: str) -> RemoteProtocolError:
-        """Close the connection; return the error for a service that sent something."""
+        """Close the connection; return the error for a service that sent something invalid."""
         self.close(f"it sent {what}")
         return RemoteProtocolError(f"{self.name} sent {what}. The connection is closed.")
 
 
 def _open_socket(address: tuple[str, int], role: int, patience: float) -> socket.socket:
-    """Return a connected socket; that of an observer buffers little unread data."""
+    """Return a connected socket; an observer's socket buffers little unread data."""
     error: OSError = OSError("the host has no address")
     for family, kind, proto, _, place in socket.getaddrinfo(*address, type=socket.SOCK_STREAM):
         connected = socket.socket(family, kind, proto)

@@ -31,17 +31,17 @@ from physx_remote.serving.spaces import NONSENSE
 
 @dataclass(frozen=True)
 class Seen:
-    """A change of some worlds. The arrays have a leading axis of these worlds.
+    """A change in some worlds. The arrays have a leading axis of these worlds.
 
     Attributes:
-        number: How many requests have changed worlds so far, including skipped ones.
+        number: Number of requests that have changed worlds so far, including skipped ones.
         worlds: Numbers of the worlds.
-        is_reset: Whether their episodes began with this change.
+        is_reset: Whether their episodes started with this change.
         observation: Value of the batched observation space.
         action: Value of the batched action space; None after a reset, and in `PhysxObserver.last`.
         reward: Rewards.
-        terminated: Whether each episode is terminated.
-        truncated: Whether each episode is truncated.
+        terminated: Whether each episode was terminated.
+        truncated: Whether each episode was truncated.
         infos: Info of each world.
     """
 
@@ -57,13 +57,13 @@ class Seen:
 
 
 class PhysxObserver(Closeable):
-    """Receives the outcomes of the acting client's requests. A context manager.
+    """Receives the results of the acting client's requests. A context manager.
 
-    An observer that does not keep up skips outcomes and goes on with the latest state of all
+    An observer that does not keep up skips results and continues with the latest state of all
     worlds.
 
     Attributes:
-        num_worlds: How many worlds there are.
+        num_worlds: Number of worlds.
         observation_space: Space of one world's observations.
         action_space: Space of one world's actions.
     """
@@ -76,7 +76,7 @@ class PhysxObserver(Closeable):
             options: See `TokenOptions`.
 
         Raises:
-            ConfigError: If no token is given.
+            ConfigError: If there is no token.
             RemoteError: If nothing answers, or the tokens differ.
         """
         place = parse_address(address) if isinstance(address, str) else address
@@ -93,13 +93,13 @@ class PhysxObserver(Closeable):
         """Wait for the next change.
 
         Args:
-            timeout: How long to wait, in s; None: forever.
+            timeout: Time to wait in s; None: forever.
 
         Returns:
-            The change, or None if there was none in time.
+            The change; None if there was none in time.
 
         Raises:
-            RemoteClosedError: If the service has ended.
+            RemoteClosedError: If the service has closed the connection.
         """
         while True:
             frame = self._link.look(timeout)
@@ -112,10 +112,10 @@ class PhysxObserver(Closeable):
             self._notes = frame
 
     def last(self) -> Seen:
-        """Return the latest state of all worlds that have begun; earlier changes are skipped.
+        """Return the latest state of all worlds that have started; earlier changes are skipped.
 
         Raises:
-            RemoteError: If the service has ended, or does not answer in time.
+            RemoteError: If the service has closed the connection, or does not answer in time.
         """
         self._asked += 1
         self._link.send(pack_value(Kind.REQUEST, {"do": "last"}, "request", self._asked))
@@ -126,7 +126,7 @@ class PhysxObserver(Closeable):
             self._notes = frame if frame.kind is Kind.NOTES else None
 
     def close(self) -> None:
-        """End the connection; calling it again does nothing."""
+        """Close the connection; calling it again does nothing."""
         self._link.close()
 
     def _seen(self, frame: Frame) -> Seen:
@@ -163,5 +163,5 @@ class PhysxObserver(Closeable):
     def _nonsense(self, frame: Frame) -> RemoteProtocolError:
         self.close()
         return RemoteProtocolError(
-            f"{self._link.name} sent a message {frame.kind.name} that is not for observers."
+            f"{self._link.name} sent a message {frame.kind.name} that is not valid for observers."
         )

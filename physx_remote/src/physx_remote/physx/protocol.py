@@ -1,4 +1,4 @@
-"""Physx: authenticated, sends arrays unchanged, several worlds on one connection, observers."""
+"""Physx: an authenticated protocol with typed arrays, several worlds per connection, observers."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ from physx_remote.serving.worlds import Worlds
 
 
 class Physx(Protocol):
-    """Serves worlds to one client that acts, and to any number of observers.
+    """Serves worlds to one acting client and any number of observers.
 
     Both sides prove that they know a token. A request is answered with its result, or with the
-    error and its traceback; the worlds go on, and keep their state when a client leaves.
+    error and its traceback; the worlds keep running, and keep their state when a client leaves.
     """
 
     name: ClassVar[str] = "physx"
@@ -37,19 +37,19 @@ class Physx(Protocol):
         max_snapshots: int = 256,
         **options: Any,
     ) -> None:
-        """Keep the options.
+        """Store the options.
 
         Args:
             token: Secret that clients must know, at least 16 characters. None: the content of
-                `token_file`, without that of the environment variable ``PHYSX_TOKEN``, and without
-                that a random one, `PhysxService.token`.
-            token_file: File that holds the token, readable by its owner alone.
-            handshake_timeout: How long a client may take to prove that it knows the token, in s.
-            max_request: Longest request in bytes; a client that sends a longer one is closed.
-            max_clients: How many clients may be connected; further ones are told so. There may be
-                as many connections without a proof of the token besides, or 32; where another
-                comes, one of those is closed.
-            max_snapshots: How many snapshots are kept at most.
+                `token_file`, else the environment variable ``PHYSX_TOKEN``, else a random one,
+                `PhysxService.token`.
+            token_file: File with the token, readable only by its owner.
+            handshake_timeout: Time in s in which a client must prove that it knows the token.
+            max_request: Longest request in bytes; clients that send longer ones are disconnected.
+            max_clients: Maximum number of clients; further ones get an error. In addition, as many
+                connections that have not proved that they know the token are kept, but at least 32;
+                if another arrives, one of them is closed.
+            max_snapshots: Maximum number of snapshots.
             options: Must be empty.
         """
         super().__init__(**options)
@@ -89,7 +89,7 @@ class Physx(Protocol):
 
         Args:
             host: Host of the service.
-            port: Its port.
+            port: Port of the service.
             world: Number of the world.
             options: See `TokenOptions`.
         """

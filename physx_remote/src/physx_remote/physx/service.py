@@ -1,4 +1,4 @@
-"""PhysxService: the connections of the protocol physx, their requests and answers."""
+"""PhysxService: serves worlds over the protocol physx."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ from physx_remote.serving.worlds import Worlds
 
 _BACKLOG = 1 << 16
 _LARGE = 1 << 15
-_MOST_PARTS = 512  # a system call takes no more than 1024
+_MOST_PARTS = 512  # a system call accepts at most 1024
 
 
 class PhysxService(SocketService):
@@ -65,7 +65,7 @@ class PhysxService(SocketService):
         max_clients: int,
         max_snapshots: int,
     ) -> None:
-        """Take the worlds; the options are those of `Physx`."""
+        """Store the worlds; the options are those of `Physx`."""
         super().__init__(max_clients=max_clients)
         self.token = token
         self._worlds = worlds
@@ -79,7 +79,7 @@ class PhysxService(SocketService):
         self._seen = 0
 
     def _release(self) -> None:
-        """Close the worlds too, once no request is being carried out."""
+        """Also close the worlds, once no request is in progress."""
         super()._release()
         self._worlds.close()
 
@@ -107,7 +107,7 @@ class PhysxService(SocketService):
         return FrameReader(HANDSHAKE_LIMIT)
 
     def new_strangers(self) -> Handshakes[RequestConnection]:
-        """Return what has new clients prove that they know the token."""
+        """Return the handshakes, in which new clients prove that they know the token."""
         self._handshakes = Handshakes[RequestConnection](
             self.token,
             self._handshake_timeout,
@@ -124,7 +124,7 @@ class PhysxService(SocketService):
         """Forget a client; the worlds keep their state."""
         self._observers.pop(connection, None)
         if connection is self._actor:
-            self.log.info(connection.name, "%s acts no longer", connection.name)
+            self.log.info(connection.name, "%s no longer acts", connection.name)
             self._actor = None
             self._requests.forget_snapshots()
 
@@ -145,7 +145,7 @@ class PhysxService(SocketService):
                 steps = self._requests.steps(_arrays(decode(payload)))
                 return self._finish(connection, number, steps)
             if kind is not Kind.REQUEST:
-                raise RequestError("Only the client that acts may step.")
+                raise RequestError("Only the acting client may step.")
             return self._carry_out(connection, number, decode(payload))
         except ConnectionRefusedByPeerError as error:
             self.drop(connection, str(error))
@@ -179,20 +179,20 @@ class PhysxService(SocketService):
         """Assign a client its role."""
         self.welcome(connection)
         if role == OBSERVE:
-            self.log.info(connection.name, "%s looks on", connection.name)
+            self.log.info(connection.name, "%s observes", connection.name)
             connection.limit_backlog(_BACKLOG)
             self._observers[connection] = False
             return
         if role != ACT:
             raise RemoteError(
-                "This is a service of environments, and not the server of a run: connect with "
+                "This is a service of environments, not the server of a run: connect with "
                 "physx_remote.connect."
             )
         actor = self._actor
         if actor is not None and not actor.ended:
             raise RemoteError(
-                f"{actor.name} acts here already; only one client at a time may. Try again when "
-                "it has left, or look on with physx_remote.PhysxObserver."
+                f"{actor.name} acts here already; only one client may act at a time. Try again "
+                "when it has left, or observe with physx_remote.PhysxObserver."
             )
         if actor is not None:
             self.drop(actor)
@@ -202,12 +202,12 @@ class PhysxService(SocketService):
     # Requests -------------------------------------------------------------------------------
 
     def _carry_out(self, connection: RequestConnection, number: int, request: Any) -> Work | None:
-        """Carry out a request; return the remaining work if it is not done at once."""
+        """Carry out a request; return the remaining work if it is not completed immediately."""
         if not isinstance(request, dict):
-            raise RequestError("A request is a dictionary.")
+            raise RequestError("A request must be a dictionary.")
         what = request.get("do")
         if not isinstance(what, str):
-            raise RequestError(f'"do" must name what to do, not {what!r:.60}.')
+            raise RequestError(f'"do" must be the name of a request, not {what!r:.60}.')
         if what == "last":
             self.send(connection, self._latest(Kind.ANSWER, number))
             return None
@@ -224,7 +224,7 @@ class PhysxService(SocketService):
         return None
 
     def _finish(self, connection: RequestConnection, number: int, change: Change) -> Work:
-        """Make a change of worlds, and answer."""
+        """Change the worlds, and answer the request."""
         try:
             for wait in change.work:
                 yield wait
@@ -240,13 +240,13 @@ class PhysxService(SocketService):
         """Report an error in the log and to the client."""
         told, name = error if isinstance(error, PhysxError) else wrap_error(error), connection.name
         cause = error if error is not told or error.__cause__ is not None else None
-        self.log.error(name, "A request of %s failed: %s", name, told, cause=cause)
+        self.log.error(name, "A request from %s failed: %s", name, told, cause=cause)
         self.send(connection, pack(Kind.REFUSAL, encode_error(told), number))
 
     # Answers --------------------------------------------------------------------------------
 
     def _publish(self, connection: RequestConnection, number: int, change: Change) -> None:
-        """Answer with the change of worlds, and send it to the observers."""
+        """Answer with the change in the worlds, and send it to the observers."""
         latest = self._requests.latest
         rows = latest.rows(change.worlds)
         infos = [latest.infos[world] for world in change.worlds]
@@ -300,7 +300,7 @@ def _message(
 
 def _arrays(value: Any) -> dict[str, Any]:
     if not isinstance(value, dict):
-        raise RequestError("Actions are a dictionary of arrays.")
+        raise RequestError("Actions must be a dictionary of arrays.")
     return value
 
 

@@ -1,4 +1,4 @@
-"""SpaceArrays: the values that several worlds have in a space, as one array for each leaf."""
+"""SpaceArrays: values of several worlds in a space, as one array per leaf."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class SpaceArrays(SpaceTree):
 
         Args:
             space: Space of one world's values.
-            prefix: What the arrays' names begin with.
+            prefix: Prefix of the arrays' names.
         """
         super().__init__(space)
         self.names = [f"{prefix}{number}" for number in range(len(self.leaves))]
@@ -49,7 +49,7 @@ class SpaceArrays(SpaceTree):
         return {name: np.zeros((count, *shape), dtype) for name, dtype, shape, _ in self._parts}
 
     def put(self, arrays: Sequence[Array], row: int, value: Any) -> None:
-        """Write one world's value into a row of the arrays; shapes are not broadcast."""
+        """Write one world's value into a row of the arrays, without broadcasting."""
         if self.is_leaf:  # in every step of most environments
             _put(arrays[0], row, value)
             return
@@ -57,7 +57,7 @@ class SpaceArrays(SpaceTree):
             _put(array, row, part)
 
     def check(self, arrays: Mapping[str, Any], worlds: Sequence[int]) -> None:
-        """Check received arrays of some worlds."""
+        """Validate received arrays of some worlds."""
         count = len(worlds)
         for (name, dtype, shape, leaf), path in zip(self._parts, self.paths, strict=True):
             array = arrays.get(name)
@@ -75,14 +75,14 @@ class SpaceArrays(SpaceTree):
                 raise invalid_value(leaf, place, array[index])
 
     def fit(self, arrays: Mapping[str, Any], count: int) -> bool:
-        """Return whether received arrays are those of `count` worlds."""
+        """Return whether received arrays are valid for `count` worlds."""
         return all(
             is_array(arrays.get(name), dtype, (count, *shape))
             for name, dtype, shape, _ in self._parts
         )
 
     def rows(self, arrays: Mapping[str, Array], count: int) -> list[Any]:
-        """Return the value of each of `count` worlds: views of the arrays."""
+        """Return the value of each of `count` worlds, as views of the arrays."""
         if self._rows_are_values:
             return list(arrays[self.names[0]])
         return [self.row(arrays, row) for row in range(count)]
@@ -94,7 +94,7 @@ class SpaceArrays(SpaceTree):
         return self.join(arrays[name] for name in self.names)
 
     def row(self, arrays: Mapping[str, Array], row: int) -> Any:
-        """Return one world's value: views of the arrays."""
+        """Return one world's value, as views of the arrays."""
         if self.is_leaf:
             array = arrays[self.names[0]]
             return array[row] if self._is_discrete[0] else array[row, ...]
@@ -106,7 +106,7 @@ class SpaceArrays(SpaceTree):
 
         Args:
             value: Value of Gymnasium's batched space, or of the space itself.
-            one: Whether it is the value of one world.
+            one: Whether it is the value of a single world.
         """
         arrays = {}
         try:

@@ -18,7 +18,7 @@ from physx_remote.serving.spaces import NONSENSE
 
 
 class PhysxVectorEnv(VectorEnv[Any, Any, Any], Closeable):
-    """All worlds of a service, stepped with one request. Closing it ends the connection.
+    """All worlds of a service, stepped with one request. Closing it closes the connection.
 
     Attributes:
         client: The connection.
@@ -27,12 +27,12 @@ class PhysxVectorEnv(VectorEnv[Any, Any, Any], Closeable):
     def __init__(
         self, client: PhysxClient, *, autoreset_mode: AutoresetMode | str = AutoresetMode.NEXT_STEP
     ) -> None:
-        """Take all worlds.
+        """Use all worlds of a service.
 
         Args:
             client: The connection.
-            autoreset_mode: What happens after the end of an episode: ``"NextStep"``,
-                ``"SameStep"`` or ``"Disabled"``, as in Gymnasium.
+            autoreset_mode: What happens after the end of an episode: ``"NextStep"``, ``"SameStep"``
+                or ``"Disabled"``, as in Gymnasium.
 
         Raises:
             ConfigError: If the mode is unknown.
@@ -60,16 +60,16 @@ class PhysxVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         seed: int | Sequence[int | None] | None = None,
         options: dict[str, Any] | None = None,
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin new episodes; return observations and infos.
+        """Start new episodes; return observations and infos.
 
         Args:
-            seed: World i gets ``seed + i``; or a seed for each.
+            seed: World i gets ``seed + i``; or a list with a seed for each.
             options: Passed to each world's `reset`, except for ``reset_mask``, shape (num_envs,):
-                which worlds to reset.
+                the worlds to reset.
 
         Raises:
-            ConfigError: If the number of seeds or the mask does not fit the worlds.
-            PhysxError: If a world raises, or the service is gone or does not answer in time.
+            ConfigError: If the number of seeds or the mask does not match the worlds.
+            PhysxError: If a world raises, or the service disconnects or does not answer in time.
         """
         count = self.num_envs
         seeds = [seed + i for i in range(count)] if isinstance(seed, int) else seed
@@ -79,10 +79,10 @@ class PhysxVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         if len(seeds) != count or mask.shape != (count,) or mask.dtype != np.bool_:
             raise ConfigError(
                 f"reset() of {count} worlds got {len(seeds)} seeds, and a mask of shape "
-                f"{mask.shape} and type {mask.dtype}: give one seed and one bool per world."
+                f"{mask.shape} and type {mask.dtype}: pass one seed and one bool per world."
             )
         if not mask.any():
-            raise ConfigError("reset_mask resets no world.")
+            raise ConfigError("reset_mask selects no world.")
         worlds = np.flatnonzero(mask).tolist()
         chosen = None if len(worlds) == count else worlds
         begun = self.client.reset(
@@ -91,7 +91,7 @@ class PhysxVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         if chosen is None:
             self._last = begun.arrays
         elif not self._last:
-            raise ConfigError("The first reset() must be of all worlds: do not give a reset_mask.")
+            raise ConfigError("The first reset() must reset all worlds: omit reset_mask.")
         else:
             self._last = {name: array.copy() for name, array in self._last.items()}
             self._take(worlds, begun.arrays)
@@ -111,7 +111,7 @@ class PhysxVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         Raises:
             ActionError: If the actions do not have the shapes or types of the space.
             EpisodeError: If an episode is over and the mode is ``"Disabled"``.
-            PhysxError: If a world raises, or the service is gone or does not answer in time.
+            PhysxError: If a world raises, or the service disconnects or does not answer in time.
         """
         arrays = self._stack(actions)
         if self._over.any():
@@ -131,7 +131,7 @@ class PhysxVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         for array in arrays.values():
             if len(array) != self.num_envs:
                 raise ActionError(
-                    f"Got {len(array)} actions for {self.num_envs} worlds: give one per world."
+                    f"Got {len(array)} actions for {self.num_envs} worlds: pass one per world."
                 )
         return arrays
 
@@ -160,7 +160,7 @@ class PhysxVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         return infos
 
     def _reset_at_once(self, infos: dict[int, dict[str, Any]]) -> None:
-        """Begin new episodes where they are over; the infos keep the final transition."""
+        """Start new episodes where they are over; the infos keep the final transition."""
         over = np.flatnonzero(self._over).tolist()
         observations = self.client.observations
         before = self._last
@@ -191,14 +191,14 @@ class PhysxVectorEnv(VectorEnv[Any, Any, Any], Closeable):
             return self._add_info(infos, info, world)
         except NONSENSE as error:
             raise RemoteProtocolError(
-                f"The infos of the worlds do not fit together, for example that of world {world}: "
+                f"The infos of the worlds are incompatible, for example that of world {world}: "
                 f"{error}."
             ) from error
 
     def render(self) -> tuple[Any, ...]:
-        """Return what each world renders."""
+        """Return the rendering of each world."""
         return tuple(self.client.render(world) for world in range(self.num_envs))
 
     def close_extras(self, **kwargs: Any) -> None:
-        """End the connection."""
+        """Close the connection."""
         self.client.close()

@@ -12,18 +12,18 @@ VERSION = 1
 """Version of the messages after the handshake."""
 
 SERVICE = "physx environments"
-"""How a service introduces itself, so that it is not mistaken for the server of a run."""
+"""How a service introduces itself, to distinguish it from the server of a run."""
 
 ACT, OBSERVE = 1, 2
-"""Role of a client, sent in the handshake in place of an instance's number."""
+"""Role of a client, sent in the handshake in place of an instance number."""
 
 WORLDS, IS_RESET, COUNT = "worlds", "is_reset", "count"
 REWARD, TERMINATED, TRUNCATED = "reward", "terminated", "truncated"
-"""Names of the arrays besides those of observations and actions."""
+"""Names of the arrays other than observations and actions."""
 
 
 def encode_infos(infos: Sequence[Mapping[str, Any]]) -> bytes:
-    """Return the encodable values of infos as bytes, with the names of the values left out."""
+    """Return the encodable values of infos as bytes, with the names of the omitted values."""
     left_out: set[str] = set()
     try:
         return encode({"infos": [dict(info) for info in infos], "left_out": []}, "info")
@@ -49,10 +49,10 @@ def _encodable(info: Mapping[str, Any], left_out: set[str]) -> dict[str, Any]:
 
 
 def split_infos(value: Any, count: int) -> tuple[list[dict[str, Any]], list[str]]:
-    """Return the infos of each world, and the names of the values left out.
+    """Return the infos of each world, and the names of the omitted values.
 
     Args:
-        value: The decoded value of `encode_infos`.
+        value: The decoded result of `encode_infos`.
         count: Number of worlds.
     """
     if isinstance(value, dict):
@@ -60,4 +60,4 @@ def split_infos(value: Any, count: int) -> tuple[list[dict[str, Any]], list[str]
         is_named = isinstance(left_out, list) and all(isinstance(name, str) for name in left_out)
         if is_named and isinstance(infos, list) and len(infos) == count:
             return [info if isinstance(info, dict) else {} for info in infos], list(left_out or ())
-    raise RemoteProtocolError(f"The other side sent infos that do not belong to {count} worlds.")
+    raise RemoteProtocolError(f"The other side sent infos that do not match {count} worlds.")

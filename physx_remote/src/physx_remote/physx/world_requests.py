@@ -1,4 +1,4 @@
-"""WorldRequests: checks and carries out what a client of the protocol physx asks of the worlds."""
+"""WorldRequests: validates and carries out a physx client's requests to the worlds."""
 
 from __future__ import annotations
 
@@ -24,12 +24,12 @@ _SLICE = 0.02
 
 @dataclass
 class Change:
-    """A change of some worlds; `WorldRequests.latest` holds the result once the work is done.
+    """A change in some worlds; `WorldRequests.latest` has the result once the work is done.
 
     Attributes:
         worlds: Numbers of the worlds.
-        is_reset: Whether their episodes begin.
-        work: Makes the change; yields now and then how long to wait before it goes on, in s.
+        is_reset: Whether new episodes start.
+        work: Makes the change; yields the time in s until it resumes.
         actions: The actions of the worlds, as stacked arrays.
     """
 
@@ -40,14 +40,14 @@ class Change:
 
 
 class WorldRequests:
-    """Carries out requests, each checked before anything is changed.
+    """Carries out requests; each is validated before anything changes.
 
     Attributes:
         latest: The last transition of each world.
     """
 
     def __init__(self, worlds: Worlds, max_snapshots: int) -> None:
-        """Take the worlds."""
+        """Store the worlds."""
         self._worlds = worlds
         self._actions = SpaceArrays(worlds.action_space, "action")
         observations = SpaceArrays(worlds.observation_space, "observation")
@@ -63,7 +63,7 @@ class WorldRequests:
         """Prepare a step of some worlds.
 
         Args:
-            arrays: The actions, and ``worlds`` with the worlds' numbers; all worlds without it.
+            arrays: The actions, and ``worlds`` with the worlds' numbers; by default all worlds.
         """
         chosen = arrays.pop(WORLDS, None)
         worlds = self._all if chosen is None else self._chosen(chosen)
@@ -89,7 +89,7 @@ class WorldRequests:
         """Prepare a new episode of some worlds.
 
         Args:
-            request: Any of ``worlds``, a list, ``seeds``, one or None for each of them, and
+            request: Any of ``worlds``, a list, ``seeds``, an integer or None for each of them, and
                 ``options``.
         """
         chosen = request.get("worlds")
@@ -97,7 +97,9 @@ class WorldRequests:
         seeds = request.get("seeds")
         seeds = [None] * len(worlds) if seeds is None else seeds
         if not isinstance(seeds, list) or len(seeds) != len(worlds):
-            raise RequestError(f"{len(worlds)} worlds need as many seeds, not {seeds!r:.100}.")
+            raise RequestError(
+                f"seeds must have {len(worlds)} entries, one per world, not {seeds!r:.100}."
+            )
         for seed in seeds:
             if seed is not None and (type(seed) is not int or seed < 0):
                 raise RequestError(f"A seed must be a non-negative integer, not {seed!r:.60}.")
@@ -122,12 +124,12 @@ class WorldRequests:
     # Snapshots --------------------------------------------------------------------------------
 
     def restore(self, request: Mapping[str, Any]) -> int:
-        """Restore a snapshot, of any world, into a world; return the world's number."""
+        """Restore a snapshot, taken in any world, in a world; return the world's number."""
         world, number = self._world(request), request.get("snapshot")
         if not isinstance(number, int) or number not in self._snapshots:
             raise RequestError(
-                f"There is no snapshot {number!r:.40}: a snapshot is kept until it is forgotten or "
-                "the client that took it leaves."
+                f"There is no snapshot {number!r:.40}: a snapshot is kept until it is deleted with "
+                "forget, or the client that took it leaves."
             )
         state, rows = self._snapshots[number]
         with _Place("restore", world):
@@ -136,11 +138,11 @@ class WorldRequests:
         return world
 
     def forget_snapshots(self) -> None:
-        """Forget all snapshots."""
+        """Delete all snapshots."""
         self._snapshots.clear()
 
     def answer(self, what: str, request: Mapping[str, Any]) -> Any:
-        """Carry out a request that changes no world, and return the answer."""
+        """Carry out a request that does not change any world, and return the answer."""
         if what == "snapshot":
             return self._snapshot(self._world(request))
         if what == "forget":
@@ -157,11 +159,11 @@ class WorldRequests:
     def _snapshot(self, world: int) -> int:
         if len(self._snapshots) >= self._max_snapshots:
             raise RequestError(
-                f"{self._max_snapshots} snapshots are kept already: forget some, or serve with a "
+                f"There are already {self._max_snapshots} snapshots: forget some, or serve with a "
                 "larger max_snapshots."
             )
         if not self.latest.known[world]:
-            raise RequestError(f"World {world} has not begun: reset it first.")
+            raise RequestError(f"World {world} has not started: reset it first.")
         with _Place("snapshot", world):
             state = self._worlds.snapshot(world)
         number = next(self._numbers)
@@ -174,7 +176,7 @@ class WorldRequests:
         return self._chosen([request.get("world", 0)])[0]
 
     def _chosen(self, given: Any) -> list[int]:
-        """Return numbers of worlds as a list."""
+        """Return world numbers as a list, after validating them."""
         if isinstance(given, np.ndarray) and given.ndim == 1 and given.dtype.kind in "iu":
             given = given.tolist()
         count = len(self._all)
@@ -189,14 +191,14 @@ class WorldRequests:
 
 
 def wrap_error(error: Exception, place: str = "") -> RequestError:
-    """Return an error of the environment's code as one that clients know, with its traceback."""
+    """Wrap an error of the environment's code in one that clients know, with its traceback."""
     told = RequestError(f"{place}{type(error).__name__}: {error}")
     told.__cause__ = error
     return told
 
 
 class _Place:
-    """A context that adds the world to errors.
+    """A context manager that adds the world to errors.
 
     Attributes:
         world: Number of the current world.

@@ -1,1 +1,1 @@
-"""Sockets, requests, and worlds that all protocols share."""
+"""Sockets, requests and worlds, shared by all protocols."""

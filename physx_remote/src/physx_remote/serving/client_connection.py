@@ -1,4 +1,4 @@
-"""ClientConnection: base of the clients' connections, whatever they send."""
+"""ClientConnection: base class of the clients' connections, independent of the protocol."""
 
 from __future__ import annotations
 
@@ -15,40 +15,40 @@ _RETRY = 0.1
 
 
 class ClientConnection:
-    """A connection to a server, which cannot be opened again.
+    """A connection to a server, which cannot be reopened.
 
-    Every wait ends after its time, and within about 15 s if the server's machine no longer answers.
+    Every wait is bounded by its time limit, and by about 15 s if the server's machine is lost.
 
     Attributes:
         name: The server as ``host:port``.
     """
 
     _server: ClassVar[str] = "server"
-    """What the other side is called in messages."""
-    _advice: ClassVar[str] = "It may be busy with another client, or be waiting for it."
-    """What to do if it does not answer in time, or why it does not."""
+    """Name for the other side in messages."""
+    _advice: ClassVar[str] = "It may be busy with another client, or waiting for one."
+    """What to do if it does not answer in time, or a possible reason."""
     _socket: socket.socket
 
     def __init__(self, address: tuple[str, int]) -> None:
-        """Keep the address."""
+        """Store the address."""
         self.name = "{}:{}".format(*address)
         self._why_closed = ""
         self._readable, self._writable = select.poll(), select.poll()
         self._hidden: Collection[Any] = ()
 
     def _reach(self, connect: Callable[[float], socket.socket], patience: float) -> socket.socket:
-        """Return a connected socket; try again as long as nothing listens.
+        """Return a connected socket; retry while nothing listens.
 
         Args:
             connect: Connects within a time in s.
-            patience: How long to try, in s.
+            patience: Time in s to keep trying.
         """
         try:
             return retry(connect, patience, _RETRY, ConnectionRefusedError, TimeoutError)
         except (ConnectionRefusedError, TimeoutError) as error:
             raise RemoteTimeoutError(
-                f"Nothing answers at {self.name} within {patience:g} s: {error}. Start the "
-                f"{self._server} first, or give a longer connect_timeout."
+                f"Nothing answered at {self.name} within {patience:g} s: {error}. Start the "
+                f"{self._server} first, or set a longer connect_timeout."
             ) from error
         except OSError as error:
             raise RemoteError(f"{self.name} cannot be reached: {error}.") from error
@@ -57,7 +57,7 @@ class ClientConnection:
         """Prepare the connected socket for `_send` and `_wait`."""
         prepare_connection(self._socket)
         self._socket.setblocking(False)
-        self._hidden = getattr(self._socket, "hidden", ())  # of a socket that encrypts
+        self._hidden = getattr(self._socket, "hidden", ())  # data held by an encrypting socket
         self._readable.register(self._socket, select.POLLIN)
         self._writable.register(self._socket, select.POLLOUT)
 
@@ -66,7 +66,7 @@ class ClientConnection:
 
         Args:
             message: The message.
-            patience: How long the server may read nothing of it, in s; None: for ever.
+            patience: Time in s that the server may take to read any of it; None: unlimited.
         """
         self._check_open()
         rest = memoryview(message)
@@ -82,10 +82,10 @@ class ClientConnection:
             raise self._broken(error) from error
 
     def _wait(self, patience: float | None) -> bool:
-        """Wait until something can be read, and return whether it can.
+        """Wait until there is something to read; return whether there is.
 
         Args:
-            patience: How long to wait, in s; None: for ever.
+            patience: Time to wait in s; None: forever.
 
         Raises:
             OSError: If the server's machine no longer answers.
@@ -93,7 +93,7 @@ class ClientConnection:
         return bool(self._hidden) or poll_peer(self._readable, self._socket, patience)
 
     def _late(self, patience: float | None) -> RemoteTimeoutError:
-        """Close the connection; return the error for an answer that does not come in time."""
+        """Close the connection; return the error for an answer that did not arrive in time."""
         self.close(f"an answer took longer than {patience} s")
         return RemoteTimeoutError(
             f"{self.name} did not answer within {patience} s. The connection is closed. "
@@ -101,12 +101,12 @@ class ClientConnection:
         )
 
     def _broken(self, error: Exception) -> RemoteClosedError:
-        """Close the connection; return the error for one that was ended."""
+        """Close the connection; return the error for a connection that was lost or closed."""
         is_lost = is_loss(error.__cause__ or error)
         self.close(VANISHED if is_lost else str(error))
         if is_lost:
-            return RemoteClosedError(f"The connection to {self.name} is lost: {VANISHED}.")
-        return RemoteClosedError(f"{self.name} ended the connection: {error}.")
+            return RemoteClosedError(f"The connection to {self.name} was lost: {VANISHED}.")
+        return RemoteClosedError(f"{self.name} closed the connection: {error}.")
 
     def _check_open(self) -> None:
         """Check that the connection is not closed."""
@@ -114,10 +114,10 @@ class ClientConnection:
             raise RemoteClosedError(f"The connection to {self.name} is closed: {self._why_closed}.")
 
     def close(self, why: str = "it was closed here") -> None:
-        """End the connection; calling it again does nothing.
+        """Close the connection; calling it again does nothing.
 
         Args:
-            why: The reason that later calls name.
+            why: Reason to state in errors of later calls.
         """
         self._why_closed = self._why_closed or why
         self._socket.close()

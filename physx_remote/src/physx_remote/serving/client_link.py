@@ -1,4 +1,4 @@
-"""RequestLink: a client's connection on which each message is answered by one message."""
+"""RequestLink: a client's connection on which each message gets one answer."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ _LONGEST = 1e9
 class RequestLink(ClientConnection):
     """A connection on which each message is answered by one message.
 
-    After any failure it is closed: a late answer must not be taken for that of another message.
+    It is closed after any failure: a late answer must not be mistaken for that of another message.
     """
 
     def __init__(
@@ -27,13 +27,13 @@ class RequestLink(ClientConnection):
         connect_timeout: float = 10.0,
         max_answer: int = MAX_ANSWER,
     ) -> None:
-        """Connect, and try again as long as nothing listens.
+        """Connect; retry while nothing listens.
 
         Args:
             address: Host and port.
-            timeout: How long an answer may take, in s; None: forever.
-            connect_timeout: How long to try to connect, in s.
-            max_answer: Longest answer in bytes that is accepted.
+            timeout: Time limit for an answer in s; None: no limit.
+            connect_timeout: Time in s to keep trying to connect.
+            max_answer: Longest accepted answer in bytes.
         """
         if timeout is not None:
             _check_time("timeout", timeout)
@@ -56,7 +56,7 @@ class RequestLink(ClientConnection):
         self._send(add_prefix(body), self._timeout)
 
     def exchange(self, body: bytes) -> bytes:
-        """Send a message and return the answer to it."""
+        """Send a message and return its answer."""
         try:
             self.tell(body)
             return self._answer()
@@ -74,7 +74,7 @@ class RequestLink(ClientConnection):
                 raise self._late(self._timeout)
             if not self._reader.receive(self._socket):
                 place = f" within an answer, after {n} bytes" if (n := self._reader.waiting) else ""
-                raise RemoteClosedError(f"{self.name} ended the connection{place}.")
+                raise RemoteClosedError(f"{self.name} closed the connection{place}.")
             body = self._reader.take()
             if body is not None:
                 return body

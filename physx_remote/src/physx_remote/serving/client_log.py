@@ -1,4 +1,4 @@
-"""ClientLog: what clients do, in the log; who does much cannot fill it."""
+"""ClientLog: logs what clients do; a busy client cannot flood the log."""
 
 from __future__ import annotations
 
@@ -14,13 +14,13 @@ _MOST = 20
 
 
 class ClientLog:
-    """Logs at most 20 entries of a level in 10 s about a host, and how many were left out."""
+    """Logs at most 20 entries per level and host in 10 s, and how many entries were suppressed."""
 
     def __init__(self, after: Callable[[float, Callable[[], None]], None]) -> None:
-        """Start with nothing logged.
+        """Start with an empty log.
 
         Args:
-            after: Calls a function so many seconds later.
+            after: Calls a function after a time in s.
         """
         self._after = after
         self._counts: Counter[tuple[int, str]] = Counter()
@@ -34,20 +34,20 @@ class ClientLog:
         self.log(logging.WARNING, client, text, *args)
 
     def error(self, client: str, text: str, *args: Any, cause: BaseException | None = None) -> None:
-        """Log that a request of a client failed; see `log`."""
+        """Log that a client's request failed; see `log`."""
         self.log(logging.ERROR, client, text, *args, cause=cause)
 
     def log(
         self, level: int, client: str, text: str, *args: Any, cause: BaseException | None = None
     ) -> None:
-        """Make an entry about a client, unless there are many about its host.
+        """Log an entry about a client, unless there are too many about its host.
 
         Args:
             level: Level of the entry.
             client: The client as ``host:port``.
-            text: The entry, with a place for each of `args`.
-            args: Parts of the entry.
-            cause: Exception whose traceback to log, too.
+            text: The entry, with placeholders for `args`.
+            args: Values of the placeholders.
+            cause: Exception whose traceback is logged too.
         """
         if not LOG.isEnabledFor(level):
             return
@@ -59,7 +59,7 @@ class ClientLog:
             LOG.log(level, text, *args, exc_info=cause)
 
     def summarize(self) -> None:
-        """Log how many entries were left out since the last time."""
+        """Log how many entries were suppressed since the last summary."""
         counts, self._counts = self._counts, Counter()
         for (level, host), count in counts.items():
             if count > _MOST:

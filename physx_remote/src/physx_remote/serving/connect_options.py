@@ -1,4 +1,4 @@
-"""The keyword options that clients share, and the check of their names."""
+"""The keyword options that clients share, and the validation of their names."""
 
 from __future__ import annotations
 
@@ -12,9 +12,9 @@ class ConnectOptions(TypedDict, total=False):
     """Options of every client.
 
     Attributes:
-        timeout: How long an answer may take, in s, 60 unless given; None: forever.
-        connect_timeout: How long to keep trying to connect, in s, 10 unless given.
-        max_answer: Size of the longest accepted answer in bytes, 256 MiB unless given.
+        timeout: Time limit for an answer in s, 60 by default; None: no limit.
+        connect_timeout: Time in s to keep trying to connect, 10 by default.
+        max_answer: Size of the longest accepted answer in bytes, 256 MiB by default.
     """
 
     timeout: float | None
@@ -26,9 +26,9 @@ class TokenOptions(ConnectOptions, total=False):
     """Options of the clients of the protocol physx.
 
     Attributes:
-        token: The token of the service; None: the content of `token_file`, or without that of the
-            environment variable ``PHYSX_TOKEN``.
-        token_file: File that holds the token, readable by its owner alone.
+        token: The service's token; None: the content of `token_file`, else the environment
+            variable ``PHYSX_TOKEN``.
+        token_file: File with the token, readable only by its owner.
     """
 
     token: str | None
@@ -39,9 +39,9 @@ def check_names(owner: str, options: Mapping[str, Any], known: Iterable[str]) ->
     """Check that all options are known.
 
     Args:
-        owner: What takes the options, for the error.
+        owner: What takes the options, for the error message.
         options: The options by name.
-        known: The names of the options that `owner` takes.
+        known: The names of the options that `owner` accepts.
     """
     names = list(known)
     if not options.keys() <= set(names):

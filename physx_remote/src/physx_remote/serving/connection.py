@@ -1,4 +1,4 @@
-"""RequestConnection: a connection of a service, on which requests arrive."""
+"""RequestConnection: a service's connection, on which requests arrive."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Any
 from physx_core.net import Connection, Reader, yield_core
 
 MOMENT = 100e-6
-"""How long to look for the next message of a quick client without sleeping, in s."""
+"""How long to poll for the next message of a quick client without sleeping, in s."""
 
 _QUICK = 2 * MOMENT
 
@@ -18,13 +18,13 @@ class RequestConnection(Connection):
     """A connection whose messages are handled one at a time.
 
     Attributes:
-        body: The next message to be handled; None if there is none yet.
+        body: The next message to handle; None if there is none yet.
         is_quick: Whether the client sent its last message soon after the previous answer.
-        ended: Whether the client sends no more.
+        ended: Whether the client has stopped sending.
     """
 
     def __init__(self, connected: socket.socket, reader: Reader, name: str) -> None:
-        """Take a connected socket; see `Connection`."""
+        """Use a connected socket; see `Connection`."""
         super().__init__(connected, reader, name)
         self.body: Any = None
         self.ended = self.is_quick = False
@@ -36,24 +36,24 @@ class RequestConnection(Connection):
 
     @property
     def silence(self) -> float:
-        """For how long the client has sent nothing, in s."""
+        """Time in s since the client last sent something."""
         return time.monotonic() - self.heard
 
     @property
     def wants_more(self) -> bool:
-        """Whether to read on: a client that sends faster than it is served has to wait."""
+        """Whether to keep reading: a client that sends faster than it is served has to wait."""
         return not self.ended and (self.body is None or self.reader.has_room)
 
     def limit_backlog(self, size: int) -> None:
-        """Have the system keep at most about `size` bytes that the client has not read."""
+        """Limit the unread data that the system keeps for the client to about `size` bytes."""
         self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, size)
 
     def touch(self) -> None:
-        """Let the time of silence begin now, because the client had to wait until now."""
+        """Restart the time of silence, because the client had to wait until now."""
         self.heard = time.monotonic()
 
     def receive(self) -> bool:
-        """Take what has arrived; return whether there was anything, be it the end of the stream.
+        """Take what has arrived; return whether there was anything, even the end of the stream.
 
         Raises:
             OSError: If the connection is broken.
@@ -71,7 +71,7 @@ class RequestConnection(Connection):
     def receive_soon(self) -> bool:
         """Take what arrives within a moment; return whether there was anything.
 
-        For so short a time it is faster to look again and again than to be woken by the system.
+        For such a short time, polling is faster than being woken by the system.
 
         Raises:
             OSError: If the connection is broken.
@@ -84,10 +84,10 @@ class RequestConnection(Connection):
         return True
 
     def next_body(self) -> bool:
-        """Put the next whole message into `body`; return whether there is one.
+        """Put the next complete message into `body`; return whether there is one.
 
         Raises:
-            PhysxError: If what has arrived is not a message.
+            PhysxError: If what has arrived is not a valid message.
         """
         if self.body is None:
             self.body = self.reader.take()

@@ -1,4 +1,4 @@
-"""Framing: each message is a length prefix of 4 bytes, little-endian, and its body."""
+"""Framing: each message is a 4-byte little-endian length prefix followed by its body."""
 
 from __future__ import annotations
 
@@ -12,34 +12,34 @@ PREFIX = struct.Struct("<I")
 """Length of the body in bytes."""
 
 MAX_REQUEST = 1 << 24
-"""Longest body in bytes that a service accepts by default."""
+"""Default for the longest body that a service accepts, in bytes."""
 
 MAX_ANSWER = 1 << 28
-"""Longest body in bytes that a client accepts by default."""
+"""Default for the longest body that a client accepts, in bytes."""
 
 _PIECE = 1 << 16
 _MOST_UNREAD = 1 << 20
 
 
 def add_prefix(body: bytes) -> bytes:
-    """Return prefix and body as one piece: some clients read the prefix with one plain call."""
+    """Return prefix and body as one piece: some clients read the prefix with a single call."""
     try:
         return PREFIX.pack(len(body)) + body
     except struct.error:
         raise RemoteProtocolError(
-            f"A message of {len(body)} bytes is too long: its length has to fit into 4 bytes."
+            f"A message of {len(body)} bytes is too long: its length must fit into 4 bytes."
         ) from None
 
 
 class BufferReader(Reader):
-    """Keeps what arrives in one buffer.
+    """Collects what arrives in one buffer.
 
     Attributes:
-        buffer: What has arrived and was not taken.
+        buffer: What has arrived and was not taken yet.
     """
 
     def __init__(self) -> None:
-        """Start with nothing."""
+        """Start with an empty buffer."""
         self.buffer = bytearray()
 
     def receive(self, connection: socket.socket) -> int:
@@ -50,7 +50,7 @@ class BufferReader(Reader):
 
     @property
     def waiting(self) -> int:
-        """How many bytes have arrived and were not taken."""
+        """Number of bytes that have arrived and were not taken yet."""
         return len(self.buffer)
 
     @property
@@ -60,19 +60,19 @@ class BufferReader(Reader):
 
 
 class PrefixReader(BufferReader):
-    """Cuts bodies behind prefixes. Only what has arrived takes memory, whatever is announced."""
+    """Extracts prefixed bodies. Memory use depends on what has arrived, not on announced sizes."""
 
     def __init__(self, limit: int = MAX_REQUEST) -> None:
-        """Start in front of a prefix.
+        """Start before a prefix.
 
         Args:
-            limit: Longest body in bytes that is accepted.
+            limit: Longest accepted body in bytes.
         """
         super().__init__()
         self.limit = limit
 
     def take(self) -> bytes | None:
-        """Return the next whole body, or None until more has arrived."""
+        """Return the next complete body; None if it has not arrived yet."""
         buffer = self.buffer
         if len(buffer) < PREFIX.size:
             return None

@@ -1,4 +1,4 @@
-"""Conversion of any value to data for JSON."""
+"""Conversion of arbitrary values to JSON data."""
 
 from __future__ import annotations
 
@@ -11,10 +11,10 @@ _DEEPEST = 32
 
 
 def to_json_data(value: Any, depth: int = 0) -> Any:
-    """Return the part of a value that JSON can hold.
+    """Return the part of a value that JSON can represent.
 
-    Arrays become lists. Other values are left out of dictionaries, and are None anywhere else.
-    Numbers that are not finite stay as they are.
+    Arrays become lists. Values that JSON cannot represent are omitted from dictionaries, and become
+    None elsewhere. Numbers that are not finite are kept.
     """
     if value is None or isinstance(value, (bool, int, float, str)):
         return value

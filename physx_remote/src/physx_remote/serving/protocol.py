@@ -24,23 +24,23 @@ PROTOCOLS: Mapping[str, str] = {
     "godot-rl": "physx_remote.godot_rl.protocol:GodotRL",
     "physx": "physx_remote.physx.protocol:Physx",
 }
-"""Names of the protocols that physx brings."""
+"""Names of physx's own protocols."""
 
 
 class Scene(typing.Protocol):
-    """What a protocol may serve besides `Worlds`: an `RLEnvironment`, which answers requests."""
+    """What a protocol may serve other than `Worlds`: an `RLEnvironment`, which answers requests."""
 
     def open(self) -> object:
-        """Prepare agent, world and simulation."""
+        """Prepare the agent, world and simulation."""
 
     def close(self) -> None:
-        """End all connections and close the simulation."""
+        """Close all connections and the simulation."""
 
 
 class Protocol(ABC):
     """One way of driving environments from another process.
 
-    A subclass takes its own options in the constructor, as keywords, and checks them.
+    A subclass takes its own options as keyword arguments of the constructor and validates them.
 
     Attributes:
         name: The name by which users select it.
@@ -49,7 +49,7 @@ class Protocol(ABC):
     name: ClassVar[str]
 
     def __init__(self, **options: Any) -> None:
-        """Reject options that no subclass took.
+        """Reject options that no subclass accepted.
 
         Raises:
             UnknownOptionError: If there are any.
@@ -66,8 +66,8 @@ class Protocol(ABC):
 
         Args:
             worlds: The environments to serve.
-            address: Where to listen, or what to connect to.
-            port: Port there; 0: any free port, or the protocol's own.
+            address: Address to listen at, or to connect to.
+            port: Port to listen at or connect to; 0: any free port, or the protocol's default.
 
         Raises:
             RemoteError: If it cannot listen or connect there.
@@ -94,12 +94,12 @@ class Protocol(ABC):
 
 
 def find_protocol(reference: str | type[Protocol]) -> type[Protocol]:
-    """Return the protocol of a name or of ``"package.module:Class"``, or the class itself."""
+    """Return the protocol for a name, ``"package.module:Class"``, or the class itself."""
     if isinstance(reference, str) and ":" not in reference:
         if reference not in PROTOCOLS:
             raise ConfigError(
                 f'There is no protocol "{reference}".{nearest(reference, PROTOCOLS)} '
-                f'There are: {listed(PROTOCOLS)}; or give "package.module:Class".'
+                f'Available: {listed(PROTOCOLS)}; or use "package.module:Class".'
             )
         module, _, name = PROTOCOLS[reference].partition(":")
         found = getattr(import_module(module), name)

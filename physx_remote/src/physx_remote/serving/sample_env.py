@@ -1,4 +1,4 @@
-"""SampleEnv: an environment of physx as a Gymnasium environment."""
+"""SampleEnv: a physx environment as a Gymnasium environment."""
 
 from __future__ import annotations
 
@@ -26,24 +26,24 @@ from physx_core.typing import Array, Sample
 from physx_core.workers import Instance
 
 REWARD, TERMINATED, TRUNCATED = "reward", "terminated", "truncated"
-"""Fields with a meaning of their own, which are not part of the observation."""
+"""Fields with their own meaning, which are not part of the observation."""
 
 _LARGEST_SEED = 1 << 63
 
 
 class SampleEnv(gymnasium.Env[Any, Any]):
-    """An environment of physx, driven by actions in place of a network's predictions.
+    """A physx environment, driven by actions in place of a network's predictions.
 
-    The observation is the sample's training fields by name. The action is what a network would
-    predict, in physical units: it is passed to `apply_prediction` before the step, and returned by
-    `get_prediction` within the step. An environment does not know which fields a network predicts,
-    so the user names them; without any the environment takes no action.
+    The observation consists of the sample's training fields by name. The action is what a network
+    would predict, in physical units: it is passed to `apply_prediction` before the step, and
+    returned by `get_prediction` within the step. An environment does not know which fields a
+    network predicts, so the user names them; otherwise, the environment takes no action.
 
     The reward is the field ``reward``, or 0. An episode ends with the fields ``terminated`` and
     ``truncated``, and is also truncated if the environment calls `new_episode` in the step.
-    `reset` creates the environment again, with its seed, and makes one step without an action, in
-    which `get_prediction` returns zeros.
-    Additional fields, and the numbers of the step and of the trajectory, are in `info`.
+    `reset` recreates the environment with its seed and makes one step without an action, in which
+    `get_prediction` returns zeros. Additional fields, and the numbers of the step and of the
+    trajectory, are in `info`.
     """
 
     def __init__(
@@ -60,8 +60,8 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         Args:
             environment: The environment's class or reference.
             action_fields: Names of the training fields whose predictions are the action.
-            instance_id: Number of the instance, counted from 1.
-            instance_nb: How many instances run together.
+            instance_id: Number of the instance, from 1.
+            instance_nb: Number of instances that run together.
             env_kwargs: Further arguments of the environment.
 
         Raises:
@@ -86,10 +86,10 @@ class SampleEnv(gymnasium.Env[Any, Any]):
     def reset(
         self, *, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[dict[str, Array], dict[str, Any]]:
-        """Create the environment again and return its first sample.
+        """Recreate the environment and return its first sample.
 
         Args:
-            seed: Seed of the environment; None: the next of a stream of seeds.
+            seed: Seed of the environment; None: the next one of a sequence of seeds.
             options: Must be empty.
 
         Raises:
@@ -98,7 +98,7 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         """
         super().reset(seed=seed)
         if options:
-            raise UsageError(f"An environment of physx takes no reset options: {list(options)}.")
+            raise UsageError(f"A physx environment takes no reset options: {list(options)}.")
         self._open(int(self.np_random.integers(_LARGEST_SEED)) if seed is None else seed)
         observation, _, _, _, info = self._advance()
         return observation, info
@@ -145,13 +145,13 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         """
         if not self._action_fields:
             raise UsageError(
-                "get_prediction() returns the action, and there is none: name the fields that a "
+                "get_prediction() returns the action, but there is none: list the fields that a "
                 "network would predict in action_fields."
             )
         return {name: value.copy() for name, value in self._prediction.items()}
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
-        """Keep values of the environment for the life of this object."""
+        """Store values of the environment for the lifetime of this object."""
         self._parameters.update(values)
 
     def load_parameters(self, instance_id: int) -> dict[str, Any]:
@@ -193,7 +193,7 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         return {n: np.zeros(fields[n].shape or (), fields[n].dtype) for n in self._action_fields}
 
     def _find_fields(self) -> list[Field]:
-        """Return the fields with their shapes; undeclared ones are those of a first sample."""
+        """Return the fields with their shapes; undeclared shapes are taken from a first sample."""
         instance = self._open(0)
         try:
             if all(field.shape is not None for field in instance.fields):
@@ -234,8 +234,8 @@ def _space(field: Field) -> spaces.Space[Any]:
     dtype, shape = np.dtype(field.dtype), field.shape or ()
     if dtype.kind == "c":
         raise ConfigError(
-            f'Field "{field.name}" is complex, which Gymnasium has no space for. Define its '
-            "real and imaginary parts."
+            f'Field "{field.name}" is complex, but Gymnasium has no space for complex numbers. '
+            "Define its real and imaginary parts."
         )
     if dtype.kind == "f":
         return spaces.Box(-np.inf, np.inf, shape, dtype.type)

@@ -14,14 +14,14 @@ LOG = logging.getLogger("physx.remote")
 """Log of all services."""
 
 _PERIOD = 0.1
-"""How often to look for a signal while nothing arrives, in s."""
+"""How often to check for a signal while nothing arrives, in s."""
 
 
 class Service(Closeable):
-    """Serves environments to other processes, in calls of `poll`. A context manager.
+    """Serves environments to other processes in calls of `poll`. A context manager.
 
     Attributes:
-        address: Host and port where it listens, or to which it is connected.
+        address: Host and port at which it listens, or to which it is connected.
     """
 
     address: tuple[str, int]
@@ -31,15 +31,15 @@ class Service(Closeable):
         """Handle what has arrived.
 
         Args:
-            timeout: How long to wait for something to arrive, in s; None: forever.
+            timeout: Time in s to wait for something to arrive; None: forever.
 
         Returns:
-            False once the service has ended: closed here, or by the other side where the
-            protocol says so.
+            False once the service has ended: it was closed here, or by the other side if the
+            protocol allows that.
 
         Raises:
             RemoteError: If it has ended because the only other side violated the protocol, or its
-                machine no longer answers.
+                machine no longer responds.
         """
 
     def run(self) -> None:
@@ -49,18 +49,18 @@ class Service(Closeable):
 
     @abstractmethod
     def close(self) -> None:
-        """End all connections; calling it again does nothing."""
+        """Close all connections; calling it again does nothing."""
 
 
 def poll_until_interrupted(poll: Callable[[float], bool]) -> None:
-    """Call `poll` until it returns False, or until a signal came.
+    """Call `poll` until it returns False, or until a signal arrives.
 
-    A signal that raises an exception could be lost where Python ignores exceptions, as in a
+    An exception raised by a signal handler could be lost where Python ignores exceptions, as in a
     finalizer.
 
     Raises:
-        KeyboardInterrupt: After Ctrl-C; at once after a second one.
-        Terminated: Likewise for SIGTERM.
+        KeyboardInterrupt: After Ctrl-C; immediately after a second one.
+        Terminated: The same for SIGTERM.
     """
     with deferred_interrupt() as interrupt:
         while not interrupt and poll(_PERIOD):

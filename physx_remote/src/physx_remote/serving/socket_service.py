@@ -24,31 +24,31 @@ _SLICE = 0.02
 _FEW = 32
 
 Work = Iterator[float]
-"""A request in progress: yields the time in s after which it goes on."""
+"""A request in progress: yields the time in s until it resumes."""
 
 
 class SocketService(Service):
-    """A service whose clients connect to a socket, or to whose socket it is connected.
+    """A service whose clients connect to a socket, or that is connected to a peer's socket.
 
-    `handle` is called with one message at a time, of any connection. While the work that it returns
-    is in progress no other message is handled, but connections are accepted, read and closed, and
-    timers run. A client that sends faster than it is served, or does not read its answers, waits.
-    A connection is a stranger at first, and a client once `welcome` was called.
+    `handle` is called with one message at a time, from any connection. While the work that it
+    returns is in progress, no other message is handled, but connections are accepted, read and
+    closed, and timers run. A client that sends faster than it is served, or does not read its
+    answers, has to wait. A connection is a stranger at first, and a client after `welcome`.
 
     Attributes:
         connections: All open connections.
-        log: Log of what the clients do.
+        log: Log of the clients' actions.
     """
 
     encrypts: ClassVar[bool] = False
     """Whether the protocol encrypts what leaves this machine, and authenticates."""
 
     def __init__(self, *, max_clients: int = 256) -> None:
-        """Start without any connection.
+        """Start without connections.
 
         Args:
-            max_clients: How many clients there are at most; further ones are turned away. There
-                may be as many strangers besides, or 32; where another comes, one has to go.
+            max_clients: Maximum number of clients; further ones are turned away. In addition, as
+                many strangers are kept, but at least 32; if another arrives, one of them is closed.
         """
         self.address = ("", 0)
         self.connections: list[RequestConnection] = []
@@ -67,19 +67,19 @@ class SocketService(Service):
 
     @abstractmethod
     def handle(self, connection: RequestConnection, body: Any) -> Work | None:
-        """Handle one message; return the rest of the work if it is not done at once."""
+        """Handle one message; return the remaining work if it is not completed immediately."""
 
     def on_open(self, connection: RequestConnection) -> None:
         """Handle a new connection."""
 
     def on_first_message(self, connection: RequestConnection) -> None:
-        """Handle that a stranger sent a whole message; by default it is a client from now on."""
+        """Handle a stranger's first complete message; by default the stranger becomes a client."""
         self.welcome(connection)
 
     def on_fault(self, connection: RequestConnection, error: PhysxError) -> None:
-        """Handle a violation of the protocol, or the loss of the client's machine.
+        """Handle a protocol violation, or the loss of the client's machine.
 
-        By default the connection is dropped.
+        By default, the connection is dropped.
         """
         self.drop(connection, str(error))
 
@@ -87,7 +87,7 @@ class SocketService(Service):
         """Handle the end of a connection; nothing can be sent on it."""
 
     def on_drain(self, connection: RequestConnection) -> None:
-        """Handle that everything is sent that had to wait."""
+        """Handle that all delayed data have been sent."""
 
     def admits(self, connection: RequestConnection) -> bool:
         """Return whether a message of this connection may be handled now."""
@@ -98,12 +98,12 @@ class SocketService(Service):
         return PrefixReader()
 
     def new_strangers(self) -> Strangers[RequestConnection]:
-        """Return what holds the connections that are no clients yet; called once."""
+        """Return what manages the connections that are not clients yet; called once."""
         return Strangers(self.max_strangers, self.drop)
 
     @property
     def max_strangers(self) -> int:
-        """How many connections that are no clients yet there may be at most."""
+        """Maximum number of connections that are not clients yet."""
         return max(self._max_clients, _FEW)
 
     @property
@@ -114,11 +114,11 @@ class SocketService(Service):
     # For a subclass to call ----------------------------------------------------------------------
 
     def listen(self, address: str, port: int) -> None:
-        """Start to accept connections.
+        """Start accepting connections.
 
         Args:
             address: Address of this machine.
-            port: Port, 0 for any free one.
+            port: Port; 0: any free one.
 
         Raises:
             RemoteError: If the address is not one of this machine, or the port is in use.
@@ -129,8 +129,8 @@ class SocketService(Service):
             self._listener.listen(address, port)
         except OSError as error:
             raise RemoteError(
-                f"Nothing can be served at {address} port {port}: {error}. Choose port 0 for any "
-                "free port, or an address of this machine; one that another program uses is taken."
+                f"Cannot listen at {address} port {port}: {error}. Use an address of this machine, "
+                "and a port that no other program uses; port 0 chooses a free one."
             ) from error
         self.address = self._listener.address
 
@@ -151,9 +151,9 @@ class SocketService(Service):
         if not (self.encrypts or is_loopback(host)):
             LOG.warning(
                 "%s is not a loopback address, and this protocol neither encrypts nor "
-                "authenticates: anyone on the way can read and change what travels, and anyone who "
-                "reaches the port can drive the environment. Use a tunnel, or the protocol "
-                '"physx".',
+                "authenticates: anyone on the network path can read and modify the data, and "
+                "anyone who can reach the port can drive the environment. Use a tunnel, or the "
+                'protocol "physx".',
                 host,
             )
 
@@ -161,7 +161,7 @@ class SocketService(Service):
         """Count a connection as a client from now on.
 
         Raises:
-            RemoteError: If there are too many.
+            RemoteError: If there are too many clients.
         """
         self._strangers.forget(connection)
         if len(self.connections) - len(self._strangers) > self._max_clients:
@@ -180,16 +180,16 @@ class SocketService(Service):
             self.drop(connection, f"{error}")
 
     def drop(self, connection: RequestConnection, reason: str = "") -> None:
-        """Close a connection; its request in progress is finished, but not answered.
+        """Close a connection; its request in progress is completed but not answered.
 
         Args:
             connection: The connection.
-            reason: The reason for the log; empty: nothing is logged.
+            reason: Reason to log; empty: nothing is logged.
         """
         if connection.closed:
             return
         if reason:
-            self.log.warning(connection.name, "Connection of %s ended: %s", connection.name, reason)
+            self.log.warning(connection.name, "Connection to %s ended: %s", connection.name, reason)
         connection.close()
         self.connections.remove(connection)
         self._strangers.forget(connection)
@@ -206,7 +206,7 @@ class SocketService(Service):
 
     def poll(self, timeout: float | None = 0.0) -> bool:
         """Handle what has arrived; see `Service.poll`."""
-        # Another thread may be in `close`: at least one of the two sees that the other is at work.
+        # Another thread may be in `close`: at least one of the two sees that the other is active.
         self._is_polling = True
         try:
             if not self._over:
@@ -218,7 +218,7 @@ class SocketService(Service):
         return not self._over
 
     def close(self) -> None:
-        """End all connections; may be called from any thread, and within a request."""
+        """Close all connections; may be called from any thread, and within a request."""
         self._over = True
         if not self._is_polling:
             self._release()
@@ -239,7 +239,7 @@ class SocketService(Service):
             self._has_more = False
 
     def _came_soon(self, timeout: float | None) -> bool:
-        """Handle the next message of a quick, lone client, if it comes within a moment."""
+        """Handle the next message of a quick client that is alone, if it comes within a moment."""
         connection, self._recent = self._recent, None
         if connection is None or not connection.is_quick or connection.closed:
             return False
@@ -258,14 +258,14 @@ class SocketService(Service):
         return True
 
     def _look(self, timeout: float | None) -> None:
-        """Handle what the selector finds."""
+        """Handle the events reported by the selector."""
         for connection, events in self._listener.select(self._wait(timeout)):
             self._serve(connection, events)
         self._looked = time.monotonic()
         self._listener.accept()
 
     def _open(self) -> None:
-        """Acquire what the loop needs from the system."""
+        """Acquire the system resources of the loop."""
         with self._lock:
             if not (self._is_open or self._released):
                 self._is_open = True
@@ -318,7 +318,7 @@ class SocketService(Service):
                 return
 
     def _next(self) -> RequestConnection | None:
-        """Return the connection whose message has waited longest, of those that are admitted."""
+        """Return the admitted connection whose message has waited longest."""
         for _ in range(len(self._ready)):
             connection = self._ready.popleft()
             if not connection.outgoing and self.admits(connection):
@@ -358,11 +358,11 @@ class SocketService(Service):
         if not isinstance(error, Exception):
             self.drop(connection, "the service ends")
             raise error
-        self.log.error(connection.name, "A request of %s failed", connection.name, cause=error)
+        self.log.error(connection.name, "A request from %s failed", connection.name, cause=error)
         self.drop(connection, f"{type(error).__name__}: {error}")
 
     def _after(self, connection: RequestConnection) -> None:
-        """Look for the next message of a connection, or for its end."""
+        """Check for the next message of a connection, or for its end."""
         if connection.closed:
             return
         connection.touch()
@@ -382,7 +382,7 @@ class SocketService(Service):
         connection.watch()
 
     def _serve(self, connection: RequestConnection, events: int) -> None:
-        """Receive from a connection and send to it, as the selector found."""
+        """Receive from a connection and send to it, as reported by the selector."""
         if connection.closed:
             return
         had_body = connection.body is not None
@@ -406,7 +406,7 @@ class SocketService(Service):
             self._answer(connection)
 
     def _answer(self, connection: RequestConnection) -> None:
-        """Handle the message that has just arrived, if no other waits."""
+        """Handle the message that has just arrived, if no other is waiting."""
         try:
             if self._take_body(connection) and self.admits(connection) and not connection.outgoing:
                 self._begin(connection)
@@ -417,7 +417,7 @@ class SocketService(Service):
         self._after(connection)
 
     def _take_body(self, connection: RequestConnection) -> bool:
-        """Put the next whole message into `body`; return whether there is one."""
+        """Put the next complete message into `body`; return whether there is one."""
         if not connection.next_body():
             return False
         if connection in self._strangers:

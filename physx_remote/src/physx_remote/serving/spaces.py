@@ -1,4 +1,4 @@
-"""Gymnasium spaces: their leaves, and spaces and values as plain data for JSON."""
+"""Gymnasium spaces: their leaves, and spaces and values as JSON data."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ NONSENSE: tuple[type[Exception], ...] = (
     *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError),
     *(RecursionError, MemoryError),
 )
-"""What may be raised where received data are not what the protocol says."""
+"""Exceptions that malformed received data may raise."""
 
 _LARGEST = 1 << 26
 
@@ -31,7 +31,7 @@ KINDS = "Box, Discrete, MultiBinary, MultiDiscrete, Dict and Tuple"
 
 
 class SpaceTree:
-    """A space as a sequence of leaves: of the parts that have no parts themselves.
+    """A space as a sequence of leaves: the parts that have no parts themselves.
 
     Attributes:
         space: The space.
@@ -86,7 +86,7 @@ def _no_layout(space: Space) -> UsageError:
 
 
 def cast_exactly(value: Any, dtype: np.dtype[Any]) -> Array:
-    """Return numbers as an array of a type; some programs send whole numbers as 1.0."""
+    """Return numbers as an array of a type; some programs send integers as 1.0."""
     array = np.asarray(value)
     if array.dtype == dtype:
         return array
@@ -100,10 +100,10 @@ def cast_exactly(value: Any, dtype: np.dtype[Any]) -> Array:
 
 
 def find_invalid(leaf: Leaf, values: Array) -> tuple[int, ...] | None:
-    """Return where the first value is that no element of a space holds; None if there is none.
+    """Return the index of the first value that is not valid in a space; None if all are valid.
 
-    Floating values must be finite. Their bounds are the environment's own concern, as in Gymnasium:
-    many environments clip them, or take more than they announce. Whole numbers must be in range.
+    Floating-point values must be finite. Their bounds are up to the environment, as in Gymnasium:
+    many environments clip them, or accept more than they declare. Integers must be in range.
 
     Args:
         leaf: The space.
@@ -120,7 +120,7 @@ def find_invalid(leaf: Leaf, values: Array) -> tuple[int, ...] | None:
 
 
 def _range(leaf: Leaf) -> tuple[Any, Any]:
-    """Return the least and the largest elements of a space of whole numbers."""
+    """Return the smallest and largest elements of a space of integers."""
     if isinstance(leaf, spaces.Box):
         return leaf.low, leaf.high
     if isinstance(leaf, spaces.MultiBinary):
@@ -130,11 +130,11 @@ def _range(leaf: Leaf) -> tuple[Any, Any]:
 
 
 def invalid_value(leaf: Leaf, place: str, value: Any) -> RequestError:
-    """Return the error for a value that no element of a space holds.
+    """Return the error for a value that is not valid in a space.
 
     Args:
         leaf: The space.
-        place: What the value is, such as ``The action[2]``.
+        place: Description of the value, such as ``The action[2]``.
         value: The value.
     """
     is_float = isinstance(leaf, spaces.Box) and np.issubdtype(leaf.dtype, np.floating)
@@ -143,15 +143,15 @@ def invalid_value(leaf: Leaf, place: str, value: Any) -> RequestError:
 
 
 def subscripts(keys: Iterable[Any]) -> str:
-    """Return keys and indices as they are written in Python, such as ``["arm"][2]``."""
+    """Return keys and indices in Python's notation, such as ``["arm"][2]``."""
     return "".join(f'["{key}"]' if isinstance(key, str) else f"[{key}]" for key in keys)
 
 
-# Plain data for JSON ---------------------------------------------------------------------------
+# JSON data -------------------------------------------------------------------------------------
 
 
 def describe_space(space: Space) -> dict[str, Any]:
-    """Return a space as plain data for JSON."""
+    """Return a space as JSON data."""
     kind = type(space).__name__
     match space:
         case spaces.Box():
@@ -161,7 +161,7 @@ def describe_space(space: Space) -> dict[str, Any]:
             start, count = int(space.start), int(space.n)
             return {"kind": kind, "n": count, "start": start, "dtype": space.dtype.str}
         case spaces.MultiBinary():
-            bits = space.n  # a number is another space than a shape of one number
+            bits = space.n  # a number and a shape of one number are different spaces
             return {"kind": kind, "n": bits if isinstance(bits, int) else [*space.shape]}
         case spaces.MultiDiscrete():
             counts, starts = space.nvec.tolist(), space.start.tolist()
@@ -174,7 +174,7 @@ def describe_space(space: Space) -> dict[str, Any]:
 
 
 def build_space(plain: Mapping[str, Any]) -> Space:
-    """Return the space that a description of `describe_space` stands for."""
+    """Return the space described by the result of `describe_space`."""
     try:
         return _build(plain)
     except NONSENSE as error:
@@ -208,11 +208,11 @@ def _build(plain: Mapping[str, Any]) -> Space:
 
 
 def check_shape(sizes: Iterable[Any], num_worlds: int = 1) -> tuple[int, ...]:
-    """Return a shape that was received.
+    """Return a received shape, after validating it.
 
     Args:
         sizes: The shape.
-        num_worlds: How many arrays of that shape there are.
+        num_worlds: Number of arrays with that shape.
 
     Raises:
         ValueError: If it is not the shape of an array that fits into memory.
@@ -226,7 +226,7 @@ def check_shape(sizes: Iterable[Any], num_worlds: int = 1) -> tuple[int, ...]:
 
 
 def _bounds(array: Array) -> Any:
-    """Return bounds as one number if all are the same; infinite ones become strings."""
+    """Return bounds as one number if all are equal; infinite ones become strings."""
     flat = array.ravel()
     if flat.size and (flat == flat[0]).all():
         return _number(flat[0].item())
@@ -245,7 +245,7 @@ def _limits(plain: Any, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Array:
 
 
 def to_json(space: Space, value: Any) -> Any:
-    """Return a value of any space as plain data for JSON, without loss."""
+    """Return a value of any space as lossless JSON data."""
     if isinstance(space, spaces.Dict):
         return {name: to_json(part, value[name]) for name, part in space.items()}
     if isinstance(space, spaces.Tuple):
@@ -254,7 +254,7 @@ def to_json(space: Space, value: Any) -> Any:
 
 
 def from_json(space: Space, plain: Any, place: str = "The action") -> Any:
-    """Return the value of a space that JSON data stand for."""
+    """Return the value of a space represented by JSON data."""
     try:
         if isinstance(space, spaces.Dict):
             return {n: from_json(s, plain[n], f'{place}["{n}"]') for n, s in space.items()}

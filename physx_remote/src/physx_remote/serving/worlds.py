@@ -15,12 +15,12 @@ from physx_core.plugins import available, find, load
 from physx_remote.serving.sample_env import SampleEnv
 
 _PLUGIN = "gym"
-"""The plugin of Gymnasium's environments; its import registers further ids."""
+"""The plugin with Gymnasium environments; importing it registers further ids."""
 _PREFIX = f"{_PLUGIN}/"
 
 _SERVED = (
-    "Give an RLEnvironment or its class, a Gymnasium environment or a function that returns one, "
-    'an environment of physx, or a reference such as "gym/CartPole-v1" or "script.py:Class".'
+    "Pass an RLEnvironment or its class, a Gymnasium environment or a function that returns one, "
+    'a physx environment, or a reference such as "gym/CartPole-v1" or "script.py:Class".'
 )
 
 Served: TypeAlias = str | gymnasium.Env[Any, Any] | Callable[..., Any]
@@ -30,26 +30,26 @@ Transition: TypeAlias = tuple[Any, float, bool, bool, dict[str, Any]]
 
 
 class Worlds(Closeable):
-    """One or several gymnasium environments with the same spaces. A context manager.
+    """One or several Gymnasium environments with the same spaces. A context manager.
 
-    Errors of the environments pass through; services report them and go on.
+    Errors of the environments pass through; services report them and continue.
 
     Attributes:
-        environments: The environments, by number of the world.
+        environments: The environments, by world number.
         name: Name of the environments, for messages.
         observation_space: Space of one world's observations.
         action_space: Space of one world's actions.
     """
 
     def __init__(self, environments: Sequence[gymnasium.Env[Any, Any]], name: str = "") -> None:
-        """Take the environments.
+        """Store the environments.
 
         Args:
             environments: At least one.
             name: Name of the environments; empty: the id or class of the first one.
 
         Raises:
-            UsageError: If there is none, or their spaces differ.
+            UsageError: If there are none, or their spaces differ.
         """
         if not environments:
             raise UsageError("There must be at least one world.")
@@ -65,22 +65,22 @@ class Worlds(Closeable):
                 if getattr(other, kind) != getattr(first, kind):
                     raise UsageError(
                         f"World {number} has the {kind} {getattr(other, kind)}, but world 0 has "
-                        f"{getattr(first, kind)}. Worlds served together need equal spaces."
+                        f"{getattr(first, kind)}. Worlds served together must have equal spaces."
                     )
 
     @property
     def num_worlds(self) -> int:
-        """How many worlds there are."""
+        """Number of worlds."""
         return len(self.environments)
 
     def reset(
         self, world: int, seed: int | None = None, options: dict[str, Any] | None = None
     ) -> tuple[Any, dict[str, Any]]:
-        """Begin an episode of one world; return its observation and info."""
+        """Start an episode in one world; return its observation and info."""
         return self.environments[world].reset(seed=seed, options=options)
 
     def step(self, world: int, action: Any) -> Transition:
-        """Make one step of one world."""
+        """Step one world."""
         observation, reward, terminated, truncated, info = self.environments[world].step(action)
         return observation, float(reward), bool(terminated), bool(truncated), info
 
@@ -105,8 +105,8 @@ class Worlds(Closeable):
         """Restore one world to a state that `snapshot` returned.
 
         Raises:
-            UsageError: If the environment does not define `snapshot`, or it did not return the
-                state.
+            UsageError: If the environment does not define `snapshot`, or the state is not one that
+                it returned.
         """
         limits = self._limits(world)
         is_own = set(state) == {"environment", "elapsed_steps"}
@@ -117,7 +117,7 @@ class Worlds(Closeable):
             limit._elapsed_steps = elapsed
 
     def _keeper(self, world: int) -> Any:
-        """Return the outermost wrapper or environment that has snapshots, or None."""
+        """Return the outermost wrapper or environment that has snapshots; None if there is none."""
         found = (env for env in self._parts(world) if hasattr(env, "snapshot"))
         return next(found, None)
 
@@ -162,18 +162,18 @@ def open_worlds(
     """Create worlds.
 
     Args:
-        environment: A Gymnasium id, as ``"gym/CartPole-v1"`` or, if it has a version,
+        environment: A Gymnasium id, such as ``"gym/CartPole-v1"`` or, if it has a version,
             ``"physx/Cartpole-v0"`` or ``"package:id-v0"``, which imports the package first; a
-            reference of a physx environment, such as ``"toy/spring"``, which becomes a `SampleEnv`;
+            reference to a physx environment, such as ``"toy/spring"``, which becomes a `SampleEnv`;
             ``"package.module:Class"`` or ``"script.py:Class"`` of either kind; a class, or a
             function that returns an environment; or one Gymnasium environment.
-        num_worlds: How many worlds to create.
-        env_kwargs: Keyword arguments of each environment, and those of `SampleEnv`.
+        num_worlds: Number of worlds to create.
+        env_kwargs: Keyword arguments of each environment, including those of `SampleEnv`.
 
     Raises:
-        ConfigError: If an environment does not take the arguments.
+        ConfigError: If an environment does not accept the arguments.
         UsageError: If several worlds of one existing environment are requested, or a function
-            returns something else than an environment.
+            returns something other than an environment.
         PhysxError: If the reference cannot be resolved: see `physx_core.plugins.find`.
     """
     if type(num_worlds) is not int or num_worlds < 1:
@@ -182,7 +182,7 @@ def open_worlds(
     if isinstance(environment, gymnasium.Env):
         if num_worlds > 1 or arguments:
             raise UsageError(
-                "An existing environment is one world and takes no arguments: give its class, or a "
+                "An existing environment is one world and takes no arguments: pass its class, or a "
                 "function that returns one."
             )
         return Worlds([environment])
@@ -198,7 +198,7 @@ def open_worlds(
 
 
 def is_gymnasium_id(reference: str) -> bool:
-    """Return whether a reference is a Gymnasium id: it begins with ``gym/`` or has a version."""
+    """Return whether a reference is a Gymnasium id: it starts with ``gym/`` or has a version."""
     return reference.startswith(_PREFIX) or reference.rpartition("-v")[2].isdigit()
 
 
@@ -227,7 +227,7 @@ def call_with(maker: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
         return maker(**arguments)
     except TypeError as error:
         if error.__traceback__ is not None and error.__traceback__.tb_next is not None:
-            raise  # the call succeeded, and the code within it failed
+            raise  # the call succeeded, and the code inside it failed
         raise ConfigError(f"{maker!r} does not take these arguments: {error}.") from error
 
 

@@ -17,7 +17,7 @@ from physx_rerun.viewer.headless import render_picture
 
 @dataclass
 class Snapshot:
-    """Render a picture of a recording or dataset at one time; needs no display.
+    """Render a picture of a recording or dataset at one time, without a display.
 
     physx snapshot sessions/prediction
 
@@ -27,19 +27,19 @@ class Snapshot:
     """
 
     place: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FILE|SESSION")]
-    """A recording (.rrd), a session's folder (its newest recording, or else its dataset), a
-    dataset's folder, or one of its files."""
+    """A recording (.rrd), a session's folder (its newest recording, else its dataset), a dataset's
+    folder, or one of its files."""
     at: str | None = None
     """A step such as 150, a simulated time such as 1.5s, or a position on --timeline; by default
     the end."""
     out: Annotated[Path | None, tyro.conf.arg(aliases=("-o",))] = None
-    """Picture to write; by default in this folder, named like the recording."""
+    """Picture to write; by default in this folder, named after the recording."""
     timeline: str | None = None
     """Name of the timeline, for example sim_time or epoch."""
     width: int = 1600
-    """In pixels."""
+    """Width in pixels."""
     height: int = 900
-    """In pixels."""
+    """Height in pixels."""
 
 
 def run(words: Sequence[str]) -> None:
@@ -59,5 +59,5 @@ def _position(text: str | None) -> float | None:
         return None if text is None else float(text.removesuffix("s"))
     except ValueError:
         raise UsageError(
-            f'--at is "{text}" and must be a number such as 150, or a time such as 1.5s.'
+            f'--at is "{text}" but must be a number such as 150, or a time such as 1.5s.'
         ) from None

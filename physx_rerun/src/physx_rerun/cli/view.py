@@ -28,10 +28,10 @@ class View:
     """
 
     place: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FILE|SESSION")]
-    """A recording (.rrd), a session's folder (its newest recording, or else its dataset), a
-    dataset's folder, or one of its files."""
+    """A recording (.rrd), a session's folder (its newest recording, else its dataset), a dataset's
+    folder, or one of its files."""
     web: bool = False
-    """Serve a page for browsers on this machine, and print its address; Ctrl-C ends it."""
+    """Serve a page for browsers on this machine, and print its address; Ctrl-C stops it."""
     port: int = 0
     """Port of the viewer; 0: any free one."""
     page_port: int = 0
@@ -39,12 +39,12 @@ class View:
 
 
 def run(words: Sequence[str]) -> None:
-    """Show the recording until its window is closed, or until Ctrl-C."""
+    """Show the recording until its window is closed or Ctrl-C is pressed."""
     options = tyro.cli(View, args=words, prog="physx view")
     with recording_of(options.place) as path:
         viewer = _open(path.resolve(), options)
         try:
-            with contextlib.suppress(KeyboardInterrupt):  # the usual way to end it
+            with contextlib.suppress(KeyboardInterrupt):  # the usual way to stop it
                 viewer.process.wait()
         finally:
             viewer.end()
@@ -53,12 +53,12 @@ def run(words: Sequence[str]) -> None:
 def _open(recording: Path, options: View) -> Viewer:
     if options.web:
         viewer = start_web_viewer(options.port, options.page_port, str(recording))
-        show(f"viewer: {viewer.page}  (Ctrl-C ends it)")
+        show(f"viewer: {viewer.page}  (Ctrl-C stops it)")
         return viewer
     if not has_display():
         raise VisualizerError(
-            "There is no display to open a window on. Add --web to see it in a browser, or make a "
-            "picture: physx snapshot FILE|SESSION -o PICTURE.png"
+            "There is no display to open a window on. Add --web to view it in a browser, or render "
+            "a picture: physx snapshot FILE|SESSION -o PICTURE.png"
         )
     viewer = Viewer(options.port, (str(recording),))
     viewer.wait_until_ready()

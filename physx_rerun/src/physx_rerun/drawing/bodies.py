@@ -1,4 +1,4 @@
-"""Bodies: the frames of one instance's rigid bodies, which move in every step."""
+"""Bodies: the frames of one instance's rigid bodies, which move every step."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ from physx_rerun.drawing.chunks import Chunk, Times, columns_of, indexes_of
 from physx_rerun.drawing.framing import Frame, extremes
 
 _BLOCK_ROWS = 2000
-"""Rows of a chunk. Rerun's compression finds what repeats within 64 KiB only: a column's offsets
-are those of the column before."""
+"""Rows per chunk. Rerun's compression only finds repetitions within 64 KiB: a column's offsets
+repeat those of the previous column."""
 _UPRIGHT = np.array([0, 0, 0, 1], np.float32)
 
 
 @dataclass(slots=True)
 class _Move:
-    """A move of some bodies at one time: rows of them; a part that is None stays as it was."""
+    """A move of some bodies at one time, one row each; None: position or orientation is kept."""
 
     times: Times
     places: Array
@@ -31,16 +31,16 @@ class _Move:
 
 
 class Bodies:
-    """Poses of bodies, collected into columns.
+    """Poses of bodies, collected in columns.
 
-    A pose is x, y, z in m and a quaternion x, y, z, w, in the frame of the world.
+    A pose is x, y, z in m and a quaternion x, y, z, w, in the world frame.
     """
 
     def __init__(self, entity: str) -> None:
         """Start without bodies.
 
         Args:
-            entity: Path of the entity that holds all poses; its parent is the world.
+            entity: Path of the entity with all poses; its parent is the world.
         """
         self._entity = entity
         self._frames: list[str] = []
@@ -52,7 +52,7 @@ class Bodies:
         self._named: tuple[Array, pa.Array] = (np.zeros(0, np.int64), pa.array([], pa.utf8()))
 
     def add(self, frames: Sequence[str]) -> Array:
-        """Add bodies at the origin, by the names of their frames, and return their places."""
+        """Add bodies at the origin, by the names of their frames, and return their indices."""
         first, count = len(self._frames), len(frames)
         self._frames += frames
         self._positions = np.concatenate([self._positions, np.zeros((count, 3), np.float32)])
@@ -60,7 +60,7 @@ class Bodies:
         return np.arange(first, first + count)
 
     def set_box(self, place: int, corners: Array) -> None:
-        """Set the points around a body that are kept in view, in its frame, shape (n, 3)."""
+        """Set the points around a body that stay in view, in its frame, shape (n, 3)."""
         box = np.stack(extremes(corners))
         self._boxes[place] = box
         self._radii[place] = float(np.linalg.norm(np.abs(box).max(axis=0)))
@@ -69,7 +69,7 @@ class Bodies:
         """Move bodies.
 
         Args:
-            places: Of the bodies, shape (n,).
+            places: Indices of the bodies, shape (n,).
             times: Time of the row.
             values: ``position`` (n, 3), ``orientation`` (n, 4), or both.
         """
@@ -80,7 +80,7 @@ class Bodies:
         self._moves.append(_Move(times, places, positions, orientations))
 
     def in_world(self, place: int, points: Array) -> Array:
-        """Return points of a body's frame, shape (n, 3), in the frame of the world."""
+        """Transform points, shape (n, 3), from a body's frame to the world frame."""
         position, orientation = self._positions[place], self._orientations[place]
         for move in self._moves:
             for row in np.flatnonzero(move.places == place):
@@ -94,7 +94,7 @@ class Bodies:
         """Return and clear the rows since the last call.
 
         Args:
-            frame: What the camera shows, to be told where the bodies were; None: nothing.
+            frame: The camera's view, which is informed of the bodies' positions; None: no view.
         """
         moves, self._moves = self._moves, []
         chunks = []
@@ -113,9 +113,9 @@ class Bodies:
         return chunks
 
     def _rows(self, moves: Sequence[_Move]) -> tuple[Array, Array, Array]:
-        """Return places, positions and orientations of moves, one after another."""
+        """Return the indices, positions and orientations of moves, concatenated."""
         if any(move.positions is None or move.orientations is None for move in moves):
-            for move in moves:  # the parts that stay are those of the moves before
+            for move in moves:  # kept parts come from earlier moves
                 if move.positions is not None:
                     self._positions[move.places] = move.positions
                 if move.orientations is not None:
@@ -129,7 +129,7 @@ class Bodies:
         return places, positions, orientations
 
     def _names(self, places: Array) -> pa.Array:
-        """Return the names of frames; mostly the same bodies move in the same order as before."""
+        """Return the names of frames; usually the same bodies move in the same order as before."""
         known, names = self._named
         if not np.array_equal(known[: len(places)], places):
             names = pa.array(self._frames, pa.utf8()).take(pa.array(places))
@@ -137,7 +137,7 @@ class Bodies:
         return names[: len(places)]
 
     def _tell(self, frame: Frame, places: Array, positions: Array, orientations: Array) -> None:
-        """Tell a frame where bodies were, unless it surely shows them."""
+        """Inform a view of the bodies' positions, unless it is certain to show them."""
         if not self._boxes:
             return
         if len(self._boxes) < len(self._frames):
@@ -160,7 +160,7 @@ class Bodies:
 
 
 def _blocks(moves: Iterable[_Move]) -> Iterator[list[_Move]]:
-    """Yield moves in blocks that have the same timelines, and not too many rows to be packed."""
+    """Yield moves in blocks with the same timelines that do not have too many rows."""
     block: list[_Move] = []
     count = 0
     for move in moves:

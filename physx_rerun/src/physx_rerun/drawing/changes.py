@@ -10,7 +10,7 @@ _POSE = {"position", "orientation"}
 
 
 class Changes:
-    """Collects the events of several steps, of which only the last values are kept.
+    """Collects the events of several steps, and keeps only the last values.
 
     Attributes:
         step: The last step.
@@ -26,34 +26,34 @@ class Changes:
         """Add the events of a step.
 
         Returns:
-            Whether there are only changes of objects, which can wait for those of later steps.
+            Whether there are only changes to objects, which can wait for those of later steps.
         """
         self.step, can_wait = step, True
         for event in events:
             if event.action == "update":
                 self._join(event)
-            else:  # what was before stays before
+            else:  # the order relative to earlier changes must be kept
                 self._events = [*self.pop(), event]
                 can_wait = False
         return can_wait
 
     def _join(self, event: Event) -> None:
-        """Join a change with those of the same objects."""
+        """Merge a change with earlier changes to the same objects."""
         moves = {option: event.values[option] for option in _POSE & event.values.keys()}
         looks = {option: event.values[option] for option in event.values.keys() - moves.keys()}
         if moves:
             key = (*event.names, "", *sorted(moves))
-            self._moves.pop(key, None)  # the later one has its own place in the order
+            self._moves.pop(key, None)  # the later change has its own place in the order
             self._moves[key] = Event("update", event.kind, event.names, moves)
         for one in Event("update", event.kind, event.names, looks).each() if looks else ():
             before = self._looks.pop(one.name, None)
             known = {} if before is None else dict(before.values)
             if "color" in looks:
-                known.pop("scalar_field", None)  # which the color replaces
+                known.pop("scalar_field", None)  # replaced by the color
             self._looks[one.name] = Event("update", one.kind, one.names, {**known, **one.values})
 
     def pop(self) -> list[Event]:
-        """Return and forget the events."""
+        """Return and clear the events."""
         events = [*self._events, *self._moves.values(), *self._looks.values()]
         self._events, self._moves, self._looks = [], {}, {}
         return events

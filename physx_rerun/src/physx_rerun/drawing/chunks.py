@@ -1,7 +1,7 @@
-"""ChunkBuilder: gathers the rows drawn since the last flush into columns.
+"""ChunkBuilder: collects the rows drawn since the last flush in columns.
 
-One call of Rerun for each object and step costs some 100 µs; the same as columns of many steps
-costs a few µs and stores far less.
+A call to Rerun for each object and step costs some 100 µs; the same data as columns of many steps
+cost a few µs and far less space.
 """
 
 from __future__ import annotations
@@ -18,10 +18,10 @@ import rerun as rr
 from physx_core.typing import Array
 
 Times = Mapping[str, float]
-"""Timeline to position: the timelines `TIME` and `SIM_TIME` in s, all others counted."""
+"""Timeline to position: the timelines `TIME` and `SIM_TIME` in s, all others as integers."""
 
 TIME = "time"
-"""Timeline of the seconds since the run began."""
+"""Timeline of the seconds since the start of the run."""
 
 SIM_TIME = "sim_time"
 """Timeline of the simulated time."""
@@ -33,7 +33,7 @@ class Chunk:
 
     Attributes:
         entity: Path of the entity.
-        indexes: One column for each timeline; none: the row is valid at all times.
+        indexes: One column for each timeline; empty: the row is valid at all times.
         columns: One column for each component.
         nbytes: Size of the components in bytes.
     """
@@ -45,12 +45,12 @@ class Chunk:
 
     @property
     def is_static(self) -> bool:
-        """Whether it is valid at all times."""
+        """Whether the rows are valid at all times."""
         return not self.indexes
 
     @classmethod
     def of(cls, entity: str, indexes: list[rr.TimeColumn], columns: list[Any]) -> Chunk:
-        """Return the chunk of some columns."""
+        """Return a chunk with the given columns."""
         nbytes = sum(column.component_batch.as_arrow_array().nbytes for column in columns)
         return cls(entity, indexes, columns, nbytes)
 
@@ -80,7 +80,7 @@ class ChunkBuilder:
         self._whole: list[Chunk] = []
         self._blocks: dict[tuple[Any, ...], _Block] = {}
         self._at: Times = {}
-        self._keys_at: dict[str, list[tuple[Any, ...]]] = {}  # of the blocks of each entity
+        self._keys_at: dict[str, list[tuple[Any, ...]]] = {}  # keys of the blocks by entity
 
     def add_static(self, entity: str, *archetypes: Any) -> None:
         """Add components that are valid at all times.
@@ -103,10 +103,10 @@ class ChunkBuilder:
             entity: Path of the entity.
             archetype: A Rerun archetype.
             times: Position of the row on the timelines.
-            values: The archetype's fields: arrays or lists whose first axis is that of instances.
+            values: The archetype's fields: arrays or lists whose first axis is the instances.
         """
         key = (entity, archetype, tuple(values), tuple(times))
-        if archetype is not rr.Scalars:  # of which all rows are alike
+        if archetype is not rr.Scalars:  # whose rows all have the same fields
             self._keep_order(key, times)
         block = self._blocks.get(key)
         if block is None:
@@ -117,7 +117,7 @@ class ChunkBuilder:
             self.nbytes += value.nbytes if isinstance(value, np.ndarray) else 50 * len(value)
 
     def _keep_order(self, key: tuple[Any, ...], times: Times) -> None:
-        """End blocks to which a row must not be added: of rows at one time the last one counts."""
+        """End blocks that must not get the row: of rows at the same time, the last one counts."""
         if times is not self._at:
             self._at = times
             self._keys_at.clear()
@@ -135,13 +135,13 @@ class ChunkBuilder:
         before.append(key)
 
     def _end(self, key: tuple[Any, ...]) -> None:
-        """Make a chunk of a block, so that later rows come after it."""
+        """Make a chunk of a block, so later rows come after it."""
         block = self._blocks.pop(key, None)
         if block is not None:
             self._whole.append(_chunk_of(key, block))
 
     def next_frame(self) -> str:
-        """Return a name for another frame, as short as can be: each row of a pose contains it."""
+        """Return a name for another frame, as short as possible: each row of a pose contains it."""
         return next(self._frames)
 
     def pop_chunks(self) -> list[Chunk]:
@@ -189,7 +189,7 @@ def indexes_of(times: Sequence[Times], counts: Sequence[int]) -> list[rr.TimeCol
     """Return a column for each timeline.
 
     Args:
-        times: Positions on the timelines, one after another.
+        times: Positions on the timelines, in order.
         counts: Number of rows at each of them.
     """
     columns = []

@@ -8,10 +8,10 @@ from physx_core.components import Event
 
 
 class SimulatedClock:
-    """Follows the simulated time that an instance tells; it goes on where a new episode begins.
+    """Tracks the simulated time reported by an instance; it keeps running across episodes.
 
     Attributes:
-        seconds: The time, in s; None: not known yet.
+        seconds: The time in s; None: not known yet.
     """
 
     def __init__(self) -> None:
@@ -19,7 +19,7 @@ class SimulatedClock:
         self._told = self._before = 0.0
 
     def read(self, events: Sequence[Event]) -> list[Event]:
-        """Take the time from the events of a step, and return the other events."""
+        """Read the time from the events of a step, and return the other events."""
         others = []
         for event in events:
             if event.kind != "time":

@@ -1,4 +1,4 @@
-"""Converts the colors of scene objects to Rerun's numbers."""
+"""Converts the colors of scene objects to Rerun's integers."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ CURVES = ("#4c9be8", "#ff9f43", "#2ecc71", "#ff6b6b", "#a78bfa", "#1dd1a1", "#fe
 
 
 def rgba(color: Color, alpha: float = 1.0) -> Array:
-    """Return one color as a number 0xRRGGBBAA, shape (1,), unsigned 32 bit."""
+    """Return one color as an integer 0xRRGGBBAA, shape (1,), unsigned 32 bit."""
     return pack_rgba(np.array([[*parse_color(color), alpha]]))
 
 
 def pack_rgba(rgba: Array) -> Array:
-    """Pack colors into numbers 0xRRGGBBAA.
+    """Pack colors into integers 0xRRGGBBAA.
 
     Args:
         rgba: Red, green, blue and alpha in [0, 1], shape (..., 4).
@@ -40,8 +40,8 @@ def map_values(values: Array, limits: tuple[float, float], colormap: str, alpha:
 
     Args:
         values: Any numbers, shape (n,).
-        limits: Values of the first and the last color.
-        colormap: Name of a colormap of matplotlib.
+        limits: Values of the first and last color.
+        colormap: Name of a Matplotlib colormap.
         alpha: Opacity in [0, 1].
 
     Returns:

@@ -19,7 +19,7 @@ from physx_rerun.drawing.chunks import ChunkBuilder, Times
 
 _BINS = 30
 _LEGEND = 8  # largest number of names in a plot's legend
-_POINTS = 2000  # largest number of predicted values that are shown of a field
+_POINTS = 2000  # largest number of predicted values shown per field
 _FIELDS, _PREDICTIONS = "fields", "predictions"
 _RUN = "run"
 _LOSSES, _RATE = ("loss per epoch", "loss per batch"), "learning rate"
@@ -43,10 +43,10 @@ class _Plot:
 
     Attributes:
         curves: Paths of the curves.
-        logarithms: Paths of the curves of logarithms to the base 10, shown in their place.
-        colored: What has a color of its own.
-        is_positive: Whether all values so far are, so that they have logarithms.
-        highest: End of an axis that begins at 0; 0: the axis fits the curves.
+        logarithms: Paths of the curves of base-10 logarithms, shown in their place.
+        colored: What has its own color.
+        is_positive: Whether all values so far are positive, so they have logarithms.
+        highest: End of an axis that starts at 0; 0: the axis fits the curves.
     """
 
     curves: list[str] = field(default_factory=list)
@@ -58,14 +58,14 @@ class _Plot:
 
 @dataclass(frozen=True)
 class _Curve:
-    """A number that is shown.
+    """A number to show.
 
     Attributes:
-        name: Its name.
+        name: Name of the number.
         title: Title of its plot.
-        label: Its name in the legend.
-        colored: What has its color: the curve, or the component that several curves are of.
-        spread: Its standard deviation, shown as a band; None: it has none.
+        label: Name in the legend.
+        colored: What has its color: the curve, or the component that several curves belong to.
+        spread: Its standard deviation, shown as a band; None: no band.
     """
 
     name: str
@@ -76,17 +76,17 @@ class _Curve:
 
 
 class Dashboard:
-    """Shows what a training records; every number is also a curve of its own in the recording.
+    """Shows what a training records; every number is also a separate curve in the recording.
 
-    The loss is shown as its logarithm while it is positive: that of batches as mean of the last
-    ones with its standard deviation, those of epochs in one plot for training and validation.
+    The loss is shown as its logarithm while it is positive: for batches as the mean of the last
+    ones with their standard deviation, for epochs in one plot for training and validation.
 
     Attributes:
-        changed: Whether the windows are others than at the last call of `cells`.
+        changed: Whether the windows differ from those at the last call of `cells`.
     """
 
     def __init__(self, rows: ChunkBuilder) -> None:
-        """Start empty.
+        """Start without windows.
 
         Args:
             rows: Collects the rows.
@@ -108,7 +108,7 @@ class Dashboard:
     # What is recorded -----------------------------------------------------------------------
 
     def fields(self, fields: Iterable[Field]) -> None:
-        """Take the units of fields: see `Observer.fields`."""
+        """Store the units of fields: see `Observer.fields`."""
         self._units = {field.name: f" ({field.unit})" for field in fields if field.unit}
 
     def scalars(self, values: Mapping[str, float], times: Times) -> None:
@@ -149,7 +149,7 @@ class Dashboard:
     def predictions(
         self, predicted: Mapping[str, Array], truth: Mapping[str, Array], times: Times
     ) -> None:
-        """Show predicted values over true ones: see `Observer.predictions`."""
+        """Show predicted versus true values: see `Observer.predictions`."""
         for name, values in predicted.items():
             entity = entity_of(f"{_PREDICTIONS}/{name}")
             pairs = np.column_stack([truth[name].ravel(), values.ravel()]).astype(np.float64)
@@ -174,7 +174,7 @@ class Dashboard:
         self._add_tab(_RUN, rrb.TextLogView(origin="run/notes", name="notes"), "notes")
 
     def describe(self, configuration: str) -> None:
-        """Show the configuration of the run, a text in TOML, and make it the run's properties."""
+        """Show the run's configuration, given as TOML, and make it the properties of the run."""
         text = f"```toml\n{configuration}\n```"
         document = rr.TextDocument(text, media_type=rr.MediaType.MARKDOWN)
         self._rows.add_static("run/configuration", document)
@@ -186,7 +186,7 @@ class Dashboard:
     # The windows ----------------------------------------------------------------------------
 
     def cells(self) -> list[rrb.View | rrb.Tabs]:
-        """Return the windows, the losses first; none if no numbers were recorded."""
+        """Return the windows, the losses first; empty if no numbers were recorded."""
         self.changed = False
         first = [title for title in (*_LOSSES, _RATE) if title in self._plots]
         groups: dict[str, list[rrb.View]] = {title: [self._view(title)] for title in first}
@@ -228,7 +228,7 @@ class Dashboard:
     def _add_logarithm(
         self, plot: _Plot, curve: _Curve, times: Times, value: float, number: int
     ) -> None:
-        """Add the logarithm of a loss; one that is not positive has none."""
+        """Add the logarithm of a loss, if it is positive."""
         if not value > 0:
             self.changed |= plot.is_positive and not math.isnan(value)
             plot.is_positive &= math.isnan(value)
@@ -282,7 +282,7 @@ class Dashboard:
         )
         self._rows.add_static(f"{entity}/axes", places)
         bounds = rrb.VisualBounds2D(x_range=[-0.3, 1.1], y_range=[-1.1, 0.15])
-        title = f"{name}: predicted over true{self._units.get(name, '')}"
+        title = f"{name}: predicted vs. true{self._units.get(name, '')}"
         view = rrb.Spatial2DView(origin=entity, name=title, visual_bounds=bounds)
         self._add_tab(_PREDICTIONS, view, title)
         return low, high
@@ -294,7 +294,7 @@ def entity_of(name: str) -> str:
 
 
 def _curves(values: Mapping[str, float], units: Mapping[str, str]) -> Iterator[_Curve]:
-    """Yield the curves that are shown of some numbers; `units` are those of fields."""
+    """Yield the curves to show for some numbers; `units` are those of fields."""
     for name in values:
         group, _, label = name.rpartition("/")
         if group.startswith(f"{_FIELDS}/"):
@@ -316,7 +316,7 @@ def _curves(values: Mapping[str, float], units: Mapping[str, str]) -> Iterator[_
 
 
 def _flatten(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, str]]:
-    """Yield the entries of nested tables as texts."""
+    """Yield the entries of nested tables as strings."""
     for name, value in table.items():
         if isinstance(value, dict):
             yield from _flatten(value, f"{prefix}{name}.")
@@ -325,7 +325,7 @@ def _flatten(table: Mapping[str, Any], prefix: str = "") -> Iterator[tuple[str, 
 
 
 def _title(group: str, label: str) -> str:
-    """Return the title of the plot of a number."""
+    """Return the title of a number's plot."""
     if group == "online":
         return _ONLINE.get(label, "online: others")
     if label in ("training", "validation"):

@@ -25,15 +25,15 @@ DEFAULT_COLOR = "silver"
 _SCREEN_POINTS = -3.0  # Rerun reads a negative radius as one in points of the screen.
 _SCREEN_LINES = -1.5
 _REMEMBERED = 1000  # sets of names
-_SYMBOL_SIZE = 0.02  # of the scene's size
+_SYMBOL_SIZE = 0.02  # as a fraction of the scene's size
 _BAR_PARTS = 64
-_DENSITY = 4.0  # of a volume: how much light its largest values take on their way through
+_DENSITY = 4.0  # optical density of a volume's largest values
 _MOVES = {"position", "orientation"}
 _RIGID = {"box", "sphere", "capsule", "cylinder", "height_field", "slice", "volume"}
 _COLORING = {"color", "alpha", "scalar_field", "values", "colormap", "vmin", "vmax"}
-_COLORING |= {"wireframe", "symbol"}  # which need them in another form
+_COLORING |= {"wireframe", "symbol"}  # which need the colors in another form
 _PARTS = ("/color_bar", "/color_bar/values", "/edges", "/labels", "/slices")
-"""What an object can consist of besides its own entity."""
+"""What an object may consist of in addition to its own entity."""
 _VOLUME_MAPS = {
     "gray": rr.components.Colormap.Grayscale,
     "inferno": rr.components.Colormap.Inferno,
@@ -64,15 +64,15 @@ class Drawing:
             instance_id: Number of the instance.
             rows: Collects the rows.
             layout: Lays out the windows.
-            draws_shapes: Whether to draw shapes; otherwise only numbers and texts are recorded.
-            resolution: How many of the smallest details of its meshes a robot has from end to end;
-                None: all.
+            draws_shapes: Whether to draw shapes; otherwise, only numbers and texts are recorded.
+            resolution: Size of a robot divided by that of its smallest details to draw; None:
+                draw all details.
         """
         self._resolution = resolution
         self._id, self._rows, self._layout = instance_id, rows, layout
         self._draws_shapes = draws_shapes
         self._origin = f"env_{instance_id}"
-        self._world = f"tf#/{self._origin}"  # the frame that Rerun gives the origin
+        self._world = f"tf#/{self._origin}"  # the frame that Rerun assigns to the origin
         self._drawn: dict[str, Item] = {}
         self._moved: dict[tuple[str, ...], Array] = {}
         self._bodies = Bodies(f"{self._origin}/tf")
@@ -117,7 +117,7 @@ class Drawing:
         self._follow()
 
     def _places(self, names: tuple[str, ...]) -> Array | None:
-        """Return the places of rigid bodies; None if not all of the objects are."""
+        """Return the indices of rigid bodies; None if some of the objects are not rigid."""
         places = self._moved.get(names)
         if places is None:
             drawn = [self._drawn.get(name) for name in names]
@@ -131,7 +131,7 @@ class Drawing:
     def _draw(self, event: Event, times: Times) -> None:
         if event.kind not in self._draw_kind and event.kind != "view":
             raise VisualizerError(
-                f'Rerun cannot draw "{event.name}": it is of the unknown kind "{event.kind}". '
+                f'Rerun cannot draw "{event.name}" of the unknown kind "{event.kind}". '
                 f"Kinds: {listed(self._draw_kind)}."
             )
         if not self._draws_shapes and event.kind not in ("scalars", "text"):
@@ -183,16 +183,16 @@ class Drawing:
             if not any(other.entity.startswith(inner) for other in self._drawn.values()):
                 self._rows.add(drawn.entity, rr.Clear, times, is_recursive=[True])
                 return
-            for part in ("", *_PARTS):  # other objects lie below it
+            for part in ("", *_PARTS):  # other objects are below it
                 self._rows.add(f"{drawn.entity}{part}", rr.Clear, times, is_recursive=[False])
 
     def _follow(self) -> None:
-        """Let the camera follow the configured object, once it is drawn."""
+        """Make the camera follow the configured object once it is drawn."""
         if self._followed is None:
             return
         drawn = self._drawn.get(self._followed)
         if drawn is not None:
-            # The first shape of a robot belongs to its root link, if that has any.
+            # The first shape of a robot belongs to its root link, if that has one.
             entity, place = drawn.shapes[0][0] if drawn.shapes else drawn.entity, None
             if len(drawn.bodies):
                 (place,) = self._bodies.in_world(int(drawn.bodies[0]), np.zeros((1, 3)))
@@ -200,7 +200,7 @@ class Drawing:
             self._followed = None
 
     def _pop(self) -> list[Chunk]:
-        """Return and clear the moves of bodies, and tell the camera where everything was."""
+        """Return and clear the moves of bodies, and inform the camera of all positions."""
         frame = self._layout.frame(self._id) if self._has_world else None
         chunks = self._bodies.pop(frame)
         for drawn in self._drawn.values():
@@ -215,11 +215,11 @@ class Drawing:
     # Frames ----------------------------------------------------------------------------------
 
     def _register(self, drawn: Item) -> None:
-        """Give an object its frame: one of its own if it is rigid, else the world's."""
+        """Assign a frame to an object: its own if it is rigid, else the world's."""
         life = self._lives[drawn.name] = self._lives.get(drawn.name, 0) + 1
         name = drawn.name if life == 1 else f"{drawn.name} ({life})"
         entity = "/".join(map(rr.escape_entity_path_part, name.split("/")))
-        # What lies below the origin is drawn in the scene.
+        # Everything below the origin is drawn in the scene.
         folder = f"images/{self._origin}" if drawn.kind == "image" else self._origin
         drawn.entity = f"{folder}/{entity}"
         drawn.frame = self._world
@@ -235,7 +235,7 @@ class Drawing:
             self._rows.add_static(drawn.entity, rr.CoordinateFrame(drawn.frame))
 
     def _see(self, drawn: Item, points: Array) -> None:
-        """Keep points of an object in view, in its frame."""
+        """Keep points of an object, given in its frame, in view."""
         if not drawn.in_view or not len(points):
             return
         if drawn.kind not in _RIGID:
@@ -246,7 +246,7 @@ class Drawing:
     # Looks -----------------------------------------------------------------------------------
 
     def _colors(self, drawn: Item, changes: dict[str, Any], times: Times) -> Array | None:
-        """Return the object's colors, one or one per value; None if they do not change."""
+        """Return the object's colors, one in total or one per value; None if they do not change."""
         if not drawn.is_new and not changes.keys() & _COLORING:
             return None
         values = drawn.values
@@ -258,7 +258,7 @@ class Drawing:
         return colors.map_values(shown.ravel(), limits, drawn.colormap, drawn.alpha)
 
     def _color_bar(self, drawn: Item, limits: tuple[float, float], times: Times) -> None:
-        """Draw the colors of the limits beside the object."""
+        """Draw a color bar for the limits next to the object."""
         if not drawn.values.get("color_bar") or limits == drawn.barred:
             return
         points = self._points_of(drawn)
@@ -283,7 +283,7 @@ class Drawing:
         self._layout.frame(self._id).see(*extremes(np.concatenate([corners, ticks])))
 
     def _points_of(self, drawn: Item) -> Array:
-        """Return points of an object in the world."""
+        """Return points of an object in the world frame."""
         if drawn.kind in surfaces.GRIDS:
             corners = surfaces.corners_of_grid(drawn.kind, drawn.values)
             return self._bodies.in_world(int(drawn.bodies[0]), corners)
@@ -324,7 +324,7 @@ class Drawing:
             self._see(drawn, positions)
             shown = positions[:0] if wireframe else positions
             look["vertex_positions"] = shown
-            if drawn.kind != "slice":  # without normals its colors are not shaded
+            if drawn.kind != "slice":  # without normals, its colors are not shaded
                 look["vertex_normals"] = vertex_normals(shown, cells)
             if reshaped:
                 look["triangle_indices"] = cells[:0] if wireframe else cells
@@ -366,7 +366,7 @@ class Drawing:
         known = _VOLUME_MAPS.get(drawn.colormap)
         if known is None:
             warnings.warn(
-                f'Rerun draws no volumes in "{drawn.colormap}" but in {listed(_VOLUME_MAPS)}: '
+                f'Rerun cannot draw volumes in "{drawn.colormap}", only in {listed(_VOLUME_MAPS)}: '
                 f'"{drawn.name}" is drawn in viridis.',
                 stacklevel=2,
             )
@@ -510,7 +510,7 @@ class Drawing:
             self._bodies.move(drawn.bodies, times, place)
 
     def _see_robot(self, drawn: Item) -> None:
-        """Keep a robot's shapes in view, and the origins of its bodies."""
+        """Keep a robot's shapes and the origins of its bodies in view."""
         for number, body in enumerate(drawn.bodies):
             shapes = [shape for _, shape in drawn.shapes if shape.body == number]
             self._bodies.set_box(int(body), corners_of(shapes))
@@ -518,7 +518,7 @@ class Drawing:
         if fixed:
             self._layout.frame(self._id).see(*extremes(corners_of(fixed)))
 
-    # Windows beside the scene ----------------------------------------------------------------
+    # Windows next to the scene ---------------------------------------------------------------
 
     def _image(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
         if drawn.is_new:

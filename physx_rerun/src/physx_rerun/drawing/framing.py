@@ -1,4 +1,4 @@
-"""Frame: what the camera of one scene shows."""
+"""Frame: the view of one scene's camera."""
 
 from __future__ import annotations
 
@@ -7,20 +7,20 @@ import numpy as np
 from physx_core.typing import Array
 
 VIEW_FROM = np.array([1.0, -1.1, 0.65]) / np.linalg.norm([1.0, -1.1, 0.65])
-"""Direction from what is shown to the camera."""
+"""Direction from the target to the camera."""
 
 RIGHT = np.array([1.1, 1.0, 0.0]) / np.linalg.norm([1.1, 1.0])
 """Direction to the right in the picture."""
 
 _UP = np.cross(RIGHT, -VIEW_FROM)
-_SLOPE = np.tan(np.deg2rad(55 / 2))  # of the edges of Rerun's pictures, and of square ones
-_FILLED = 0.85  # share of the picture that the box fills at first
-_POINT = 0.5  # half of the edge of what is shown around a single point, in m
-_RESERVE = 0.25  # share by which a scene that outgrew its picture is shown larger than it is
+_SLOPE = np.tan(np.deg2rad(55 / 2))  # of the edges of Rerun's pictures, even square ones
+_FILLED = 0.85  # fraction of the picture that the box fills at first
+_POINT = 0.5  # half the edge of the box shown around a single point, in m
+_RESERVE = 0.25  # fraction by which the view exceeds a scene that has outgrown it
 
 
 class Frame:
-    """The box around all objects of a scene, since its beginning."""
+    """The box around everything that was ever in a scene."""
 
     def __init__(self) -> None:
         self._low, self._high = np.full(3, np.inf), np.full(3, -np.inf)
@@ -28,7 +28,7 @@ class Frame:
         self._position: Array | None = None
 
     def grow(self) -> bool:
-        """Show more if something is out of the picture, and return whether it was."""
+        """Zoom out if something is out of view, and return whether something was."""
         if self._shown is None or self.shows(self._low, self._high):
             return False
         reserve = _RESERVE * (self._high - self._low)
@@ -36,11 +36,11 @@ class Frame:
         return True
 
     def shows(self, low: Array, high: Array) -> bool:
-        """Return whether a box is in the picture.
+        """Return whether a box is in view.
 
         Args:
-            low: Its lower corner, shape (3,), in m.
-            high: Its upper corner, shape (3,), in m.
+            low: Lower corner of the box, shape (3,), in m.
+            high: Upper corner of the box, shape (3,), in m.
         """
         if self._position is None:
             return False
@@ -49,22 +49,22 @@ class Frame:
         return bool((sides <= _SLOPE * -(corners @ VIEW_FROM)).all())
 
     def see(self, low: Array, high: Array) -> None:
-        """Extend the box by another one: see `shows`."""
+        """Extend the scene's box by another one: see `shows`."""
         if np.isfinite(low).all() and np.isfinite(high).all():
             self._low, self._high = np.minimum(self._low, low), np.maximum(self._high, high)
 
     @property
     def size(self) -> float:
-        """Diagonal of the box, in m; 0 without objects."""
+        """Diagonal of the box in m; 0 without objects."""
         if not np.isfinite(self._low).all():
             return 0.0
         return float(np.linalg.norm(self._high - self._low))
 
     def camera(self, target: Array | None = None) -> tuple[Array, Array, float]:
-        """Return position and target of the camera that shows everything, and its distance.
+        """Return the position, target and distance of the camera that shows everything.
 
         Args:
-            target: Where the camera looks; None: to the middle.
+            target: Where the camera looks; None: at the middle.
         """
         if self._shown is None and np.isfinite(self._low).all():
             self._shown = self._low, self._high
@@ -89,5 +89,5 @@ _SIGNS = np.array([[x, y, z] for x in (False, True) for y in (False, True) for z
 
 def extremes(points: Array) -> tuple[Array, Array]:
     """Return the smallest and largest coordinates of points, shape (n, 3) with n > 0."""
-    columns = np.ascontiguousarray(points.T)  # many times faster than along the first axis
+    columns = np.ascontiguousarray(points.T)  # many times faster than reducing along the first axis
     return columns.min(axis=1), columns.max(axis=1)

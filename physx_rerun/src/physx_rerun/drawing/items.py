@@ -1,4 +1,4 @@
-"""Item: a drawn object, with what its later changes are drawn from."""
+"""Item: a drawn object, with the state needed to draw later changes."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ class Item:
 
     Attributes:
         kind: Kind of the object.
-        name: Its name.
-        entity: Path of its entity.
-        frame: Name of its frame; None: it is not drawn yet.
+        name: Name of the object.
+        entity: Path of the object's entity.
+        frame: Name of the object's frame; None: it is not drawn yet.
         values: All options set so far.
-        is_new: Whether all of it is to be drawn.
-        bodies: Places of its bodies among those of the instance.
+        is_new: Whether all of it has to be drawn.
+        bodies: Indices of its bodies among those of the instance.
         limits: Smallest and largest value of its scalar field so far.
-        barred: Limits that its color bar shows.
+        barred: Limits shown by its color bar.
         edges: Pairs of vertices of a wireframe mesh, shape (edges, 2).
-        grid: Numbers of its points along the axes, if it is a grid.
-        seen: Points that it had since the last flush.
+        grid: Numbers of points along the axes, if it is a grid.
+        seen: Points that it has had since the last flush.
         shapes: Shapes of a robot.
     """
 
@@ -46,27 +46,27 @@ class Item:
 
     @property
     def is_hidden(self) -> bool:
-        """Whether it is not to be seen."""
+        """Whether it is hidden."""
         return self.values.get("visible") is False
 
     @property
     def in_view(self) -> bool:
-        """Whether the camera shows it."""
+        """Whether the camera keeps it in view."""
         return self.values.get("in_view") is not False
 
     @property
     def alpha(self) -> float:
-        """Its opacity."""
+        """The object's opacity."""
         alpha = self.values.get("alpha")
         return 1.0 if alpha is None else alpha
 
     @property
     def colormap(self) -> str:
-        """Name of its colormap."""
+        """Name of the object's colormap."""
         return self.values.get("colormap") or "viridis"
 
     def widen(self, shown: Array) -> tuple[float, float]:
-        """Return the limits of its colors: those that are set, else the extremes so far."""
+        """Return the limits of its colors: those that were set, else the extremes so far."""
         self.limits = (
             min(self.limits[0], float(shown.min())),
             max(self.limits[1], float(shown.max())),

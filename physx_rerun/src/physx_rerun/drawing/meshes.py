@@ -1,4 +1,4 @@
-"""Mesh files: their extents, so that the camera shows all of them, and their parts."""
+"""Mesh files: their extents, which the camera keeps in view, and their parts."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ if TYPE_CHECKING:
     from collada import Collada
 
 LARGEST = 2**26
-"""Bytes of a mesh file; of larger ones only the origin is shown for certain."""
-_MOST = 2**24  # points of a document, which can repeat its shapes without end
+"""Largest size of a mesh file in bytes; of larger ones, only the origin is sure to be in view."""
+_MOST = 2**24  # points in a document, which can repeat its shapes endlessly
 _MOST_NODES = 2**14
-_MOST_ITEMS = 2**20  # tags, or items of JSON, which take many times as much memory as their text
+_MOST_ITEMS = 2**20  # tags or JSON items, which take many times more memory than their text
 _NOTHING = np.zeros((1, 3))
 _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)])
 
@@ -33,7 +33,7 @@ _SIGNS = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-1, 1)]
 def corners_of_mesh(path: Path) -> Array:
     """Return the opposite corners of the box around a mesh, shape (2, 3), in its own units.
 
-    The origin alone, shape (1, 3), stands for a file that cannot be read: the viewer will say so.
+    The origin alone, shape (1, 3), if the file cannot be read; the viewer reports that.
     """
     try:
         found = [_NOTHING[:0]]
@@ -42,12 +42,12 @@ def corners_of_mesh(path: Path) -> Array:
             found += [np.stack(extremes(finite))] if len(finite) else []
         corners = np.concatenate(found)
         return np.stack(extremes(corners)) if len(corners) else _NOTHING
-    except Exception:  # strangers' files fail in any way
+    except Exception:  # malformed files can fail in any way
         return _NOTHING
 
 
 def facets_of(content: bytes) -> Array | None:
-    """Return the corners of the triangles of a binary STL file, shape (n, 3, 3); None: a text."""
+    """Return the corners of a binary STL file's triangles, shape (n, 3, 3); None if it is text."""
     if len(content) != 84 + 50 * int.from_bytes(content[80:84], "little"):
         return None
     kind = np.dtype([("numbers", "<f4", (4, 3)), ("attribute", "<u2")])
@@ -55,22 +55,22 @@ def facets_of(content: bytes) -> Array | None:
 
 
 def read_document(content: bytes) -> Collada:
-    """Return a COLLADA document without the parts that are damaged, which are in its ``errors``.
+    """Return a COLLADA document without damaged parts, which are listed in its ``errors``.
 
     Raises:
-        ValueError: If it is packed, or may expand to something much larger than it is.
+        ValueError: If it is compressed, or may expand to something much larger.
     """
-    # A zero byte is in every zip file, which pycollada would unpack, and in UTF-16.
+    # Zip files, which pycollada would unpack, and UTF-16 contain zero bytes.
     bombs = b"\0", b"<!DOCTYPE", b"instance_node"
     if content.count(b"<") > _MOST_ITEMS or any(word in content for word in bombs):
-        raise ValueError("a document that may be a bomb")
-    import collada  # only documents need it
+        raise ValueError("a document that may be a decompression bomb")
+    import collada  # needed only for documents
 
     return collada.Collada(io.BytesIO(content), ignore=[collada.DaeError])
 
 
 def placed(document: Collada) -> list[Any]:
-    """Return the parts of the shapes in a document's scenes, placed, in its unit of length."""
+    """Return the parts of all shapes in a document's scenes, placed, in its unit of length."""
     found, count = [], 0
     for scene in document.scenes:
         for shape in scene.objects("geometry"):
@@ -78,7 +78,7 @@ def placed(document: Collada) -> list[Any]:
                 found.append(part)
                 count += len(part.vertex)
                 if count > _MOST:
-                    raise ValueError(f"a document of more than {_MOST} points")
+                    raise ValueError(f"a document with more than {_MOST} points")
     return found
 
 
@@ -92,7 +92,7 @@ def _obj(content: bytes) -> Iterator[Array]:
 
 
 def _rows(content: bytes, word: bytes) -> Iterator[Array]:
-    """Yield the three numbers after a word at the beginning of lines, in small blocks."""
+    """Yield the three numbers after a word at the start of lines, in small blocks."""
     file = io.BytesIO(content)
     while lines := file.readlines(2**20):
         rows = [line[:256].split(None, 4) for line in lines]
@@ -103,7 +103,7 @@ def _rows(content: bytes, word: bytes) -> Iterator[Array]:
 def _dae(content: bytes) -> Iterator[Array]:
     document = read_document(content)
     meter = document.assetInfo.unitmeter or 1.0
-    # Damaged materials leave shapes without place.
+    # With damaged materials, shapes are not placed in a scene.
     for part in placed(document) or [
         part for each in document.geometries for part in each.primitives
     ]:
@@ -115,7 +115,7 @@ def _gltf(content: bytes) -> Iterator[Array]:
         (length,) = struct.unpack_from("<I", content, 12)
         content = content[20 : 20 + length]
     if content.count(b",") > _MOST_ITEMS:
-        raise ValueError("a document of too many items")
+        raise ValueError("a document with too many items")
     document = json.loads(content)
     places = [(root, np.eye(4)) for scene in document["scenes"] for root in scene["nodes"]]
     for number, pose in places:
@@ -128,11 +128,11 @@ def _gltf(content: bytes) -> Iterator[Array]:
             yield corners @ pose[:3, :3].T + pose[:3, 3]
         places += [(child, pose) for child in node.get("children", ())]
         if len(places) > _MOST_NODES:
-            raise ValueError("a document whose nodes are no tree, or too many")
+            raise ValueError("a document whose nodes are not a tree, or too many")
 
 
 def _pose(node: dict[str, Any]) -> Array:
-    """Return the placement of a node of glTF as a homogeneous matrix (4, 4)."""
+    """Return the pose of a glTF node as a homogeneous matrix (4, 4)."""
     if "matrix" in node:
         return np.reshape(np.array(node["matrix"], np.float64), (4, 4)).T
     pose = np.eye(4)

@@ -36,11 +36,11 @@ def draw_robot(
     Args:
         rows: Collects the rows.
         entity: Path of the robot's entity.
-        values: Options of the robot; ``simple`` becomes the colors of simplified meshes by entity.
+        values: Options of the robot; ``simple`` is set to simplified meshes' colors by entity.
         frames: Names of the bodies' frames.
-        world: Name of the frame of shapes without body.
-        resolution: How many of the smallest details of its meshes fit into its whole size; smaller
-            ones are left out. None: meshes are drawn as they are.
+        world: Name of the frame of shapes without a body.
+        resolution: Size of the robot divided by that of its smallest details to draw; None: draw
+            meshes unmodified.
 
     Returns:
         The shapes drawn, and the bodies' poses with all joints at zero, shape (bodies, 7).
@@ -49,7 +49,7 @@ def draw_robot(
     if model.missing:
         warnings.warn(
             f"{len(model.missing)} meshes of {values['urdf']} are not drawn: Rerun found no mesh "
-            f"file {model.missing[0]}. Give the folder of each package in package_dirs.",
+            f"file {model.missing[0]}. Set the folder of each package in package_dirs.",
             stacklevel=2,
         )
     drawn = []
@@ -68,7 +68,7 @@ def draw_robot(
 def place_shapes(
     rows: ChunkBuilder, shapes: Sequence[DrawnShape], times: Times, *, is_visible: bool
 ) -> None:
-    """Place a robot's shapes in the frames of their bodies; hidden ones shrink to nothing."""
+    """Place a robot's shapes in the frames of their bodies; hidden shapes are scaled to zero."""
     for path, shape in shapes:
         scale = shape.size if shape.kind == "mesh" else (1.0, 1.0, 1.0)
         rows.add(
@@ -106,7 +106,7 @@ def tint_robot(
             default = (1.0, 1.0, 1.0, 1.0) if shape.kind == "mesh" else _SILVER
             red, green, blue, opacity = own or default
             tint = colors.rgba((red, green, blue), opacity if alpha is None else alpha)
-        if file_colors is not None:  # which the tint replaces
+        if file_colors is not None:  # replaced by the tint
             rows.add(path, rr.Mesh3D, times, albedo_factor=tint, vertex_colors=file_colors[:0])
             continue
         archetype, option = _LOOKS[shape.kind]
@@ -123,7 +123,7 @@ _LOOKS: dict[str, tuple[type[Any], str]] = {
 
 
 def corners_of(shapes: Sequence[VisualShape]) -> Array:
-    """Return the corners of a body's shapes in its frame, and its origin, shape (n, 3)."""
+    """Return the corners of a body's shapes and its origin in its frame, shape (n, 3)."""
     found = [np.zeros((1, 3))]
     for shape in shapes:
         if shape.mesh is None:
@@ -136,7 +136,7 @@ def corners_of(shapes: Sequence[VisualShape]) -> Array:
 
 
 def _extent(model: Model) -> float:
-    """Return the diagonal of the box around a robot at rest, in m."""
+    """Return the diagonal of the box around a robot at rest in m."""
     found = [model.rest[:, :3]]
     for shape in model.shapes:
         points = corners_of([shape])
@@ -166,7 +166,7 @@ def _center(shape: VisualShape) -> Array:
 
 
 def _simplified(shape: VisualShape, detail: float | None) -> SimpleMesh | None:
-    """Return a mesh without details; None: it is drawn as it is."""
+    """Return a mesh without details; None: draw the original."""
     factor = max(map(abs, shape.size))
     if shape.mesh is None or not factor:
         return None

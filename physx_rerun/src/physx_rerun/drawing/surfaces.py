@@ -31,7 +31,7 @@ SYMBOLS: Mapping[str, tuple[Array, ...]] = {
 
 
 def symbol_lines(symbol: str, positions: Array, normals: Array | None, size: float) -> list[Array]:
-    """Return the corners of symbols, one array for each of their lines, symbol by symbol.
+    """Return the corners of symbols, one array per line, symbol by symbol.
 
     Args:
         symbol: Name of the symbol.
@@ -55,10 +55,10 @@ def symbol_lines(symbol: str, positions: Array, normals: Array | None, size: flo
 
 
 def mesh_of(kind: str, values: Mapping[str, Any]) -> tuple[Array, Array]:
-    """Return vertices (n, 3) and triangles (m, 3) of a mesh, a height field or a slice."""
+    """Return the vertices (n, 3) and triangles (m, 3) of a mesh, a height field or a slice."""
     if kind == "mesh":
         return values["positions"], values["cells"]
-    # Rerun's `GridMap` is flat, of square cells, with one color each instead of values at points.
+    # Rerun's `GridMap` is flat, with square cells of one color each instead of values at points.
     shape = (values["heights"] if kind == "height_field" else values["values"]).shape
     heights = values["heights"] if kind == "height_field" else np.zeros(shape, np.float32)
     x, y = (spacing * np.arange(n) for spacing, n in zip(values["spacing"], shape, strict=True))
@@ -86,21 +86,21 @@ def corners_of_grid(kind: str, values: Mapping[str, Any]) -> Array:
 
 
 def edges_of(cells: Array) -> Array:
-    """Return the pairs of vertices that edges join, shape (edges, 2)."""
+    """Return the pairs of vertices joined by edges, shape (edges, 2)."""
     pairs = np.sort(cells[:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2), axis=1)
     return np.unique(pairs, axis=0)
 
 
 def bar_beside(points: Array, right: Array, parts: int) -> tuple[Array, Array, Array]:
-    """Return an upright bar beside points.
+    """Return an upright bar next to points.
 
     Args:
         points: The points, shape (n, 3).
-        right: Horizontal direction in which it stands, shape (3,).
+        right: Horizontal direction in which to place it, shape (3,).
         parts: Number of parts along its height.
 
     Returns:
-        Vertices (2 (parts + 1), 3), triangles (m, 3), and a point beside each of three heights.
+        Vertices (2 (parts + 1), 3), triangles (m, 3), and a point next to each of three heights.
     """
     low, high = extremes(points)
     size = max(float(np.linalg.norm(high - low)), 1e-3)

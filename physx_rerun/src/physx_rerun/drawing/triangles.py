@@ -1,8 +1,8 @@
-"""Meshes of few triangles, for pictures that are drawn without a graphics card.
+"""Meshes with few triangles, for pictures that are drawn without a GPU.
 
-A processor needs most of its time for the triangles of a robot, far more than a picture has pixels.
-COLLADA becomes triangles for all pictures: Rerun omits many documents, such as those of MeshLab,
-and turns those that call another axis upward, which engines ignore.
+A CPU spends most of its time on a robot's triangles, which far outnumber a picture's pixels.
+COLLADA files become triangles for all pictures: Rerun omits many documents, such as those from
+MeshLab, and rotates those with another up axis, which engines ignore.
 """
 
 from __future__ import annotations
@@ -18,8 +18,8 @@ from physx_core.files import read_content
 from physx_core.typing import Array
 from physx_rerun.drawing.meshes import LARGEST, facets_of, placed, read_document
 
-_MANY = 1000  # triangles, fewer of which are drawn as they are
-_ROW, _LAYER = 1 << 20, 1 << 40  # steps of the number of a cell
+_MANY = 1000  # triangles; meshes with fewer are drawn unmodified
+_ROW, _LAYER = 1 << 20, 1 << 40  # strides of cell numbers
 _WHITE = (1.0, 1.0, 1.0, 1.0)
 
 
@@ -29,7 +29,7 @@ class Triangles:
 
     Attributes:
         points: Corners, shape (triangles, 3, 3), in m.
-        normals: Unit normals of the surface at the corners, likewise.
+        normals: Unit normals of the surface at the corners, shape (triangles, 3, 3).
         color: Red, green, blue and alpha in [0, 1].
     """
 
@@ -40,7 +40,7 @@ class Triangles:
 
 @dataclass(frozen=True)
 class SimpleMesh:
-    """A mesh that is drawn in place of a file.
+    """A mesh drawn in place of a file.
 
     Attributes:
         positions: Vertices, shape (n, 3), in m.
@@ -61,11 +61,11 @@ def simple_mesh(path: Path, detail: float | None) -> SimpleMesh | None:
 
     Args:
         path: The file.
-        detail: Size of what may be lost, in the file's units of length; None: nothing.
+        detail: Size of details that may be lost, in the file's unit of length; None: keep all.
 
     Returns:
-        None if the file is best left to the viewer: nothing would be lost, or it has features that
-        are not read here, such as textures, or is damaged.
+        The mesh; None if the viewer should read the file: nothing would be lost, it has features
+        that are not supported here, such as textures, or it is damaged.
     """
     reader = {".stl": _stl, ".dae": _dae}.get(path.suffix.lower())
     try:
@@ -75,19 +75,19 @@ def simple_mesh(path: Path, detail: float | None) -> SimpleMesh | None:
         if detail and sum(len(part.points) for part in parts) >= _MANY:
             return _simplify(parts, detail)
         return _whole(parts) if reader is _dae else None
-    except Exception:  # strangers' files fail in any way, and the viewer reports it
+    except Exception:  # malformed files can fail in any way, and the viewer reports it
         return None
 
 
 def _whole(parts: list[Triangles]) -> SimpleMesh:
-    """Return all triangles of parts."""
+    """Return all triangles of the parts."""
     points, normals, owner = _corners(parts)
     colors = np.array([part.color for part in parts])[owner]
     return SimpleMesh(points, normals, colors, np.arange(len(points)).reshape(-1, 3))
 
 
 def _corners(parts: list[Triangles]) -> tuple[Array, Array, Array]:
-    """Return corners and normals of all triangles, shape (n, 3), and the parts they are of."""
+    """Return the corners and normals of all triangles, shape (n, 3), and the corners' parts."""
     points = np.concatenate([part.points for part in parts]).reshape(-1, 3)
     normals = np.concatenate([part.normals for part in parts]).reshape(-1, 3)
     return (
@@ -105,11 +105,11 @@ def _simplify(parts: list[Triangles], detail: float) -> SimpleMesh:
     _, cell = np.unique(grid @ steps, return_inverse=True)
     _, place = np.unique(len(parts) * cell + owner, return_inverse=True)
     if max(grid.max(), place.max()) >= _ROW or not np.isfinite(normals).all():
-        raise ValueError("the mesh is too large for the size of its details")
+        raise ValueError("the mesh is too large for its smallest details")
     side = np.rint(1.2 * normals).astype(np.int64) @ np.array([9, 3, 1]) + 13
     kinds, corner = np.unique(27 * place + side, return_inverse=True)
     ends = np.sort(place.reshape(-1, 3), axis=1)
-    # Where the two faces of a wall fall together, the outer one is kept.
+    # Where the two faces of a wall coincide, the outer one is kept.
     outwards = np.einsum("ij,ij->i", normals, points - points.mean(axis=0)).reshape(-1, 3).sum(1)
     order = np.argsort(-outwards)
     first = order[np.unique(ends[order] @ steps, return_index=True)[1]]
@@ -125,7 +125,7 @@ def _simplify(parts: list[Triangles], detail: float) -> SimpleMesh:
 
 
 def _means(values: Array, groups: Array) -> Array:
-    """Return the mean of the rows of each group, shape (groups, 3)."""
+    """Return the mean of each group's rows, shape (groups, 3)."""
     counts = np.bincount(groups)
     return np.stack([np.bincount(groups, axis) / counts for axis in values.T], axis=1)
 
@@ -160,8 +160,8 @@ def _dae(content: bytes) -> list[Triangles]:
 def _triangles(part: Any, meter: float) -> Triangles:
     """Return the triangles of a placed part of a document."""
     if hasattr(part, "polygons"):
-        if part.nvertices != len(part.index):  # nothing else bounds them
-            raise ValueError("polygons of more corners than there are")
+        if part.nvertices != len(part.index):  # not validated elsewhere
+            raise ValueError("polygons with more corners than there are")
         part = part.triangleset()
     points = meter * part.vertex[part.vertex_index].astype(np.float64)
     normals = part.normal
@@ -174,7 +174,7 @@ def _triangles(part: Any, meter: float) -> Triangles:
 
 
 def _to_srgb(linear: float) -> float:
-    """Return a component of a color as screens have it."""
+    """Convert a color component to sRGB."""
     if linear <= 0.0031308:
         return 12.92 * max(linear, 0.0)
     return 1.055 * min(linear, 1.0) ** (1 / 2.4) - 0.055

@@ -1,7 +1,7 @@
 """Visual shapes of a URDF file, and their poses on the robot's bodies.
 
-Rerun's `UrdfTree` finds packages by environment variables only, leaves out missing meshes without
-an error, and tells no sizes, which the camera needs.
+Rerun's `UrdfTree` finds packages only through environment variables, omits missing meshes without
+an error, and does not report sizes, which the camera needs.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ class VisualShape:
 
     Attributes:
         name: Name that is unique in the robot.
-        body: Index of the body that it is fixed to; None: the world.
-        pose: Its pose in the body's frame, a homogeneous matrix of shape (4, 4).
+        body: Index of the body that it is attached to; None: the world.
+        pose: Pose in the body's frame, a homogeneous matrix of shape (4, 4).
         kind: ``mesh``, ``box``, ``cylinder``, ``sphere`` or ``capsule``.
         size: In m: half edges of a box (3,); radius of a sphere (1,); radius and length (2,). For a
-            mesh the factors of its lengths (3,).
+            mesh: scale factors (3,).
         mesh: File of a mesh.
-        color: Red, green, blue, and alpha in [0, 1] from the URDF; None: it gives none.
+        color: Red, green, blue and alpha in [0, 1] from the URDF; None: not specified there.
     """
 
     name: str
@@ -69,13 +69,13 @@ class Model:
 
 
 def read(urdf: str | Path, bodies: Sequence[str], package_dirs: Mapping[str, str]) -> Model:
-    """Read the visual shapes of a URDF file; collision shapes are left out.
+    """Read the visual shapes of a URDF file; collision shapes are ignored.
 
     Args:
         urdf: The file.
-        bodies: Names of the links that are placed; a link that is not among them moves with the
-            nearest of its ancestors that is, its joints at zero.
-        package_dirs: Folder of each package that mesh names begin with.
+        bodies: Names of the links to place; other links move with their nearest ancestor among
+            these, with joints at zero.
+        package_dirs: Folder of each package that mesh names start with.
     """
     path = Path(urdf).absolute()
     try:
@@ -119,7 +119,7 @@ def _read(
 
 
 def _carrier(tree: UrdfTree, link: str, bodies: Sequence[str]) -> tuple[int | None, Vector]:
-    """Return the body that a link moves with, None: the root link, and its pose (4, 4) there."""
+    """Return the body that a link moves with (None: the root link), and its pose (4, 4) there."""
     offset = np.eye(4)
     while link not in bodies and link in tree.parents:
         joint = tree.parents[link]

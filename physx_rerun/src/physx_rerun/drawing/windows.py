@@ -17,7 +17,7 @@ from physx_rerun.drawing.framing import Frame
 _BACKGROUND = (25, 28, 36)
 _GRID = (58, 63, 76)
 
-_ROW = 3  # largest number of scenes side by side
+_ROW = 3  # largest number of scenes next to each other
 _COLUMN = 4  # largest number of plots in a column
 _LEGEND = 8  # largest number of names in a plot's legend
 
@@ -58,9 +58,9 @@ class WindowLayout:
         self.changed = True
 
     def follow(self, instance_id: int, entity: str, place: Array | None) -> None:
-        """Let the camera of an instance follow an entity, which is at a place now, shape (3,)."""
+        """Make an instance's camera follow an entity, now at the position `place`, shape (3,)."""
         self._followed[instance_id] = entity
-        if place is not None:  # the viewer looks there, whatever the target
+        if place is not None:  # the viewer looks there, regardless of the target
             self._cameras[instance_id] = {"target": place, **self._cameras.get(instance_id, {})}
         self._kinds.add(("follow", entity))
         self.changed = True
@@ -76,14 +76,14 @@ class WindowLayout:
         self._kinds.add((kind, name))
 
     def add_plot(self, name: str, entity: str, timeline: str, curve_nb: int) -> None:
-        """Register an entity with some curves in the plot of that name."""
+        """Register an entity with `curve_nb` curves in the plot with that name."""
         self._plots.setdefault(name, {})[entity] = curve_nb
         self._timelines.add(timeline)
         self._kinds.add(("plot", name))
         self.changed = True
 
     def add_timeline(self, timeline: str) -> None:
-        """Register a timeline of something that is shown."""
+        """Register a timeline of something shown."""
         self._timelines.add(timeline)
 
     def add_text(self, instance_id: int, name: str, entity: str) -> None:
@@ -93,44 +93,44 @@ class WindowLayout:
         self.changed = True
 
     def add_window(self, instance_id: int, name: str, view: _Window, entity: str) -> None:
-        """Register an entity of an instance that has a view of its own."""
+        """Register an entity of an instance with its own window."""
         self._windows.setdefault(name, {})[instance_id] = (view, entity)
         self._kinds.add((view.__name__, name))
         self.changed = True
 
     def frame(self, instance_id: int) -> Frame:
-        """Return what the camera of an instance shows: by default everything that there was."""
+        """Return the view of an instance's camera, by default everything ever in the scene."""
         return self._scenes.setdefault(instance_id, Frame())
 
     def grow(self, instance_id: int) -> None:
-        """Show more of an instance if something is out of view, unless its camera is placed."""
+        """Zoom out if something of an instance is out of view, unless its camera is placed."""
         is_placed = "eye" in self._cameras.get(instance_id, {}) or instance_id in self._followed
         if instance_id in self._scenes and not is_placed:
             self.changed |= self._scenes[instance_id].grow()
 
     def digest(self, kinds: Set[tuple[str, str]] = frozenset()) -> str:
-        """Return a text that is the same for equal sets of objects and numbers of instances.
+        """Return a string that is the same for equal sets of objects and numbers of instances.
 
-        Rerun keeps a user's own layout by application; runs that show the same things share it.
+        Rerun stores a user's layout by application; runs that show the same things share it.
 
         Args:
-            kinds: Further things that are shown.
+            kinds: Further things shown.
         """
         text = repr((self.instance_nb, sorted(self._kinds | kinds)))
         return hashlib.sha256(text.encode()).hexdigest()[:8]
 
     @property
     def timeline(self) -> str:
-        """Timeline that the viewer begins with: one on which everything is visible."""
+        """Timeline that the viewer starts with: one on which everything is visible."""
         if self._scenes or self._texts or "step" in self._timelines:
             known = SIM_TIME if self.has_sim_time else "step"
             return known if self._timelines <= {"step"} else TIME
         return "batch" if "batch" in self._timelines else next(iter(self._timelines), TIME)
 
     def blueprint(self, further: Sequence[rrb.View | Container] = ()) -> rrb.Blueprint:
-        """Return the windows: the scenes, and beside or below them the plots and the texts.
+        """Return the windows: the scenes, and next to or below them the plots and texts.
 
-        Two or three scenes stand in a row above the rest, so that they are easily compared.
+        Two or three scenes are placed in a row above the rest, for easy comparison.
 
         Args:
             further: More plots.

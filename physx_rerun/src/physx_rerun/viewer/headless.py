@@ -1,4 +1,4 @@
-"""Renders pictures and films of a recording with a viewer without window."""
+"""Renders pictures and films of a recording with a viewer without a window."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ from physx_core.processes import TemporaryFolder
 from physx_rerun.viewer.viewer import Viewer
 
 T = TypeVar("T")
-_TOP_BAR = 36  # height of the viewer's own menu bar in pixels, cut off
-_QUIET_SECONDS = 0.4  # without a change of state, after which everything is loaded
+_TOP_BAR = 36  # height of the viewer's menu bar in pixels, which is cropped
+_QUIET_SECONDS = 0.4  # without a change of state, after which everything counts as loaded
 _TIMELINES = ("step", "row", "epoch", "batch")  # in order of preference
-_NOTES = 30  # frames after which the viewer's notifications at its start are gone
+_NOTES = 30  # frames after which the viewer's startup notifications are gone
 _QUALITY = 60  # of a film's pictures, from 0 to 100
-_PATIENCE = 5  # equal pictures in a row, after which missing assets are given up
+_PATIENCE = 5  # equal pictures in a row, after which missing assets are ignored
 
 
 def render_picture(
@@ -39,15 +39,15 @@ def render_picture(
         png_path: Picture to write.
         size: Width and height in pixels.
         at: Position on the timeline, in s on ``sim_time`` and ``time``; None: its end.
-        timeline: Name of the timeline; None: ``step`` where there is one.
-        timeout: Longest time to take, in s.
+        timeline: Name of the timeline; None: ``step`` if there is one.
+        timeout: Time limit in s.
 
     Returns:
         The picture's path.
 
     Raises:
-        VisualizerError: If the recording is missing or has no such time, there is no graphics
-            driver, or the viewer fails or takes too long.
+        VisualizerError: If the recording is missing or does not contain the time, there is no
+            graphics driver, or the viewer fails or takes too long.
     """
     [picture] = _pictures(Path(rrd_path), size, [at], timeline, timeout)
     png_path = Path(png_path)
@@ -65,23 +65,23 @@ def render_film(
     timeline: str | None = None,
     timeout: float = 600.0,
 ) -> Path:
-    """Render a recording as a film: a looping animation that browsers show.
+    """Render a recording as a film: a looping animation for browsers.
 
     Args:
         rrd_path: The recording, a ``.rrd`` file.
         film_path: Film to write, a ``.webp`` file.
         size: Width and height in pixels.
-        frames: Number of pictures, at equal distances from the beginning of the timeline to its
-            end, both included.
+        frames: Number of pictures, at equal distances from the start to the end of the timeline,
+            both included.
         frame_rate: Pictures per second.
-        timeline: Name of the timeline; None: ``step`` where there is one.
-        timeout: Longest time to take, in s.
+        timeline: Name of the timeline; None: ``step`` if there is one.
+        timeout: Time limit in s.
 
     Returns:
         The film's path.
 
     Raises:
-        ConfigError: If the film is no ``.webp`` file, or of fewer than two pictures.
+        ConfigError: If the film is not a ``.webp`` file, or has fewer than two pictures.
         VisualizerError: As in `render_picture`.
     """
     film_path = Path(film_path)
@@ -107,7 +107,7 @@ def _pictures(
     *,
     by_share: bool = False,
 ) -> Iterator[Image.Image]:
-    """Yield pictures of a recording at some times: see `Camera.find`."""
+    """Yield pictures of a recording at the given times: see `Camera.find`."""
     if not recording.is_file():
         raise VisualizerError(f"There is no recording {recording}.")
     with TemporaryFolder("rerun-") as folder:
@@ -122,13 +122,13 @@ def _pictures(
                 yield picture.crop((0, _TOP_BAR, size[0], size[1] + _TOP_BAR))
         except OSError as error:
             viewer.check(wait=2.0)
-            raise VisualizerError(f"The Rerun viewer rendered no picture: {error}.") from error
+            raise VisualizerError(f"The Rerun viewer did not render a picture: {error}.") from error
         finally:
             viewer.end()
 
 
 def start_viewer(size: tuple[int, int], folder: Path, *options: str) -> Viewer:
-    """Start a viewer without the user's settings and stored layouts; its files go to a folder."""
+    """Start a viewer without the user's settings and layouts; its files are put in a folder."""
     window = f"{size[0]}x{size[1] + _TOP_BAR}"
     places = dict.fromkeys(("XDG_DATA_HOME", "XDG_CONFIG_HOME", "TMPDIR"), str(folder))
     return Viewer(0, ("--headless", "--window-size", window, *options), environment=places)
@@ -138,7 +138,7 @@ class Camera:
     """Requests a viewer's state and pictures, retrying while it is busy.
 
     Attributes:
-        deadline: Time after which to give up, as of `time.monotonic`.
+        deadline: Time at which to give up, as of `time.monotonic`.
     """
 
     def __init__(self, viewer: Viewer, deadline: float) -> None:
@@ -152,7 +152,7 @@ class Camera:
                 raise VisualizerError("The Rerun viewer took too long to draw the picture.")
             try:
                 return call()
-            except OSError:  # it is busy, or it ended, which the check reports
+            except OSError:  # it is busy, or has ended, which the check reports
                 time.sleep(0.1)
 
     def wait_for_recording(self) -> None:
@@ -167,15 +167,15 @@ class Camera:
             if complete and not state.loading and time.monotonic() - since > _QUIET_SECONDS:
                 break
             time.sleep(0.1)
-        for _ in range(_NOTES):  # a request lets a frame pass, without drawing it
+        for _ in range(_NOTES):  # a request lets a frame pass without drawing it
             self._request(self._client.get_state)
 
     def find(
         self, timeline: str | None, at: float | None, *, by_share: bool = False
     ) -> tuple[str, int]:
-        """Return a timeline and the viewer's number for a time on it, as in `render_picture`.
+        """Return a timeline and the viewer's integer for a time on it, as in `render_picture`.
 
-        With `by_share`, `at` is a share of the timeline, from 0 to 1.
+        With `by_share`, `at` is a fraction of the timeline, from 0 to 1.
         """
         state = self._request(self._client.get_state)
         known = {line.name: line for line in state.recordings[0].timelines}
@@ -208,7 +208,7 @@ class Camera:
         """Wait until the viewer has received all rows up to a position on a timeline.
 
         Returns:
-            The id of the first three-dimensional view, or None.
+            The id of the first three-dimensional view; None if there is none.
         """
         while True:
             state = self._request(self._client.get_state)
@@ -225,8 +225,8 @@ class Camera:
     def wait_for_picture(self, view_id: str | None = None) -> bytes:
         """Return a picture of one view, or of the window, once everything is drawn.
 
-        The viewer draws while rows and meshes arrive: it is complete when two pictures in a row are
-        equal and no view reports a missing asset.
+        The viewer draws while rows and meshes arrive: a picture is complete when it equals the
+        previous one and no view reports a missing asset.
         """
         picture, repeats = b"", 0
         while True:

@@ -1,10 +1,10 @@
-"""Imports Rerun without its messages of lost connections, of which `LiveWriter` tells itself."""
+"""Imports Rerun without its messages about lost connections, which `LiveWriter` reports itself."""
 
 from __future__ import annotations
 
 import os
 
-if "RUST_LOG" not in os.environ:  # Rerun reads it when it is imported, and only then
+if "RUST_LOG" not in os.environ:  # Rerun reads it only when it is imported
     os.environ["RUST_LOG"] = "warn,re_grpc_client=off,re_sdk=off"
     try:
         import rerun as rerun

@@ -1,4 +1,4 @@
-"""Renders successive pictures of a moving scene with a viewer without window."""
+"""Renders successive pictures of a moving scene with a viewer without a window."""
 
 from __future__ import annotations
 
@@ -13,12 +13,12 @@ from physx_core.processes import TemporaryFolder
 from physx_core.typing import Array
 from physx_rerun.viewer.headless import Camera, start_viewer
 
-_MARGIN = (8, 36)  # pixels of the window around a view, frame and title, without its menu bar
+_MARGIN = (8, 36)  # pixels around a view: its frame and title, without the menu bar
 _PATIENCE = 60.0  # s per picture
 
 
 class OffscreenViewer:
-    """A viewer without window.
+    """A viewer without a window.
 
     Attributes:
         address: Address of the viewer, ``127.0.0.1:PORT``.
@@ -28,8 +28,8 @@ class OffscreenViewer:
         """Start the viewer.
 
         Args:
-            size: Width and height of its pictures, in pixels.
-            memory_limit: Memory of the viewer, beyond which it drops the oldest rows.
+            size: Width and height of its pictures in pixels.
+            memory_limit: Memory limit of the viewer, beyond which it drops the oldest rows.
         """
         self._size = size
         self._folder = TemporaryFolder("rerun-")
@@ -50,7 +50,7 @@ class OffscreenViewer:
         Args:
             step: Position on the timeline ``step`` to draw.
             mark: Timeline of the last row that must have arrived.
-            number: Its position on that timeline.
+            number: Position of the row on that timeline.
         """
         deadline = time.monotonic() + _PATIENCE
         try:
@@ -67,7 +67,7 @@ class OffscreenViewer:
             drawn = camera.wait_for_picture(scene) if is_first else camera.screenshot(scene)
         except OSError as error:
             self._viewer.check(wait=2.0)
-            raise VisualizerError(f"The Rerun viewer rendered no picture: {error}.") from error
+            raise VisualizerError(f"The Rerun viewer did not render a picture: {error}.") from error
         self._camera = camera
         return _crop(Image.open(io.BytesIO(drawn)), self._size)
 
@@ -78,7 +78,7 @@ class OffscreenViewer:
 
 
 def _crop(picture: Image.Image, size: tuple[int, int]) -> Array:
-    """Crop a picture to its center; a smaller one is enlarged first."""
+    """Crop a picture to its center; a picture that is too small is enlarged first."""
     factor = max(1.0, *(want / have for want, have in zip(size, picture.size, strict=True)))
     if factor > 1.0:
         whole = [round(factor * have) for have in picture.size]

@@ -1,4 +1,4 @@
-"""RecordingStreams: writes a recording to a file, to live viewers, or to both."""
+"""RecordingStreams: writes a recording to a file, to live viewers, or both."""
 
 from __future__ import annotations
 
@@ -20,19 +20,19 @@ from physx_rerun.drawing.chunks import Chunk
 from physx_rerun.viewer.viewer import connect
 
 QUEUE_BYTES = 64_000_000
-"""Largest size of the rows that wait for a live viewer; further rows are dropped."""
+"""Largest size of the rows queued for a live viewer; further rows are dropped."""
 QUEUE_LENGTH = 4096
-"""Largest number of chunks that wait for a live viewer; further rows are dropped."""
+"""Largest number of chunks queued for a live viewer; further rows are dropped."""
 CLOSE_SECONDS = 2.5
-"""Time that the end of a run waits for live viewers."""
+"""Time that a run waits for live viewers at its end."""
 RETRY_SECONDS = 2.0
-"""Time between two looks for a live viewer that is not there."""
+"""Time between attempts to reach a live viewer that is not running."""
 
 _FRAME = "Transform3D:child_frame"
 
 
 class RecordingStreams:
-    """A run's recording. The file gets all rows, live viewers those that they can keep up with."""
+    """A run's recording. The file gets all rows, live viewers get as many as they can handle."""
 
     def __init__(
         self,
@@ -85,7 +85,7 @@ class RecordingStreams:
             live.put(_QueuedBlueprint(blueprint, make_active=self._owns_viewer))
 
     def close(self) -> None:
-        """Finish the file and disconnect live viewers; warn of rows that they did not get."""
+        """Finish the file and disconnect live viewers; warn about rows that they did not get."""
         if self._file:
             self._file.disconnect()
             self._file = None
@@ -114,13 +114,13 @@ _Item = Chunk | _QueuedBlueprint
 
 
 class LiveWriter:
-    """Writes to a live viewer in a thread of its own, as a hanging viewer blocks its writer.
+    """Writes to a live viewer in a separate thread, because a hanging viewer blocks its writer.
 
-    There need not be a viewer. One that is started later, or again, is sent the layout and the
-    last state of everything, and from then on all rows.
+    The viewer need not be running. One that is started later, or restarted, gets the layout and the
+    last state of everything, and all rows from then on.
 
     Attributes:
-        missed: Blocks of rows that the viewer did not get, as it was too slow or not there.
+        missed: Blocks of rows that the viewer did not get because it was too slow or not running.
     """
 
     def __init__(self, application_id: str, recording_id: str, run_name: str, address: str) -> None:
@@ -146,7 +146,7 @@ class LiveWriter:
         self._thread.start()
 
     def put(self, item: _Item) -> None:
-        """Queue an item; rows are dropped while the queue is full, static data never."""
+        """Queue an item; rows are dropped while the queue is full, static data never are."""
         with self._lock:
             is_full = self._waiting_bytes > QUEUE_BYTES or self._queue.qsize() > QUEUE_LENGTH
             if is_full and not item.is_static:
@@ -156,26 +156,26 @@ class LiveWriter:
         self._queue.put(item)
 
     def end(self) -> None:
-        """Let the thread end once it has sent what is queued."""
+        """End the thread once it has sent everything in the queue."""
         self._queue.put(None)
 
     def close(self, deadline: float) -> None:
         """Wait until the viewer has received everything; warn if it has not.
 
         Args:
-            deadline: Time after which to give up, as of `time.monotonic`.
+            deadline: Time at which to give up, as of `time.monotonic`.
         """
         self._thread.join(max(0.0, deadline - time.monotonic()))
         if self._thread.is_alive():
-            # Rerun would otherwise wait for the viewer when the interpreter ends.
+            # Otherwise, Rerun would wait for the viewer when the interpreter exits.
             rr.unregister_shutdown()
             problem = "does not respond"
         elif self._failure is not None:
             problem = f"disconnected ({self._failure})"
         elif self._stream is None:
-            problem = "was never there"
+            problem = "was never reachable"
         elif self.missed:
-            problem = "was too slow, or not there all the time"
+            problem = "was too slow, or not always reachable"
         else:
             return
         warnings.warn(
@@ -192,7 +192,7 @@ class LiveWriter:
                 item = self._queue.get(timeout=RETRY_SECONDS)
                 is_over = item is None
             if self._stream is not None and self._is_gone():
-                self._disconnect(ConnectionError("it is gone"))
+                self._disconnect(ConnectionError("it closed the connection"))
             if self._stream is None and (is_over or time.monotonic() >= look_at):
                 self._connect()
                 look_at = time.monotonic() + RETRY_SECONDS
@@ -214,8 +214,8 @@ class LiveWriter:
             self.missed += self._stream is None and not item.is_static
 
     def _connect(self) -> None:
-        """Connect to the viewer if it is there, and send it what it has missed."""
-        # Rerun's own connection takes 5 s where nobody listens, and never tells that it is lost.
+        """Connect to the viewer if it is running, and send it what it has missed."""
+        # Rerun's own connection takes 5 s if nobody listens, and never reports that it is lost.
         self._canary = connect(self._address)
         if self._canary is None:
             return
@@ -243,13 +243,13 @@ class LiveWriter:
     def _disconnecting_on_failure(self) -> Iterator[None]:
         try:
             yield
-        except Exception as error:  # a viewer can fail in any way, which must not end a run
+        except Exception as error:  # a viewer can fail in any way, which must not end the run
             self._disconnect(error)
 
     def _disconnect(self, reason: Exception) -> None:
         self._failure = reason
         with self._lock:
-            self.missed += 1  # what was on its way, at least
+            self.missed += 1  # at least the rows in transit
         stream, self._stream = self._stream, None
         if stream is not None:
             with contextlib.suppress(Exception):
@@ -259,26 +259,26 @@ class LiveWriter:
 
 
 class _LastState:
-    """The last value of everything that was drawn, for a viewer that has missed it."""
+    """The last value of everything drawn, for a viewer that has missed it."""
 
     def __init__(self) -> None:
         self._count = 0
         self._items: dict[tuple[str, ...], tuple[int, _Item]] = {}
 
     def add(self, item: _Item) -> None:
-        """Add an item, and forget those that it overrides."""
+        """Add an item, and remove those that it overrides."""
         self._count += 1
         for key in _keys(item):
             self._items[key] = (self._count, item)
 
     def items(self) -> list[_Item]:
-        """Return the items that are not overridden, in the order in which they came."""
+        """Return the items that are not overridden, in the order in which they were added."""
         numbered = dict(self._items.values())
         return [numbered[number] for number in sorted(numbered)]
 
 
 def _keys(item: _Item) -> Iterable[tuple[str, ...]]:
-    """Return what an item sets: the components of an entity, for each of the frames it moves."""
+    """Return keys of what an item sets: an entity's components, for each frame that it moves."""
     if not isinstance(item, Chunk):
         return [("blueprint",)]
     columns = {str(column.component_descriptor()): column for column in item.columns}

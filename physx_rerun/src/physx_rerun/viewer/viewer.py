@@ -1,4 +1,4 @@
-"""Viewer: the native Rerun viewer in its own process, reachable from this machine only."""
+"""Viewer: the native Rerun viewer in a separate process, reachable only from this machine."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ from physx_core.processes import ChildProcess, OutputTail
 _PANIC_STATUS = 102
 _PANIC = re.compile(r"panicked at '(.*)'")
 _NO_GLYPH = re.compile(r'No glyph for (".*" \(U\+\w+\))')
-_TAIL_SECONDS = 1.0  # to read the rest of it
-_LINES = 400  # of the viewer's output; after the one with its reason it writes its call stack
+_TAIL_SECONDS = 1.0  # to read the rest of the output
+_LINES = 400  # of the viewer's output; the line with the reason is followed by the call stack
 NO_VULKAN = (
     "The Rerun viewer found no graphics driver: install a software Vulkan driver, "
     "for example: apt install mesa-vulkan-drivers"
@@ -29,7 +29,7 @@ NO_VULKAN = (
 
 
 def find_executable() -> Path:
-    """Return the viewer's executable; ending the command ``rerun``, a script, leaves it running."""
+    """Return the viewer's executable; ending the script ``rerun`` would leave it running."""
     name = "rerun.exe" if sys.platform == "win32" else "rerun"
     path = Path(rerun_cli.__file__).parent / name
     if not path.is_file():
@@ -86,7 +86,7 @@ class Viewer:
 
     Attributes:
         address: Address of the viewer, ``127.0.0.1:PORT``.
-        page: Its page for browsers, if it is one of `start_web_viewer`.
+        page: Its page for browsers, if it was started by `start_web_viewer`.
         process: The process.
     """
 
@@ -105,7 +105,7 @@ class Viewer:
         Args:
             port: Port of the viewer; 0: any free one.
             options: Further command-line options.
-            environment: Environment variables beside those of this process.
+            environment: Environment variables in addition to those of this process.
             lives_on: Whether the viewer outlives this process.
 
         Raises:
@@ -128,7 +128,7 @@ class Viewer:
         self._tail = None if stream is None else OutputTail(stream, _LINES)
 
     def wait_until_ready(self, timeout: float = 30.0) -> None:
-        """Wait until the viewer listens."""
+        """Wait until the viewer is listening."""
         deadline = time.monotonic() + timeout
         while not is_listening(self.address):
             self.check()
@@ -138,7 +138,7 @@ class Viewer:
             time.sleep(0.05)
 
     def check(self, wait: float = 0.0) -> None:
-        """Raise if the process ended.
+        """Raise an error if the process has ended.
 
         Args:
             wait: Time in s to wait for its end.

@@ -1,1 +1,1 @@
-"""The networks that the plugin brings."""
+"""The plugin's networks."""

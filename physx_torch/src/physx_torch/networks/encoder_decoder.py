@@ -12,10 +12,10 @@ from physx_torch.networks.fc import FC, check_layer_sizes
 
 
 class EncoderDecoder(FC):
-    """Fully connected encoder and decoder: outputs depend on inputs through a code only.
+    """Fully connected encoder and decoder: outputs depend on inputs only through a code.
 
-    By default the decoder mirrors the encoder. Fields are read and predicted as in `FC`. For grids,
-    a `UNet` with ``skip_merge=True`` is a convolutional encoder and decoder.
+    By default, the decoder mirrors the encoder. Fields are read and predicted as in `FC`. For
+    grids, a `UNet` with ``skip_merge=True`` is a convolutional encoder and decoder.
 
     Attributes:
         code_size: Number of values in the code.
@@ -32,23 +32,23 @@ class EncoderDecoder(FC):
         """Create the layers.
 
         Args:
-            encoder: Number of inputs, of neurons of each hidden layer, and of the code, for
+            encoder: Numbers of inputs, of neurons of each hidden layer, and of code values, for
                 example ``[300, 64, 8]``.
-            decoder: Number of neurons of each layer after the code, the outputs last, for example
-                ``[32, 30]``; None: those of the encoder in reverse order.
-            nb_outputs: Number of outputs if no decoder is given; None: as many as inputs.
+            decoder: Numbers of neurons of each layer after the code, ending with the outputs, for
+                example ``[32, 30]``; None: those of the encoder in reverse order.
+            nb_outputs: Number of outputs if there is no decoder; None: the number of inputs.
             options: ``activation``, ``biases``, ``output_shape`` and the names of the fields as in
                 `FC`.
 
         Raises:
-            ConfigError: If a list is invalid, or `nb_outputs` is given with a decoder.
+            ConfigError: If a list is invalid, or `nb_outputs` is combined with a decoder.
         """
         own = check_layer_sizes(f"{type(self).__name__}.encoder", encoder, "[300, 64, 8]")
         if decoder is None:
             last = own[0] if nb_outputs is None else nb_outputs
             decoder = (*reversed(own[1:-1]), last)
         elif nb_outputs is not None:
-            raise ConfigError(f"{type(self).__name__}: give nb_outputs or the decoder, not both.")
+            raise ConfigError(f"{type(self).__name__}: set nb_outputs or the decoder, not both.")
         super().__init__((*own, *decoder), **options)
         self.code_size = own[-1]
         self._split = 2 * len(own) - 3  # modules up to the code: linear layers and activations
@@ -63,7 +63,7 @@ class EncoderDecoder(FC):
         return code
 
     def decode(self, code: torch.Tensor) -> torch.Tensor | list[torch.Tensor]:
-        """Return the predictions for codes, as ``forward`` does.
+        """Return the predictions for codes, in the form that ``forward`` returns.
 
         Args:
             code: Shape (samples, code_size).

@@ -18,13 +18,13 @@ from physx_torch.networks.network import TorchNetwork
 class FC(TorchNetwork):
     """Fully connected network.
 
-    The values of all `net_fields` of a sample are concatenated in that order and passed through the
+    The values of all `net_fields` of a sample are concatenated in order and passed through the
     layers, with an activation after each layer but the last. The outputs are split into the
-    prediction fields in order, in the shapes of `opt_fields`.
+    prediction fields in order, with the shapes of `opt_fields`.
 
     Attributes:
         layers: The linear layers and activations.
-        sizes: Number of inputs, of neurons of each hidden layer, and of outputs.
+        sizes: Numbers of inputs, of neurons of each hidden layer, and of outputs.
     """
 
     def __init__(
@@ -39,13 +39,13 @@ class FC(TorchNetwork):
         """Create the layers.
 
         Args:
-            layers: Number of inputs, of neurons of each hidden layer, and of outputs, for example
+            layers: Numbers of inputs, of neurons of each hidden layer, and of outputs, for example
                 ``[27, 256, 256, 9]``.
-            activation: Class of an activation, or its name in `torch.nn`. ``"PReLU"`` learns one
+            activation: Class of an activation, or its name in `torch.nn`. ``"PReLU"`` learns a
                 slope for each neuron.
             biases: Whether layers have a bias: one value for all, or one for each of the
                 ``len(layers) - 1`` layers.
-            output_shape: Shape of one sample's prediction; None: that of the field in
+            output_shape: Shape of one sample's prediction; None: the shape of the field in
                 `opt_fields`.
             fields: ``net_fields``, ``opt_fields`` and ``pred_fields`` as in `TorchNetwork`.
 
@@ -65,7 +65,7 @@ class FC(TorchNetwork):
         own = type(self).__name__
         shape = (given,) if isinstance(given, int) else tuple(given)
         if len(self.pred_fields) > 1:
-            raise ConfigError(f"{own}.output_shape is for one prediction field: leave it out.")
+            raise ConfigError(f"{own}.output_shape is only for one prediction field: omit it.")
         if math.prod(shape) != self.sizes[-1]:
             raise ConfigError(
                 f"{own}.output_shape {shape} has {math.prod(shape)} values, but the last of layers "
@@ -77,8 +77,8 @@ class FC(TorchNetwork):
         """Set the shapes of the fields before the first batch.
 
         Raises:
-            FieldsMismatchError: If a field is missing, its shape is unknown, or the fields do not
-                have as many values as the first and the last layer.
+            FieldsMismatchError: If a field is missing, its shape is unknown, or the number of
+                values in the fields differs from the size of the first or last layer.
         """
         super().bind(fields)
         self._check("first", self.sizes[0], {name: fields[name] for name in self.net_fields})
@@ -132,7 +132,7 @@ class FC(TorchNetwork):
         return torch.cat([self._flatten(tensor) for tensor in inputs], dim=1)
 
     def split_outputs(self, output: torch.Tensor) -> torch.Tensor | list[torch.Tensor]:
-        """Split outputs of shape (samples, number) into prediction fields of their shapes."""
+        """Split outputs of shape (samples, number) into prediction fields with their shapes."""
         if len(self._shapes) == 1:
             return _reshape(output, self._shapes[0])
         parts = output.split([math.prod(shape) for shape in self._shapes], dim=1)
@@ -158,9 +158,9 @@ def check_layer_sizes(
     """Return numbers of neurons after validating them.
 
     Args:
-        option: Name of the option, for the message.
+        option: Name of the option, for error messages.
         given: At least two positive integers.
-        example: Example for the message.
+        example: Example for error messages.
     """
     sizes = () if isinstance(given, str) or not isinstance(given, Iterable) else tuple(given)
     right = all(type(size) is int and size > 0 for size in sizes)

@@ -12,12 +12,12 @@ from physx_core import Field
 
 
 class Border(NamedTuple):
-    """Padding of one axis of a grid, and the part of the output that corresponds to it.
+    """Padding of one axis of a grid, and the part of the output that corresponds to the grid.
 
     Attributes:
         size: Points of the grid along the axis.
-        before: Points added in front.
-        after: Points added behind.
+        before: Points added before the grid.
+        after: Points added after the grid.
         start: Point of the output that corresponds to the first point of the grid.
     """
 
@@ -33,16 +33,16 @@ class Border(NamedTuple):
 
 
 def make_border(size: int, steps: int, sublayers: int, same: bool) -> Border:
-    """Return the least padding with which a UNet predicts a value for each point of an axis.
+    """Return the smallest padding with which a UNet predicts a value for each point of an axis.
 
-    Each of the `steps` halves the axis on the way down, which must be even there, and doubles it on
-    the way up. Without padding of their own (`same` is False), the `sublayers` convolutions of each
-    level remove one point at either end.
+    Each of the `steps` halves the axis, whose size must be even, on the way down, and doubles it on
+    the way up. If convolutions do not pad (`same` is False), the `sublayers` convolutions of each
+    level remove one point at each end.
 
     Args:
         size: Points of the grid along the axis.
         steps: Number of times that the axis is halved.
-        sublayers: Convolutions in each level.
+        sublayers: Convolutions per level.
         same: Whether convolutions keep the size.
     """
     factor = 2**steps
@@ -50,7 +50,7 @@ def make_border(size: int, steps: int, sublayers: int, same: bool) -> Border:
         missing = -size % factor
         return Border(size, missing // 2, missing - missing // 2, missing // 2)
     lost = 2 * sublayers
-    deepest = -(-(size + lost * (factor - 1)) // factor)  # points that leave the lowest level
+    deepest = -(-(size + lost * (factor - 1)) // factor)  # points at the exit of the lowest level
     output = factor * deepest - lost * (factor - 1)
     margin = ((factor * (deepest + lost) + lost * (factor - 1)) - output) // 2
     surplus = output - size
@@ -71,15 +71,15 @@ class GridLayout(NamedTuple):
 
 
 def grid_size(shape: Sequence[int], nb_dims: int) -> tuple[int, ...] | None:
-    """Return the grid of a shape, with or without an axis of channels; None if it does not fit."""
+    """Return the grid of a shape, with or without a channel axis; None if it does not match."""
     return tuple(shape[:nb_dims]) if len(shape) in (nb_dims, nb_dims + 1) else None
 
 
 def find_layout(field: Field, size: tuple[int, ...]) -> GridLayout | None:
     """Return the layout of a grid in a field; None if the field does not contain one.
 
-    A field has the axes of the grid, or one axis with all points in row-major order; an axis of
-    channels may follow.
+    A field has the axes of the grid, or one axis with all points in row-major order, optionally
+    followed by a channel axis.
     """
     shape = tuple(field.shape or ())
     for points in (size, (math.prod(size),)):
@@ -89,12 +89,12 @@ def find_layout(field: Field, size: tuple[int, ...]) -> GridLayout | None:
 
 
 def to_grid(tensor: torch.Tensor, size: Sequence[int], channels: int) -> torch.Tensor:
-    """Return a field's tensor in the shape (samples, *size, channels)."""
+    """Return a field's tensor with shape (samples, *size, channels)."""
     return tensor.reshape(-1, *size, channels)
 
 
 def pad(tensor: torch.Tensor, borders: Sequence[Border]) -> torch.Tensor:
-    """Return a grid (samples, *size, channels) with zeros around it."""
+    """Return a grid (samples, *size, channels), padded with zeros."""
     widths = [0, 0]
     for axis in reversed(borders):
         widths += [axis.before, axis.after]

@@ -15,8 +15,8 @@ from physx_torch.networks.network import TorchNetwork
 class ModuleNetwork(TorchNetwork):
     """A plain `torch.nn.Module` with names for its inputs and outputs.
 
-    Its ``forward`` takes the tensors of `net_fields` in that order and returns one tensor, several
-    in the order of `pred_fields`, or a dictionary by those names.
+    Its ``forward`` takes the tensors of `net_fields` in order and returns one tensor, several in
+    the order of `pred_fields`, or a dictionary by those names.
 
     Attributes:
         module: The module.
@@ -34,21 +34,20 @@ class ModuleNetwork(TorchNetwork):
     ) -> None:
         """Create the module.
 
-        The keyword arguments of the module's constructor can be given beside the others, or in
-        `module_kwargs`, which is necessary if it takes one of the names below itself.
+        Keyword arguments of the module's constructor can be passed along with the others, or in
+        `module_kwargs`, which is necessary if their names include one of the names below.
 
         Args:
-            module: Class of the module, or ``"package.module:Class"``, or ``"script.py:Class"``.
+            module: Class of the module, ``"package.module:Class"``, or ``"script.py:Class"``.
             net_fields: As in `TorchNetwork`.
             opt_fields: As in `TorchNetwork`.
             pred_fields: As in `TorchNetwork`.
-            module_kwargs: Keyword arguments of the module's constructor; None: they are
-                `arguments`.
+            module_kwargs: Keyword arguments of the module's constructor; None: use `arguments`.
             arguments: Keyword arguments of the module's constructor.
 
         Raises:
-            ConfigError: If there is no such class, it rejects the arguments, does not create a
-                plain module, or an argument is ambiguous.
+            ConfigError: If the class does not exist, rejects the arguments, or does not create a
+                plain module, or if an argument is ambiguous.
         """
         super().__init__(net_fields=net_fields, opt_fields=opt_fields, pred_fields=pred_fields)
         names = {
@@ -64,7 +63,7 @@ class ModuleNetwork(TorchNetwork):
             raise ConfigError(f"{module!r} returned {type(made).__name__}, not a torch.nn.Module.")
         if isinstance(made, TorchNetwork):
             raise ConfigError(
-                f"{type(made).__name__} is a network already: choose it as NetworkConfig.network."
+                f"{type(made).__name__} is already a network: set it as NetworkConfig.network."
             )
         self.module = made
 
@@ -79,19 +78,19 @@ def _module_arguments(
     module_kwargs: Mapping[str, Any] | None,
     arguments: Mapping[str, Any],
 ) -> dict[str, Any]:
-    """Return the arguments of the module.
+    """Return the module's arguments.
 
     Args:
         module: Class of the module.
-        given: Names of the arguments that the network takes itself.
-        module_kwargs: Arguments that the user gave for the module, if any.
-        arguments: Other arguments that the network does not take.
+        given: Names of the arguments that the network itself takes.
+        module_kwargs: Arguments that the user passed for the module, if any.
+        arguments: Other arguments, which the network does not take.
     """
     name = getattr(module, "__name__", repr(module))
     if module_kwargs is not None:
         if arguments:
             raise ConfigError(
-                f"{listed(arguments)} and module_kwargs are given: put all arguments of {name} "
+                f"Both {listed(arguments)} and module_kwargs are set: put all arguments of {name} "
                 "into module_kwargs."
             )
         return dict(module_kwargs)
@@ -99,7 +98,7 @@ def _module_arguments(
     for option in given:
         if option in taken:
             raise ConfigError(
-                f'{name} takes an argument "{option}" itself, so it is ambiguous. '
+                f'{name} also takes an argument "{option}", which makes it ambiguous. '
                 f"Put the arguments of {name} into module_kwargs={{...}}."
             )
     return dict(arguments)

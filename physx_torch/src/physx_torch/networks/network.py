@@ -25,22 +25,22 @@ from physx_torch.parallel import join_group
 from physx_torch.storage.parameters import check_match, read_shapes, read_tensors, write_tensors
 
 DATA_TYPES = {"float32": torch.float32, "float64": torch.float64}
-"""Floating types that a network can compute in, by name."""
+"""Floating-point types that a network can compute in, by name."""
 
 
 class TorchNetwork(torch.nn.Module, Network):
     """Base of PyTorch networks: a module whose inputs and outputs are fields.
 
     A subclass creates its layers in the constructor and implements ``forward``, which takes the
-    tensors of `net_fields` in that order, of shape (samples, *field shape), and returns those of
-    `pred_fields`: one tensor, several in that order, or a dictionary by name.
+    tensors of `net_fields` in order, of shape (samples, *field shape), and returns those of
+    `pred_fields`: one tensor, several in order, or a dictionary by name.
 
     The names of the fields are class attributes of the subclass or arguments of the constructor.
-    If `opt_fields` are given and `pred_fields` are not, predictions are named like their targets.
+    With `opt_fields` but no `pred_fields`, predictions have the names of their targets.
 
     Attributes:
         device: Device of the parameters.
-        data_type: Floating type of parameters and tensors.
+        data_type: Floating-point type of parameters and tensors.
     """
 
     parameters_file: ClassVar[str] = "parameters.safetensors"
@@ -66,7 +66,7 @@ class TorchNetwork(torch.nn.Module, Network):
             kwargs: Must be empty; a subclass takes its own options by name.
 
         Raises:
-            UnknownOptionError: If no class of the network takes an option.
+            UnknownOptionError: If no class of the network accepts an option.
             ConfigError: If names are missing or duplicate, or their numbers do not match.
         """
         if kwargs:
@@ -89,21 +89,21 @@ class TorchNetwork(torch.nn.Module, Network):
 
     @classmethod
     def set_seed(cls, seed: int) -> None:
-        """Seed torch's random numbers, those of every device."""
+        """Seed torch's random numbers on all devices."""
         torch.manual_seed(seed)
 
     @classmethod
     def check_arguments(cls, arguments: Mapping[str, Any], path: Path) -> None:
-        """Check arguments from a checkpoint against its parameters, before a network is created.
+        """Validate arguments from a checkpoint against its parameters, before creating a network.
 
         Raises:
-            CheckpointError: If the parameters are not those of such a network.
+            CheckpointError: If the parameters do not belong to such a network.
         """
         shapes = read_shapes(path)
         try:
-            with torch.device("meta"):  # where tensors have no memory
+            with torch.device("meta"):  # where tensors take no memory
                 made = cls(**arguments)
-        except RuntimeError:  # it needs the values of tensors; if it is invalid, this is seen later
+        except RuntimeError:  # it needs tensor values; invalid arguments are detected later
             return
         check_match(path, cls.__name__, shapes, made._state())
 
@@ -140,7 +140,7 @@ class TorchNetwork(torch.nn.Module, Network):
         """Return the tensors of `pred_fields`; implemented by subclasses.
 
         Args:
-            inputs: The tensors of `net_fields` in that order, of shape (samples, *field shape).
+            inputs: The tensors of `net_fields` in order, of shape (samples, *field shape).
 
         Raises:
             UsageError: If the subclass does not implement it.
@@ -156,7 +156,7 @@ class TorchNetwork(torch.nn.Module, Network):
     def set_training_forward(self, forward: Callable[..., Any] | None) -> None:
         """Replace ``forward`` in training mode; None: do not replace it.
 
-        For optimizations that compile it or compute in mixed precision.
+        Used by optimizations that compile it or compute in mixed precision.
         """
         self._training_forward = forward
 
@@ -181,14 +181,14 @@ class TorchNetwork(torch.nn.Module, Network):
         self.train()
 
     def set_eval(self) -> None:
-        """Switch to evaluation mode: no gradients are recorded."""
-        if self.training:  # visiting every layer takes as long as a small network's prediction
+        """Switch to evaluation mode, without recording gradients."""
+        if self.training:  # visiting all layers takes as long as a small network's prediction
             self.eval()
 
     def set_device(self, device: str) -> None:
         """Move to ``"cpu"``, ``"cuda"``, ``"cuda:<index>"``, ``"mps"`` or ``"auto"``.
 
-        ``"auto"`` is the first CUDA device if there is one, otherwise the processor.
+        ``"auto"`` is the first CUDA device if there is one, else the CPU.
 
         Raises:
             ConfigError: If the device does not exist, or does not support the data type.
@@ -202,7 +202,7 @@ class TorchNetwork(torch.nn.Module, Network):
         """Compute in ``"float32"`` or ``"float64"``.
 
         Raises:
-            ConfigError: If it is another type, or the device does not support it.
+            ConfigError: If the type is a different one, or not supported by the device.
         """
         if data_type not in DATA_TYPES:
             raise ConfigError(f'data_type is "{data_type}" but must be {listed(DATA_TYPES)}.')
@@ -211,11 +211,11 @@ class TorchNetwork(torch.nn.Module, Network):
         self._apply(lambda tensor: _to_precision(tensor, self.data_type))
 
     def get_parameters(self) -> dict[str, torch.Tensor]:
-        """Return the trainable parameters by name; they are the network's own."""
+        """Return the trainable parameters by name, not copies."""
         return dict(self.named_parameters())
 
     def get_gradients(self) -> dict[str, torch.Tensor]:
-        """Return the gradients of the last step by parameter; they are the network's own."""
+        """Return the gradients of the last step by parameter, not copies."""
         named = self.named_parameters()
         return {name: p.grad for name, p in named if p.grad is not None}
 
@@ -234,13 +234,13 @@ class TorchNetwork(torch.nn.Module, Network):
             parameter.grad = None if found is None else found.to(parameter.device, parameter.dtype)
 
     def nb_parameters(self) -> int:
-        """Return the number of real numbers in the parameters; a complex one counts as two."""
+        """Return the number of real numbers in the parameters; complex numbers count twice."""
         return sum(p.numel() * (2 if p.is_complex() else 1) for p in self.parameters())
 
     def find_not_finite(self) -> str:
         """Return the name of a parameter or buffer that is not finite; empty if there is none.
 
-        Buffers may hold infinity, as masks do.
+        Buffers may contain infinity, as masks do.
         """
         for name, parameter in self.named_parameters():
             if not torch.isfinite(parameter).all():
@@ -259,11 +259,11 @@ class TorchNetwork(torch.nn.Module, Network):
         write_tensors(path, self._state())
 
     def load_parameters(self, path: Path) -> None:
-        """Read parameters and buffers that `save_parameters` wrote, in any floating type.
+        """Read parameters and buffers written by `save_parameters`, in any floating-point type.
 
         Raises:
-            CheckpointError: If the file is missing, damaged or of another architecture; the network
-                is not changed then.
+            CheckpointError: If the file is missing, damaged or from another architecture; the
+                network is then unchanged.
         """
         check_match(path, type(self).__name__, read_shapes(path), self._state())
         self.load_state_dict(read_tensors(path)[0])
@@ -279,8 +279,8 @@ class TorchNetwork(torch.nn.Module, Network):
     def numpy_to_tensor(self, batch: Batch) -> Tensors:
         """Return arrays as tensors on the network's device.
 
-        Floating arrays are converted to the network's data type; integers, booleans and complex
-        numbers keep theirs. On the processor, writable arrays of the right type share memory.
+        Floating-point arrays are converted to the network's data type; integers, booleans and
+        complex numbers keep theirs. On the CPU, writable arrays of the right type share memory.
 
         Args:
             batch: Arrays by field, each of shape (samples, *field shape).
@@ -294,12 +294,12 @@ class TorchNetwork(torch.nn.Module, Network):
         return tensor.to(self.device)
 
     def tensor_to_numpy(self, tensors: Tensors) -> Batch:
-        """Return tensors as arrays; those on the processor share memory."""
+        """Return tensors as arrays; those on the CPU share memory."""
         return {name: tensor.numpy(force=True) for name, tensor in tensors.items()}
 
 
 def _to_compatible(array: Array) -> Array:
-    # torch accepts neither read-only memory, nor foreign byte orders, nor negative strides.
+    # torch does not accept read-only memory, foreign byte orders, or negative strides.
     flags = array.flags
     regular = flags.writeable and array.dtype.isnative
     if regular and (flags.c_contiguous or min(array.strides) >= 0):
@@ -320,7 +320,7 @@ def _names(
 
 
 def _to_precision(tensor: torch.Tensor, data_type: torch.dtype) -> torch.Tensor:
-    """Convert floating and complex tensors to a precision; others are not changed."""
+    """Convert floating-point and complex tensors to a precision; leave others unchanged."""
     if tensor.is_complex():
         return tensor.to(data_type.to_complex())
     return tensor.to(data_type) if tensor.is_floating_point() else tensor

@@ -25,10 +25,10 @@ class TorchTransformation(Transformation):
 
     Fields of `net_fields` and `opt_fields` are normalized with their own coefficients; the i-th of
     `pred_fields` is converted to physical units with those of the i-th of `opt_fields`. Fields
-    without coefficients are not changed.
+    without coefficients are unchanged.
 
-    Everything is computed in the network's data type: values with a large offset (1e6 standard
-    deviations) lose their last digits in float32 before the mean is subtracted; use float64 for
+    Everything is computed in the network's data type: in float32, values with a large offset (1e6
+    standard deviations) lose their last digits before the mean is subtracted; use float64 for
     those.
     """
 
@@ -41,7 +41,7 @@ class TorchTransformation(Transformation):
     def set_normalization(
         self, normalization: Mapping[str, Normalization], network: Network
     ) -> None:
-        """Set the coefficients as tensors of the network's device and data type.
+        """Set the coefficients as tensors with the network's device and data type.
 
         Call it again after changing the network's device or data type.
 
@@ -51,7 +51,7 @@ class TorchTransformation(Transformation):
             network: The network whose fields are transformed.
 
         Raises:
-            ConfigError: If it is not a PyTorch network.
+            ConfigError: If the network is not a PyTorch network.
         """
         if not isinstance(network, TorchNetwork):
             raise ConfigError(f"{type(network).__name__} is not a TorchNetwork.")

@@ -24,7 +24,7 @@ from physx_torch.networks.network import TorchNetwork
 Modules = list[torch.nn.Module]
 
 GROUPS = 8
-"""Largest number of groups of channels for group normalization."""
+"""Largest number of channel groups in group normalization."""
 _MOST_STEPS = 16
 NORMALIZATIONS = ("none", "batch", "group")
 
@@ -34,16 +34,16 @@ class UNet(TorchNetwork):
 
     On the way down, each step convolves, stores the result, and halves the grid, with twice as many
     channels below; on the way up, each step doubles the grid, concatenates the stored result, and
-    convolves. Convolutions have kernels of 3 points, and are followed by a normalization and an
-    activation.
+    convolves. Convolutions have kernels of 3 points per axis, and are followed by a normalization
+    and an activation.
 
     Normalization ``"none"``: initial weights preserve the variance of activations (He et al.,
-    2015). ``"batch"``: by mean and deviation of the batch, or of all batches for predictions: it
-    trains quickly at first, but varying batch statistics limit the accuracy, the more the smaller
-    the batches. ``"group"``: by those of each sample, in up to 8 groups of channels.
+    2015). ``"batch"``: by the mean and deviation of the batch, or of all batches for predictions:
+    it trains fast at first, but varying batch statistics limit the accuracy, especially with small
+    batches. ``"group"``: by those of each sample, in up to 8 groups of channels.
 
     A sample's field has the shape ``(*grid, channels)``, ``grid`` if there is one channel, or
-    ``(points, channels)`` with the points of the grid in row-major order. Several `net_fields` are
+    ``(points, channels)`` with the grid points in row-major order. Several `net_fields` are
     concatenated as channels; the output's channels are split into `pred_fields`.
     `UNetTransformation` pads the grid to the smallest size that the network accepts and crops the
     prediction; ``forward`` itself reads and returns padded grids.
@@ -78,23 +78,23 @@ class UNet(TorchNetwork):
         """Create the layers.
 
         Args:
-            nb_dims: 2 or 3 axes of the grid.
-            nb_input_channels: Input values at each point, of all fields.
-            nb_output_channels: Predicted values at each point, of all fields.
+            nb_dims: Number of grid axes, 2 or 3.
+            nb_input_channels: Input values per point, over all fields.
+            nb_output_channels: Predicted values per point, over all fields.
             nb_first_layer_channels: Channels of the finest level; they double with each level.
             nb_steps: Number of times that the grid is halved.
-            two_sublayers: Two convolutions in each level, instead of one.
-            border_mode: ``"valid"``: convolutions remove the outermost points, so that no value
-                depends on points beyond the padded grid; ``"same"``: they keep the size, which
-                needs less padding.
-            skip_merge: Whether to leave out the skip connections: a convolutional encoder and
-                decoder.
+            two_sublayers: Whether to use two convolutions per level instead of one.
+            border_mode: ``"valid"``: convolutions remove the outermost points, so no value depends
+                on points beyond the padded grid; ``"same"``: they keep the size, which needs less
+                padding.
+            skip_merge: Whether to omit the skip connections, which makes it a convolutional encoder
+                and decoder.
             data_scale: Factor of the targets in the loss, by which predictions are divided.
             normalization: ``"none"``, ``"batch"`` or ``"group"``, as described above.
             activation: Class, or name in `torch.nn` such as ``"SiLU"``.
             positions: Whether the network also reads the position of each point, as one more
                 channel per axis from -1 to 1: for bodies that are fixed somewhere.
-            input_size: Points of the grid along each axis; None: taken from the fields' shapes.
+            input_size: Points of the grid along each axis; None: inferred from the fields' shapes.
             fields: ``net_fields``, ``opt_fields`` and ``pred_fields`` as in `TorchNetwork`.
 
         Raises:
@@ -142,9 +142,9 @@ class UNet(TorchNetwork):
         for name, parameter in self.named_parameters():
             if name.endswith("bias"):
                 torch.nn.init.zeros_(parameter)
-            elif name.startswith("up."):  # each value below makes one of each kernel's points
+            elif name.startswith("up."):  # each value below contributes one of each kernel's points
                 torch.nn.init.normal_(parameter, std=parameter.shape[0] ** -0.5)
-            elif parameter.dim() > 1:  # else it is of an activation
+            elif parameter.dim() > 1:  # otherwise, it belongs to an activation
                 followed_by: Literal["linear", "relu"] = "linear" if name[:4] == "last" else "relu"
                 torch.nn.init.kaiming_normal_(parameter, nonlinearity=followed_by)
 
@@ -175,8 +175,8 @@ class UNet(TorchNetwork):
         """Set the grid from the fields before the first batch.
 
         Raises:
-            FieldsMismatchError: If a field is missing, has another grid, or the fields do not have
-                as many channels as the network.
+            FieldsMismatchError: If a field is missing or has another grid, or the number of
+                channels of the fields differs from the network's.
         """
         super().bind(fields)
         mine = {name: fields[name] for name in (*self.net_fields, *self.opt_fields)}
@@ -195,7 +195,7 @@ class UNet(TorchNetwork):
     def _size_of(self, field: Field) -> tuple[int, ...]:
         size = grid_size(field.shape or (), self._dims)
         if size is None:
-            text = f"shape {field.shape} is not a grid of {self._dims} axes: give input_size"
+            text = f"shape {field.shape} is not a grid of {self._dims} axes: set input_size"
             raise FieldsMismatchError("UNet needs values on a grid", {field.name: text})
         return size
 
@@ -234,7 +234,7 @@ class UNet(TorchNetwork):
 
 
 def _crop_center(tensor: torch.Tensor, like: torch.Tensor) -> torch.Tensor:
-    """Crop a tensor (samples, channels, *axes) to the center part with the size of another."""
+    """Crop a tensor (samples, channels, *axes) at its center to the size of another."""
     for axis in range(2, tensor.dim()):
         surplus = tensor.shape[axis] - like.shape[axis]
         if surplus:

@@ -13,11 +13,11 @@ from physx_torch.networks.unet import UNet
 
 
 class UNetTransformation(TorchTransformation):
-    """Normalizes as `TorchTransformation` does, and converts fields to the grid of a `UNet`.
+    """Normalizes like `TorchTransformation`, and converts fields to the grid of a `UNet`.
 
     Inputs are padded with zeros to the smallest size that the network accepts. Predictions are
-    cropped to the grid and get the shape of their target field, each value at its point. Targets
-    are multiplied by `UNet.data_scale`, predictions divided by it.
+    cropped to the grid and reshaped like their target fields, with each value at its point. Targets
+    are multiplied by `UNet.data_scale`, and predictions divided by it.
     """
 
     def __init__(self) -> None:
@@ -27,7 +27,7 @@ class UNetTransformation(TorchTransformation):
     def set_normalization(
         self, normalization: Mapping[str, Normalization], network: Network
     ) -> None:
-        """Set the coefficients and the network, whose fields are bound already.
+        """Set the coefficients and the network, whose fields must already be bound.
 
         Raises:
             ConfigError: If the network is not a UNet.
@@ -52,7 +52,7 @@ class UNetTransformation(TorchTransformation):
     def transform_before_loss(
         self, prediction: Tensors, targets: Tensors
     ) -> tuple[Tensors, Tensors]:
-        """Return the prediction in the fields' shapes, and the targets normalized and scaled."""
+        """Return the prediction with the fields' shapes, and the targets normalized and scaled."""
         prediction, targets = super().transform_before_loss(self._crop(prediction), targets)
         scale = self._unet().data_scale
         if scale != 1:
@@ -60,7 +60,7 @@ class UNetTransformation(TorchTransformation):
         return prediction, targets
 
     def transform_before_apply(self, prediction: Tensors) -> Tensors:
-        """Return the prediction in the fields' shapes and in physical units."""
+        """Return the prediction with the fields' shapes and in physical units."""
         prediction = self._crop(prediction)
         scale = self._unet().data_scale
         if scale != 1:

@@ -1,1 +1,1 @@
-"""Parameter and state files in safetensors."""
+"""Parameter and state files in the safetensors format."""

@@ -22,23 +22,23 @@ def write_tensors(
 
     Args:
         path: The file; an existing one is replaced.
-        tensors: Tensors by name. Those that share memory are written separately.
+        tensors: Tensors by name. Tensors that share memory are written separately.
         metadata: Further strings to write.
     """
     for name, value in tensors.items():
         if not isinstance(value, torch.Tensor):
             raise CheckpointError(
-                f'"{name}" is a {type(value).__name__}; a checkpoint contains tensors only. '
+                f'"{name}" is a {type(value).__name__}; a checkpoint can only contain tensors. '
                 "Register it as a buffer of the module, or pass it to the constructor."
             )
     try:
         safetensors.torch.save_file(_separate(tensors), path, metadata)
     except (SafetensorError, OSError) as error:
-        raise CheckpointError(f"{path} cannot be written: {error}.") from _system_error(error)
+        raise CheckpointError(f"Cannot write {path}: {error}.") from _system_error(error)
 
 
 def _separate(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
-    """Return the tensors on the processor, contiguous, copied only if two of them share memory."""
+    """Return contiguous tensors on the CPU, copied only if two of them share memory."""
     separate, places = {}, set()
     for name, value in tensors.items():
         plain = value.detach().resolve_conj().resolve_neg().cpu().contiguous()
@@ -49,13 +49,13 @@ def _separate(tensors: Mapping[str, torch.Tensor]) -> dict[str, torch.Tensor]:
 
 
 def _system_error(error: Exception) -> Exception:
-    """Return the error of the system, such as a full disk, that the library tells as text only."""
+    """Return the system's error, such as a full disk, which the library reports only as text."""
     number = re.search(r"\(os error (\d+)\)", str(error))
     return OSError(int(number[1]), os.strerror(int(number[1]))) if number else error
 
 
 def read_shapes(path: Path) -> dict[str, torch.Size]:
-    """Return the shapes of the tensors in a safetensors file, which are not read."""
+    """Return the shapes of the tensors in a safetensors file, without reading the tensors."""
     if not path.is_file():
         raise CheckpointError(f"There is no file {path}.")
     try:
@@ -69,7 +69,7 @@ def read_shapes(path: Path) -> dict[str, torch.Size]:
 
 
 def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
-    """Return the tensors, on the processor, and the metadata of a safetensors file."""
+    """Return the tensors, on the CPU, and the metadata of a safetensors file."""
     if not path.is_file():
         raise CheckpointError(f"There is no file {path}.")
     try:
@@ -84,13 +84,13 @@ def read_tensors(path: Path) -> tuple[dict[str, torch.Tensor], dict[str, str]]:
 def check_match(
     path: Path, name: str, found: Mapping[str, torch.Size], own: Mapping[str, Any]
 ) -> None:
-    """Check that the tensors of a file fit a network, by name and shape.
+    """Check that the tensors of a file match a network by name and shape.
 
     Args:
-        path: The file, for the message.
-        name: The network's name, for the message.
-        found: Shapes of the tensors of the file.
-        own: Tensors of the network.
+        path: The file, for error messages.
+        name: The network's name, for error messages.
+        found: Shapes of the tensors in the file.
+        own: The network's tensors.
     """
     lines = [f"{key}: not in the file" for key in own if key not in found]
     lines += [f"{key}: only in the file" for key in found if key not in own]
@@ -101,6 +101,6 @@ def check_match(
     ]
     if lines:
         raise CheckpointError(
-            f"{path} contains the parameters of another network than this {name}:\n  "
+            f"{path} contains the parameters of a network other than this {name}:\n  "
             + "\n  ".join(lines)
         )

@@ -24,7 +24,7 @@ def write_state(path: Path, state: Mapping[str, Any]) -> None:
 
 
 def read_state(path: Path) -> dict[str, Any]:
-    """Return the state that `write_state` wrote, with tuples as lists."""
+    """Return the state written by `write_state`, with tuples as lists."""
     tensors, texts = read_tensors(path)
     try:
         state: dict[str, Any] = _join(parse_json(texts[_KEY]), tensors)
@@ -34,7 +34,7 @@ def read_state(path: Path) -> dict[str, Any]:
 
 
 def random_state(device: torch.device) -> dict[str, torch.Tensor]:
-    """Return the state of torch's random numbers on a device and the processor."""
+    """Return the states of torch's random numbers on a device and on the CPU."""
     state = {"cpu": torch.get_rng_state()}
     if device.type == "cuda":
         state["cuda"] = torch.cuda.get_rng_state(device)
@@ -42,7 +42,7 @@ def random_state(device: torch.device) -> dict[str, torch.Tensor]:
 
 
 def set_random_state(state: Mapping[str, torch.Tensor], device: torch.device) -> None:
-    """Restore the state of torch's random numbers that `random_state` returned."""
+    """Restore the states of torch's random numbers returned by `random_state`."""
     torch.set_rng_state(state["cpu"])
     if device.type == "cuda" and "cuda" in state:
         torch.cuda.set_rng_state(state["cuda"], device)
@@ -60,7 +60,7 @@ def _split(value: Any, where: str, tensors: dict[str, torch.Tensor]) -> dict[str
     if value is None or isinstance(value, (bool, int, float, str)):
         return {"value": value}
     raise CheckpointError(
-        f'"{where}" of the optimization\'s state is a {type(value).__name__}, which cannot be '
+        f'"{where}" in the optimization\'s state is a {type(value).__name__}, which cannot be '
         "stored without code."
     )
 

@@ -1,1 +1,1 @@
-"""Optimization, data loading, and statistics."""
+"""Optimization, data loading and statistics."""

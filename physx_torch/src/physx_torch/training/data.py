@@ -24,7 +24,7 @@ class StoredDataset(torch.utils.data.Dataset[Tensors]):
         samples = StoredDataset("sessions/run", "training", dtype="float32")
         for batch in DataLoader(samples, batch_size=32, shuffle=True, num_workers=2): ...
 
-    For large batches, let PyTorch request whole batches, which it need not assemble::
+    For large batches, have PyTorch request whole batches, which it then need not assemble::
 
         sampler = BatchSampler(RandomSampler(samples), 1024, drop_last=False)
         for batch in DataLoader(samples, batch_size=None, sampler=sampler, num_workers=2): ...
@@ -32,7 +32,7 @@ class StoredDataset(torch.utils.data.Dataset[Tensors]):
     `physx_core.Dataset.batches` needs no `DataLoader` and is faster than either.
 
     Attributes:
-        directory: The dataset's folder, absolute.
+        directory: The dataset's folder, as an absolute path.
         mode: The mode.
         fields: Names of the samples' fields.
     """
@@ -44,17 +44,17 @@ class StoredDataset(torch.utils.data.Dataset[Tensors]):
         fields: Sequence[str] | None = None,
         dtype: DTypeLike | None = None,
     ) -> None:
-        """Select the current samples; later ones are not included.
+        """Select the current samples; samples added later are not included.
 
         Args:
             directory: The dataset's folder, or the session's folder that contains it.
             mode: The mode.
             fields: Names of the fields to read; None: all.
-            dtype: NumPy type of floating fields; None: their own.
+            dtype: NumPy type of floating-point fields; None: their own.
 
         Raises:
             DatasetNotFoundError: If there is no dataset.
-            DatasetError: If there is no such mode or field, or a partition is missing or damaged.
+            DatasetError: If a mode or field does not exist, or a partition is missing or damaged.
         """
         with Dataset.open(directory) as dataset:
             self.directory, self.mode = dataset.directory.absolute(), mode
@@ -75,7 +75,7 @@ class StoredDataset(torch.utils.data.Dataset[Tensors]):
             index: An index, a slice, or a list, array or tensor of indices.
 
         Raises:
-            IndexError: If there is no such sample.
+            IndexError: If a sample does not exist.
             DatasetError: If a partition is missing, truncated or damaged.
         """
         if isinstance(index, (int, np.integer)):
@@ -85,7 +85,7 @@ class StoredDataset(torch.utils.data.Dataset[Tensors]):
         return self._batch(index)
 
     def __getitems__(self, indices: Sequence[int]) -> list[Tensors]:
-        """Return several samples, read at once; called by `DataLoader` for a batch."""
+        """Return several samples, read together; called by `DataLoader` for a batch."""
         batch = self._batch(indices)
         columns = zip(*(values.unbind() for values in batch.values()), strict=True)
         return [dict(zip(batch, row, strict=True)) for row in columns]

@@ -1,4 +1,4 @@
-"""TorchOptimization: loss, optimizer and learning-rate scheduler of PyTorch."""
+"""TorchOptimization: PyTorch's losses, optimizers and learning-rate schedulers."""
 
 from __future__ import annotations
 
@@ -39,14 +39,14 @@ Loss = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
 
 def _clear_gradients(optimizer: torch.optim.Optimizer) -> None:
-    # As optimizer.zero_grad() does, without its hooks: they take as long as a small network.
+    # Like optimizer.zero_grad(), without its hooks, which take as long as a small network.
     for group in optimizer.param_groups:
         for parameter in group["params"]:
             parameter.grad = None
 
 
 def _without_reduction(loss: Loss) -> Loss | None:
-    """Return a loss that gives each element's own; None if that is not known of it."""
+    """Return a loss that returns each element's own loss; None if that is not known to work."""
     if not isinstance(loss, torch.nn.Module) or getattr(loss, "reduction", "") != "mean":
         return None
     if (
@@ -60,16 +60,16 @@ def _without_reduction(loss: Loss) -> Loss | None:
 
 
 class TorchOptimization(Optimization):
-    """Gradient descent with any loss, optimizer and scheduler of PyTorch.
+    """Gradient descent with any PyTorch loss, optimizer and scheduler.
 
-    The loss of a network with several prediction fields is the mean of the losses of the fields:
-    the i-th of `pred_fields` is compared with the i-th of `opt_fields`. A subclass that returns
-    more than ``loss`` from `transform_loss` has that recorded as well.
+    The loss of a network with several prediction fields is the mean of the fields' losses: the i-th
+    of `pred_fields` is compared with the i-th of `opt_fields`. If a subclass returns more than
+    ``loss`` from `transform_loss`, that is recorded too.
 
     Attributes:
         loss: The loss function; None before `set_loss`.
         optimizer: The optimizer; None before `set_optimizer`.
-        scheduler: Scheduler of the learning rate; None if the rate is constant.
+        scheduler: Learning-rate scheduler; None if the rate is constant.
     """
 
     state_file: ClassVar[str] = "optimization.safetensors"
@@ -85,15 +85,15 @@ class TorchOptimization(Optimization):
         """Set the options.
 
         Args:
-            gradient_clip: Largest Euclidean norm of all gradients together, to which larger ones
-                are scaled down. None: no limit.
+            gradient_clip: Largest Euclidean norm of all gradients together; larger gradients are
+                scaled down to it. None: no limit.
             accumulate: Number of batches whose mean gradient is used in one step of the optimizer.
-                Batches left at the end of an epoch are continued in the next one.
-            mixed_precision: ``"bfloat16"`` or ``"float16"``: type of those operations that do not
-                need more digits, in training; parameters and loss stay float32. Gradients are
-                scaled for float16, which has a small range. None: all in the network's type.
-            compile: Whether to compile the network for training with ``torch.compile``, or the
-                name of its backend; True is ``"inductor"``.
+                Batches left over at the end of an epoch carry over to the next one.
+            mixed_precision: ``"bfloat16"`` or ``"float16"``: type of those operations in training
+                that do not need more digits; parameters and loss stay float32. For float16, whose
+                range is small, gradients are scaled. None: use the network's type everywhere.
+            compile: Whether to compile the network for training with ``torch.compile``, or the name
+                of its backend; True is ``"inductor"``.
             loss_kwargs: Keyword arguments of the loss, if it is a class.
 
         Raises:
@@ -118,7 +118,7 @@ class TorchOptimization(Optimization):
         self._network: TorchNetwork | None = None
         self._scaler: torch.amp.GradScaler | None = None
         self._is_shared = False
-        self._known: tuple[torch.Tensor | None, float] = (None, 0.0)  # the loss that was read
+        self._known: tuple[torch.Tensor | None, float] = (None, 0.0)  # the loss that was last read
 
     def set_loss(self, loss: str | type[Any] | Loss | None) -> None:
         """Choose the loss function.
@@ -128,7 +128,7 @@ class TorchOptimization(Optimization):
                 class; a module; or a function of prediction and target.
 
         Raises:
-            ConfigError: If there is no such loss, it rejects `loss_kwargs`, or none was given.
+            ConfigError: If the loss does not exist, rejects `loss_kwargs`, or is None.
         """
         known = find_classes(torch.nn.modules.loss, torch.nn.Module)
         if loss is None:
@@ -146,7 +146,7 @@ class TorchOptimization(Optimization):
         self._place_loss()
 
     def _place_loss(self) -> None:
-        # Losses may have tensors of their own, for example class weights.
+        # Losses may have their own tensors, for example class weights.
         if isinstance(self.loss, torch.nn.Module) and self._network is not None:
             self.loss.to(self._network.device, self._network.data_type)
 
@@ -159,11 +159,11 @@ class TorchOptimization(Optimization):
             optimizer: Class, name in `torch.optim` such as ``"Adam"``, or
                 ``"package.module:Class"``.
             network: The network to train.
-            kwargs: Arguments of the optimizer, ``lr`` among them.
+            kwargs: Arguments of the optimizer, including ``lr``.
 
         Raises:
-            ConfigError: If there is no such optimizer, it rejects the arguments, the network has no
-                parameters, or it does not support the options.
+            ConfigError: If the optimizer does not exist or rejects the arguments, or the network
+                has no parameters or does not support the options.
         """
         if optimizer is None:
             raise ConfigError(
@@ -204,20 +204,20 @@ class TorchOptimization(Optimization):
         network.set_training_forward(forward)
 
     def set_scheduler(self, scheduler: str | type[Any], **kwargs: Any) -> None:
-        """Choose the scheduler of the learning rate.
+        """Choose the learning-rate scheduler.
 
         Args:
             scheduler: Class, or name in `torch.optim.lr_scheduler` such as
-                ``"CosineAnnealingLR"``. ``"ReduceLROnPlateau"`` takes the validation loss,
-                or else the mean training loss of the epoch.
+                ``"CosineAnnealingLR"``. ``"ReduceLROnPlateau"`` gets the validation loss, else the
+                mean training loss of the epoch.
             kwargs: Arguments of the scheduler.
 
         Raises:
-            ConfigError: If there is no such scheduler, or it rejects the arguments.
+            ConfigError: If the scheduler does not exist, or rejects the arguments.
             UsageError: If there is no optimizer yet.
         """
         if self.optimizer is None:
-            raise UsageError("set_scheduler() needs set_optimizer() before it.")
+            raise UsageError("set_scheduler() must be called after set_optimizer().")
         chosen = choose("scheduler", scheduler, find_classes(torch.optim.lr_scheduler, LRScheduler))
         made = make("scheduler", LRScheduler, chosen, self.optimizer, **kwargs)
         if not isinstance(made, LRScheduler):
@@ -225,7 +225,7 @@ class TorchOptimization(Optimization):
         self.scheduler = made
 
     def compute_loss(self, prediction: Tensors, targets: Tensors, data: Tensors) -> torch.Tensor:
-        """Return the mean over the prediction fields of their losses.
+        """Return the mean of the prediction fields' losses.
 
         Args:
             prediction: The network's `pred_fields`.
@@ -233,11 +233,11 @@ class TorchOptimization(Optimization):
             data: The whole batch; not used.
 
         Raises:
-            UsageError: If loss or optimizer were not chosen yet.
+            UsageError: If the loss or optimizer has not been chosen yet.
             FieldsMismatchError: If the shapes of a prediction and its target differ.
         """
         if self.loss is None or self._network is None:
-            raise UsageError("compute_loss() needs set_loss() and set_optimizer() before it.")
+            raise UsageError("compute_loss() must be called after set_loss() and set_optimizer().")
         losses = []
         names = zip(self._network.pred_fields, self._network.opt_fields, strict=True)
         for pred_name, opt_name in names:
@@ -256,9 +256,12 @@ class TorchOptimization(Optimization):
         """Return the loss of each row.
 
         Losses of PyTorch with a ``reduction`` are computed for all rows at once, others row by row.
+
+        Raises:
+            UsageError: If the loss or optimizer has not been chosen yet.
         """
         if self.loss is None or self._network is None:
-            raise UsageError("compute_row_losses() needs set_loss() and set_optimizer() before it.")
+            raise UsageError("compute_row_losses() needs set_loss() and set_optimizer() first.")
         by_row = _without_reduction(self.loss)
         if by_row is None or type(self).compute_loss is not TorchOptimization.compute_loss:
             rows = range(len(next(iter(prediction.values()))))
@@ -274,7 +277,7 @@ class TorchOptimization(Optimization):
 
     def transform_loss(self, loss: torch.Tensor, data: Tensors) -> dict[str, Any]:
         """Return ``{"loss": <number>}``."""
-        if loss is self._known[0]:  # read already: on a GPU reading it again waits for the step
+        if loss is self._known[0]:  # already read: on a GPU, reading it again waits for the step
             number = self._known[1]
             self._known = (None, 0.0)
             return {"loss": number}
@@ -283,14 +286,14 @@ class TorchOptimization(Optimization):
     def optimize(self, loss: torch.Tensor) -> None:
         """Update the parameters along the gradient of the loss, or of the mean of several batches.
 
-        With `stops_at_nan` the loss of each batch and the gradients of each step are looked at
+        With `stops_at_nan`, the loss of each batch and the gradients of each step are checked
         before the step, which costs one norm of all gradients. Gradients that overflow in float16
-        are left to the scaler, which leaves out the step.
+        are left to the scaler, which skips the step.
 
         Raises:
             UsageError: If there is no optimizer yet.
             ConfigError: If the loss is not a single number.
-            DivergedError: If the loss or a gradient is not finite; the parameters are not changed.
+            DivergedError: If the loss or a gradient is not finite; the parameters stay unchanged.
         """
         optimizer, network = self._prepared("optimize")
         if loss.numel() != 1:
@@ -320,7 +323,7 @@ class TorchOptimization(Optimization):
     def _limit_gradients(
         self, optimizer: torch.optim.Optimizer, network: TorchNetwork
     ) -> Sequence[torch.Tensor]:
-        """Scale large gradients down, and return norms that are finite if all gradients are."""
+        """Scale down large gradients, and return norms that are finite if all gradients are."""
         if self._gradient_clip is not None:
             if self._scaler is not None:
                 self._scaler.unscale_(optimizer)
@@ -339,9 +342,9 @@ class TorchOptimization(Optimization):
     def _check_finite(
         self, loss: torch.Tensor, norms: Sequence[torch.Tensor], network: TorchNetwork
     ) -> None:
-        """Raise if loss or gradients are not finite.
+        """Raise an error if the loss or gradients are not finite.
 
-        In a group of processes only the gradients are looked at, which all of them have in common.
+        In a group of processes, only the gradients are checked, which all processes have in common.
         """
         values = [*norms] if self._is_shared else [loss.detach(), *norms]
         if loss.is_cuda and values:  # waits for the GPU once
@@ -358,14 +361,14 @@ class TorchOptimization(Optimization):
             if what:
                 break
             if not torch.isfinite(gradient).all():
-                what = f'the gradient of the parameter "{name}" holds NaN or infinity'
-        if what:  # else only the norm was too large for its type
+                what = f'the gradient of the parameter "{name}" contains NaN or infinity'
+        if what:  # otherwise, only the norm was too large for its type
             self._accumulated, self._known = 0, (None, 0.0)
             raise DivergedError(what)
 
     def _prepared(self, method: str) -> tuple[torch.optim.Optimizer, TorchNetwork]:
         if self.optimizer is None or self._network is None:
-            raise UsageError(f"{method}() needs set_optimizer() before it.")
+            raise UsageError(f"{method}() must be called after set_optimizer().")
         return self.optimizer, self._network
 
     def _step(self, optimizer: torch.optim.Optimizer) -> None:
@@ -401,11 +404,11 @@ class TorchOptimization(Optimization):
         """Step the scheduler; see `Optimization.epoch_end`.
 
         Raises:
-            DivergedError: If gradients stayed infinite in float16 however little they were scaled.
+            DivergedError: If gradients stayed infinite in float16, regardless of their scaling.
         """
         if self.stops_at_nan and self._scaler and self._scaler.get_scale() < _LEAST_SCALE:
             raise DivergedError(
-                "the gradients are not finite in float16, however little they are scaled; "
+                "the gradients are not finite in float16, regardless of their scaling; "
                 'mixed_precision="bfloat16" has a wider range'
             )
         if isinstance(self.scheduler, ReduceLROnPlateau):
@@ -415,7 +418,7 @@ class TorchOptimization(Optimization):
             self.scheduler.step()
 
     def save_state(self, path: Path) -> None:
-        """Write the state of optimizer, scheduler, unfinished step and torch's random numbers.
+        """Write the state of the optimizer, scheduler, unfinished step and torch's random numbers.
 
         Raises:
             UsageError: If there is no optimizer yet.
@@ -436,11 +439,11 @@ class TorchOptimization(Optimization):
         write_state(path, state)
 
     def load_state(self, path: Path) -> None:
-        """Restore the state that `save_state` wrote, including torch's random numbers.
+        """Restore the state written by `save_state`, including torch's random numbers.
 
         Raises:
             UsageError: If there is no optimizer yet.
-            CheckpointError: If the file is missing, damaged, or of another optimizer or scheduler.
+            CheckpointError: If the file is missing, damaged, or for another optimizer or scheduler.
         """
         optimizer, network = self._prepared("load_state")
         state = read_state(path)
@@ -452,7 +455,7 @@ class TorchOptimization(Optimization):
             self._accumulated = state.get("accumulated", 0)
             network.set_gradients(state.get("gradients", {}))
         except (KeyError, ValueError) as error:
-            raise CheckpointError(f"{path} is of another network: {error}.") from error
+            raise CheckpointError(f"{path} is from another network: {error}.") from error
         for name, item in (("scheduler", self.scheduler), ("scaler", self._scaler)):
             if item is not None:
                 item.load_state_dict(state[name])

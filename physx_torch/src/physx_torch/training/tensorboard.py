@@ -20,27 +20,27 @@ from physx_core.typing import Array
 
 
 class TensorBoard(Visualizer):
-    """Writes numbers, histograms, point clouds and meshes to ``stats/tensorboard`` of the session.
+    """Writes numbers, histograms, point clouds and meshes to the session's ``stats/tensorboard``.
 
-    ``physx stats SESSION --tensorboard`` shows them. TensorBoard draws at most a thousand points of
-    a curve, and writing one takes as long as a small batch, so only some numbers of batches are
-    written per second, while ``stats/scalars.csv`` contains all of them.
+    ``physx stats SESSION --tensorboard`` shows them. TensorBoard draws at most a thousand points
+    per curve, and writing one takes as long as a small batch, so only a limited number of points
+    per second is written for batches, while ``stats/scalars.csv`` contains all of them.
 
-    As `EnvironmentConfig.visualizer` it also shows the points and meshes of environments.
+    As `EnvironmentConfig.visualizer`, it also shows the points and meshes of environments.
     """
 
     def __init__(self, interval: float = 0.1, drawing_interval: float = 1.0) -> None:
         """Set the options.
 
         Args:
-            interval: Least time in s between two points of a curve over batches.
-            drawing_interval: Least time in s between two pictures of one drawn object.
+            interval: Shortest time in s between two points of a curve over batches.
+            drawing_interval: Shortest time in s between two pictures of one drawn object.
 
         Raises:
             ConfigError: If a time is negative.
         """
         if interval < 0 or drawing_interval < 0:
-            raise ConfigError("interval and drawing_interval must be at least 0 (s).")
+            raise ConfigError("interval and drawing_interval must not be negative.")
         self._interval, self._drawing_interval = interval, drawing_interval
         self._writer: Any = None
         self._session, self._wrote = Path(), False
@@ -50,7 +50,7 @@ class TensorBoard(Visualizer):
         self._drawn: dict[str, float] = {}
 
     def open(self, run_name: str, session_dir: Path, instance_nb: int) -> None:
-        """Start a file beside those of earlier runs of the session.
+        """Start a file next to those of the session's earlier runs.
 
         Raises:
             MissingLibraryError: If TensorBoard is not installed.
@@ -66,7 +66,7 @@ class TensorBoard(Visualizer):
         self._writer = SummaryWriter(str(folder), max_queue=1000, flush_secs=5)
 
     def scalars(self, values: Mapping[str, float], step: int, timeline: str) -> None:
-        """Write the numbers; those of batches at limited rate."""
+        """Write the numbers; those of batches at a limited rate."""
         if self._writer is None:
             return
         self._wrote = True
@@ -82,7 +82,7 @@ class TensorBoard(Visualizer):
         self._waiting.clear()
 
     def histograms(self, values: Mapping[str, Array], step: int, timeline: str) -> None:
-        """Write the distributions of the finite numbers, if any."""
+        """Write the distributions of the finite numbers, if there are any."""
         if self._writer is None:
             return
         for name, array in values.items():
@@ -127,8 +127,8 @@ class TensorBoard(Visualizer):
             name: Name of the object; a ``/`` separates groups.
             positions: Vertices or points, shape (n, 3), in m.
             cells: Indices of the vertices of each triangle, shape (m, 3); None: points.
-            color: Red, green and blue in [0, 1], for all points or shape (n, 3) for each, or
-                ``"#rrggbb"``. For other names TensorBoard chooses a color.
+            color: Red, green and blue in [0, 1], one for all points or shape (n, 3), or
+                ``"#rrggbb"``. For other names, TensorBoard chooses a color.
             step: Position on the slider.
         """
         if self._writer is None:
@@ -152,7 +152,7 @@ class TensorBoard(Visualizer):
             self._writer = None
 
     def outputs(self) -> Sequence[str]:
-        """Name the folder of the files, if anything was written: see `Observer.outputs`."""
+        """Return the folder of the files, if anything was written: see `Observer.outputs`."""
         if not self._wrote:
             return []
         shown = f"physx stats {shlex.quote(str(self._session))} --tensorboard"

@@ -20,7 +20,7 @@ def compile_forward(forward: Forward, backend: str) -> Forward:
 
     Args:
         forward: The function.
-        backend: Name of a backend of ``torch.compile``, for example ``"inductor"``.
+        backend: Name of a ``torch.compile`` backend, for example ``"inductor"``.
     """
     known = torch.compiler.list_backends(exclude_tags=())
     if backend not in known:
@@ -36,7 +36,7 @@ def compile_forward(forward: Forward, backend: str) -> Forward:
             reason = " ".join(str(error).strip().splitlines()[:2])
             raise ConfigError(
                 f'torch.compile with the backend "{backend}" does not work here: {reason}. '
-                'Leave out "compile", or give it a compiler: for the processor, g++.'
+                'Omit "compile", or install the compiler that it needs: for the CPU, g++.'
             ) from error
 
     return run
@@ -50,8 +50,8 @@ def run_in_precision(
     Args:
         forward: The function.
         device: Device of the network.
-        precision: Floating type of operations that do not need more digits.
-        back: Floating type of the network, in which the loss is computed.
+        precision: Floating-point type of operations that do not need more digits.
+        back: Floating-point type of the network, in which the loss is computed.
     """
 
     def run(*inputs: Any) -> Any:

@@ -1,4 +1,4 @@
-"""Weights & Biases: an observer that writes statistics as a run, offline unless asked otherwise."""
+"""Weights & Biases: an observer that writes statistics as a run, offline by default."""
 
 from __future__ import annotations
 
@@ -20,10 +20,10 @@ _TIMELINES = ("batch", "epoch", "step")
 
 
 class WandB(Observer):
-    """Writes numbers and histograms to ``stats/wandb`` of the session, as a run of W&B.
+    """Writes numbers and histograms to the session's ``stats/wandb`` as a W&B run.
 
-    Nothing leaves the machine unless `mode` is ``"online"``; ``wandb sync`` sends a run later. Of
-    the system only what W&B needs is recorded: no output, no code, no statistics of the machine.
+    Nothing leaves the machine unless `mode` is ``"online"``; ``wandb sync`` uploads a run later.
+    Only system information that W&B needs is recorded: no output, code, or machine statistics.
     """
 
     def __init__(
@@ -35,17 +35,17 @@ class WandB(Observer):
         """Set the options.
 
         Args:
-            project: Name of the project of W&B.
-            mode: ``"online"`` sends everything at once, to the account that W&B is logged in to.
-            interval: Least time in s between two points of a curve over batches.
+            project: Name of the W&B project.
+            mode: ``"online"`` uploads everything immediately, to the account logged in to W&B.
+            interval: Shortest time in s between two points of a curve over batches.
 
         Raises:
-            ConfigError: If there is no such mode, or the interval is negative.
+            ConfigError: If the mode does not exist, or the interval is negative.
         """
         if mode not in _MODES:
-            raise ConfigError(f'mode is "{mode}". Modes: {", ".join(_MODES)}.')
+            raise ConfigError(f'mode is "{mode}" but must be one of: {", ".join(_MODES)}.')
         if interval < 0:
-            raise ConfigError("interval must be at least 0 (s).")
+            raise ConfigError("interval must not be negative.")
         self._project, self._mode, self._interval = project, mode, interval
         self._run: Any = None
         self._waiting: dict[str, dict[str, float]] = {}
@@ -54,7 +54,7 @@ class WandB(Observer):
         self._known: set[str] = set()
 
     def open(self, run_name: str, session_dir: Path, instance_nb: int) -> None:
-        """Start a run beside those of earlier runs of the session.
+        """Start a run next to those of the session's earlier runs.
 
         Raises:
             MissingLibraryError: If Weights & Biases is not installed.
@@ -89,7 +89,7 @@ class WandB(Observer):
         self._known = set(_TIMELINES)
 
     def scalars(self, values: Mapping[str, float], step: int, timeline: str) -> None:
-        """Write the numbers over their timeline; those of batches at limited rate."""
+        """Write the numbers over their timeline; those of batches at a limited rate."""
         if self._run is None:
             return
         waiting = self._waiting.setdefault(timeline, {})
@@ -112,7 +112,7 @@ class WandB(Observer):
         self._run.log(values)
 
     def histograms(self, values: Mapping[str, Array], step: int, timeline: str) -> None:
-        """Write the distributions of the finite numbers, if any."""
+        """Write the distributions of the finite numbers, if there are any."""
         if self._run is None:
             return
         import wandb
@@ -126,7 +126,7 @@ class WandB(Observer):
         self._log({**found, timeline: step}, timeline)
 
     def note(self, text: str) -> None:
-        """Add the text to the notes of the run."""
+        """Add the text to the run's notes."""
         if self._run is not None:
             self._run.notes = "\n".join(filter(None, [self._run.notes, text]))
 
@@ -139,7 +139,7 @@ class WandB(Observer):
             self._run = None
 
     def outputs(self) -> Sequence[str]:
-        """Name the folder of the run: see `Observer.outputs`."""
+        """Return the folder of the run: see `Observer.outputs`."""
         if self._folder is None:
             return []
         if self._mode == "online":

@@ -80,11 +80,11 @@ def test_every_kind_has_an_example():
 
 WRONG = [
     ("mesh", {"positions": [[np.nan, 0, 0], *SQUARE[1:]]}, r"is nan at index \(0, 0\)"),
-    ("mesh", {"positions": SQUARE[:3]}, "index 3, but positions only the 3 vertices 0 to 2"),
-    ("mesh", {"cells": [[0, 1, 4]]}, "index 4, but positions only the 4 vertices"),
+    ("mesh", {"positions": SQUARE[:3]}, "index 3, but positions has only the 3 vertices 0 to 2"),
+    ("mesh", {"cells": [[0, 1, 4]]}, "index 4, but positions has only the 4 vertices"),
     ("mesh", {"cells": [[0, 1, -1]]}, "negative index -1"),
-    ("mesh", {"cells": [[0, 1, 0.5]]}, "no indices"),
-    ("mesh", {"scalar_field": [1, 2, 3]}, "length 3, but positions has 4"),
+    ("mesh", {"cells": [[0, 1, 0.5]]}, "not indices"),
+    ("mesh", {"scalar_field": [1, 2, 3]}, "length 3, but positions has length 4"),
     ("mesh", {"scalar_field": [1, 2, 3, np.inf]}, "is inf at index"),
     ("mesh", {"vmin": 1.0, "vmax": 0.0}, "vmin is 1 but must be less than vmax, 0"),
     ("mesh", {"colormap": "viridi"}, 'Did you mean "viridis"'),
@@ -92,13 +92,13 @@ WRONG = [
     ("points", {"positions": SQUARE[:, :2]}, r"has shape \(4, 2\), expected \(n, 3\)"),
     ("points", {"positions": [[0, 0], [1, 2, 3]]}, "not an array"),
     ("points", {"positions": [["a", "b", "c"]]}, "not an array of numbers"),
-    ("points", {"labels": ["a"]}, "labels has the length 1, but positions has 4"),
+    ("points", {"labels": ["a"]}, "labels has length 1, but positions has length 4"),
     ("points", {"size": 0}, "size is 0 but must be a finite number greater than 0"),
     ("points", {"color": "gren"}, 'Did you mean "green"'),
     ("points", {"color": (1, 2, 3)}, "color"),
     ("points", {"alpha": 1.5}, "alpha is 1.5 but must be a finite number at least 0 and at most 1"),
-    ("arrows", {"vectors": SQUARE[:2]}, "vectors has the length 2, but positions has 4"),
-    ("symbols", {"orientations": SQUARE[:2]}, "orientations has the length 2"),
+    ("arrows", {"vectors": SQUARE[:2]}, "vectors has length 2, but positions has length 4"),
+    ("symbols", {"orientations": SQUARE[:2]}, "orientations has length 2"),
     ("markers", {"indices": [4]}, 'indices goes from 4 to 4, but the mesh "plate"'),
     ("lines", {"positions": [SQUARE, SQUARE[0]]}, "has shape"),
     ("box", {"half_sizes": [1, 2]}, "has shape"),
@@ -111,15 +111,15 @@ WRONG = [
     ("slice", {"values": np.full((2, 3), np.nan)}, "is nan"),
     ("image", {"image": np.zeros((4, 5, 2), np.uint8)}, r"shape \(4, 5, 2\)"),
     ("image", {"image": np.full((4, 5), 2.0)}, r"floats in \[0, 1\]"),
-    ("scalars", {"values": [1.0]}, "values has the length 1, but labels has 2"),
+    ("scalars", {"values": [1.0]}, "values has length 1, but labels has length 2"),
     ("scalars", {"values": [1.0, np.nan]}, "is nan"),
-    ("robot", {"poses": np.zeros((3, 7))}, "poses has the length 3, but bodies has 2"),
-    ("robot", {"poses": np.zeros((0, 7))}, "poses has the length 0, but bodies has 2"),
-    ("scalars", {"values": []}, "values has the length 0, but labels has 2"),
+    ("robot", {"poses": np.zeros((3, 7))}, "poses has length 3, but bodies has length 2"),
+    ("robot", {"poses": np.zeros((0, 7))}, "poses has length 0, but bodies has length 2"),
+    ("scalars", {"values": []}, "values has length 0, but labels has length 2"),
     ("points", {"positions": [["1", "2", "3"]]}, "not an array of numbers"),
     ("points", {"positions": 1j * SQUARE}, "not an array of numbers"),
     ("points", {"size": 10**400}, "must be a finite number"),
-    ("points", {"labels": np.array("a")}, "must be a list of texts"),
+    ("points", {"labels": np.array("a")}, "must be a list of strings"),
     ("symbols", {"symbol": np.array(["plus", "star"])}, "must be one of"),
 ]
 
@@ -138,7 +138,7 @@ def test_a_refused_change_changes_nothing(factory):
     with pytest.raises(ConfigError):
         factory.update_points("points", positions=SQUARE[:2], scalar_field=[1, 2, 3])
     factory.update_points("points", scalar_field=[1, 2, 3, 4])
-    with pytest.raises(ConfigError, match="scalar_field has the length 4, but positions has 2"):
+    with pytest.raises(ConfigError, match="scalar_field has length 4, but positions has length 2"):
         factory.update_points("points", positions=SQUARE[:2])
     factory.update_points("points", positions=SQUARE[:2], scalar_field=None)
     factory.update_points("points", positions=SQUARE[:3])
@@ -216,7 +216,7 @@ def test_names_of_removed_objects_can_be_used_again(factory):
 def test_changes_of_several_objects_are_made_together_or_not_at_all(factory):
     factory.add_points("fixed", SQUARE, scalar_field=[1, 2, 3, 4])
     factory.take_events()
-    with pytest.raises(ConfigError, match='"fixed".*length 4, but positions has 2'):
+    with pytest.raises(ConfigError, match='"fixed".*length 4, but positions has length 2'):
         factory.update_many("points", ["points", "fixed"], {"positions": np.zeros((2, 2, 3))})
     factory.update_points("points", labels=list("abcd"))
     assert [dict(event.values) for event in factory.take_events()] == [{"labels": list("abcd")}]
@@ -245,7 +245,7 @@ def test_marked_vertices_stay(factory):
 def test_markers_stay_where_a_refused_change_of_several_meshes_began(factory):
     factory.update_mesh("mesh", scalar_field=[1, 2, 3, 4])
     factory.take_events()
-    with pytest.raises(ConfigError, match='"mesh".*length 4, but positions has 5'):
+    with pytest.raises(ConfigError, match='"mesh".*length 4, but positions has length 5'):
         factory.update_many("mesh", ["plate", "mesh"], {"positions": np.ones((2, 5, 3))})
     factory.update_markers("markers", indices=[1])
     (markers,) = factory.take_events()

@@ -1,1 +1,1 @@
-"""Executors: where the processes of trials run."""
+"""Executors: run the processes of trials."""

@@ -1,4 +1,4 @@
-"""Executor: starts the processes of trials and tells which have ended."""
+"""Executor: starts the processes of trials and reports which have ended."""
 
 from __future__ import annotations
 
@@ -10,7 +10,7 @@ from physx_core import Closeable
 from physx_core.processes import describe_exit
 
 PATIENCE = 20.0
-"""Time in s that a trial gets to write a checkpoint when it is asked to end."""
+"""Time in s that a trial has to write a checkpoint when it is asked to end."""
 
 
 class Job(Closeable):
@@ -22,24 +22,24 @@ class Job(Closeable):
 
     @abstractmethod
     def describe_end(self) -> str:
-        """Return how it ended, for example ``was killed by signal 9 (SIGKILL)``."""
+        """Describe how it ended, for example ``was killed by signal 9 (SIGKILL)``."""
 
 
 class Executor(Closeable):
-    """Runs the processes of trials. Closing it ends those that still run.
+    """Runs the processes of trials. Closing it ends those that are still running.
 
     Attributes:
-        interval: Time in s between two looks at the jobs.
+        interval: Time in s between checks of the jobs.
     """
 
     interval: float
 
     @abstractmethod
     def start(self, folder: Path) -> Job:
-        """Start the process of the trial of a folder, an absolute path.
+        """Start the process of the trial in a folder, given as an absolute path.
 
         Raises:
-            PhysxError: If that is not possible.
+            PhysxError: If the process cannot be started.
         """
 
 
@@ -59,5 +59,5 @@ def variables_of(threads: int) -> dict[str, str]:
 
 
 def describe_status(status: int | None) -> str:
-    """Return how a process ended whose exit status is known, or not."""
-    return "ended without a word" if status is None else describe_exit(status)
+    """Describe how a process ended, given its exit status if known."""
+    return "ended for an unknown reason" if status is None else describe_exit(status)

@@ -1,4 +1,4 @@
-"""LocalExecutor: trials in processes of this machine."""
+"""LocalExecutor: trials in processes on this machine."""
 
 from __future__ import annotations
 
@@ -20,15 +20,15 @@ from physx_core.processes import ChildProcess
 
 
 class LocalExecutor(Executor):
-    """Runs each trial in a process of this machine, which ends with this one."""
+    """Runs each trial in a process on this machine, which ends with this process."""
 
     interval = 0.05
 
     def __init__(self, options: Mapping[str, Any], threads: int) -> None:
-        """Take the options.
+        """Validate and store the options.
 
         Args:
-            options: There are none.
+            options: Must be empty.
             threads: Threads of each trial.
 
         Raises:
@@ -50,7 +50,7 @@ class LocalExecutor(Executor):
         return self._jobs[-1]
 
     def close(self) -> None:
-        """End all processes, in order: each writes a checkpoint."""
+        """End all processes gracefully: each writes a checkpoint."""
         for job in self._jobs:
             job.ask_to_end()
         for job in self._jobs:
@@ -72,7 +72,7 @@ class LocalJob(Job):
         return self.process.exit_status() is not None
 
     def describe_end(self) -> str:
-        """Return its exit status in words."""
+        """Describe its exit status."""
         return describe_status(self.process.exit_status())
 
     def ask_to_end(self) -> None:
@@ -80,6 +80,6 @@ class LocalJob(Job):
         self.process.ask_to_end()
 
     def close(self) -> None:
-        """End it."""
+        """End the process."""
         if not self.has_ended():
             self.process.close(PATIENCE)

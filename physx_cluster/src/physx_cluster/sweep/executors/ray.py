@@ -1,4 +1,4 @@
-"""RayExecutor: each trial is a task of Ray."""
+"""RayExecutor: each trial is a Ray task."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from physx_core.processes import ChildProcess
 
 
 class RayExecutor(Executor):
-    """Runs each trial in a process beside a worker of Ray, on whatever node Ray chooses.
+    """Runs each trial in a process next to a Ray worker, on a node that Ray chooses.
 
-    All nodes need the study's folder and the sweep's working directory under the same path, as a
-    shared disk provides them. A trial whose node is lost is continued on another one.
+    All nodes need the study's folder and the sweep's working directory under the same path, as on a
+    shared disk. If a trial's node is lost, the trial resumes on another node.
     """
 
     interval = 0.2
@@ -33,12 +33,12 @@ class RayExecutor(Executor):
         """Connect to the cluster: see `RayConnection`.
 
         Args:
-            options: Options of Ray's tasks, for example ``num_cpus``, and ``address``.
-            threads: Threads of each trial; also what ``num_cpus`` is by default.
+            options: Options of Ray tasks, for example ``num_cpus``, and ``address``.
+            threads: Threads of each trial; also the default of ``num_cpus``.
 
         Raises:
             MissingLibraryError: If Ray is not installed.
-            ConfigError: If the cluster cannot be reached, or Ray refuses the options.
+            ConfigError: If the cluster cannot be reached, or Ray rejects the options.
         """
         try:
             import ray
@@ -54,7 +54,7 @@ class RayExecutor(Executor):
             self._task = ray.remote(run_command).options(**task)
         except (TypeError, ValueError) as error:
             self.close()
-            raise ConfigError(f"Ray refuses the options of the executor: {error}") from None
+            raise ConfigError(f"Ray rejects the options of the executor: {error}") from None
         self._jobs: list[RayJob] = []
 
     def start(self, folder: Path) -> RayJob:
@@ -66,7 +66,7 @@ class RayExecutor(Executor):
         return job
 
     def close(self) -> None:
-        """End all tasks, in order, and leave the cluster."""
+        """End all tasks gracefully, and disconnect from the cluster."""
         jobs = [job for job in getattr(self, "_jobs", []) if not job.has_ended()]
         for job in jobs:
             job.ask_to_end()
@@ -79,19 +79,19 @@ class RayJob(Job):
     """The task of a trial.
 
     Attributes:
-        result: Ray's reference to its exit status.
+        result: Ray's reference to the exit status.
     """
 
     def __init__(self, ray: Any, result: Any) -> None:
         self._ray, self.result = ray, result
 
     def has_ended(self) -> bool:
-        """Return whether it has ended, or its node is lost."""
+        """Return whether the task has ended or its node was lost."""
         ended, _ = self._ray.wait([self.result], timeout=0)
         return bool(ended)
 
     def describe_end(self) -> str:
-        """Return its exit status in words, or what Ray says."""
+        """Describe its exit status, or Ray's error."""
         try:
             return describe_status(self._ray.get(self.result))
         except self._ray.exceptions.RayError as error:
@@ -103,25 +103,25 @@ class RayJob(Job):
             self._ray.cancel(self.result)
 
     def close(self) -> None:
-        """End it."""
+        """End the task."""
         self.ask_to_end()
         self._ray.wait([self.result], timeout=PATIENCE)
 
 
 def run_command(command: Sequence[str], variables: Mapping[str, str], output: str) -> int | None:
-    """Run a command in a process of its own, on Ray's node, and return its exit status.
+    """Run a command in a separate process on Ray's node, and return its exit status.
 
     Args:
-        command: The words of the command.
-        variables: Environment variables beside those of the worker.
-        output: File that its output is appended to.
+        command: Words of the command.
+        variables: Environment variables in addition to the worker's.
+        output: File to append the output to.
     """
     with Path(output).open("ab") as file:
         place = file.fileno()
         process = ChildProcess(command, variables=variables, stdout=place, stderr=place)
     try:
         while process.wait(0.1) is None:
-            pass  # between two looks Ray can cancel the task, which raises KeyboardInterrupt here
+            pass  # between polls, Ray can cancel the task, which raises KeyboardInterrupt here
         return process.exit_status()
     finally:
         process.close(PATIENCE)

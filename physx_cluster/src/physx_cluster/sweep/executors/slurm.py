@@ -1,4 +1,4 @@
-"""SlurmExecutor: each trial is a job of Slurm, submitted by submitit."""
+"""SlurmExecutor: each trial is a Slurm job, submitted by submitit."""
 
 from __future__ import annotations
 
@@ -28,16 +28,16 @@ from physx_core.errors import ConfigError, MissingLibraryError
 from physx_core.processes import ChildProcess
 
 _FOLDER = "jobs"
-_TIMEOUTS = 1_000  # after which submitit starts a job again
-_RARELY = 5.0  # s between two questions to the queue
+_TIMEOUTS = 1_000  # how often submitit requeues a job that times out
+_RARELY = 5.0  # s between queries of the queue
 
 
 class SlurmExecutor(Executor):
-    """Runs each trial as a job of Slurm, or as a process of submitit's local executor.
+    """Runs each trial as a Slurm job, or as a process of submitit's local executor.
 
-    All nodes need the study's folder and the sweep's working directory under the same path, as a
-    shared disk provides them. A job that is preempted or reaches its time limit is queued again,
-    and continues the trial. All jobs end with the sweep, even if that is killed.
+    All nodes need the study's folder and the sweep's working directory under the same path, as on a
+    shared disk. A job that is preempted or reaches its time limit is requeued and resumes the
+    trial. All jobs end with the sweep, even if it is killed.
     """
 
     interval = 0.5
@@ -46,14 +46,13 @@ class SlurmExecutor(Executor):
         """Find Slurm.
 
         Args:
-            options: Parameters of submitit's jobs, for example ``timeout_min`` or
-                ``slurm_partition``, and ``cluster``: "slurm", or "local" for processes of this
-                machine.
-            threads: Threads of each trial; also what ``cpus_per_task`` is by default.
+            options: submitit's parameters, for example ``timeout_min`` or ``slurm_partition``, and
+                ``cluster``: "slurm", or "local" for processes on this machine.
+            threads: Threads of each trial; also the default of ``cpus_per_task``.
 
         Raises:
             MissingLibraryError: If submitit is not installed.
-            ConfigError: If there is no Slurm here.
+            ConfigError: If `cluster` is invalid, or Slurm is not available here.
         """
         try:
             import submitit
@@ -89,7 +88,7 @@ class SlurmExecutor(Executor):
             submitted = self._executor.submit(run)
         except self._submitit.core.utils.FailedJobError as error:
             reason = " ".join(str(error).split()[-60:])
-            raise ConfigError(f"Slurm refuses the job of a trial: {reason}") from None
+            raise ConfigError(f"Slurm rejects the job of a trial: {reason}") from None
         self._asked = 0.0
         job = SlurmJob(submitted, self)
         self._jobs = [each for each in self._jobs if not each.is_over]
@@ -97,7 +96,7 @@ class SlurmExecutor(Executor):
         return job
 
     def state_of(self, job: Any) -> JobState:
-        """Return what the queue says of a job; all are asked for at once, now and then."""
+        """Return the state of a job in the queue; all jobs are queried together, at intervals."""
         if self._queue is None:
             return JobState("FINISHED" if job.done() else "RUNNING")
         if time.monotonic() - self._asked > _RARELY:
@@ -119,11 +118,11 @@ class SlurmExecutor(Executor):
             job.close()
         guard, self._guard = self._guard, None
         if guard is not None:
-            os.close(self._pipe)  # it does the rest, as it would if this process were killed
+            os.close(self._pipe)  # the guard does the rest, as if this process had been killed
             guard.wait()
 
     def _open(self, folder: Path) -> None:
-        """Have the jobs end with this process, and with them those that an earlier one left."""
+        """End an earlier sweep's remaining jobs, and make new ones end with this process."""
         name = f"physx-{hashlib.sha256(str(folder).encode()).hexdigest()[:12]}"
         if self._cluster == "slurm":
             self._queue = SlurmQueue(name)
@@ -136,7 +135,7 @@ class SlurmExecutor(Executor):
             )
             self._executor.update_parameters(name=name, **self._options)
         except (NameError, TypeError, ValueError, AssertionError) as error:
-            raise ConfigError(f"submitit refuses the options of the executor: {error}") from None
+            raise ConfigError(f"submitit rejects the options of the executor: {error}") from None
         self._guard, self._pipe = start_guard(folder, name if self._queue is not None else "")
 
 
@@ -144,7 +143,7 @@ class SlurmJob(Job):
     """The job of a trial.
 
     Attributes:
-        is_over: Whether it has been seen to have ended.
+        is_over: Whether it is known to have ended.
     """
 
     def __init__(self, job: Any, executor: SlurmExecutor) -> None:
@@ -160,35 +159,35 @@ class SlurmJob(Job):
             state = self._executor.state_of(self._job)
             if state.is_hopeless:
                 raise ConfigError(
-                    f"Slurm cannot give job {self._job.job_id} what it asks for ({state.reason}). "
-                    "What jobs ask for are run.options, such as timeout_min, mem_gb and "
-                    'slurm_partition; "sinfo" says what there is.'
+                    f"Slurm cannot give job {self._job.job_id} what it requests ({state.reason}). "
+                    "Set a job's resources with run.options, such as timeout_min, mem_gb and "
+                    'slurm_partition; "sinfo" shows what is available.'
                 )
             self.is_over = state.is_over or self._job.paths.result_pickle.exists()
         return self.is_over
 
     def describe_end(self) -> str:
-        """Return its exit status in words, or what Slurm says."""
-        with contextlib.suppress(Exception):  # submitit raises whatever it likes
+        """Describe its exit status, or what Slurm reports."""
+        with contextlib.suppress(Exception):  # submitit may raise anything
             return describe_status(self._job.result())
-        return f"ended with its job {self._job.job_id}"
+        return f"ended together with its job {self._job.job_id}"
 
     def close(self) -> None:
-        """End it."""
+        """End the job."""
         if not self.is_over:
             self._executor.cancel(self._job)
 
 
 class TrialJob:
-    """What a job does: it runs a trial, and is requeued if its time is up."""
+    """The work of a job: runs a trial, and is requeued when its time is up."""
 
     def __init__(self, command: Sequence[str], variables: Mapping[str, str], output: str) -> None:
-        """Keep the command.
+        """Store the command.
 
         Args:
-            command: Its words.
-            variables: Environment variables beside those of the job.
-            output: File that its output is appended to.
+            command: Words of the command.
+            variables: Environment variables in addition to the job's.
+            output: File to append the output to.
         """
         self._command, self._variables, self._output = command, variables, output
 
@@ -206,7 +205,7 @@ class TrialJob:
             process.close(PATIENCE)
 
     def checkpoint(self) -> Any:
-        """Have the trial write a checkpoint; return what the requeued job does."""
+        """Have the trial write a checkpoint; return the work of the requeued job."""
         import submitit
 
         for process in _RUNNING:
@@ -215,4 +214,4 @@ class TrialJob:
 
 
 _RUNNING: list[ChildProcess] = []
-"""The process of this job, which submitit's handler of signals must end."""
+"""The process of this job, which submitit's signal handler must end."""

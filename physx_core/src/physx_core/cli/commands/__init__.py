@@ -1,1 +1,1 @@
-"""The commands of the core, one module each."""
+"""The core's commands, one module each."""

@@ -1,4 +1,4 @@
-"""``physx check``: check that components of plugins do what is expected of their kind."""
+"""``physx check``: check the components of plugins against the contract of their kind."""
 
 from __future__ import annotations
 
@@ -23,22 +23,22 @@ _STATUSES = ("passed", "failed", "expected", "skipped")
 class Check:
     """Check a plugin, or one component, against what physx and its users expect of its kind.
 
-    Each check runs in a process of its own, so a crash is a result like others. The exit status is
-    1 if a check fails, or if nothing of the only component could be checked.
+    Each check runs in its own process, so a crash counts as a failed check. The exit status is 1 if
+    a check fails, or if the only component could not be checked at all.
     """
 
     name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="PLUGIN|REFERENCE")]
-    """A plugin, as "toy", or a component, as "toy/spring", "package.module:Class" or
+    """A plugin, such as "toy", or a component, such as "toy/spring", "package.module:Class" or
     "script.py:Class"."""
     kind: str | None = None
-    """Kind of component, as "environment"; None: all that the name stands for."""
+    """Kind of component, such as "environment"; None: all kinds that the name stands for."""
     kwargs: dict[str, Any] = field(default_factory=dict)
     """Arguments of the component's constructor."""
     fields: dict[str, Any] = field(default_factory=dict)
-    """Fields of a network with their shapes, as "input=[8,3] ground_truth=3"; by default some are
-    tried."""
+    """Fields of a network with their shapes, such as "input=[8,3] ground_truth=3"; by default
+    several are tried."""
     network: str | None = None
-    """Network that an optimization or transformation is checked with; None: one of its plugin."""
+    """Network to check an optimization or transformation with; None: one from its plugin."""
     network_kwargs: dict[str, Any] = field(default_factory=dict)
     """Arguments of that network's constructor."""
     loss: str | None = None
@@ -48,15 +48,15 @@ class Check:
     lr: float | None = None
     """Learning rate of an optimization."""
     expect: dict[str, Any] = field(default_factory=dict)
-    """Checks that may fail, and why, as "bounces by its restitution=nothing bounces in it"."""
+    """Checks that may fail, and why, as in "bounces by its restitution=nothing bounces in it"."""
     timeout: float = 120.0
-    """Time in s after which a check that has not ended has failed."""
+    """Time in s after which an unfinished check counts as failed."""
     json: bool = False
     """Print the reports as JSON."""
 
 
 def run(words: Sequence[str]) -> None:
-    """Print a table of counts and what was found."""
+    """Print a table of counts, then the findings."""
     with argument_registry():
         options = tyro.cli(Check, args=words, prog="physx check")
     found = check_plugin(
@@ -70,7 +70,7 @@ def run(words: Sequence[str]) -> None:
     )
     reports = list(found) if options.json else _shown(found)
     failed = [report for report in reports if not report.ok]
-    if len(reports) > 1:  # those that the plugin's user must give arguments are not wrong
+    if len(reports) > 1:  # components that need arguments from the user are not failures
         failed = [report for report in failed if report.counts()["failed"]]
     if options.json:
         plain = {"ok": not failed, "reports": [report.to_dict() for report in reports]}
@@ -101,14 +101,14 @@ def _fields(given: Mapping[str, Any]) -> list[Field]:
         sizes = [shape] if isinstance(shape, int) else shape
         if not isinstance(sizes, list) or not all(type(size) is int for size in sizes):
             raise ConfigError(
-                f"--fields: {name}={shape} is no shape: give {name}=3 or {name}=[3,3]."
+                f"--fields: {name}={shape} is not a shape: give {name}=3 or {name}=[3,3]."
             )
         fields.append(Field(name, tuple(sizes)))
     return fields
 
 
 def _shown(reports: Iterable[Report]) -> list[Report]:
-    """Print a line for each report when it is there, and then what was found."""
+    """Print a line for each report as it arrives, then the findings."""
     done = []
     show(f"{'kind':14}  {'component':32}" + "".join(f"  {name:>8}" for name in _STATUSES))
     for report in reports:

@@ -25,38 +25,38 @@ class Client:
 
     The run has launcher = "physx/manual" and prints its address. The token is in the environment
     variable PHYSX_TOKEN, or in a file that only you can read. A run with min_clients or max_clients
-    decides itself how many of its instances this client runs, each in a process of its own.
+    decides how many of its instances this client runs, each in a separate process.
     """
 
     connect: Annotated[str, tyro.conf.arg(metavar="HOST:PORT")]
     """Address of the run."""
     instance: int | None = None
-    """Number of the instance to run, from 1; by default any without a client. In a run with
-    min_clients or max_clients, number of the client."""
+    """Number of the instance to run, from 1; by default any instance without a client. In a run
+    with min_clients or max_clients: number of the client."""
     token_file: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """File with the token, readable only by you."""
     patience: float = PATIENCE
-    """Time in s to retry while nothing listens at the address."""
+    """Time in s to keep trying while nothing listens at the address."""
 
 
 def run(words: Sequence[str]) -> None:
-    """Run the client, and print what it does."""
+    """Run the client and print what it does."""
     options = tyro.cli(Client, args=words, prog="physx client")
     token = find_token(options.token_file)
     if token is None:
         raise ConfigError(
-            f"A client needs the token of the run: set {TOKEN_VARIABLE}, or name a file that "
+            f"A client needs the run's token: set {TOKEN_VARIABLE}, or name a file that "
             "contains it with --token-file."
         )
     if options.instance is not None and options.instance < 1:
         raise ConfigError(f"--instance is {options.instance}; instances are numbered from 1.")
-    os.environ.pop(TOKEN_VARIABLE, None)  # not for the environment and its processes
+    os.environ.pop(TOKEN_VARIABLE, None)  # the environment and its processes must not see it
     try:
         status = run_client(
             options.connect, token, options.instance, patience=options.patience, say=_say
         )
     finally:
-        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is ending already
+        signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is already ending
         kill_descendants()
     sys.exit(status)
 

@@ -1,4 +1,4 @@
-"""``physx completion``: print a script that lets bash or zsh complete commands and options."""
+"""``physx completion``: print a completion script for bash or zsh."""
 
 from __future__ import annotations
 
@@ -15,10 +15,10 @@ from physx_core.plugins import KINDS
 
 _HELP = """usage: physx completion {bash,zsh}
 
-Prints a script that completes commands, options, their values, names of components, and files:
+Prints a script that completes commands, options, their values, component names, and files:
   bash: physx completion bash > ~/.local/share/bash-completion/completions/physx
   zsh:  physx completion zsh > ~/.physx-completion; echo 'source ~/.physx-completion' >> ~/.zshrc
-It asks  physx completion after WORD ...  for what may follow, so it knows all installed plugins."""
+It calls  physx completion after WORD ...  to learn what may follow, and so knows all plugins."""
 
 _ASK = r"""# Completes the command physx.
 typeset -gA _physx_known
@@ -54,9 +54,9 @@ compdef _physx physx
 }
 
 _KIND_OF = {kind: kind for kind in KINDS} | {"online": "buffer", "statistics": "visualizer"}
-"""The kind of component that an option or argument of a name takes."""
+"""Name of an option or argument to the kind of component that it takes."""
 _WORD = re.compile(r"[\w.][\w./@+-]*|--[\w.-]+")
-"""What a shell takes for a word as it is: names in metadata come from strangers."""
+"""Text that a shell takes as a literal word: names in metadata are not trusted."""
 _OPTION = re.compile(
     r"^[│ ]*(?:-\w, )?(--[a-z][\w.-]*)(?:, (--[a-z][\w.-]*))?(?: (\S.*?))?(?:  |│|$)"
 )
@@ -101,8 +101,8 @@ def _after(words: Sequence[str]) -> Iterator[str]:
 
 
 def _help(*command: str) -> str:
-    """Return what ``--help`` prints."""
-    os.environ["COLUMNS"] = "80"  # each option on a line of its own
+    """Return the output of ``--help``."""
+    os.environ["COLUMNS"] = "80"  # each option on its own line
     printed = io.StringIO()
     with contextlib.redirect_stdout(printed):
         main([*command, "--help"])
@@ -127,7 +127,7 @@ def _options(text: str) -> Iterator[tuple[str, tuple[str, str]]]:
 
 
 def _values(name: str, metavar: str, description: str) -> Iterator[str]:
-    """Yield what an argument takes: choices, names of components, words that its help quotes."""
+    """Yield an argument's possible values: choices, components, and words quoted in its help."""
     choices = {each for group in re.findall(r"\{(.*?)\}", metavar) for each in group.split(",")}
     yield from sorted(choices - {"None"})
     name = name.lstrip("-").rpartition(".")[2]

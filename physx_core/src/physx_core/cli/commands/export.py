@@ -1,4 +1,4 @@
-"""``physx export``: export a dataset as npz, Parquet, Minari, LeRobot, Zarr or one HDF5 file."""
+"""``physx export``: export a dataset as npz, Parquet, Minari, LeRobot, Zarr, or one HDF5 file."""
 
 from __future__ import annotations
 
@@ -17,10 +17,10 @@ from physx_core.observers import ProgressBar
 
 @dataclass
 class Export:
-    """Write the samples of a dataset as one file or folder of another format.
+    """Write a dataset's samples as one file or folder of another format.
 
     npz: NumPy. hdf5-single: one plain HDF5 file with MODE/FIELD. parquet: columns, for pandas,
-    polars and databases. zarr: chunked arrays, for xarray. minari: episodes for offline
+    polars, and databases. zarr: chunked arrays, for xarray. minari: episodes for offline
     reinforcement learning. lerobot: episodes for imitation learning, in version 3 of LeRobot's
     format.
     """
@@ -28,25 +28,25 @@ class Export:
     directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
     """A session's or a dataset's folder."""
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT")]
-    """The file, or the folder for zarr, minari and lerobot, to create."""
+    """The file to create, or the folder for zarr, minari, and lerobot."""
     to: Literal["npz", "parquet", "minari", "lerobot", "zarr", "hdf5-single"]
     """The format."""
     mode: tuple[str, ...] = ()
-    """Modes to export; by default all with samples. Parquet, minari and lerobot take one."""
+    """Modes to export; by default all that have samples. Parquet, minari, and lerobot take one."""
     compression: str = "none"
     """npz: deflate; parquet: snappy, gzip, zstd, lz4, brotli; zarr: zstd, gzip, blosc;
     hdf5-single: gzip, lzf."""
     observations: tuple[str, ...] = ()
-    """minari, lerobot: fields of the observations; by default all training fields without another
-    role. A single field is the observation itself."""
+    """minari, lerobot: observation fields; by default all training fields not used otherwise. A
+    single field is the observation itself."""
     actions: tuple[str, ...] = ()
-    """minari, lerobot: fields of the actions; by default minari has one action, without effect."""
+    """minari, lerobot: action fields; by default minari gets one action without effect."""
     rewards: str | None = None
-    """minari, lerobot: field that is the reward; by default minari's rewards are 0."""
+    """minari, lerobot: reward field; by default minari's rewards are 0."""
     fps: int | None = None
-    """lerobot: frames per second of simulated time; it must be given."""
+    """lerobot: frames per second of simulated time; required."""
     task: str | None = None
-    """lerobot: what is done, in words."""
+    """lerobot: description of the task."""
 
 
 def run(words: Sequence[str]) -> None:
@@ -83,4 +83,4 @@ def run(words: Sequence[str]) -> None:
         show(f"{count(rows, f'{mode} sample')}: {options.out}")
         if rows < stored[mode]:
             left = stored[mode] - rows
-            show(f"left out: {left:,} samples that are a trajectory of their own")
+            show(f"left out: {left:,} samples in trajectories of a single sample")

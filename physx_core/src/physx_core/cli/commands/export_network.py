@@ -23,19 +23,19 @@ class ExportNetwork:
     """
 
     directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SESSION")]
-    """The session's folder, or that of a checkpoint."""
+    """The session's folder, or a checkpoint's folder."""
     to: str
     """Format of the file: "onnx", "torchscript" or "pt2" for PyTorch networks."""
     output: str | None = None
-    """The file; by default in the session's folder, named like the checkpoint."""
+    """The file; by default in the session's folder, named after the checkpoint."""
     network_name: str | None = None
-    """Name of the checkpoints in the session, if there are several names."""
+    """Name of the checkpoints in the session, if there are several."""
     which_network: int = -1
     """Number of the checkpoint; -1: the last."""
     network: Annotated[str | None, tyro.conf.arg(name="network.network")] = None
-    """The network's reference, if it is no component of an installed plugin."""
+    """The network's reference, if it is not a component of an installed plugin."""
     trust: bool = False
-    """Import whatever the checkpoint names, which can be any code."""
+    """Import whatever code the checkpoint names."""
 
 
 def run(words: Sequence[str]) -> None:

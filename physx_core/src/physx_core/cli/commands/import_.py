@@ -1,4 +1,4 @@
-"""``physx import``: import an npz or HDF5 file, or a DeepPhysX dataset."""
+"""``physx import``: import an npz file, an HDF5 file, or a DeepPhysX dataset."""
 
 from __future__ import annotations
 
@@ -18,22 +18,22 @@ from physx_core.observers import ProgressBar
 class Import:
     """Store the arrays of a file as the fields of a dataset.
 
-    Arrays of one length become the fields of one mode. Group names become part of the fields'
-    names, except training, validation and prediction, which become modes.
+    Arrays of the same length become the fields of one mode. Group names become part of the field
+    names, except for training, validation, and prediction, which become modes.
     """
 
     file: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FILE")]
     """A NumPy archive (npz), an HDF5 file, a DeepPhysX database, or the folder of a DeepPhysX
     dataset or session."""
     directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
-    """The dataset's folder; rows are added to an existing dataset with these fields."""
+    """The dataset's folder; rows are appended to an existing dataset that has the same fields."""
     mode: str | None = None
     """Mode of the rows, regardless of the file's; for a file with several modes, the one to import.
-    By default the modes of the file, or else training."""
+    By default the file's modes, or training if it has none."""
     fields: tuple[str, ...] = ()
     """Arrays to import; by default all."""
     max_bytes: int | None = None
-    """How many bytes the arrays may have; by default 100 times the size of the file, and at least
+    """Maximum size of the arrays in bytes; by default 100 times the size of the file, but at least
     0.27 GB."""
 
 

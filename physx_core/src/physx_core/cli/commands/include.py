@@ -12,7 +12,7 @@ def run(words: Sequence[str]) -> None:
     """Print the folder."""
     if words and words[0] in ("-h", "--help"):
         print(
-            "usage: physx include\n\nPrints the folder that programs are compiled with, as in\n"
+            "usage: physx include\n\nPrints the include folder for compiling programs, as in\n"
             '  cc -I"$(physx include)" heat.c -o heat'
         )
         return

@@ -22,8 +22,8 @@ from physx_core.errors import CheckpointError, DatasetNotFoundError, UsageError
 class Info:
     """Show the contents of a session or dataset.
 
-    Without a folder, show what a report of a bug needs: the interpreter, versions, where each
-    package comes from, drivers, plugins that are broken, packages that hide others.
+    Without a folder, show what a bug report needs: the interpreter, versions, where each package
+    comes from, drivers, broken plugins, and packages that hide others.
     """
 
     directory: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="[DIR]")] = None
@@ -33,7 +33,7 @@ class Info:
 
 
 def run(words: Sequence[str]) -> None:
-    """Print the dataset and the checkpoints of a folder, or what is installed."""
+    """Print a folder's dataset and checkpoints, or what is installed."""
     options = tyro.cli(Info, args=words, prog="physx info")
     if options.directory is not None:
         _show_session(Path(options.directory), options)
@@ -44,21 +44,21 @@ def run(words: Sequence[str]) -> None:
 
 
 def _show_installation() -> None:
-    """Print what a report of a bug needs, without secrets."""
+    """Print what a bug report needs, without secrets."""
     packages = installation.find_packages()
     for title, values in (
         ("machine", installation.describe_machine()),
         ("drivers", installation.describe_drivers(os.environ)),
         ("environment variables", installation.describe_variables(os.environ)),
     ):
-        show(title if values else f"{title}: none that matter")
+        show(title if values else f"{title}: none relevant")
         for name, text in values.items():
             show(f"  {name:<12} {text}")
     show("packages")
     rows = [(each.name, each.version, each.place) for each in packages]
     show_table(("name", "version", "imported from"), rows, indent=2)
     problems = [f"{each.name}: {text}" for each in packages for text in each.problems]
-    show(f"in each other's way: {'' if problems else 'nothing'}")
+    show(f"conflicts: {'' if problems else 'none'}")
     for text in problems:
         show(f"  {text}")
     show("plugins")

@@ -1,4 +1,4 @@
-"""``physx new``: begin a plugin: a package that installs, passes the contract kit, has a README."""
+"""``physx new``: create a plugin package that installs and passes the contract kit."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class _Part:
     """A component of a new plugin.
 
     Attributes:
-        summary: What it is, for descriptions.
-        tried: Commands that try it.
+        summary: Short description.
+        tried: Commands to try it with.
         arguments: Arguments of its contract kit.
-        options: Options of ``physx check``, likewise.
+        options: The same as options of ``physx check``.
         requires: Distributions that it needs.
     """
 
@@ -50,7 +50,7 @@ _SPRING = "physx generate toy/spring --batch-nb 10 --batch-size 100"
 _PARTS = {
     "environment": _Part("a simulated cart", _GENERATE),
     "network": _Part(
-        "a network of two layers",
+        "a two-layer network",
         f"{_SPRING}\n{_TRAIN}",
         "$class_name, fields=FIELDS",
         " --fields state=2 force=1 next_state=2",
@@ -60,7 +60,7 @@ _PARTS = {
         "a visualizer that writes a text file", f"{_SPRING} --environment.visualizer $name"
     ),
     "backend": _Part(
-        "a physics engine for free rigid bodies",
+        "a physics engine for articulated rigid bodies, without contacts",
         'python -c "\n'
         "from physx_core import Sphere, World, plugins\n\n"
         "world = World(objects=[Sphere(name='ball', radius=0.1, position=(0, 0, 1))])\n"
@@ -77,17 +77,18 @@ _KINDS = {kind: (kind,) for kind in _PARTS} | {"plugin": ("environment", "networ
 
 @dataclass
 class New:
-    """Write the repository of a new plugin: it installs, passes the contract kit, has a README.
+    """Create a new plugin's repository, which installs, passes the contract kit, and has a README.
 
-    A `plugin` holds an environment and a network that learns from it; any may hold more.
+    A `plugin` contains an environment and a network that learns from it. You can add more
+    components to any of them.
     """
 
     kind: tyro.conf.Positional[Literal["environment", "network", "visualizer", "backend", "plugin"]]
-    """What the plugin brings."""
+    """What the plugin contains."""
     name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")]
-    """Name of the plugin, by which users select it, as in wave-tank."""
+    """Name by which users select the plugin, such as wave-tank."""
     folder: Path = Path()
-    """The folder in which that of the plugin, physx-NAME, is created."""
+    """Folder in which to create the plugin's folder, physx-NAME."""
 
 
 def run(words: Sequence[str]) -> None:
@@ -97,7 +98,7 @@ def run(words: Sequence[str]) -> None:
     _check_name(name)
     target = options.folder / f"physx-{name}"
     if target.exists():
-        raise ConfigError(f"{target} exists already. Choose another name, or --folder.")
+        raise ConfigError(f"{target} already exists. Choose another name or --folder.")
     try:
         _write(target, _render(name, _KINDS[options.kind]))
     except OSError as error:
@@ -108,13 +109,13 @@ def run(words: Sequence[str]) -> None:
 def _check_name(name: str) -> None:
     if not _NAME.fullmatch(name):
         raise ConfigError(
-            f'NAME is "{name}": it consists of lower-case letters, digits, and single hyphens '
-            "between them, and begins with a letter, as in wave-tank."
+            f'NAME is "{name}" but must consist of lowercase letters, digits, and single hyphens '
+            "between them, and begin with a letter, as in wave-tank."
         )
     taken = plugins.available()
     if name in taken:
         owners = " and ".join(taken[name].distributions)
-        raise ConfigError(f'There is a plugin "{name}" already: it is part of {owners}.')
+        raise ConfigError(f'There is already a plugin "{name}": it is part of {owners}.')
     official = OFFICIAL.get((PLUGINS, name), f"physx-{name}")
     if official in OFFICIAL.values() or _is_installed(official):
         raise ConfigError(f'"{name}" is the name of {official}. Choose another.')
@@ -129,7 +130,7 @@ def _is_installed(distribution: str) -> bool:
 
 
 def _render(name: str, kinds: Sequence[str]) -> dict[str, str]:
-    """Return the path of each file of the plugin, and its content."""
+    """Return the plugin's files: path to content."""
     package = f"physx_{name.replace('-', '_')}"
     camel = name.title().replace("-", "")
     parts = [_PARTS[kind] for kind in kinds]
@@ -144,7 +145,7 @@ def _render(name: str, kinds: Sequence[str]) -> dict[str, str]:
         return Template(text).substitute(values)
 
     requires = list(dict.fromkeys(one for part in parts for one in part.requires))
-    summary = "A plugin of physx: " + " and ".join(part.summary for part in parts) + "."
+    summary = "A physx plugin: " + " and ".join(part.summary for part in parts) + "."
     listed = "\n".join(
         f"| `src/{package}/{kind}.py` | the class `{values['class_name']}`: {part.summary} |"
         for kind, part, values in zip(kinds, parts, each, strict=True)
@@ -162,7 +163,7 @@ def _render(name: str, kinds: Sequence[str]) -> dict[str, str]:
     ]
     imports = [f"from {package}.{v['kind']} import {v['class_name']}" for v in each]
     kit = ", ".join(f"check_{kind}" for kind in kinds)
-    head = ['"""The components keep the contracts that physx and its users rely on."""\n']
+    head = ['"""The components fulfill the contracts that physx and its users rely on."""\n']
     head += ["from physx_core import Field"] if "network" in kinds else []
     head += [f"from physx_core.testing import {kit}", *imports]
     head += [_FIELDS] if "network" in kinds else []
@@ -183,10 +184,10 @@ def _usage(kinds: Sequence[str]) -> str:
 
 
 def _write(target: Path, files: dict[str, str]) -> None:
-    """Write the files under a hidden name, and rename the folder when it is complete."""
+    """Write the files to a hidden folder, and rename it when it is complete."""
     hidden = target.with_name(f".{target.name}.new")
     make_folder(target.parent)
-    remove_folder(hidden)  # of a process that was killed
+    remove_folder(hidden)  # left by a killed process
     create_folder(hidden)
     try:
         for name, text in files.items():

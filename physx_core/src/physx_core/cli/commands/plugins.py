@@ -1,4 +1,4 @@
-"""``physx plugins``: list the installed plugins, their components, and those that are broken."""
+"""``physx plugins``: list the installed plugins, their components, and broken plugins."""
 
 from __future__ import annotations
 
@@ -13,9 +13,9 @@ from physx_core.plugins.entries import find_unreadable
 
 
 def run(words: Sequence[str]) -> None:
-    """Print each plugin with its components, or with the reason why it is broken."""
+    """Print each plugin with its components, or the reason why it is broken."""
     if words and words[0] in ("-h", "--help"):
-        print("usage: physx plugins\n\nLists the plugins, and loads each to list its components.")
+        print("usage: physx plugins\n\nLists the plugins and loads each to list its components.")
         return
     if words:
         raise UsageError(f"physx plugins takes no options, not {' '.join(words)}.")
@@ -35,9 +35,9 @@ def run(words: Sequence[str]) -> None:
 
 
 def load_all() -> Iterator[tuple[str, Plugin]]:
-    """Load each plugin, print its name before and what is wrong with it after, yield the others."""
+    """Load each plugin and yield it; print its name first, and its error if it is broken."""
     for name, info in plugins.available().items():
-        # At once: if the plugin crashes or hangs for ever, this is what tells which one it was.
+        # Flush: if the plugin crashes or hangs, this line shows which one it was.
         print(printable(f"{name}  ({', '.join(info.distributions)})"), flush=True)
         try:
             plugin = plugins.load(name)

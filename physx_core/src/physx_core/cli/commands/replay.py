@@ -1,4 +1,4 @@
-"""``physx replay``: send stored samples through their environment, to view them."""
+"""``physx replay``: send stored samples through their environment to view them."""
 
 from __future__ import annotations
 
@@ -18,14 +18,14 @@ _VISUALIZER = "--environment.visualizer"
 def run(words: Sequence[str]) -> None:
     """Replay samples; the first word is a session's or dataset's folder.
 
-    The environment is the second word, or else the one that the dataset was generated with. It is
-    drawn with the given visualizer, or else with that of the only installed visualizer plugin.
-    ``--mode`` is short for ``--dataset.mode``.
+    The environment is the second word, by default the one that generated the dataset. It is drawn
+    with the given visualizer, by default that of the only installed visualizer plugin. ``--mode``
+    is short for ``--dataset.mode``.
     """
     words = ["--dataset.mode" if word == "--mode" else word for word in words]
     place = ("dataset.existing_dir", "environment.environment")
     is_given = any(word.partition("=")[0] == _VISUALIZER for word in words)
-    viewers = [] if is_given else _visualizer_plugins()  # to find them imports all plugins
+    viewers = [] if is_given else _visualizer_plugins()  # finding them imports all plugins
     viewer = {"visualizer": viewers[0]} if len(viewers) == 1 else {}
     pipeline = pipeline_from(
         Replay,
@@ -43,8 +43,8 @@ def run(words: Sequence[str]) -> None:
     config = pipeline.environment_config
     if config is not None and config.visualizer is None and not is_given:
         raise UsageError(
-            f"physx replay needs {_VISUALIZER} REFERENCE, as there is not exactly one visualizer "
-            f"plugin. Installed: {listed(viewers)}. (None: draw nothing.)"
+            f"physx replay needs {_VISUALIZER} REFERENCE unless exactly one visualizer plugin is "
+            f"installed. Installed: {listed(viewers)}. (None: draw nothing.)"
         )
     pipeline.execute()
 

@@ -1,4 +1,4 @@
-"""``physx stats``: show the statistics of a training as a table, or in TensorBoard."""
+"""``physx stats``: show a training's statistics as a table or in TensorBoard."""
 
 from __future__ import annotations
 
@@ -32,11 +32,11 @@ class Stats:
     session: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SESSION")]
     """The session's folder."""
     width: int | None = None
-    """Width of the spark lines, in characters; by default what the terminal leaves."""
+    """Width of the spark lines in characters; by default the rest of the terminal's width."""
     tensorboard: bool = False
-    """Start TensorBoard and print its address; Ctrl-C ends it."""
+    """Start TensorBoard and print its address; Ctrl-C stops it."""
     port: int = 6006
-    """Port of TensorBoard, on this machine only."""
+    """Port of TensorBoard, which is reachable only from this machine."""
 
 
 def run(words: Sequence[str]) -> None:
@@ -47,7 +47,7 @@ def run(words: Sequence[str]) -> None:
         return
     series = read_scalars(Path(options.session))
     if not series:
-        raise SessionError(f"{options.session} has no statistics: a training records them.")
+        raise SessionError(f"{options.session} has no statistics: only training runs record them.")
     of_rows = {name: steps for (_, name), steps in series.items() if name.startswith(_ROWS)}
     series = {key: steps for key, steps in series.items() if key[1] not in of_rows}
     numbers = ("number", "last", "min", "max", "mean")
@@ -64,7 +64,7 @@ def run(words: Sequence[str]) -> None:
 
 
 def _units(session: Path) -> dict[str, str]:
-    """Return the units of the fields in the session's dataset; none if it cannot be read."""
+    """Return the units of the fields in the session's dataset; empty if it cannot be read."""
     try:
         with Dataset.open(session) as dataset:
             fields = [of for mode in dataset.modes for of in dataset.fields(mode).values()]
@@ -94,10 +94,10 @@ def _line(timeline: str, name: str, values: list[float]) -> tuple[str, ...]:
 
 
 def spark_line(values: Sequence[float], width: int) -> str:
-    """Return a curve of at most `width` bars from the smallest to the largest value.
+    """Return a curve of at most `width` bars, scaled from the smallest to the largest value.
 
-    Each bar is a mean of consecutive values. If all are positive and span more than a factor of
-    100, bars show their logarithms. NaN and infinity are shown as "x".
+    Each bar is the mean of consecutive values. If all are positive and span more than a factor of
+    100, the bars show their logarithms. NaN and infinity appear as "x".
     """
     size = min(width, len(values))
     edges = [len(values) * number // max(1, size) for number in range(size + 1)]

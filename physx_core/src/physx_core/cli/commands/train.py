@@ -1,4 +1,4 @@
-"""``physx train``: train a network on a dataset, or on samples that an environment generates."""
+"""``physx train``: train a network on a dataset or on samples that an environment generates."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from physx_core.session import Session
 def run(words: Sequence[str]) -> None:
     """Train on the dataset that the first word names.
 
-    With ``--resume`` the first word is a session instead, whose ``config.toml`` gives the options.
+    With ``--resume``, the first word is a session instead; its ``config.toml`` gives the options.
     """
     if "--resume" in words and "--session-name" not in words:
         session, words = take_session(words)

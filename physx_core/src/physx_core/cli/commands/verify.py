@@ -1,4 +1,4 @@
-"""``physx verify``: verify the files of a dataset, and repair them."""
+"""``physx verify``: verify and repair the files of a dataset."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ class Verify:
 
 
 def run(words: Sequence[str]) -> None:
-    """Print the repairs and each remaining problem."""
+    """Print the repairs and all remaining problems."""
     options = tyro.cli(Verify, args=words, prog="physx verify")
     if options.repair:
         for text in Dataset.repair(options.directory):

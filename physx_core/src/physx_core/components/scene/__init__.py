@@ -1,4 +1,4 @@
-"""The scene: what an environment draws, as plain events that travel to any viewer.
+"""The scene: what an environment draws, as plain events for any viewer.
 
-What cannot be drawn is an error where it is given, not in a viewer.
+What cannot be drawn raises an error where it is added or changed, not in a viewer.
 """

@@ -45,25 +45,25 @@ tomato=ff6347 turquoise=40e0d0 violet=ee82ee wheat=f5deb3 white=ffffff whitesmok
 yellow=ffff00 yellowgreen=9acd32
 """
 NAMES: dict[str, str] = dict(pair.split("=") for pair in _CSS.split())
-"""Colors of CSS by name, each as ``rrggbb``."""
+"""CSS colors by name, each as ``rrggbb``."""
 
 
 def parse_color(color: Color) -> tuple[float, float, float]:
     """Return red, green and blue in [0, 1].
 
     Args:
-        color: A name of CSS, ``#rrggbb``, or three numbers in [0, 1].
+        color: A CSS color name, ``#rrggbb``, or three numbers in [0, 1].
 
     Raises:
-        ConfigError: If it is none of them.
+        ConfigError: If it is none of these.
     """
     if not isinstance(color, str):
         return _from_numbers(color)
     text = NAMES.get(color.lower(), color.removeprefix("#") if color.startswith("#") else "")
     if not re.fullmatch("[0-9a-fA-F]{6}", text):
         raise ConfigError(
-            f'"{color}" is not a color.{nearest(color, NAMES)} Give a name of CSS, "#rrggbb", or '
-            "three numbers in [0, 1]."
+            f'"{color}" is not a color.{nearest(color, NAMES)} Give a CSS color name, "#rrggbb", '
+            "or three numbers in [0, 1]."
         )
     number = int(text, 16)
     return (number >> 16) / 255, (number >> 8 & 255) / 255, (number & 255) / 255
@@ -78,7 +78,7 @@ def _from_numbers(color: Color) -> tuple[float, float, float]:
     if not fits or not ((numbers >= 0) & (numbers <= 1)).all():
         raise ConfigError(
             f"{color!r} is not a color: it is not red, green and blue in [0, 1]. Give three "
-            'numbers, a name of CSS, or "#rrggbb".'
+            'numbers, a CSS color name, or "#rrggbb".'
         )
     red, green, blue = numbers.tolist()
     return red, green, blue
@@ -93,7 +93,7 @@ def _tables() -> Mapping[str, Array]:
 
 
 def colormap(name: str) -> Array:
-    """Return the red, green and blue of a colormap, shape (256, 3), uint8.
+    """Return the RGB values of a colormap, shape (256, 3), uint8.
 
     Args:
         name: Name of one of matplotlib's colormaps; one that ends with ``_r`` is reversed.
@@ -106,13 +106,13 @@ def colormap(name: str) -> Array:
     if table is None:
         raise ConfigError(
             f'There is no colormap "{name}".{nearest(str(name), tables)} '
-            f"Colormaps: {listed(tables)}; with _r at the end they are reversed."
+            f"Colormaps: {listed(tables)}; append _r to reverse one."
         )
     return table[::-1] if name.endswith("_r") else table
 
 
 def map_values(values: Array, low: float, high: float, name: str) -> Array:
-    """Return the red, green and blue of values in a colormap, shape (..., 3), uint8.
+    """Return the RGB colors of values in a colormap, shape (..., 3), uint8.
 
     Args:
         values: Any numbers, shape (...).

@@ -1,4 +1,4 @@
-"""Consistency: whether options of an object fit each other and those set before."""
+"""Consistency: checks that an object's options fit each other and those set before."""
 
 from __future__ import annotations
 
@@ -11,17 +11,17 @@ from physx_core.components.scene.kinds import EMPTY_IS_UNSET, KINDS, Kind
 from physx_core.errors import ConfigError
 
 _LINKED = {"cells", "color", "heights", "scalar_field", "vmin", "vmax"}
-"""Options whose change always needs a look at others."""
+"""Options whose changes must always be checked against others."""
 
 
 @dataclass(frozen=True, slots=True)
 class Known:
-    """What changes of an object are checked against.
+    """What changes to an object are checked against.
 
     Attributes:
         kind: Its kind.
         lengths: Length of each aligned option that is set.
-        limits: Its ``vmin`` and ``vmax``, as far as they are set.
+        limits: Its ``vmin`` and ``vmax``, if set.
         largest: Largest index among a mesh's cells.
     """
 
@@ -62,7 +62,7 @@ class Known:
         return True
 
     def _aligned(self, name: str, changes: Mapping[str, Any], spec: Kind) -> dict[str, Any]:
-        """Return the lengths; options that belong together have the same."""
+        """Return the lengths; options that belong together must have the same length."""
         lengths = dict(self.lengths)
         if "color" in changes and "scalar_field" not in changes:
             lengths.pop("scalar_field", None)
@@ -79,13 +79,13 @@ class Known:
             first, *rest = lengths
             other = next(option for option in rest if lengths[option] != lengths[first])
             raise ConfigError(
-                f'Object "{name}": {other} has the length {lengths[other]}, but {first} has '
-                f"{lengths[first]}. Give both, of one length."
+                f'Object "{name}": {other} has length {lengths[other]}, but {first} has length '
+                f"{lengths[first]}. Give both, with the same length."
             )
         return lengths
 
     def _indexed(self, name: str, changes: Mapping[str, Any], lengths: Mapping[str, Any]) -> int:
-        """Return the largest index of a mesh's cells; they are of its vertices."""
+        """Return the largest index in a mesh's cells; it must be one of the vertices."""
         largest = self.largest
         if self.kind != "mesh" or not changes.keys() & {"positions", "cells"}:
             return largest
@@ -97,13 +97,13 @@ class Known:
         count = lengths["positions"]
         if largest >= count:
             raise ConfigError(
-                f'Object "{name}": cells has the index {largest}, but positions only the '
-                f"{count} vertices 0 to {count - 1}."
+                f'Object "{name}": cells has the index {largest}, but positions has only '
+                f"the {count} vertices 0 to {count - 1}."
             )
         return largest
 
     def _limited(self, name: str, changes: Mapping[str, Any]) -> dict[str, float]:
-        """Return the limits of the colormap, which are a range."""
+        """Return the limits of the colormap, which must form a range."""
         limits = dict(self.limits)
         for option in changes.keys() & {"vmin", "vmax"}:
             limits[option] = changes[option]

@@ -18,8 +18,8 @@ class Event:
         action: What happens to them.
         kind: Their kind, for example ``mesh``.
         names: Their names, unique in their environment.
-        values: Options that are set: copies of arrays, and plain data. Of several objects each
-            value has a leading axis, with one entry for each object.
+        values: Options that are set: copies of arrays, and plain data. For several objects, each
+            value has a leading axis with one entry for each object.
     """
 
     action: Action

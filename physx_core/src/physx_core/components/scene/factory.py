@@ -21,7 +21,7 @@ from physx_core.fields import NO_ARRAY
 _REMEMBERED = 1000  # sets of names
 _SECONDS = number(-math.inf)
 _SEEN_AS = {"markers": "symbols"}
-"""Kinds that reach viewers as another one."""
+"""Kinds that reach viewers as another kind."""
 
 
 class Factory:
@@ -31,10 +31,11 @@ class Factory:
     `Environment.update_visualization`. Objects are identified by their names.
     Lengths are in m, positions in the world frame; orientations are quaternions x, y, z, w.
 
-    All objects in space have ``color`` (a name of CSS, ``"#rrggbb"``, or red, green and blue in
+    All objects in space have ``color`` (a CSS color name, ``"#rrggbb"``, or red, green and blue in
     [0, 1]), ``alpha``, ``visible``, and ``in_view``: False for what the camera need not show, such
-    as a ground. Those with a ``scalar_field`` show it in a ``colormap``, one of matplotlib's, from
-    ``vmin`` to ``vmax`` (by default the extremes so far), with a ``color_bar`` beside them.
+    as the ground. Those with a ``scalar_field`` show it in one of matplotlib's colormaps
+    (``colormap``), from ``vmin`` to ``vmax`` (by default the extremes so far), next to a
+    ``color_bar``.
     """
 
     def __init__(self) -> None:
@@ -45,7 +46,7 @@ class Factory:
         self._known_names: dict[tuple[str, ...], str] = {}
 
     def __bool__(self) -> bool:
-        """Return whether what is drawn can be seen."""
+        """Return whether what is drawn is visible."""
         return True
 
     def take_events(self) -> list[Event]:
@@ -120,7 +121,7 @@ class Factory:
         self._update("markers", name, changes)
 
     def add_lines(self, name: str, positions: Any, **look: Any) -> str:
-        """Add a line, or several.
+        """Add one or more lines.
 
         Args:
             name: Name of the object; also returned.
@@ -173,9 +174,9 @@ class Factory:
         Args:
             name: Name of the object; also returned.
             heights: Heights in m, shape (nx, ny): axis 0 is along x, axis 1 along y.
-            spacing: Distance of the grid's points along x and y, shape (2,), in m.
-            look: ``position`` (3,) of the grid's first point, ``orientation`` (4,); else as of a
-                mesh, ``scalar_field`` (nx, ny).
+            spacing: Distance between the grid's points along x and y, shape (2,), in m.
+            look: ``position`` (3,) of the grid's first point, ``orientation`` (4,); otherwise as
+                for a mesh, with ``scalar_field`` (nx, ny).
         """
         return self._add("height_field", name, heights=heights, spacing=spacing, **look)
 
@@ -184,12 +185,12 @@ class Factory:
         self._update("height_field", name, changes)
 
     def add_slice(self, name: str, values: ArrayLike, spacing: ArrayLike, **look: Any) -> str:
-        """Add a plane that shows the values of a grid, such as a slice of a volume, in colors.
+        """Add a plane that shows the values of a grid in colors, such as a slice of a volume.
 
         Args:
             name: Name of the object; also returned.
             values: Values at the grid's points, shape (nx, ny): axis 0 along x, axis 1 along y.
-            spacing: Distance of the grid's points along x and y, shape (2,), in m.
+            spacing: Distance between the grid's points along x and y, shape (2,), in m.
             look: ``position`` (3,) of the grid's first point, ``orientation`` (4,); ``colormap``,
                 ``vmin``, ``vmax``, ``color_bar``, ``alpha``.
         """
@@ -200,7 +201,7 @@ class Factory:
         self._update("slice", name, changes)
 
     def add_volume(self, name: str, values: ArrayLike, spacing: ArrayLike, **look: Any) -> str:
-        """Add the values of a grid in space, as a cloud and in a window of slices.
+        """Add the values of a 3D grid, as a cloud and in a window of slices.
 
         Args:
             name: Name of the object; also returned.
@@ -229,10 +230,10 @@ class Factory:
         Args:
             name: Name of the object; also returned.
             urdf: Path of the URDF file.
-            bodies: Names of the links that `update_robot` places, in its order.
+            bodies: Names of the links that `update_robot` places, in that order.
             package_dirs: Folder of each package that the URDF's mesh names start with.
-            look: ``color`` and ``alpha`` replace the URDF's own: a translucent robot for a
-                prediction or a reference; ``poses`` as in `update_robot`.
+            look: ``color`` and ``alpha`` replace the URDF's own, for example to show a prediction
+                or a reference as a translucent robot; ``poses`` as in `update_robot`.
         """
         return self._add(
             "robot", name, urdf=urdf, bodies=bodies, package_dirs=package_dirs or {}, **look
@@ -242,15 +243,15 @@ class Factory:
         """Place a robot's links: ``poses`` (bodies, 7), x, y, z in m and quaternion x, y, z, w."""
         self._update("robot", name, changes)
 
-    # Windows beside the scene ----------------------------------------------------------------
+    # Windows next to the scene ---------------------------------------------------------------
 
     def add_image(self, name: str, image: ArrayLike) -> str:
-        """Add an image in a window of its own.
+        """Add an image in its own window.
 
         Args:
             name: Name of the object; also returned.
-            image: Gray (height, width), RGB or RGBA (height, width, 3 or 4): numbers of uint8, or
-                floats in [0, 1].
+            image: Gray (height, width), RGB or RGBA (height, width, 3 or 4): uint8, or floats in
+                [0, 1].
         """
         return self._add("image", name, image=image)
 
@@ -259,7 +260,7 @@ class Factory:
         self._update("image", name, {"image": image})
 
     def add_text(self, name: str, content: str) -> str:
-        """Add a text in Markdown."""
+        """Add a Markdown text."""
         return self._add("text", name, content=content)
 
     def update_text(self, name: str, content: str) -> None:
@@ -267,7 +268,7 @@ class Factory:
         self._update("text", name, {"content": content})
 
     def add_scalars(self, name: str, labels: Sequence[str], **values: Any) -> str:
-        """Add a plot over time with one curve for each label; ``unit`` is that of its values."""
+        """Add a plot over time with one curve for each label; ``unit`` is their unit."""
         return self._add("scalars", name, labels=labels, **values)
 
     def update_scalars(self, name: str, values: ArrayLike) -> None:
@@ -288,8 +289,11 @@ class Factory:
     def set_time(self, seconds: float) -> None:
         """Set the simulated time of what is drawn until the next call, in s.
 
-        Viewers play what is drawn in this time; call it before the first object is added, too. With
-        `Environment.step_time` this is done.
+        Viewers play what is drawn in this time; call it before the first object is added, too. If
+        `Environment.step_time` is set, this is done automatically.
+
+        Raises:
+            ConfigError: If it is not a finite number.
         """
         try:
             plain = {"seconds": _SECONDS(seconds)}
@@ -300,12 +304,12 @@ class Factory:
     # Any objects -----------------------------------------------------------------------------
 
     def update_many(self, kind: str, names: Sequence[str], values: Mapping[str, ArrayLike]) -> None:
-        """Change several objects of one kind, which costs much less than one by one.
+        """Change several objects of one kind: much cheaper than one by one.
 
         Args:
             kind: Their kind, for example ``box``.
             names: Their names.
-            values: The changed options, each with one entry for each name: of boxes ``position``
+            values: The changed options, each with one entry per name: for boxes, ``position``
                 (n, 3) and ``orientation`` (n, 4).
         """
         chosen = tuple(names)
@@ -332,7 +336,11 @@ class Factory:
             raise
 
     def remove(self, *names: str) -> None:
-        """Remove objects; their names can be used again."""
+        """Remove objects; their names can be used again.
+
+        Raises:
+            ConfigError: If one of them does not exist; then none is removed.
+        """
         for name in names:
             known = self._objects.get(name)
             if known is None or known.kind == "view":
@@ -346,7 +354,7 @@ class Factory:
                     kind = _SEEN_AS.get(known.kind, known.kind)
                     self._events.append(Event("remove", kind, (each,), {}))
 
-    # How -------------------------------------------------------------------------------------
+    # Implementation --------------------------------------------------------------------------
 
     def _list(self) -> str:
         return f"Objects: {listed(self._objects)}."
@@ -365,7 +373,7 @@ class Factory:
 
     def _add(self, kind: str, name: str, **values: Any) -> str:
         if not isinstance(name, str):
-            raise ConfigError(f"The name of an object must be a text, not {name!r}.")
+            raise ConfigError(f"The name of an object must be a string, not {name!r}.")
         if name in self._objects:
             raise ConfigError(f'The factory already has an object "{name}".')
         spec = KINDS[kind]
@@ -412,7 +420,7 @@ class Factory:
         self._events += followers
 
     def _move(self, kind: str, name: str, changes: Mapping[str, Any]) -> bool:
-        """Add to the moves in a row, or begin others, unless the numbers need a closer look."""
+        """Append to the consecutive moves, or begin new ones; False if full checks are needed."""
         options = [option for option in POSE if option in changes]
         if not options or "position" not in KINDS[kind].options:
             return False
@@ -431,7 +439,7 @@ class Factory:
         return True
 
     def _check_names(self, kind: str, names: tuple[str, ...]) -> None:
-        """Check that objects are of a kind; what was found is remembered."""
+        """Check that objects are of a kind; the result is remembered."""
         if self._known_names.get(names) == kind:
             return
         if kind not in KINDS or kind == "view":
@@ -457,7 +465,7 @@ class Factory:
 
 
 class NullFactory(Factory):
-    """The factory of an environment that nobody looks at: it accepts everything and is false."""
+    """The factory of an environment without a visualizer: it accepts everything and is false."""
 
     def __bool__(self) -> bool:
         """Return False."""

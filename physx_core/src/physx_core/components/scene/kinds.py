@@ -47,12 +47,12 @@ _SOLID: dict[str, Check] = {**_LOOK, **_POSE, "wireframe": flag, "size": _POSITI
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of objects.
+    """A kind of object.
 
     Attributes:
         required: Options that adding one needs, and their checks.
         optional: Other options, and their checks.
-        aligned: Options whose leading axes, of all those that are set, have the same length.
+        aligned: Options whose leading axes must have the same length, if they are set.
         fixed: Options that cannot be changed.
     """
 
@@ -73,10 +73,10 @@ class Kind:
 
 
 RESETTABLE = frozenset({"alpha", "color", "label", "scalar_field", "size", "vmax", "vmin"})
-"""Options whose value None is their default."""
+"""Options that None resets to their default."""
 
 EMPTY_IS_UNSET = frozenset({"labels", "orientations", "scalar_field"})
-"""Options that an empty value unsets, where they are not required."""
+"""Options that an empty value unsets, unless they are required."""
 
 KINDS: dict[str, Kind] = {
     "mesh": Kind(

@@ -1,4 +1,4 @@
-"""Markers: symbols on vertices of meshes, which move and turn with these."""
+"""Markers: symbols on vertices of meshes, which move and turn with them."""
 
 from __future__ import annotations
 
@@ -43,7 +43,7 @@ class MarkedMeshes:
         self._meshes = dict(meshes or {})
 
     def copy(self) -> MarkedMeshes:
-        """Return a copy that changes on its own."""
+        """Return an independent copy."""
         return MarkedMeshes(self._meshes)
 
     def add(self, name: str, positions: Array, cells: Array) -> None:
@@ -54,7 +54,7 @@ class MarkedMeshes:
         """Change a mesh, and return the moves of its markers.
 
         Raises:
-            ConfigError: If it loses vertices that are marked.
+            ConfigError: If it loses marked vertices.
         """
         parts = {part: changes[part] for part in ("positions", "cells") if part in changes}
         if not parts:

@@ -1,4 +1,4 @@
-"""Moves: moves of bodies in a row, which travel as one event."""
+"""Moves: consecutive moves of bodies, sent as one event."""
 
 from __future__ import annotations
 
@@ -14,12 +14,12 @@ from physx_core.components.scene.options import LARGEST
 from physx_core.typing import Array
 
 POSE = {"position": 3, "orientation": 4}
-"""Options that many objects change in every step: numbers of each."""
+"""Options that many objects change in every step, and how many numbers each has."""
 _TURN = POSE["orientation"]
 
 
 class Moves:
-    """Moves of bodies of one kind in a row.
+    """Consecutive moves of bodies of one kind.
 
     Attributes:
         kind: Their kind.
@@ -34,7 +34,7 @@ class Moves:
         self._count = sum(POSE[option] for option in options)
 
     def add(self, name: str, changes: Mapping[str, Array]) -> bool:
-        """Add a move, in few operations; return False if it is not one of these options."""
+        """Add a move, in few operations; return False if it does not fit the options."""
         if len(changes) != len(self.options):
             return False
         try:
@@ -53,7 +53,7 @@ class Moves:
         return True
 
     def event(self) -> Event:
-        """Return one event of all moves."""
+        """Return one event with all moves."""
         count, begin = len(self._names), 0
         packed = struct.pack(f"{len(self._floats)}f", *self._floats)  # 3 times as fast as NumPy
         rows = np.frombuffer(packed, np.float32).reshape(count, -1)

@@ -1,4 +1,4 @@
-"""Options of objects: what each accepts, and as what plain value it travels."""
+"""Options of objects: what each accepts, and the plain value that is sent for it."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Numbers:
     """An option that is an array of finite numbers.
 
     Attributes:
-        shape: Its shape; None: any number.
+        shape: Its shape; None: any length.
         dtype: Type that it is converted to.
     """
 
@@ -41,7 +41,7 @@ class Numbers:
             ConfigError: If it is not such an array.
         """
         shape = self.shape if count is None else (count, *self.shape)
-        # The common case in few operations; what it refuses is looked at again.
+        # The common case, in few operations; what it refuses is checked in full below.
         raw = value if type(value) is np.ndarray else _as_array(value)
         if (
             raw.dtype.kind == "f"
@@ -66,7 +66,7 @@ class Numbers:
             raise ConfigError(f"is not an array of numbers: {error}") from error
         if self.dtype is np.int32:
             if not np.array_equal(array, raw):
-                raise ConfigError("contains numbers that are no indices")
+                raise ConfigError("contains numbers that are not indices")
         elif not np.isfinite(array).all():
             place = tuple(np.argwhere(~np.isfinite(array))[0].tolist())
             raise ConfigError(f"is {array[place]} at index {place}, but must be finite")
@@ -94,7 +94,7 @@ def many(check: Check, value: Any, count: int, *, resettable: bool = False) -> A
 
     Args:
         check: The option's check.
-        value: One entry for each object; of arrays, one array with this leading axis.
+        value: One entry for each object; for arrays, one array with this leading axis.
         count: Number of objects.
         resettable: Whether an entry may be None.
     """
@@ -106,7 +106,7 @@ def many(check: Check, value: Any, count: int, *, resettable: bool = False) -> A
 
 
 def number(low: float, *, or_equal: bool = False, high: float = math.inf) -> Check:
-    """Return the check of a number greater than `low`, or equal if allowed, and at most `high`."""
+    """Return a check for a number greater than `low`, or equal if allowed, and at most `high`."""
 
     def check(value: Any) -> float:
         try:
@@ -147,33 +147,33 @@ def colormap_name(value: Any) -> str:
 
 
 def flag(value: Any) -> bool:
-    """Check a truth value."""
+    """Check a boolean."""
     if not isinstance(value, (bool, np.bool_)):
         raise ConfigError(f"is {value!r} but must be True or False")
     return bool(value)
 
 
 def text(value: Any) -> str:
-    """Convert anything to text."""
+    """Convert anything to a string."""
     return str(value)
 
 
 def texts(value: Any) -> list[str]:
-    """Convert a sequence to texts."""
+    """Convert a sequence to a list of strings."""
     if isinstance(value, (str, bytes)) or not np.iterable(value):
-        raise ConfigError(f"is {value!r} but must be a list of texts")
+        raise ConfigError(f"is {value!r} but must be a list of strings")
     return [str(entry) for entry in value]
 
 
 def folders(value: Any) -> dict[str, str]:
-    """Convert the folders of packages to texts."""
+    """Convert the names and folders of packages to strings."""
     if not isinstance(value, Mapping):
         raise ConfigError(f"is {value!r} but must give the folder of each package")
     return {str(package): str(folder) for package, folder in value.items()}
 
 
 def choice(*known: str) -> Check:
-    """Return the check of one of some words."""
+    """Return a check for one of several words."""
 
     def check(value: Any) -> str:
         if not isinstance(value, str) or value not in known:
@@ -207,5 +207,5 @@ def image(value: Any) -> Array:
     if array.dtype == np.uint8:
         return array
     if array.dtype.kind != "f" or not ((array >= 0) & (array <= 1)).all():
-        raise ConfigError("must be of uint8, or of floats in [0, 1]")
+        raise ConfigError("must be uint8, or floats in [0, 1]")
     return np.round(255 * array).astype(np.uint8)

@@ -1,4 +1,4 @@
-"""Exports and imports rows to and from files of other formats, block by block."""
+"""Exports rows to files of other formats and imports them, block by block."""
 
 from physx_core.dataset.exchange.exporting import FORMATS, export
 from physx_core.dataset.exchange.importing import import_file

@@ -1,9 +1,9 @@
-"""Reads NumPy arrays from pickles that may come from a stranger.
+"""Reads NumPy arrays from untrusted pickles.
 
-A pickle is a program that may call anything. Here it meets stand-ins instead: what it wants to call
-is looked up in a table of the few names that NumPy itself writes for an array, and each of these
-only notes what it was given. The array is then made from type, shape and bytes. No function of
-NumPy's and none of any other library is called with what the pickle says.
+A pickle is a program that may call anything. Here its calls only reach stand-ins: each name is
+looked up in a table of the few that NumPy itself writes for an array, and the stand-in only records
+its arguments. The array is then built from type, shape and bytes. No function of NumPy or of any
+other library is called with arguments from the pickle.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ import numpy as np
 from physx_core.typing import Array
 
 _MOST_OPERATIONS = 100
-"""Operations of the pickle of an array: those that NumPy writes have about 60."""
+"""Limit on the operations of an array's pickle: NumPy writes about 60."""
 _MOST_CALLS = 6
 _OPERATIONS = {
     "PROTO", "FRAME", "STOP", "GLOBAL", "STACK_GLOBAL", "REDUCE", "BUILD", "MARK", "NONE",
@@ -30,28 +30,28 @@ _OPERATIONS = {
     "SHORT_BINUNICODE", "BINUNICODE", "BINUNICODE8", "SHORT_BINBYTES", "BINBYTES", "BINBYTES8",
     "BYTEARRAY8",
 }  # fmt: skip
-"""Operations in the pickles that NumPy writes; LONG_BINPUT, whose number is how much memory is
-taken, is not among them."""
+"""Operations in the pickles that NumPy writes. LONG_BINPUT, whose argument determines how much
+memory is allocated, is not among them."""
 _KIND = re.compile(r"[biufc]\d{1,2}")
 _SHAPE_LENGTH = 64
 
 
 class ArrayPickleError(ValueError):
-    """A pickle is damaged, or holds anything but an array of plain numbers."""
+    """A pickle is damaged or holds anything but an array of plain numbers."""
 
 
 def load_array(content: bytes) -> Array:
-    """Return the array or the number of NumPy in a pickle, of protocol 2 to 5.
+    """Return the NumPy array or number in a pickle of protocol 2 to 5.
 
     Raises:
-        ArrayPickleError: If it is damaged, or holds anything else.
+        ArrayPickleError: If the pickle is damaged or holds anything else.
     """
     try:
         _check_operations(content)
         found = _ArrayUnpickler(content).load()
     except ArrayPickleError:
         raise
-    except Exception as error:  # a damaged pickle raises anything
+    except Exception as error:  # a damaged pickle may raise anything
         raise ArrayPickleError(f"its pickle is damaged: {str(error)[:200]}") from error
     if not isinstance(found, _Array):
         raise ArrayPickleError(f"its pickle holds a {type(found).__name__}, not an array")
@@ -62,7 +62,7 @@ def load_array(content: bytes) -> Array:
 
 
 def _check_operations(content: bytes) -> None:
-    """Check the program: its length and number of calls, and that it does nothing unusual."""
+    """Check the program's length, number of calls, and operations."""
     calls = 0
     for number, (operation, _, _) in enumerate(pickletools.genops(content)):
         calls += operation.name == "REDUCE"
@@ -75,7 +75,7 @@ class _ArrayUnpickler(pickle.Unpickler):
         super().__init__(io.BytesIO(content))
 
     def find_class(self, module: str, name: str) -> Any:
-        """Return the stand-in of a name that NumPy writes; no other name is known."""
+        """Return the stand-in for a name that NumPy writes; other names are errors."""
         if (module, name) not in _NAMES:
             raise ArrayPickleError(
                 f'its pickle names "{module}.{name}", which an array of numbers does not need'
@@ -84,7 +84,7 @@ class _ArrayUnpickler(pickle.Unpickler):
 
 
 class _StandIn:
-    """Stands for a function or class; a pickle can call it, but change nothing about it."""
+    """Stands in for a function or class; a pickle can call it but not modify it."""
 
     __slots__ = ("_call",)
 
@@ -99,7 +99,7 @@ class _StandIn:
 
 
 class _Type:
-    """What a pickle says about the type of numbers."""
+    """Number type as described by a pickle."""
 
     __slots__ = ("_kind", "_order")
 
@@ -120,7 +120,7 @@ class _Type:
 
 
 class _Array:
-    """What a pickle says about an array."""
+    """Array as described by a pickle."""
 
     __slots__ = ("_content", "_is_columnwise", "_shape", "_type")
 
@@ -135,14 +135,14 @@ class _Array:
 
     @classmethod
     def of_buffer(cls, content: Any, type_: Any, shape: Any, order: Any) -> _Array:
-        """Return the array that ``numpy._frombuffer`` stands for."""
+        """Return the array that ``numpy._frombuffer`` would make."""
         found = cls()
         found.__setstate__((1, shape, type_, order == "F", content))
         return found
 
     @classmethod
     def of_number(cls, type_: Any, content: Any) -> _Array:
-        """Return the array that ``numpy.scalar`` stands for."""
+        """Return the array that ``numpy.scalar`` would make."""
         return cls.of_buffer(content, type_, (), "C")
 
     def make(self) -> Array:
@@ -165,14 +165,14 @@ class _Array:
 def _encode(text: Any, encoding: Any = None) -> bytes:
     """Return the bytes that protocol 2 writes as text."""
     if not isinstance(text, str) or encoding != "latin1":
-        raise ArrayPickleError("its bytes are no bytes")
+        raise ArrayPickleError("its bytes are not encoded as bytes")
     return text.encode("latin-1")
 
 
 def _no_bytes(*args: Any) -> bytes:
     """Return the empty bytes, which protocol 2 writes as a call."""
     if args:
-        raise ArrayPickleError("its bytes are no bytes")
+        raise ArrayPickleError("its bytes are not encoded as bytes")
     return b""
 
 

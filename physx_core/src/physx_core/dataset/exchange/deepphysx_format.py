@@ -1,9 +1,9 @@
-"""DeepPhysX datasets: a folder of SQLite databases, or of NumPy files of older versions.
+"""DeepPhysX datasets: folders of SQLite databases or, in older versions, of NumPy files.
 
-A database ``<session>_<mode>_<index>.db`` is a partition, with the tables ``Training`` and
-``Additional`` (v22.12), or ``dataset.db`` is everything, with the tables ``train``, ``test`` and
-``run`` (v25). Numbers are plain columns, arrays are pickles, which `load_array` reads. Before
-v22.12 partitions were files ``<session>_<mode>_<IN, OUT or ADD_name>_<index>.npy``.
+Either each database ``<session>_<mode>_<index>.db`` is a partition, with the tables ``Training``
+and ``Additional`` (v22.12), or ``dataset.db`` holds everything, with the tables ``train``, ``test``
+and ``run`` (v25). Numbers are plain columns; arrays are pickles, which `load_array` reads. Before
+v22.12, partitions were files ``<session>_<mode>_<IN, OUT or ADD_name>_<index>.npy``.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ _TABLES = {
     "test": ("validation", "training"),
     "run": ("prediction", "training"),
 }
-"""Name of a table to its mode, "" for that of the partition, and the role of its fields."""
+"""Name of a table to its mode ("" for that of the partition) and the role of its fields."""
 _NUMPY_FIELDS = {"IN": "input", "OUT": "ground_truth"}
 _NUMPY_ADDITIONAL = "ADD_"
 _ALLOWED = (sqlite3.SQLITE_SELECT, sqlite3.SQLITE_READ)
@@ -53,8 +53,8 @@ class _Part:
 
     Attributes:
         place: Where they are, for messages.
-        rows: How many there are.
-        read: Returns the next ones, given the number of the first and how many.
+        rows: Their number.
+        read: Returns the next rows, given the number of the first and the count.
     """
 
     place: str
@@ -63,7 +63,7 @@ class _Part:
 
 
 class PartsColumn:
-    """A field of all partitions of a mode, one after the other; see `Column`."""
+    """A field of all partitions of a mode, in sequence; see `Column`."""
 
     unit = ""
     problem = ""
@@ -74,7 +74,7 @@ class PartsColumn:
         values = self._rows()
         try:
             first = next(values)
-        except ExchangeError as error:  # it is raised if the field is asked for
+        except ExchangeError as error:  # raised only if the field is requested
             first, self.problem = np.zeros((), object), str(error)
         self.shape: tuple[int, ...] = (sum(part.rows for part in parts), *first.shape)
         self.dtype: np.dtype[Any] = first.dtype
@@ -87,8 +87,8 @@ class PartsColumn:
             if value.shape != self.shape[1:] or not np.can_cast(value.dtype, self.dtype):
                 raise ExchangeError(
                     f"Row {start + number} has the shape {value.shape} and the type {value.dtype}, "
-                    f"unlike the first one of {self._parts[0].place} with {self.shape[1:]} and "
-                    f"{self.dtype}. A field has one shape and type: {_CHOOSE}"
+                    f"unlike the first row of {self._parts[0].place} with {self.shape[1:]} and "
+                    f"{self.dtype}. All rows of a field have the same shape and type: {_CHOOSE}"
                 )
             block[number] = value
         return block
@@ -101,7 +101,7 @@ class PartsColumn:
                     yield _array_of(f"Row {number} of {part.place}", value)
                     number += 1
             if number != part.rows:
-                raise ExchangeError(f"{part.place} has fewer rows than were counted.")
+                raise ExchangeError(f"{part.place} has fewer rows than counted.")
 
 
 def _array_of(where: str, value: Any) -> Array:
@@ -109,11 +109,11 @@ def _array_of(where: str, value: Any) -> Array:
         try:
             return load_array(value)
         except ArrayPickleError as error:
-            raise ExchangeError(f"{where} is no array of numbers: {error}.") from error
+            raise ExchangeError(f"{where} is not an array of numbers: {error}.") from error
     if value is None:
         raise ExchangeError(
-            f"{where} has no value, which DeepPhysX stores in silence. A field has a value in each "
-            f"row: {_CHOOSE}"
+            f"{where} has no value, which DeepPhysX stores silently. A field needs a value in "
+            f"every row: {_CHOOSE}"
         )
     return np.asarray(value)
 
@@ -122,7 +122,7 @@ def _array_of(where: str, value: Any) -> Array:
 
 
 def find_folder(directory: Path) -> Path | None:
-    """Return the folder of a DeepPhysX dataset, given it or its session's; None if it is none."""
+    """Return the folder of a DeepPhysX dataset, given that or its session's; None if not found."""
     for folder in (directory, directory / "dataset"):
         if folder.is_dir() and any(_is_partition(path) for path in folder.iterdir()):
             return folder
@@ -136,9 +136,9 @@ def _is_partition(path: Path) -> bool:
 
 @contextlib.contextmanager
 def open_columns(path: Path, limit: int) -> Iterator[tuple[dict[str, Column], Notes]]:
-    """Open a database, or a folder of them or of old files; yield fields, and notes on roles.
+    """Open a database, or a folder of databases or old files; yield fields and notes on roles.
 
-    The fields' names are ``<mode>/<field>``. What they hold is no larger than the files.
+    The fields' names are ``<mode>/<field>``. Their contents are no larger than the files.
     """
     paths = [path]
     if path.is_dir():
@@ -209,7 +209,7 @@ def _database_part(
     cursor = database.cursor()
 
     def read(start: int, count: int) -> Iterator[Any]:
-        """Yield the next rows one by one: each may be as large as the file."""
+        """Yield the next rows one by one, as each may be as large as the file."""
         with _reading(path):
             if start == 0:
                 cursor.execute(query)
@@ -220,7 +220,7 @@ def _database_part(
 
 
 def _connect(path: Path) -> sqlite3.Connection:
-    """Open a database for reading; its schema, which may be a stranger's, can do nothing else."""
+    """Open a database for reading only; its schema may be hostile."""
     database = sqlite3.connect(f"{path.absolute().as_uri()}?mode=ro", uri=True)
     database.execute("PRAGMA trusted_schema = OFF")
     database.execute("PRAGMA cell_size_check = ON")
@@ -229,7 +229,7 @@ def _connect(path: Path) -> sqlite3.Connection:
 
 
 def _tables(path: Path, database: sqlite3.Connection) -> dict[str, tuple[int, list[str]]]:
-    """Return number of rows and names of the columns of the tables that DeepPhysX knows."""
+    """Return the number of rows and the column names of each of DeepPhysX's tables."""
     found = {
         name.lower(): str(text)
         for name, text in database.execute("SELECT name, sql FROM sqlite_master WHERE type='table'")
@@ -242,7 +242,7 @@ def _tables(path: Path, database: sqlite3.Connection) -> dict[str, tuple[int, li
         columns = database.execute(f'PRAGMA table_xinfo("{name}")').fetchall() if is_plain else []
         if not is_plain or any(hidden for *_, hidden in columns):
             raise ExchangeError(f"The table {name} of {path} is computed, not stored.")
-        # Each row takes bytes, but in a damaged file it may be found on several ways.
+        # Each row takes bytes, but in a damaged file it may be reachable on several paths.
         counted = f'SELECT count(*) FROM (SELECT 1 FROM "{name}" LIMIT {nbytes})'
         (rows,) = database.execute(counted).fetchone()
         if rows == nbytes:

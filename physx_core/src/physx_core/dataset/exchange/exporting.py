@@ -25,10 +25,10 @@ class Format:
     """A format that datasets can be exported to.
 
     Attributes:
-        write: Writes tables to a path; returns how many rows it left out.
+        write: Writes tables to a path; returns the number of rows left out.
         compressions: Names of its compressions, "none" first.
-        several: Whether one file holds several modes.
-        options: Which of the options for episodes it takes.
+        several: Whether one file can hold several modes.
+        options: Names of the episode options it takes.
     """
 
     write: Callable[[Sequence[Table], Path, ExportOptions], int]
@@ -70,15 +70,15 @@ def export(
         out: The file, or the folder for zarr, minari and lerobot. It must not exist.
         modes: Names of the modes; empty: all that have rows. Parquet, minari and lerobot hold one.
         options: Options of the format.
-        advance: Is called with the number of bytes read.
+        advance: Called with the number of bytes read.
 
     Returns:
-        How many rows of each mode were written.
+        Number of rows written for each mode.
 
     Raises:
-        ConfigError: If there is no such format or compression, or several modes do not fit.
-        ExchangeError: If a field does not fit into the format, or the file cannot be written.
-        MissingLibraryError: If the library of the format is not installed.
+        ConfigError: If there is no such format or compression, or it cannot hold several modes.
+        ExchangeError: If the format cannot hold a field, or the file cannot be written.
+        MissingLibraryError: If the library for the format is not installed.
         DatasetError: If there is no such mode, nothing to write, or a partition is damaged.
     """
     out, options = Path(out), options or ExportOptions()
@@ -102,7 +102,7 @@ def export(
     except OSError as error:
         reason = error.strerror or str(error)
         raise ExchangeError(
-            f"{out} cannot be written: {reason}. Nothing was left there."
+            f"{out} cannot be written: {reason}. Nothing was left behind."
         ) from error
     return {table.mode: table.rows - left_out for table in tables}
 
@@ -122,7 +122,7 @@ def _choose_format(to: str, options: ExportOptions) -> Format:
             takers = [other for other, known in FORMATS.items() if name in known.options]
             raise ConfigError(f"{name} is for {listed(takers)}, not for {to}.")
     if options.fps is not None and options.fps < 1:
-        raise ConfigError(f"fps is {options.fps}: at least 1 frame per second.")
+        raise ConfigError(f"fps is {options.fps} but must be at least 1 frame per second.")
     return form
 
 

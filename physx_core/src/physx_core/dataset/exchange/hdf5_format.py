@@ -20,11 +20,11 @@ from physx_core.typing import Array
 COMPRESSIONS = {"none": None, "gzip": "gzip", "lzf": "lzf"}
 _CHUNK = 2**20
 _ATTRIBUTE = 60000
-"""Bytes that fit into an attribute."""
+"""Maximum number of bytes in an attribute."""
 _MOST_ITEMS = 10_000
 _LARGEST_CHUNK = 2**28
 _UNREADABLE = (OSError, RuntimeError, KeyError, TypeError, ValueError)
-"""What HDF5 raises for a file that is damaged or holds types that NumPy does not have."""
+"""Errors that HDF5 raises for a damaged file or types that NumPy does not have."""
 
 
 def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
@@ -48,15 +48,15 @@ def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
 
 
 class _Sink(io.FileIO):
-    """A file whose `check` raises the first error of writing, which HDF5 never sees.
+    """A file that hides write errors from HDF5; `check` raises the first one.
 
-    HDF5 ends the process when a write fails.
+    HDF5 terminates the process when a write fails.
     """
 
     _error: OSError | None = None
 
     def write(self, content: Any) -> int:
-        """Write all of the content; nothing after an error."""
+        """Write the whole content, or nothing after an earlier error."""
         view = memoryview(content).cast("B")
         count = len(view)
         try:
@@ -75,7 +75,7 @@ class _Sink(io.FileIO):
             return 0
 
     def check(self) -> None:
-        """Raise the first error of writing."""
+        """Raise the first write error, if any."""
         if self._error is not None:
             raise self._error
 
@@ -116,9 +116,9 @@ class Hdf5Column:
 
 @contextlib.contextmanager
 def open_columns(path: Path, limit: int) -> Iterator[tuple[dict[str, Column], Notes]]:
-    """Open a file; yield its datasets by their paths, and the notes in its attributes.
+    """Open a file; yield its datasets by path and the notes in its attributes.
 
-    What the datasets say about their size is checked when they are chosen.
+    The sizes that the datasets claim are checked when they are chosen.
     """
     import h5py
 
@@ -137,7 +137,7 @@ def open_columns(path: Path, limit: int) -> Iterator[tuple[dict[str, Column], No
 def _columns(
     path: Path, group: Any, prefix: str, seen: set[Any], items: Iterator[int]
 ) -> Iterator[tuple[str, Column]]:
-    """Yield the datasets below a group; what leads out of the file is rejected, not followed."""
+    """Yield the datasets below a group; links are rejected, not followed."""
     import h5py
 
     for name in group:
@@ -161,8 +161,8 @@ def _check_storage(place: str, dataset: Any) -> None:
     """Check that the values are in the file itself, in pieces that fit into memory."""
     if dataset.is_virtual:
         raise ExchangeError(
-            f"{place} is virtual: its values are those of other files, which are not followed. "
-            "Import these files; of a physx dataset, give its folder to Dataset.merge."
+            f"{place} is virtual: its values are in other files, which are not followed. Import "
+            "those files; for a physx dataset, pass its folder to Dataset.merge."
         )
     if dataset.external:
         raise ExchangeError(f"{place} stores its values in other files, which are not followed.")
@@ -170,6 +170,6 @@ def _check_storage(place: str, dataset: Any) -> None:
         nbytes = math.prod(dataset.chunks) * dataset.dtype.itemsize
         if nbytes > _LARGEST_CHUNK:
             raise ExchangeError(
-                f"{place} is stored in chunks of {nbytes} bytes, more than {_LARGEST_CHUNK}: write "
-                "it again with smaller chunks (h5repack)."
+                f"{place} is stored in chunks of {nbytes} bytes, more than {_LARGEST_CHUNK}: "
+                "rewrite it with smaller chunks (h5repack)."
             )

@@ -1,4 +1,4 @@
-"""Imports rows of a NumPy archive, an ordinary HDF5 file, or a DeepPhysX dataset."""
+"""Imports rows from a NumPy archive, an ordinary HDF5 file, or a DeepPhysX dataset."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _READERS = {
     b"\x89HDF\r\n\x1a\n": hdf5_format.open_columns,
     b"SQLite f": deepphysx_format.open_columns,
 }
-"""The first bytes of a file, regardless of its name, to the function that opens it."""
+"""The first bytes of a file to the function that opens it; file names do not matter."""
 
 _SESSION = "import"
 _ALWAYS = 2**28
 _RATIO = 100
-"""How many times larger than a file what it holds may be, beyond `_ALWAYS` bytes."""
+"""Maximum ratio of a file's contents to its size, for contents of more than `_ALWAYS` bytes."""
 _LEAST_ROW = 8
 
 Columns = dict[str, Column]
@@ -46,28 +46,28 @@ def import_file(
     """Store the arrays of a file as fields of a dataset, block by block.
 
     Arrays of equal length become the fields of one mode; groups become part of the names
-    (``obs/state`` is the field ``obs_state``). Only groups that are named after modes, and those of
-    files that physx wrote, become modes themselves.
+    (``obs/state`` is the field ``obs_state``). Only groups that are named after modes, and those in
+    files written by physx, become modes themselves.
 
     Args:
         path: A NumPy archive (npz), an HDF5 file or a DeepPhysX database, of any name; or the
             folder of a DeepPhysX dataset or session.
-        directory: The dataset's folder. The rows are added to an existing dataset.
-        mode: Mode for the rows, regardless of the mode in the file; of a file with several modes,
+        directory: The dataset's folder. Rows are appended if the dataset exists.
+        mode: Mode for the rows, regardless of the mode in the file; for a file with several modes,
             the one to import. None: the modes that the file names, or else ``training``.
         fields: Names of the arrays to import, as in the file; empty: all of them.
-        max_bytes: How many bytes the arrays may have, because a small file can unpack to any size;
-            None: 100 times the size of the file, and at least 0.27 GB.
-        advance: Is called with the number of bytes stored.
+        max_bytes: Maximum number of bytes of the arrays, as a small file can unpack to any size;
+            None: 100 times the size of the file, but at least 0.27 GB.
+        advance: Called with the number of bytes stored.
 
     Returns:
-        How many rows were added to each mode.
+        Number of rows added to each mode.
 
     Raises:
-        ExchangeError: If the file is missing or damaged, does not hold arrays of one length, or
-            holds more than `max_bytes`.
+        ExchangeError: If the file is missing or damaged, its arrays differ in length, or it holds
+            more than `max_bytes`.
         SampleError: If a value is NaN or infinite.
-        DatasetError: If the dataset has other fields, or cannot be written.
+        DatasetError: If the dataset has other fields or cannot be written.
     """
     path, directory = Path(path), Path(directory)
     limit = max(_ALWAYS, _RATIO * _size_of(path)) if max_bytes is None else max_bytes
@@ -86,7 +86,7 @@ def import_file(
 
 
 def _size_of(path: Path) -> int:
-    """Return the bytes of a file, or of those in a folder."""
+    """Return the size in bytes of a file, or of the files in a folder."""
     try:
         files = [path, *(path.iterdir() if path.is_dir() else ())]
         return sum(file.lstat().st_size for file in files)
@@ -104,8 +104,8 @@ def _reader(path: Path) -> Callable[[Path, int], AbstractContextManager[tuple[Co
     if path.is_dir():
         if deepphysx_format.find_folder(path) is None:
             raise ExchangeError(
-                f"{path} is a folder without partitions of DeepPhysX. Give a file; rows of another "
-                "physx dataset are added with Dataset.merge."
+                f"{path} is a folder without DeepPhysX partitions. Give a file; to add rows of "
+                "another physx dataset, use Dataset.merge."
             )
         return deepphysx_format.open_columns
     if not path.is_file():
@@ -119,20 +119,20 @@ def _reader(path: Path) -> Callable[[Path, int], AbstractContextManager[tuple[Co
         if begin.startswith(signature):
             return reader
     raise ExchangeError(
-        f"{path} is neither a NumPy archive (npz) nor an HDF5 file nor a DeepPhysX database."
+        f"{path} is neither a NumPy archive (npz), an HDF5 file, nor a DeepPhysX database."
     )
 
 
 @contextlib.contextmanager
 def _open_target(directory: Path) -> Iterator[Dataset]:
-    """Open the dataset for writing, or create it; one created for rows that fail is removed."""
+    """Open the dataset for writing, or create it; a created one is removed if the import fails."""
     if holds_dataset(directory) or holds_dataset(directory / "dataset"):
         with Dataset.open(directory, writable=True) as dataset:
             yield dataset
         return
     was_there = directory.is_dir()
     if was_there and any(directory.iterdir()):
-        raise ExchangeError(f"{directory} is not empty and not a dataset; choose a new folder.")
+        raise ExchangeError(f"{directory} is not empty and not a dataset. Choose a new folder.")
     try:
         with Dataset.create(directory, session=_SESSION) as dataset:
             yield dataset
@@ -157,7 +157,7 @@ def _choose(path: Path, columns: Columns, names: Sequence[str]) -> Columns:
             what = "no rows" if not column.shape else str(column.dtype)
             raise ExchangeError(
                 f'"{name}" of {path} holds {what}; a field has rows of plain numbers. Choose what '
-                "to import by fields (--fields on the command line)."
+                "to import with fields (--fields on the command line)."
             )
     return chosen
 
@@ -190,7 +190,7 @@ def _make_fields(path: Path, mode: str, columns: Columns, notes: Notes) -> dict[
         counts = ", ".join(f"{name} {count}" for name, count in lengths.items())
         raise ExchangeError(
             f"The arrays of {path} have different numbers of rows: {counts}. Choose those that "
-            "belong together by fields (--fields on the command line)."
+            "belong together with fields (--fields on the command line)."
         )
     noted = mode if mode in notes.modes else next(iter(notes.modes), mode)
     return {name: notes.field(noted, name, column) for name, column in columns.items()}

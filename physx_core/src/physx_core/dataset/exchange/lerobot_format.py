@@ -1,4 +1,4 @@
-"""LeRobot's dataset format, version 3: Parquet files that hold the episodes of a mode in turn.
+"""LeRobot's dataset format, version 3: Parquet files with the episodes of a mode in sequence.
 
 A row is a frame: ``observation.*``, ``action``, ``next.reward``, and ``info.*`` for other fields.
 """
@@ -29,13 +29,13 @@ _FILES_PER_CHUNK = 1000
 _FILE_MEGABYTES = 100
 _MOST_AXES = 5
 _DESCRIBED = 2**14
-"""Components whose statistics are in memory before they are written."""
+"""Number of components whose statistics are kept in memory before they are written."""
 _COUNTERS = {"frame_index": "i8", "episode_index": "i8", "index": "i8", "task_index": "i8"}
 
 
 @dataclass(frozen=True)
 class _Feature:
-    """A column of the frames, made of one field, or of several that are put side by side."""
+    """A column of the frames: one field, or several concatenated."""
 
     name: str
     fields: tuple[Field, ...]
@@ -46,7 +46,7 @@ class _Feature:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """Shape of a frame; one number is a vector of length 1."""
+        """Shape of a frame; a single number is a vector of length 1."""
         if len(self.fields) == 1:
             return self.fields[0].shape or (1,)
         return (sum((of.shape or (1,))[0] for of in self.fields),)
@@ -63,8 +63,8 @@ def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
     (table,) = tables
     if options.fps is None:
         raise ConfigError(
-            "LeRobot keeps how many frames belong to a second: give it with fps (--fps on the "
-            "command line), as in fps=50 for steps of 0.02 s."
+            "LeRobot needs the number of frames per second: give it with fps (--fps on the command "
+            "line), such as fps=50 for steps of 0.02 s."
         )
     import_library("pyarrow.parquet", "Exporting to LeRobot", "lerobot")
     pandas = import_library("pandas", "Exporting to LeRobot", "lerobot")
@@ -118,13 +118,13 @@ def _check(feature: _Feature) -> None:
     if feature.dtype.kind == "c" or 0 in feature.shape or len(feature.shape) > _MOST_AXES:
         raise ExchangeError(
             f"LeRobot has no feature for the field {names} of type {feature.dtype} and shape "
-            f"{feature.shape}: real numbers with 1 to {_MOST_AXES} axes."
+            f"{feature.shape}: it takes real numbers with 1 to {_MOST_AXES} axes."
         )
     if len(feature.fields) > 1 and any(
         len(of.shape or (1,)) > 1 or of.dtype != feature.dtype for of in feature.fields
     ):
         raise ExchangeError(
-            f"An action of LeRobot is one vector: the fields {names} must be vectors of one type."
+            f"A LeRobot action is one vector: the fields {names} must be vectors of the same type."
         )
 
 
@@ -156,7 +156,7 @@ def _component_names(feature: _Feature) -> list[str] | None:
 
 
 class _Writer(AbstractContextManager["_Writer"]):
-    """Writes episodes to files of limited size, and what is to be known of them to another."""
+    """Writes episodes to files of limited size, and their descriptions to a separate file."""
 
     def __init__(self, out: Path, features: Sequence[_Feature], fps: int, task: str) -> None:
         self._arrow = import_library("pyarrow", "Exporting to LeRobot", "lerobot")
@@ -251,7 +251,7 @@ class _Writer(AbstractContextManager["_Writer"]):
         return {name: _summary(found) for name, found in self._total.items()}
 
     def __exit__(self, *error: object) -> None:
-        """Write what is left and finish the files."""
+        """Write the remaining descriptions and close the files."""
         if self._described and error[0] is None:
             self._write_described()
         for file in (self._file, self._table):

@@ -1,8 +1,8 @@
 """Exports the trajectories of a mode to Minari, as episodes for offline reinforcement learning.
 
-Minari's episode of n steps has n + 1 observations: row i of a trajectory is observation i, and its
-action and reward belong to the step to row i + 1. So a trajectory of n + 1 rows becomes n steps;
-the action and the reward of its last row, which lead to no further row, are kept in ``infos/last``.
+A Minari episode of n steps has n + 1 observations: row i of a trajectory is observation i, and its
+action and reward belong to the step to row i + 1. A trajectory of n + 1 rows thus becomes n steps;
+the action and reward of its last row, which lead to no further row, are kept in ``infos/last``.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from physx_core.fields import Field
 from physx_core.typing import Batch
 
 _OVERHEAD = 6000
-"""Upper bound of the bytes that an array of an episode takes besides its values."""
+"""Upper bound on the bytes that an array of an episode takes in addition to its values."""
 _OWN_ARRAYS = 4
 """Arrays that Minari adds to each episode: actions, rewards, terminations, truncations."""
 _NAME = re.compile(r"[-_\w]+-v\d+")
@@ -37,7 +37,7 @@ def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
     folder has a name such as ``arm-v0`` and is in the folder ``MINARI_DATASETS_PATH``.
 
     Returns:
-        How many rows are in no episode, because each is a trajectory of its own.
+        Number of rows that are in no episode because they are trajectories of one row.
     """
     (table,) = tables
     roles = Roles.choose(table, options)
@@ -54,9 +54,9 @@ def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
     episodes = [e for e in find_episodes(table.view, table.rows) if len(e.rows) > 1]
     if not episodes:
         raise ExchangeError(
-            f'No trajectory of mode "{table.mode}" has two samples, which an episode of Minari '
-            "needs. A trajectory ends where an environment calls new_episode(), and where "
-            "check_sample() rejects a sample."
+            f'No trajectory of mode "{table.mode}" has two samples, as a Minari episode needs. A '
+            "trajectory ends where an environment calls new_episode() and where check_sample() "
+            "rejects a sample."
         )
     _check_space(table, out, len(episodes))
     out.mkdir()
@@ -83,7 +83,7 @@ def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
 
 
 def _check_space(table: Table, out: Path, episodes: int) -> None:
-    """Check that the disk has room: HDF5, with which Minari writes, crashes if it has not."""
+    """Check that the disk has room: HDF5, which Minari writes with, crashes on a full disk."""
     arrays = episodes * (len(table.fields) + _OWN_ARRAYS)
     needed, free = (
         table.rows * table.row_nbytes + arrays * _OVERHEAD,
@@ -128,7 +128,7 @@ def _single(arrays: Batch) -> Any:
 
 
 def _space(fields: Mapping[str, Field], names: Sequence[str], *, entries: bool) -> dict[str, Any]:
-    """Return the space of fields in the form in which Minari stores it."""
+    """Return the space of fields in the form that Minari stores."""
     if not names:
         return {"type": "Discrete", "n": 1, "start": 0}
     boxes = {name: _box(fields[name]) for name in names}

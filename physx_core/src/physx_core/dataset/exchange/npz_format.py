@@ -1,4 +1,4 @@
-"""NumPy's ``.npz``: a zip archive with one array for each field; nothing in it is ever unpickled.
+"""NumPy's ``.npz``: a zip archive with one array per field; nothing in it is ever unpickled.
 
 The archive's comment holds units, roles and modes; `numpy.load` ignores it.
 """
@@ -32,7 +32,7 @@ from physx_core.typing import Array
 COMPRESSIONS = {"none": zipfile.ZIP_STORED, "deflate": zipfile.ZIP_DEFLATED}
 _COMMENT = 2**16 - 1
 _MOST_LISTED = 2**22
-"""Bytes of an archive's list of contents."""
+"""Maximum number of bytes of an archive's list of contents."""
 _DAMAGE = (zipfile.BadZipFile, zlib.error, EOFError, NotImplementedError, RuntimeError)
 
 
@@ -61,7 +61,7 @@ def _write_array(table: Table, name: str, file: IO[bytes]) -> None:
 
 
 class NpzColumn:
-    """An array of an archive, read from its beginning to its end; see `Column`."""
+    """An array of an archive, read sequentially; see `Column`."""
 
     unit = ""
     problem = ""
@@ -73,7 +73,7 @@ class NpzColumn:
             path: The archive, for messages.
             name: Name of the array.
             file: Its bytes.
-            size: How many bytes there are according to the archive.
+            size: Number of bytes according to the archive.
         """
         self._place, self._file = f'The array "{name}" of {path}', file
         try:
@@ -84,7 +84,7 @@ class NpzColumn:
             raise ExchangeError(f"{self._place} has no readable header.") from error
         self._whole: Array | None = None
         if self.dtype.kind not in "biufc" or not self.shape:
-            return  # it cannot be imported; the error is raised if it is asked for
+            return  # it cannot be imported; the error is raised if it is requested
         self._row = math.prod(self.shape[1:]) * self.dtype.itemsize
         if min(self.shape) < 0 or size - file.tell() != self.shape[0] * self._row:
             raise ExchangeError(f"{self._place} is not as long as its header says.")
@@ -110,7 +110,7 @@ class NpzColumn:
 
 
 class _ArchiveFile(io.FileIO):
-    """The file of an archive; nothing longer than `longest` bytes is read from it at once."""
+    """The file of an archive; reads of more than `longest` bytes at once are rejected."""
 
     longest = _MOST_LISTED
 
@@ -123,11 +123,11 @@ class _ArchiveFile(io.FileIO):
 
 @contextlib.contextmanager
 def open_columns(path: Path, limit: int) -> Iterator[tuple[dict[str, Column], Notes]]:
-    """Open an archive; yield its arrays by name, and the notes in its comment.
+    """Open an archive; yield its arrays by name and the notes in its comment.
 
     Args:
         path: The archive.
-        limit: How many bytes it may unpack to.
+        limit: Maximum number of bytes it may unpack to.
     """
     columns: dict[str, Column] = {}
     with contextlib.ExitStack() as files:
@@ -136,7 +136,7 @@ def open_columns(path: Path, limit: int) -> Iterator[tuple[dict[str, Column], No
             archive = files.enter_context(zipfile.ZipFile(source))
             source.longest = sys.maxsize
             check_size(path, sum(item.file_size for item in archive.infolist()), limit)
-            damaged = archive.testzip()  # before anything of it is stored
+            damaged = archive.testzip()  # before any of it is stored
             if damaged is not None:
                 raise zipfile.BadZipFile(f"{damaged} does not match its checksum")
             for item in archive.infolist():

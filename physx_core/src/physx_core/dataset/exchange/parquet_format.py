@@ -1,4 +1,4 @@
-"""Parquet: one file with a column for each field; arrays are nested lists of a fixed size.
+"""Parquet: one file with a column for each field; arrays are nested lists of fixed size.
 
 Complex numbers are lists of two numbers. The metadata of each column hold unit, role, shape and
 NumPy type.
@@ -63,7 +63,7 @@ def _type(arrow: Any, field: Field) -> Any:
         kind = arrow.from_numpy_dtype(np.empty(0, dtype).real.dtype)
     except (arrow.ArrowNotImplementedError, arrow.ArrowInvalid) as error:
         raise ExchangeError(
-            f'Parquet has no type for {dtype}, the type of the field "{field.name}".'
+            f'Parquet has no equivalent of {dtype}, the type of the field "{field.name}".'
         ) from error
     if 0 in (field.shape or ()):
         raise ExchangeError(

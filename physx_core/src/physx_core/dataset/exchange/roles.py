@@ -16,8 +16,8 @@ class Roles:
     Attributes:
         observations: One field that is the observation itself, or several that are its entries.
         actions: Likewise for the actions; none: there is only one action, which does nothing.
-        rewards: Field that is the reward, one number; None: the reward is 0.
-        entries: Whether the observation is a dictionary even if it is one field.
+        rewards: Field that is the reward, a single number; None: the reward is 0.
+        entries: Whether the observation is a dictionary even if it has only one field.
     """
 
     observations: Sequence[str]
@@ -27,7 +27,7 @@ class Roles:
 
     @classmethod
     def choose(cls, table: Table, options: ExportOptions) -> Roles:
-        """Complete what a user chose."""
+        """Complete the user's choice."""
         observations, actions, rewards = options.observations, options.actions, options.rewards
         chosen = [*observations, *actions, *([] if rewards is None else [rewards])]
         for name in chosen:
@@ -39,7 +39,7 @@ class Roles:
             if chosen.count(name) > 1:
                 raise ConfigError(f'The field "{name}" is chosen more than once.')
         if rewards is not None and table.fields[rewards].shape != ():
-            raise ConfigError(f'The reward "{rewards}" is not one number.')
+            raise ConfigError(f'The reward "{rewards}" is not a single number.')
         rest = [n for n, f in table.fields.items() if f.role == "training" and n not in chosen]
         if not observations and not rest:
             raise ConfigError("No field is left for the observations.")

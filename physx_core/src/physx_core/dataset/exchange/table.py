@@ -1,4 +1,4 @@
-"""Tables: the rows of one mode on their way to or from a file of another format."""
+"""Tables: the rows of one mode in transfer to or from a file of another format."""
 
 from __future__ import annotations
 
@@ -21,10 +21,10 @@ from physx_core.typing import Array, Batch
 FORMAT = "physx export"
 VERSION = 1
 BLOCK = 2**23
-"""Bytes of the blocks that are in memory at a time."""
+"""Approximate number of bytes of a block in memory."""
 
 Advance = Callable[[int], None]
-"""Is called with the number of bytes that were transferred."""
+"""Called with the number of bytes transferred."""
 
 
 @dataclass(frozen=True)
@@ -37,8 +37,8 @@ class ExportOptions:
             empty: all training fields without another role.
         actions: Fields that are its actions (likewise).
         rewards: Field that is its rewards (likewise); None: minari has zeros, lerobot none.
-        fps: Frames per second of simulated time (lerobot only, and needed there).
-        task: What is done, in words (lerobot only).
+        fps: Frames per second of simulated time (lerobot only, and required there).
+        task: Description of the task (lerobot only).
     """
 
     compression: str = "none"
@@ -56,10 +56,10 @@ class Table:
     Attributes:
         mode: Name of the mode.
         fields: The fields by name, all with shapes.
-        rows: How many rows to export; those that a writer adds meanwhile are left out.
+        rows: Number of rows to export; rows that a writer adds meanwhile are left out.
         info: Where the data come from.
         view: Reads the rows.
-        advance: Is called with the number of bytes read.
+        advance: Called with the number of bytes read.
     """
 
     mode: str
@@ -79,7 +79,7 @@ class Table:
 
         Args:
             name: Name of the field.
-            step: Rows of a block; None: as many as make about `BLOCK` bytes.
+            step: Rows per block; None: as many as take about `BLOCK` bytes.
         """
         values = self.view[name]
         step = step or rows_per_block(self.fields[name].nbytes, BLOCK)
@@ -89,7 +89,7 @@ class Table:
             yield start, block
 
     def blocks(self, nbytes: int) -> Iterator[Batch]:
-        """Yield blocks of rows of all fields, of about `nbytes` bytes."""
+        """Yield blocks of rows of all fields, about `nbytes` bytes each."""
         step = rows_per_block(self.row_nbytes, nbytes)
         columns = [self.column(name, step) for name in self.fields]
         for parts in zip(*columns, strict=True):
@@ -103,7 +103,7 @@ class Column(Protocol):
         shape: (rows, *field shape).
         dtype: Type of the values.
         unit: Their unit according to the file.
-        problem: Why it cannot be imported; empty if it can.
+        problem: Why the field cannot be imported; empty if it can.
     """
 
     shape: tuple[int, ...]
@@ -112,25 +112,25 @@ class Column(Protocol):
     problem: str
 
     def read(self, start: int, count: int) -> Array:
-        """Return the next rows, those from `start` on."""
+        """Return the next `count` rows, which begin at `start`."""
         ...
 
 
 def check_size(path: Path, nbytes: int, limit: int) -> None:
-    """Check that a file does not hold more than it may, before anything of it is read."""
+    """Check that a file does not hold more than `limit` bytes before any of it is read."""
     if nbytes > limit:
         raise ExchangeError(
-            f"{path} says that it holds {nbytes / 1e9:.3g} GB, far more than its own size. If that "
-            f"is right, import it with max_bytes={nbytes} (--max-bytes {nbytes})."
+            f"{path} claims that it holds {nbytes / 1e9:.3g} GB, far more than its own size. If "
+            f"that is correct, import it with max_bytes={nbytes} (--max-bytes {nbytes})."
         )
 
 
 def encode_notes(tables: Sequence[Table], limit: int | None = None) -> str:
-    """Return what a file keeps of modes besides their rows, as JSON.
+    """Return what a file stores about modes in addition to their rows, as JSON.
 
     Args:
         tables: The modes.
-        limit: How many bytes the file can keep; only the most important notes remain then.
+        limit: Maximum number of bytes; if exceeded, only the most important notes are kept.
     """
     plain: dict[str, Any] = {"format": FORMAT, "format_version": VERSION}
     plain["modes"] = {t.mode: [of.to_dict() for of in t.fields.values()] for t in tables}
@@ -143,7 +143,7 @@ def encode_notes(tables: Sequence[Table], limit: int | None = None) -> str:
 
 @dataclass(frozen=True)
 class Notes:
-    """What a file notes about its rows; nothing, if physx did not write it.
+    """Notes of a file about its rows; empty if physx did not write it.
 
     Attributes:
         modes: Mode to the fields by name, for their units and roles.
@@ -155,7 +155,7 @@ class Notes:
 
     @classmethod
     def parse(cls, text: str | bytes) -> Notes:
-        """Return what `encode_notes` wrote; nothing from any other text."""
+        """Return what `encode_notes` wrote; empty notes for any other text."""
         try:
             plain = parse_json(text)
             if plain["format"] != FORMAT:
@@ -169,7 +169,7 @@ class Notes:
             return cls()  # only notes are lost
 
     def field(self, mode: str, name: str, column: Column) -> Field:
-        """Return the field of a column, with unit and role if they are noted."""
+        """Return the field of a column, with its noted unit and role, if any."""
         known = self.modes.get(mode, {}).get(name)
         role: Role = "additional" if name in RESERVED else "training"
         unit, role = (known.unit, known.role) if known is not None else (column.unit, role)
@@ -181,8 +181,8 @@ def import_library(name: str, purpose: str, extra: str) -> Any:
 
     Args:
         name: Name of the module.
-        purpose: What needs it, for the error message.
-        extra: Extra of physx-core that installs it.
+        purpose: Feature that needs it, for the error message.
+        extra: The extra of physx-core that installs it.
     """
     try:
         return importlib.import_module(name)

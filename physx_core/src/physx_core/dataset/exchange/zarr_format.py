@@ -1,7 +1,7 @@
 """Zarr: a folder with ``<mode>/<field>``, chunked along the rows, with units as attributes.
 
-``xarray.open_zarr(folder, group=mode)`` opens a mode. Metadata are consolidated, so that this reads
-one file.
+``xarray.open_zarr(folder, group=mode)`` opens a mode. Metadata are consolidated, so that opening
+reads a single file.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
         group = root.create_group(table.mode)
         for name in table.fields:
             _write_field(group, table, name, used)
-    with warnings.catch_warnings():  # that other libraries than zarr and xarray may not know it
+    with warnings.catch_warnings():  # that libraries other than zarr and xarray may not support it
         warnings.simplefilter("ignore")
         zarr.consolidate_metadata(str(out))
     return 0

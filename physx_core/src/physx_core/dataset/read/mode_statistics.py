@@ -1,4 +1,4 @@
-"""Statistics of a mode's rows: computed once for each partition, and merged when it is sealed."""
+"""Statistics of a mode's rows: computed once per partition and merged when it is sealed."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Statistics = dict[str, RunningStatistics]
 
 
 def compute_statistics(reader: Reader, mode_name: str) -> Statistics:
-    """Return the statistics of a mode's floating fields, over all its committed rows."""
+    """Return the statistics of a mode's floating-point fields over all its committed rows."""
     mode = reader.mode(mode_name)
     for partition in mode.partitions:
         if not partition.counted:
@@ -27,10 +27,10 @@ def compute_statistics(reader: Reader, mode_name: str) -> Statistics:
 
 
 def count_sealed(mode: Mode) -> None:
-    """Merge into the mode's statistics those of sealed partitions that cover all their rows.
+    """Merge the complete statistics of sealed partitions into those of the mode.
 
-    Rows that were updated in place are left out until they have checksums again: the disk may not
-    have them yet.
+    Partitions with rows that were updated in place are left out until they have checksums again,
+    as the rows may not have reached the disk yet.
     """
     for place, partition in enumerate(mode.partitions):
         have = (partition.running.get(name) for name in mode.counted_fields)

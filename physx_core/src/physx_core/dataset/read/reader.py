@@ -1,4 +1,4 @@
-"""Reads rows from the partitions of a field, which lie behind one flat index."""
+"""Reads rows from all partitions of a field through one flat index."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Reader:
 
     Attributes:
         directory: The dataset's folder.
-        manifest: The manifest; rows that it gets later can be read too.
+        manifest: The manifest; rows added to it later can be read too.
     """
 
     def __init__(self, directory: Path, manifest: Manifest) -> None:
@@ -66,7 +66,7 @@ class Reader:
         return self.mode(mode).rows
 
     def segments(self, mode: str, name: str) -> list[Segment]:
-        """Return where the rows of a field lie, in their order."""
+        """Return where the rows of a field are stored, in order."""
         field, known = self.field(mode, name), self.mode(mode)
         return [
             partition.segment(self.directory, field, span)
@@ -84,7 +84,7 @@ class Reader:
         return out
 
     def check(self, mode: str, name: str, start: int = 0, stop: int | None = None) -> None:
-        """Check that the files are long enough, before memory is allocated for their rows."""
+        """Check that the files are long enough before memory is allocated for their rows."""
         for segment in self.segments(mode, name):
             if segment.span.inside(start, self.rows(mode) if stop is None else stop)[1]:
                 segment.open()[0].close()
@@ -99,14 +99,14 @@ class Reader:
     ) -> None:
         """Fill a contiguous array of the field's type with the rows from `start` on.
 
-        The rows of sealed partitions that are read completely are compared with their checksums.
+        Sealed partitions that are read completely are compared with their checksums.
 
         Args:
             out: Receives the rows.
             mode: Name of the mode.
             name: Name of the field.
             start: First row.
-            checks: Of partitions that are read in several calls, kept from one to the next.
+            checks: Checks of partitions that are read in several calls, kept between calls.
         """
         if not self.field(mode, name).nbytes:
             return
@@ -120,7 +120,7 @@ class Reader:
                     rows[...] = part
 
     def partition_blocks(self, partition: Partition, name: str, start: int) -> Iterator[Array]:
-        """Yield a partition's rows from its row `start` on, as `blocks` does those of a mode."""
+        """Yield a partition's rows from its row `start` on, as `blocks` does for a mode."""
         field = self.field(partition.mode, name)
         segment = partition.segment(self.directory, field)
         count, end = rows_per_block(field.nbytes), partition.rows
@@ -141,7 +141,7 @@ class Reader:
             mode: Name of the mode.
             name: Name of the field.
             start: First row.
-            stop: Row before which to stop; None: after the last row that is committed now.
+            stop: Row before which to stop; None: after the last row committed so far.
         """
         field, end = self.field(mode, name), self.rows(mode) if stop is None else stop
         count = rows_per_block(field.nbytes)
@@ -173,15 +173,15 @@ class Reader:
             if mine and manifest_file.was_updated(self.directory, partition, name):
                 return
         raise DatasetError(
-            f"{segment.path} was changed or is damaged: its rows do not have the checksum that is "
-            "stored for them. Restore it from a copy, or set it aside with `physx verify --repair`."
+            f"{segment.path} was changed or is damaged: its rows do not match their stored "
+            "checksum. Restore it from a backup, or set it aside with `physx verify --repair`."
         )
 
 
 def _differs(
     segment: Segment, first: int, count: int, part: memoryview, checks: dict[int, RowsCheck]
 ) -> bool:
-    """Add rows to the check of their segment; return whether they fail it after the last ones."""
+    """Add rows to their segment's check; return whether it fails after the last rows."""
     known = segment.checksum is not None or segment.commit is not None
     start = segment.span.start
     if not known or (first and start not in checks):

@@ -1,6 +1,6 @@
 """Reads batches of rows, in the order of writing or shuffled, into arrays that may be reused.
 
-`physx_core.dataset.read.strategies.strategy` lists the ways to read rows; each is an `Epoch`.
+`physx_core.dataset.read.strategies.strategy` lists the read strategies; each is an `Epoch`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from physx_core.typing import Batch, Index
 
 
 class BatchOptions(TypedDict, total=False):
-    """The options of `Dataset.batches`, which describes them, and of `Subset.batches`."""
+    """Options of `Dataset.batches`, where they are described, and of `Subset.batches`."""
 
     shuffle: bool
     seed: int | Sequence[int] | None
@@ -35,7 +35,7 @@ class BatchOptions(TypedDict, total=False):
 
 
 class BatchReader:
-    """Reads the batches of a mode, or of a part of its rows, when it is iterated, once."""
+    """Iterator over the batches of a mode or of a subset of its rows; usable once."""
 
     def __init__(
         self,
@@ -53,9 +53,9 @@ class BatchReader:
         normalize: bool | Mapping[str, Normalization] = False,
         strategy: Choice = "auto",
     ) -> None:
-        """Check the options, which are those of `Dataset.batches`; `subset` is ascending.
+        """Check the options, which are those of `Dataset.batches`; `subset` must be ascending.
 
-        Here `normalize` is the normalization to use, by field, or False.
+        Here, `normalize` is the normalization to use, by field, or False.
         """
         if batch_size < 1:
             raise ConfigError(f"batch_size is {batch_size} but must be at least 1.")
@@ -129,10 +129,10 @@ class BatchReader:
 
 
 class Epoch(Protocol):
-    """One pass over all rows; it raises a `DatasetError` if a partition cannot be read.
+    """One pass over all rows; raises a `DatasetError` if a partition cannot be read.
 
     Attributes:
-        rows: How many rows there are.
+        rows: Number of rows.
     """
 
     rows: int
@@ -141,19 +141,19 @@ class Epoch(Protocol):
         """Copy the next rows of each field into the arrays of a batch.
 
         Args:
-            start: How many rows were read before.
-            batch: The fields in the order of the request, with arrays of one length.
+            start: Number of rows read so far.
+            batch: The fields in the requested order, with arrays of equal length.
         """
 
     def close(self) -> None:
-        """Close what is open."""
+        """Close open files."""
 
 
 class MemoryEpoch:
     """A pass over rows in memory, in an exact permutation.
 
     Attributes:
-        rows: How many rows there are.
+        rows: Number of rows.
     """
 
     def __init__(
@@ -179,7 +179,7 @@ class MemoryEpoch:
         else:
             index = self._order[start:stop]
             for take, out in zip(self._takes, outs):  # noqa: B905
-                take(index, 0, out, "clip")  # every mode but the default writes straight to `out`
+                take(index, 0, out, "clip")  # all modes but the default write directly to `out`
 
     def close(self) -> None:
         """Do nothing: the columns are kept for the next epoch."""

@@ -1,4 +1,4 @@
-"""Splits a mode into parts, which are lists of its rows; nothing is copied."""
+"""Splits a mode into parts, which are lists of row numbers; nothing is copied."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ _EXACT = 1e-9
 
 
 class SubsetField:
-    """One field's rows of a subset; indexed like a `FieldView`, with copies as results.
+    """The rows of one field in a subset; indexed like a `FieldView`, with copies as results.
 
     Attributes:
         field: The field.
@@ -52,7 +52,7 @@ class SubsetField:
 class Subset:
     """Some rows of a mode, in the order of writing.
 
-    The rows are among those that existed when the mode was split; later ones are in no part.
+    Its rows existed when the mode was split; later rows are in no part.
 
     Attributes:
         mode: Name of the mode.
@@ -65,7 +65,7 @@ class Subset:
 
     @property
     def num_samples(self) -> int:
-        """How many rows there are."""
+        """Number of rows."""
         return len(self.rows)
 
     @property
@@ -79,14 +79,14 @@ class Subset:
     def batches(self, batch_size: int, **options: Unpack[BatchOptions]) -> Iterator[Batch]:
         """Iterate over the rows in batches; options and errors are those of `Dataset.batches`.
 
-        ``normalize=True`` takes `normalization`, that of these rows alone.
+        ``normalize=True`` uses `normalization`, which is computed from these rows alone.
         """
         if options.get("normalize") is True:
             options["normalize"] = self.normalization()
         return iter(BatchReader(self._view.columns, self.mode, batch_size, self.rows, **options))
 
     def normalization(self) -> dict[str, Normalization]:
-        """Compute what normalizes the floating fields from these rows alone, in one pass.
+        """Compute the normalization of the floating-point fields from these rows, in one pass.
 
         Raises:
             DatasetError: If a partition is missing or damaged.
@@ -138,12 +138,12 @@ def _check(shares: Mapping[str, float], by: str) -> None:
     values = np.array(list(shares.values()), np.float64)
     if not values.size or not (values > 0).all() or values.sum() > 1 + _EXACT:
         raise ConfigError(
-            f"The shares are {dict(shares)} but must be positive and add up to 1 at most."
+            f"The shares are {dict(shares)} but must be positive and add up to at most 1."
         )
 
 
 def _ends(shares: Mapping[str, float]) -> list[float]:
-    """Return where each part ends, as a share of all rows; 1 is exact in spite of rounding."""
+    """Return where each part ends, as a share of all rows; 1 is exact despite rounding."""
     ends = np.cumsum(list(shares.values()))
     return [1.0 if abs(end - 1) < _EXACT else float(end) for end in ends]
 
@@ -153,7 +153,7 @@ def _shuffle_episodes(
 ) -> tuple[Array, list[int]]:
     """Return all rows, shuffled by trajectory, and where each part ends among them.
 
-    Each part has at least one trajectory, and ends with the one that brings it closest to its
+    Each part has at least one trajectory and ends with the one that brings it closest to its
     share of the rows.
     """
     episodes = find_episodes(view, total)

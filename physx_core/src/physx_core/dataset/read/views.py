@@ -1,4 +1,4 @@
-"""Views of a mode's fields and of a field's rows, which are read when they are asked for."""
+"""Views of a mode's fields and of a field's rows, which are read on access."""
 
 from __future__ import annotations
 
@@ -67,7 +67,7 @@ class FieldView:
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> Array:
         if copy is False:
-            raise ValueError("The rows are on the disk: reading them makes a copy.")
+            raise ValueError("The rows are on disk: reading them makes a copy.")
         rows = self._read(0, len(self))
         return rows if dtype is None else rows.astype(dtype, copy=False)
 
@@ -128,10 +128,10 @@ def row_numbers(index: Any, total: int) -> Index:
 
     Args:
         index: A number, which may be negative, a slice, or an array of numbers or `total` booleans.
-        total: How many rows there are.
+        total: Number of rows of the mode.
 
     Raises:
-        IndexError: If there are no such rows, or the index is something else.
+        IndexError: If there are no such rows, or the index is of another kind.
     """
     if isinstance(index, slice):
         return np.arange(*index.indices(total))
@@ -142,10 +142,10 @@ def row_numbers(index: Any, total: int) -> Index:
         return np.zeros(0, np.intp)
     if numbers.dtype.kind not in "iu" or numbers.ndim != 1:
         raise IndexError(
-            f"An index array has whole numbers and one axis, or {total} booleans; this one "
+            f"An index array must hold integers along one axis, or {total} booleans; this one "
             f"has type {numbers.dtype} and shape {numbers.shape}."
         )
     if numbers.min() < -total or numbers.max() >= total:
         raise IndexError(f"Row numbers are out of range: there are {total} rows.")
-    numbers = numbers.astype(np.intp, copy=False)  # in a small type the sum would overflow
+    numbers = numbers.astype(np.intp, copy=False)  # the sum would overflow in a small type
     return np.where(numbers < 0, numbers + total, numbers)

@@ -1,4 +1,4 @@
-"""Sets files aside that cannot be used: nothing is deleted that may still hold rows."""
+"""Sets unusable files aside: nothing that may still hold rows is deleted."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ FOLDER = "damaged"
 
 
 def set_aside(directory: Path, paths: Iterable[Path]) -> Path:
-    """Move files, if they are there, to a folder of the dataset; return that folder."""
+    """Move files, if they exist, to the folder of damaged files; return that folder."""
     folder = directory / FOLDER
     files.make_folder(folder)
     for path in paths:
@@ -24,7 +24,7 @@ def set_aside(directory: Path, paths: Iterable[Path]) -> Path:
 
 
 def keep(directory: Path, paths: Iterable[Path]) -> None:
-    """Give files that are about to be replaced, if they are there, a second name in that folder."""
+    """Hard-link files that are about to be replaced, if they exist, into that folder."""
     folder = directory / FOLDER
     for path in paths:
         if path.exists():
@@ -34,7 +34,7 @@ def keep(directory: Path, paths: Iterable[Path]) -> None:
 
 
 def unused(path: Path) -> Path:
-    """Return a path that does not exist: the given one, or with a number appended."""
+    """Return an unused path: the given one, or that with a number appended."""
     found, number = path, 0
     while found.exists():
         number += 1

@@ -1,4 +1,4 @@
-"""Opens datasets, even after the last writer was killed: no committed row is lost."""
+"""Opens datasets, even if the last writer was killed: no committed row is lost."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ Group = dict[str, Inspection]
 
 
 def locate(directory: str | Path) -> Path:
-    """Return the folder of a dataset, given that folder or the session's folder around it."""
+    """Return the folder of a dataset, given that folder or the session's folder."""
     given = Path(directory)
     for folder in (given, given / "dataset"):
         if holds_dataset(folder):
@@ -60,9 +60,9 @@ def holds_dataset(folder: Path) -> bool:
 
 
 def load(directory: Path, *, edited: bool = False) -> Manifest:
-    """Read the manifest, or rebuild it from the partition files, and count what is committed.
+    """Read the manifest, or rebuild it from the partition files, and count the committed rows.
 
-    Nothing on the disk is changed. Modes whose rows cannot be counted are noted as problems.
+    Nothing on disk is changed. Modes whose rows cannot be counted are recorded as problems.
 
     Args:
         directory: The dataset's folder.
@@ -77,7 +77,7 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
         else:
             _adopt(directory, manifest, strict=False)
             count_rows(directory, manifest)
-        if _state(directory) == before:  # otherwise a writer has replaced it meanwhile
+        if _state(directory) == before:  # otherwise a writer has just replaced it
             break
     for text in _lost_rows(directory, manifest):
         warnings.warn(text, stacklevel=3)
@@ -85,7 +85,7 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
 
 
 def load_from_files(directory: Path) -> Manifest:
-    """Build a manifest from the partition files alone; nothing on the disk is changed."""
+    """Build a manifest from the partition files alone; nothing on disk is changed."""
     manifest = Manifest()
     _adopt(directory, manifest, strict=True)
     count_rows(directory, manifest)
@@ -93,7 +93,7 @@ def load_from_files(directory: Path) -> Manifest:
 
 
 def damaged_files(directory: Path) -> Iterator[tuple[Path, DatasetError]]:
-    """Yield the partition files that cannot be opened, and why."""
+    """Yield each partition file that cannot be opened, with the error."""
     for path in (p for p in sorted(directory.glob("*.h5")) if _NAME.fullmatch(p.name)):
         try:
             inspect(path)
@@ -103,10 +103,10 @@ def damaged_files(directory: Path) -> Iterator[tuple[Path, DatasetError]]:
 
 
 def recover(directory: Path, manifest: Manifest) -> list[str]:
-    """Seal what a killed writer left open and remove what it left unfinished.
+    """Seal partitions that a killed writer left open and remove what it left unfinished.
 
     Returns:
-        What was sealed, completed or removed from the manifest, as texts.
+        One message for each thing that was sealed, completed or removed from the manifest.
     """
     told = _lost_rows(directory, manifest)
     count_rows(directory, manifest, thorough=True)
@@ -124,14 +124,14 @@ def recover(directory: Path, manifest: Manifest) -> list[str]:
     if complete_checksums(directory, manifest):
         done.append("Rows were being updated in place: their checksums have been recomputed.")
     if any(mode.dropped for mode in manifest.modes.values()):
-        manifest_file.save(directory, manifest)  # from now on nothing refers to the files
+        manifest_file.save(directory, manifest)  # nothing refers to the files any more
         clear_dropped(directory, manifest)
-        done = done or ["The remains of removed partitions have been deleted."]
+        done = done or ["Leftover files of removed partitions have been deleted."]
     return done + _clear_unlisted(directory, manifest)
 
 
 def _lost_rows(directory: Path, manifest: Manifest) -> list[str]:
-    """Return which rows of open partitions cannot be used, as texts."""
+    """Return one message for each open partition with unusable rows."""
     partitions = chain.from_iterable(mode.partitions for mode in manifest.modes.values())
     return [f"{directory}: {_label(p)}: {p.problem}" for p in partitions if p.problem]
 
@@ -145,23 +145,23 @@ def _label(partition: Partition) -> str:
 def _close(directory: Path, mode: Mode, partition: Partition) -> str:
     """Seal an open partition whose writer is gone, or remove it; return what was done."""
     lost = partition.problem
-    if lost:  # the files are kept as they are
+    if lost:  # the original files are kept
         keep(directory, [partition.path(directory, name) for name in mode.fields])
     if partition.rows:
-        listed = bool(partition.offsets)  # others may be sealed, as a manifest of before says
+        listed = bool(partition.offsets)  # other files may be sealed, as an older manifest says
         mode.swap(seal(directory, mode.fields, partition, rewrite=listed))
         what = f"of {partition.rows} rows was left open and has been sealed."
     else:
         mode.partitions.remove(partition)
         mode.dropped.append(partition)
-        what = "had no committed row and has been removed."
+        what = "had no committed rows and has been removed."
     if lost:
-        what += f" {lost} Its files, as they were, are in {directory / FOLDER}."
+        what += f" {lost} The original files are in {directory / FOLDER}."
     return what
 
 
 def clear_dropped(directory: Path, manifest: Manifest) -> None:
-    """Remove what is left of the files of removed partitions."""
+    """Remove leftover files of removed partitions."""
     for mode in manifest.modes.values():
         for partition in mode.dropped:
             remove_files(directory, mode.fields, partition)
@@ -169,7 +169,7 @@ def clear_dropped(directory: Path, manifest: Manifest) -> None:
 
 
 def _clear_unlisted(directory: Path, manifest: Manifest) -> list[str]:
-    """Remove partitions without rows that the manifest does not list; set torn files aside."""
+    """Remove unlisted partitions without rows; set torn files aside."""
     done = []
     counts: dict[tuple[str, str, int], dict[Path, int]] = {}
     for path in _unlisted(directory, manifest):
@@ -184,16 +184,17 @@ def _clear_unlisted(directory: Path, manifest: Manifest) -> list[str]:
             counts.setdefault(key, {})[path] = found.rows
     unfinished = [group for group in counts.values() if not all(group.values())]
     if unfinished:
-        manifest_file.save(directory, manifest)  # the one on the disk may refer to the files
+        manifest_file.save(directory, manifest)  # the one on disk may refer to the files
     for group in unfinished:
         _remove_unfinished(directory, group)
     return done
 
 
 def _remove_unfinished(directory: Path, counts: Mapping[Path, int]) -> None:
-    """Remove the files of a partition of which some have no row.
+    """Remove the files of a partition if some of them have no rows.
 
-    Those that have some go first: alone, they would look like a whole partition of fewer fields.
+    Files with rows go first: left alone, they would look like a complete partition with fewer
+    fields.
     """
     for path in counts:
         if counts[path]:
@@ -205,7 +206,7 @@ def _remove_unfinished(directory: Path, counts: Mapping[Path, int]) -> None:
 
 
 def complete_checksums(directory: Path, manifest: Manifest) -> bool:
-    """Compute the checksums that updates in place have invalidated; return whether any were."""
+    """Recompute checksums that in-place updates have invalidated; return whether there were any."""
     changed = False
     for mode in manifest.modes.values():
         for partition in [p for p in mode.partitions if p.sealed and not p.checksums]:
@@ -216,13 +217,13 @@ def complete_checksums(directory: Path, manifest: Manifest) -> bool:
 
 
 def count_rows(directory: Path, manifest: Manifest, *, thorough: bool = False) -> None:
-    """Count what is committed; modes whose rows cannot be counted are noted as problems.
+    """Count the committed rows; modes whose rows cannot be counted are recorded as problems.
 
     Args:
         directory: The dataset's folder.
-        manifest: The manifest; gets the counts.
+        manifest: The manifest; receives the counts.
         thorough: Whether to compare the rows of all open partitions with their digests, not only
-            those that were written before the machine was started.
+            those that were written before the machine's last boot.
     """
     for name, mode in manifest.modes.items():
         try:
@@ -237,8 +238,8 @@ def count_rows(directory: Path, manifest: Manifest, *, thorough: bool = False) -
 def _count_open(directory: Path, mode: Mode, partition: Partition, thorough: bool) -> None:
     """Count the rows of an open partition that can be read in all its files.
 
-    The headers of the files are on the disk before the manifest lists them, and thus before any row
-    is committed. A partition that has none in any file does not bar the mode, whatever it lacks.
+    The files' headers reach the disk before the manifest lists the files, hence before any row is
+    committed. A partition without rows in any file is therefore no error, whatever it lacks.
     """
     counted, rows, unreadable = [], [], None
     for name, field in mode.fields.items():
@@ -253,8 +254,8 @@ def _count_open(directory: Path, mode: Mode, partition: Partition, thorough: boo
             raise DatasetError(f"{path} holds {have}, but the dataset says {field}.")
         if commit is None:
             raise DatasetError(
-                f"{path} was changed or is damaged: its rows do not have the checksums of its "
-                "records. Restore it from a copy, or set it aside with `physx verify --repair`."
+                f"{path} was changed or is damaged: its rows do not match their recorded "
+                "checksums. Restore it from a backup, or set it aside with `physx verify --repair`."
             )
         counted.append(found.rows)
         rows.append(commit.rows)
@@ -263,16 +264,17 @@ def _count_open(directory: Path, mode: Mode, partition: Partition, thorough: boo
         raise unreadable
     partition.rows = 0 if unreadable is not None else min(rows)
     missing = min(counted, default=0) - partition.rows
-    partition.problem = f"The last {missing} rows of it did not reach the disk." if missing else ""
+    partition.problem = f"Its last {missing} rows did not reach the disk." if missing else ""
     if unreadable is not None:
         partition.problem = str(unreadable)
 
 
 def _discard_behind_gaps(mode: Mode) -> None:
-    """Let open partitions have no rows that would follow upon a gap.
+    """Discard rows of open partitions that would come after a gap.
 
-    These are the rows of those whose writer filled another before, of which rows are lost or were
-    never written; and of stripes those for which it was not yet the turn, as others lack theirs.
+    These are the rows of partitions whose writer had filled an earlier one, if that one has lost
+    rows or never got them; and rows of stripes whose turn had not come, as other stripes lack
+    theirs.
     """
     for group in mode.groups:
         if group[0].sealed:
@@ -304,7 +306,7 @@ def _is_partition(path: Path) -> bool:
 
 
 def _state(directory: Path) -> tuple[int, int] | None:
-    """Return what changes whenever the manifest is replaced."""
+    """Return a value that changes whenever the manifest is replaced."""
     try:
         now = (directory / manifest_file.FILE).stat()
     except OSError:
@@ -334,7 +336,7 @@ def _adopt(directory: Path, manifest: Manifest, strict: bool) -> None:
         fields = {name: found.identity.field for name, found in sorted(group.items(), key=_role)}
         mode = manifest.modes.get(mode_name)
         if mode is not None and not strict and not _fits(mode, fields):
-            continue  # a part of what was being removed, or not part of this dataset
+            continue  # part of a partition that was being removed, or of another dataset
         mode = manifest.modes.setdefault(mode_name, Mode(fields))
         mode.partitions.append(
             Partition(
@@ -356,9 +358,9 @@ def _adopt(directory: Path, manifest: Manifest, strict: bool) -> None:
 def _stripes_before(
     groups: Mapping[tuple[str, str, int], Group],
 ) -> dict[tuple[Any, ...], tuple[int, int]]:
-    """Return which partition of stripes comes before which place, and how many rows fit into it.
+    """Map the place after each partition of a stripe to its index and its capacity in rows.
 
-    Only the files of one that was not filled have space for more rows than it has.
+    Only the files of a partition that was not filled have space for more rows than it has.
     """
     found = {}
     for group in groups.values():
@@ -402,7 +404,7 @@ def _unlisted(directory: Path, manifest: Manifest) -> list[Path]:
 
 
 def _is_torn(path: Path) -> bool:
-    """Return whether a file is what a power cut may leave of a partition that nobody lists."""
+    """Return whether a file may be the remains of an unlisted partition after a power failure."""
     try:
         open_partition(path).close()
     except DatasetError:  # a link, a pipe, or no permission to read it
@@ -411,7 +413,7 @@ def _is_torn(path: Path) -> bool:
 
 
 def _is_foreign(path: Path) -> bool:
-    """Return whether a file is not a partition, by its name or because it is other HDF5."""
+    """Return whether a file is not a partition, by its name or as HDF5 of another kind."""
     if not _NAME.fullmatch(path.name):
         return True
     try:

@@ -21,7 +21,7 @@ from physx_core.fields import Field
 
 
 def repair(folder: Path) -> list[str]:
-    """Repair a dataset and return what was done: see `Dataset.repair`."""
+    """Repair a dataset and return one message per repair: see `Dataset.repair`."""
     with _lock(folder):
         manifest, done = _load_sound_manifest(folder)
         for mode in manifest.modes.values():
@@ -33,7 +33,7 @@ def repair(folder: Path) -> list[str]:
         if done:
             _store(folder, manifest)
         else:
-            files.sync_folder(folder)  # the manifest may be one that a killed writer had just named
+            files.sync_folder(folder)  # a killed writer may have just renamed the manifest
     return done
 
 
@@ -50,10 +50,10 @@ def rebuild(folder: Path) -> None:
 
 
 def _finish(folder: Path) -> None:
-    """Finish what a writer left open, if a manifest tells it; the files alone do not tell it all.
+    """Finish what a writer left open, if the manifest is readable; the files alone do not suffice.
 
-    Only the manifest knows which partitions are being removed, and which come after rows that did
-    not reach the disk.
+    Only the manifest records which partitions are being removed and which come after rows that
+    did not reach the disk.
     """
     with contextlib.suppress(DatasetError):
         manifest = recovery.load(folder)
@@ -63,7 +63,7 @@ def _finish(folder: Path) -> None:
 
 
 def _unlisted_damaged_files(folder: Path) -> Iterator[Path]:
-    """Yield the damaged files that the manifest does not list; one that it lists is an error."""
+    """Yield damaged files that the manifest does not list; a listed one is an error."""
     try:
         listed = recovery.load(folder, edited=True).file_names
     except DatasetError:
@@ -72,7 +72,7 @@ def _unlisted_damaged_files(folder: Path) -> Iterator[Path]:
         if listed is None or path.name in listed:
             raise DatasetError(
                 f"{error} Nothing was rebuilt. `physx verify --repair` or "
-                "Dataset.repair(directory) moves what cannot be used aside and keeps the rest."
+                "Dataset.repair(directory) sets unusable files aside and keeps the rest."
             ) from error
         yield path
 
@@ -96,7 +96,7 @@ def _store(folder: Path, manifest: Manifest) -> None:
 
 
 def _load_sound_manifest(folder: Path) -> tuple[Manifest, list[str]]:
-    """Return the manifest, or rebuild it from the files, setting aside those that are damaged."""
+    """Return the manifest, or rebuild it from the files and set damaged ones aside."""
     path = folder / manifest_file.FILE
     if not path.exists():
         what = f"{path} was missing: it has been rebuilt from the partition files, without info."
@@ -122,14 +122,14 @@ def _load_sound_manifest(folder: Path) -> tuple[Manifest, list[str]]:
 
 
 def _keep_old(folder: Path) -> Path:
-    """Copy the manifest, if there is one, so that it can be replaced; return the copy's path."""
+    """Copy the manifest, if there is one, before it is replaced; return the copy's path."""
     path = folder / manifest_file.FILE
     if not path.exists():
         return path
     kept = unused(path)
     try:
         content = manifest_file.read(folder)
-    except OSError:  # a link, or far too large: it was of no use
+    except OSError:  # a link, or far too large: unusable anyway
         files.rename(path, kept)
     else:
         files.replace(kept, content)
@@ -137,7 +137,7 @@ def _keep_old(folder: Path) -> Path:
 
 
 def _repair_partition(folder: Path, mode: Mode, partition: Partition) -> list[str]:
-    """Give damaged files of a partition a new header, or else set all its files aside."""
+    """Rewrite the headers of a partition's damaged files, or else set all its files aside."""
     done = []
     for name, field in mode.fields.items():
         problem = _find_damage(folder, partition, field)
@@ -152,14 +152,14 @@ def _repair_partition(folder: Path, mode: Mode, partition: Partition) -> list[st
         offset, rows = partition.offsets[name], partition.rows
         partition.offsets[name], _ = copy(path, offset, path, identity, rows)
         files.sync_folder(folder)
-        done.append(f"{problem} Its rows are sound and have a new header.")
+        done.append(f"{problem} Its rows are sound; its header has been rewritten.")
     return done
 
 
 def _find_damage(folder: Path, partition: Partition, field: Field) -> str | None:
     """Return what is wrong with one file of a partition, or None.
 
-    Rows of an open partition that did not reach the disk are no damage: the others are sealed.
+    Rows of an open partition that did not reach the disk are not damage: the others are sealed.
     """
     problem = find_problem(folder, partition, field, content=partition.sealed)
     if problem is None and not partition.sealed:

@@ -15,7 +15,7 @@ from physx_core.fields import Field
 
 
 def summarize(manifest: Manifest) -> list[dict[str, Any]]:
-    """Return one row of a table for each field of each mode: see `Dataset.describe`."""
+    """Return a table with one row for each field of each mode: see `Dataset.describe`."""
     return [
         {
             "mode": mode_name,
@@ -37,7 +37,7 @@ def find_problems(directory: Path, manifest: Manifest, content: bool = True) -> 
     """Check every partition file against the manifest and, with `content`, its checksum.
 
     Returns:
-        One text for each problem; empty for a sound dataset.
+        One message per problem; empty for a sound dataset.
     """
     found = (
         find_problem(directory, partition, field, content)
@@ -57,7 +57,7 @@ def find_problem(
         if problem is None and content and not partition.sealed:
             found, commit = partition.find_rows(directory, field, thorough=True)
             if commit is None:
-                problem = "was changed: its rows do not have the checksums of its records."
+                problem = "was changed: its rows do not match their recorded checksums."
             elif commit.rows < found.rows:
                 problem = f"counts {found.rows - commit.rows} rows that did not reach the disk."
         wanted = partition.checksums.get(field.name)
@@ -76,7 +76,7 @@ def _difference(found: Inspection, partition: Partition, field: Field) -> str | 
     if (have.mode, have.session, have.index) != (partition.mode, *partition.key):
         return f"belongs to another partition: {have.file_name}."
     if have.stripe != partition.stripe:
-        return "has another stripe of the rows than the manifest says."
+        return "has a different stripe of the rows than the manifest says."
     if have.field != field:
         return f"holds {have.field}, but the manifest says {field}."
     if not partition.sealed:

@@ -1,4 +1,4 @@
-"""Compares the fields of a mode with given fields, and completes their shapes."""
+"""Compares the fields of a mode with given fields and completes their shapes."""
 
 from __future__ import annotations
 
@@ -12,11 +12,11 @@ from physx_core.fields import Field
 
 
 def compare_fields(what: str, known: Mapping[str, Field], given: Mapping[str, Field]) -> None:
-    """Check that two sets of fields are the same; a shape of None fits any.
+    """Check that two sets of fields are equal; a shape of None matches any.
 
     Args:
         what: Owner of the known fields, for the error message.
-        known: Fields that are defined.
+        known: Defined fields.
         given: Fields to compare with them.
     """
     differences = dict.fromkeys(given.keys() - known.keys(), "is not one of its fields")
@@ -26,11 +26,11 @@ def compare_fields(what: str, known: Mapping[str, Field], given: Mapping[str, Fi
         if difference:
             differences[name] = difference
     if differences:
-        raise FieldsMismatchError(f"{what} has other fields", dict(sorted(differences.items())))
+        raise FieldsMismatchError(f"{what} has different fields", dict(sorted(differences.items())))
 
 
 def complete_shapes(known: Mapping[str, Field], given: Mapping[str, Field]) -> dict[str, Field]:
-    """Return the known fields, with open shapes taken from the given ones."""
+    """Return the known fields, with undefined shapes taken from the given ones."""
     return {
         name: replace(field, shape=given[name].shape) if field.shape is None else field
         for name, field in known.items()

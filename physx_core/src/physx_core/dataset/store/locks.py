@@ -1,4 +1,4 @@
-"""The locks of a dataset's writers: one alone, or several that take turns at the manifest."""
+"""Locks for a dataset's writers: a single one, or several that take turns with the manifest."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from physx_core.errors import DatasetError, DatasetLockedError
 LOCK = "dataset.lock"
 MANIFEST_LOCK = "dataset.json.lock"
 _PATIENCE = 20.0
-_MOMENT = 2.0  # for what a killed writer was about to start
+_MOMENT = 2.0  # for a process that a killed writer was about to start
 _PAUSE = 0.02
 
 
 def lock(directory: Path, patience: float = _MOMENT) -> int:
     """Acquire a dataset's lock for a single writer; closing the descriptor releases it.
 
-    A writer that was killed while it started a process may have left a copy of itself, which holds
-    the lock for the moment until it becomes that process.
+    A writer that was killed while starting a process may have left a forked copy of itself, which
+    holds the lock until its exec.
 
     Args:
         directory: Folder of the dataset.
-        patience: How long to wait in s while the writer that holds the lock runs no more.
+        patience: Time in s to wait if the process that holds the lock is no longer running.
 
     Raises:
         DatasetLockedError: If there is another writer.
@@ -51,7 +51,7 @@ def lock_shared(directory: Path) -> tuple[int, bool]:
     """Acquire a dataset's lock for one of several writers.
 
     Returns:
-        The descriptor, whose closing releases the lock, and whether there is no other writer: the
+        The descriptor (closing it releases the lock), and whether there is no other writer: the
         lock is then exclusive until `share` admits others.
 
     Raises:
@@ -83,14 +83,14 @@ def share(directory: Path, descriptor: int) -> None:
 def take_over(path: Path, place: int) -> int:
     """Lock one byte of a file for the process that writes a stripe; closing it releases the lock.
 
-    A process whose place it takes may need a moment to end. As the system releases the lock at its
-    end, nothing is written by both.
+    The previous process of this place may need a moment to exit. As the system releases its lock on
+    exit, the two never write at the same time.
 
     Returns:
         The descriptor.
 
     Raises:
-        DatasetError: If another process keeps it.
+        DatasetError: If another process keeps the lock.
     """
     descriptor = files.open_regular(path, os.O_RDWR)
     until = time.monotonic() + _PATIENCE
@@ -101,9 +101,9 @@ def take_over(path: Path, place: int) -> int:
             except (BlockingIOError, PermissionError):
                 if time.monotonic() > until:
                     raise DatasetError(
-                        f"An earlier client still writes the rows of instance {place + 1} to "
-                        f"{path.parent}, {_PATIENCE:g} s after another one has taken its place. "
-                        "End it; its machine may have lost its connection to the run."
+                        f"An earlier client is still writing the rows of instance {place + 1} to "
+                        f"{path.parent}, {_PATIENCE:g} s after another one took its place. "
+                        "Terminate it; its machine may have lost its connection to the run."
                     ) from None
                 time.sleep(_PAUSE)
             else:
@@ -115,7 +115,7 @@ def take_over(path: Path, place: int) -> int:
 
 @contextlib.contextmanager
 def lock_manifest(directory: Path) -> Iterator[None]:
-    """Hold the manifest's lock, which writers that share a dataset take in turn."""
+    """Hold the manifest's lock, which writers of a shared dataset take in turn."""
     descriptor = files.open_regular(directory / MANIFEST_LOCK, os.O_RDWR | os.O_CREAT)
     try:
         fcntl.flock(descriptor, fcntl.LOCK_EX)
@@ -141,7 +141,7 @@ def _owner_runs(descriptor: int) -> bool:
         os.kill(int(_owner(descriptor)), 0)
     except (ProcessLookupError, OverflowError):
         return False
-    except (PermissionError, ValueError):  # of another user; or not written yet
+    except (PermissionError, ValueError):  # another user's process, or not written yet
         return True
     return True
 

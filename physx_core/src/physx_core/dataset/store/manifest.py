@@ -36,27 +36,27 @@ from physx_core.statistics import RunningStatistics
 class Partition:
     """Rows of one mode: one file for each field.
 
-    They are consecutive, or every n-th: n partitions that were begun together may have stripes of
-    the same rows, in turn.
+    The rows are consecutive, or every n-th: n partitions that were begun together may have stripes
+    of the same rows.
 
     Attributes:
         mode: Name of the mode.
         session: Session that wrote it.
         index: Its number in the session and mode, counted from 0.
-        first_row: Row of the mode that was its first when it was begun; it orders the partitions.
+        first_row: Number of its first row in the mode when it was begun; orders the partitions.
         stripe: Which of the rows from there on it has; None: all up to the next partition.
-        rows: Committed rows, the same in all fields.
+        rows: Number of committed rows, the same in all fields.
         sealed: Whether it is complete: every file has exactly these rows.
         offsets: Byte of the file at which the rows begin, by field.
         checksums: CRC-32 of the rows, by field; empty until it is sealed, and while rows are
             updated in place.
         counted: Whether the mode's statistics include its rows.
-        writing: Whether this process writes it, so that `offsets` are right though not sealed.
+        writing: Whether this process writes it, so that `offsets` are valid before it is sealed.
         follows: While it is not sealed, number of the partition that its writer filled before it,
-            and how many rows that one got: without all of these, its own rows do not count.
-        commits: While it is not sealed, the records of its rows as its files state them, by field;
+            and that one's number of rows: if any of them is missing, its own rows do not count.
+        commits: While it is not sealed, the records of its rows as found in its files, by field;
             not stored.
-        problem: Why rows of it cannot be read though its files count them; not stored.
+        problem: Why some of its rows cannot be read although its files count them; not stored.
         running: Statistics of its first rows while it is not counted, by field; not stored.
     """
 
@@ -78,12 +78,12 @@ class Partition:
 
     @property
     def key(self) -> tuple[str, int]:
-        """What tells it from the other partitions of its mode."""
+        """Key that is unique among the partitions of its mode."""
         return self.session, self.index
 
     @property
     def group(self) -> tuple[str, int, int]:
-        """What it has in common only with the partitions that have stripes of the same rows."""
+        """Key that it shares only with the partitions that have stripes of the same rows."""
         if self.stripe is None:
             return self.session, self.first_row, self.index
         return self.session, self.first_row - self.stripe.place, -1
@@ -97,22 +97,22 @@ class Partition:
         return directory / self.file_name(name)
 
     def identity(self, of: Field) -> Identity:
-        """Return what a field's file is part of."""
+        """Return the identity of a field's file."""
         return Identity(self.session, self.mode, of, self.index, self.first_row, self.stripe)
 
     def inspect(self, directory: Path, of: Field) -> Inspection:
-        """Return what a field's file says of itself."""
+        """Return the contents of the header of a field's file."""
         return inspect(self.path(directory, of.name), self.offsets.get(of.name), of.nbytes)
 
     def find_rows(
         self, directory: Path, of: Field, *, thorough: bool
     ) -> tuple[Inspection, Commit | None]:
-        """Return what a field's file says of itself, and the record of the rows that it has."""
+        """Return the header of a field's file and the record of the rows that it holds."""
         path, offset = self.path(directory, of.name), self.offsets.get(of.name)
         return find_rows(path, offset, of.nbytes, thorough=thorough)
 
     def segment(self, directory: Path, of: Field, span: Span | None = None) -> Segment:
-        """Return the rows of a field, which lie at the places of `span` in the mode."""
+        """Return the rows of a field, which have the places of `span` in the mode."""
         return Segment(
             self.path(directory, of.name),
             of,
@@ -147,20 +147,20 @@ class Partition:
 
 
 def whole_stripes(rows: Sequence[int]) -> int:
-    """Return how many rows, from the first, none of some stripes lacks.
+    """Return the number of rows before the first one missing in any stripe.
 
     Args:
-        rows: How many rows each stripe has.
+        rows: Number of rows of each stripe.
     """
     return min(have * len(rows) + place for place, have in enumerate(rows))
 
 
 def trim_stripes(group: Sequence[Partition], total: int | None = None) -> None:
-    """Let the partitions of a group have only rows before which no row is missing.
+    """Limit the partitions of a group to the rows before the first missing one.
 
     Args:
-        group: Partitions that have stripes of the same rows, in their order.
-        total: How many rows they have together at most.
+        group: Partitions that have stripes of the same rows, in order.
+        total: Maximum number of rows they have together.
     """
     whole = whole_stripes([partition.rows for partition in group])
     total = whole if total is None else min(whole, total)
@@ -169,7 +169,7 @@ def trim_stripes(group: Sequence[Partition], total: int | None = None) -> None:
 
 
 def rows_of_stripe(total: int, place: int, count: int) -> int:
-    """Return how many of the first `total` rows belong to a stripe."""
+    """Return the number of rows of a stripe among the first `total` rows."""
     return (total - place + count - 1) // count
 
 
@@ -180,11 +180,11 @@ class Mode:
     Attributes:
         fields: The fields by name; a shape is None until the first rows determine it.
         partitions: The partitions in the order of their rows.
-        statistics: Statistics of floating fields, over the rows of all counted partitions.
-        dropped: Partitions that do not belong to the mode though their files may exist: they are
+        statistics: Statistics of floating-point fields over the rows of all counted partitions.
+        dropped: Partitions that do not belong to the mode although their files may exist: they are
             being removed, or copied from another dataset.
-        removed: Largest number of a removed partition, by session: no other gets it again, so that
-            a reader that still knows the removed one cannot take the other's rows for its rows.
+        removed: Largest number of a removed partition, by session. It is never reused, so that a
+            reader that still lists the removed partition cannot mistake new rows for its rows.
     """
 
     fields: dict[str, Field]
@@ -195,12 +195,12 @@ class Mode:
 
     @property
     def rows(self) -> int:
-        """Committed rows."""
+        """Number of committed rows."""
         return sum(partition.rows for partition in self.partitions)
 
     @property
     def next_row(self) -> int:
-        """First row of the next partition, larger than that of any before."""
+        """First row of the next partition, larger than that of any earlier one."""
         before = (p.first_row + max(1, p.rows) for p in (*self.partitions, *self.dropped))
         return max(self.rows, *before, 0)
 
@@ -215,13 +215,13 @@ class Mode:
 
     @property
     def groups(self) -> list[list[Partition]]:
-        """The partitions; those that have stripes of the same rows together, in their order."""
+        """The partitions in order; those with stripes of the same rows form one group."""
         grouped = itertools.groupby(self.partitions, lambda partition: partition.group)
         return [list(partitions) for _, partitions in grouped]
 
     @property
     def spans(self) -> list[Span]:
-        """Which rows of the mode each partition has now."""
+        """Rows of the mode that each partition currently has."""
         found, start = [], 0
         for group in self.groups:
             found += [
@@ -236,7 +236,7 @@ class Mode:
         self.partitions[self.place(partition)] = partition
 
     def forget_statistics(self) -> None:
-        """Have the statistics recomputed from all rows."""
+        """Discard the statistics, so that they are recomputed from all rows."""
         self.statistics = {}
         for place, partition in enumerate(self.partitions):
             partition.running = {}
@@ -244,7 +244,7 @@ class Mode:
                 self.partitions[place] = replace(partition, counted=False)
 
     def continues(self, earlier: Mode) -> bool:
-        """Return whether all rows of an earlier state are still there, with the same numbers."""
+        """Return whether all rows of an earlier state still exist under the same numbers."""
         before = [p for p in earlier.partitions if p.rows]
         now = [p for p in self.partitions if p.rows]
         last = before[-1].group if before else None
@@ -281,7 +281,7 @@ class Mode:
 
 
 def has_statistics(of: Field) -> bool:
-    """Return whether a field has statistics: floating ones do, unless physx adds them."""
+    """Return whether a field has statistics: floating-point fields do, unless physx adds them."""
     return of.name not in RESERVED and np.dtype(of.dtype).kind == "f"
 
 
@@ -295,15 +295,15 @@ def versions() -> dict[str, str]:
 
 @dataclass
 class Manifest:
-    """Everything that a dataset knows besides its rows.
+    """Everything in a dataset except its rows.
 
     Attributes:
         modes: The modes by name.
-        info: Where the data came from: environment, its keyword arguments, seed and the like.
-        versions: Versions of Python and of the packages that made the dataset.
+        info: Where the data come from: environment, its keyword arguments, seed, etc.
+        versions: Versions of Python and of the packages that created the dataset.
         problems: Modes whose rows cannot be counted, and why; not stored.
-        generation: Increases whenever rows known before have changed or have other numbers now,
-            so that rows kept in memory are stale; not stored.
+        generation: Increases whenever known rows have been changed or renumbered, which makes
+            rows kept in memory stale; not stored.
     """
 
     modes: dict[str, Mode] = field(default_factory=dict)
@@ -326,7 +326,7 @@ class Manifest:
 
     @property
     def file_names(self) -> set[str]:
-        """Names of all partition files, also of dropped ones."""
+        """Names of all partition files, including dropped ones."""
         return {
             partition.file_name(of)
             for mode in self.modes.values()
@@ -340,7 +340,7 @@ class Manifest:
         return Manifest(modes, dict(self.info), dict(self.versions), dict(self.problems))
 
     def take(self, other: Manifest) -> None:
-        """Become what `other` is."""
+        """Take over the contents of `other`."""
         self.generation += any(
             name not in other.modes or not other.modes[name].continues(mode)
             for name, mode in self.modes.items()
@@ -351,7 +351,7 @@ class Manifest:
 
 
 def to_plain_info(values: Mapping[str, Any]) -> dict[str, Any]:
-    """Return values as the manifest will return them: tuples and arrays become lists."""
+    """Return values as the manifest will return them; tuples and arrays become lists."""
 
     def convert(value: Any) -> Any:
         if isinstance(value, (np.ndarray, np.generic)):

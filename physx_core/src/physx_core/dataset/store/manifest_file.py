@@ -1,8 +1,8 @@
 """Writes and reads the file ``dataset.json``.
 
-Its last entry is a CRC-32 of everything before it, so that a file that was cut or edited by hand
-is noticed before a wrong offset yields wrong numbers. Every value is validated: a dataset may come
-from an untrusted source.
+Its last entry is a CRC-32 of everything before it, so that truncation or manual edits are noticed
+before a wrong offset yields wrong numbers. Every value is validated: a dataset may come from an
+untrusted source.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ FILE = "dataset.json"
 FORMAT = "physx dataset"
 VERSION = 1
 STRIPED_VERSION = 2
-"""Version of a dataset that has stripes, so that a physx that does not know of them refuses it."""
+"""Version of a dataset with stripes; a physx that does not support them rejects it."""
 
 _LARGEST = 2**27
 _END = re.compile(rb',\n "crc32": "([0-9a-f]{8})"\n\}\s*$')
@@ -35,7 +35,7 @@ _INVALID = (
     ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError, MemoryError,
     ConfigError,
 )  # fmt: skip
-"""What reading and parsing raise for text that is not a manifest."""
+"""Errors that reading and parsing raise for text that is not a manifest."""
 
 
 def save(directory: Path, manifest: Manifest) -> None:
@@ -53,7 +53,7 @@ def save(directory: Path, manifest: Manifest) -> None:
 
 
 def read(directory: Path) -> bytes:
-    """Return the manifest as it is on the disk."""
+    """Return the content of the manifest file."""
     return files.read_content(directory / FILE, _LARGEST)
 
 
@@ -62,7 +62,7 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
 
     Args:
         directory: The dataset's folder.
-        edited: Whether to accept it although its checksum is missing or wrong.
+        edited: Whether to accept it if its checksum is missing or wrong.
     """
     path = directory / FILE
     try:
@@ -74,7 +74,7 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
     try:
         plain = parse_json(content)
         if not isinstance(plain, dict) or plain.get("format") != FORMAT:
-            raise ValueError("it does not claim to be one")
+            raise ValueError(f'its format is not "{FORMAT}"')
         version = whole(plain["format_version"], "the format's version")
         if version not in (VERSION, STRIPED_VERSION):
             raise DatasetError(
@@ -83,21 +83,21 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
                 f"{install_hint('physx-core', update=True)}"
             )
         if not edited and not _is_whole(content):
-            raise ValueError("it was cut or edited by hand: its checksum does not match")
+            raise ValueError("it was truncated or edited by hand: its checksum does not match")
         return parse_manifest(plain)
     except _INVALID as error:
         reason = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
         raise DatasetError(
             f"{path} ({len(content)} bytes) is not the manifest of a dataset: {reason}. "
             "`physx verify --repair` or Dataset.repair(directory) repairs it, from the partition "
-            "files if need be; no row is lost."
+            "files if necessary; no row is lost."
         ) from error
 
 
 def was_updated(directory: Path, partition: Partition, name: str) -> bool:
-    """Return whether the manifest on the disk has another checksum for a field of a partition.
+    """Return whether the manifest on disk has a different checksum for a field of a partition.
 
-    If so, the writer has updated rows, and those that do not fit the old checksum are not damaged.
+    If so, the writer has updated rows; rows that do not match the old checksum are not damaged.
     """
     try:
         mode = load(directory).modes[partition.mode]
@@ -109,7 +109,7 @@ def was_updated(directory: Path, partition: Partition, name: str) -> bool:
 
 
 def _format(value: Any, indent: str = "\n") -> str:
-    """Return data as indented JSON with lists of numbers on one line, for people and for speed."""
+    """Return data as indented JSON with lists of numbers on one line: readable and fast."""
     inner = indent + " "
     if isinstance(value, dict) and value:
         items = (f"{json.dumps(name)}: {_format(item, inner)}" for name, item in value.items())

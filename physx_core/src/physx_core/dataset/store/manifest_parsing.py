@@ -21,7 +21,7 @@ from physx_core.statistics import RunningStatistics
 
 
 def parse_manifest(plain: Mapping[str, Any]) -> Manifest:
-    """Return the manifest that plain data of format version 1 describe."""
+    """Return the manifest described by plain data."""
     modes = {
         parse_name(name, "a mode"): _mode(name, mode)
         for name, mode in checked(dict, plain["modes"], "'modes'").items()
@@ -95,19 +95,19 @@ def _partition(mode_name: str, plain: Any, fields: Mapping[str, Field]) -> Parti
 
 
 def _check_stripes(group: list[Partition]) -> None:
-    """Check that partitions have stripes of the same rows: each in turn has one, from the first."""
+    """Check that stripes of the same rows are in order and have consistent numbers of rows."""
     places = [partition.stripe or Stripe(0, 1) for partition in group]
     if len({stripe.of for stripe in places}) > 1 or places != sorted(set(places)):
-        raise ValueError("stripes of the same rows do not follow each other")
+        raise ValueError("stripes of the same rows are inconsistent")
     if len({partition.sealed for partition in group}) > 1:
-        raise ValueError("some stripes of the same rows are sealed, and others are not")
+        raise ValueError("some stripes of the same rows are sealed and others are not")
     rows = [partition.rows for partition in group]
     if rows != sorted(rows, reverse=True) or rows[0] > rows[-1] + 1:
-        raise ValueError("stripes of the same rows have numbers of rows that do not fit together")
+        raise ValueError("stripes of the same rows have inconsistent numbers of rows")
 
 
 def _add_statistics(mode: Mode, plain: Mapping[str, Any]) -> None:
-    """Give a mode its statistics, if they cover the partitions that are marked as counted."""
+    """Give a mode its statistics if they cover the partitions that are marked as counted."""
     counted = sum(partition.rows for partition in mode.partitions if partition.counted)
     for name, values in plain.items():
         if name not in mode.fields:

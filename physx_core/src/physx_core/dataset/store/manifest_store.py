@@ -1,4 +1,4 @@
-"""Keeps the manifest in memory and on the disk, and changes both atomically."""
+"""Keeps the manifest in memory and on disk, and changes both atomically."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ from physx_core.dataset.store.manifest import Manifest, Mode
 
 @dataclass
 class ManifestStore:
-    """The manifest of a dataset that is written by one process or by several.
+    """The manifest of a dataset that is written by one or more processes.
 
-    If several writers share a dataset, they take turns: each change begins with what the others
-    have stored. The partitions that this process writes remain its own throughout.
+    Writers that share a dataset take turns: each change starts from what the others have stored.
+    Partitions that this process writes are never changed by others.
 
     Attributes:
         directory: The dataset's folder.
-        manifest: What the dataset holds, as far as this process knows.
+        manifest: The dataset's contents as known to this process.
         shared: Whether other processes write to it too.
-        failure: The first sync that failed. Afterwards nothing is changed any more: what was
-            written before may be lost, though it can still be read.
+        failure: Error of the first failed sync. After it, nothing is changed any more: rows
+            written before may be lost even if they can still be read.
     """
 
     directory: Path
@@ -34,7 +34,7 @@ class ManifestStore:
 
     @contextlib.contextmanager
     def syncing(self) -> Iterator[None]:
-        """Do something only if no sync has failed yet, and note whether one fails now."""
+        """Raise the error of an earlier failed sync, if any, and record a new one."""
         if self.failure is not None:
             raise self.failure
         try:
@@ -45,7 +45,7 @@ class ManifestStore:
 
     @contextlib.contextmanager
     def change(self) -> Iterator[Manifest]:
-        """Give the manifest to be changed and store it at the end; after an error, restore it."""
+        """Yield the manifest to be changed and store it at the end; after an error, restore it."""
         turn = locks.lock_manifest(self.directory) if self.shared else contextlib.nullcontext()
         with self.syncing(), turn:
             if self.shared:
@@ -67,7 +67,7 @@ class ManifestStore:
 
 
 def _keep_known(mode: Mode, before: Mode) -> None:
-    """Keep this process's own partitions, and the rows that others were known to have."""
+    """Keep this process's own partitions and the known rows of the others."""
     known = {partition.key: partition for partition in before.partitions}
     for place, partition in enumerate(mode.partitions):
         earlier = known.get(partition.key)

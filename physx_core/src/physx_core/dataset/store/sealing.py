@@ -1,4 +1,4 @@
-"""Seals partitions: rewrites their files at the exact size, and checksums the rows."""
+"""Seals partitions: rewrites their files at the exact size and checksums the rows."""
 
 from __future__ import annotations
 
@@ -20,16 +20,16 @@ from physx_core.statistics import RunningStatistics
 def seal(
     directory: Path, fields: Mapping[str, Field], partition: Partition, *, rewrite: bool = False
 ) -> Partition:
-    """Rewrite a partition's files at their exact size, if they are not full, and checksum them.
+    """Rewrite a partition's files at their exact size, unless they are full, and checksum them.
 
-    Everything is on the disk when this returns. If the process dies meanwhile, the files still
-    hold all rows, some already in their final form.
+    Everything is on disk when this returns. If the process dies before that, the files still hold
+    all rows, some already in their final form.
 
     Args:
         directory: The dataset's folder.
         fields: The fields of the mode.
-        partition: The partition; nothing writes to it any more.
-        rewrite: Whether to rewrite full files, too.
+        partition: The partition; nothing may write to it any more.
+        rewrite: Whether to rewrite full files too.
 
     Returns:
         The sealed partition, for the manifest.
@@ -50,7 +50,7 @@ def seal(
 
 
 def scan(directory: Path, fields: Mapping[str, Field], partition: Partition) -> Partition:
-    """Return a sealed partition with checksums and statistics of its rows, read once for both."""
+    """Return a sealed partition with checksums and statistics, computed in one pass."""
     crc, running = dict.fromkeys(fields, 0), {}
     for name, field in fields.items():
         statistics = running[name] = RunningStatistics()
@@ -62,12 +62,12 @@ def scan(directory: Path, fields: Mapping[str, Field], partition: Partition) -> 
 
 
 def unseal(directory: Path, fields: Mapping[str, Field], partition: Partition) -> Partition:
-    """Take checksums and digests of a sealed partition's rows away, so that they may be updated.
+    """Remove checksums and digests of a sealed partition's rows, so that they may be updated.
 
     Files that were full when they were sealed still have the digests of their rows.
 
     Returns:
-        The partition, for the manifest; the files are on the disk.
+        The partition, for the manifest; the files are on disk.
     """
     settled = Commit.unchecked(partition.rows)
     for name, field in fields.items():
@@ -83,13 +83,13 @@ def unseal(directory: Path, fields: Mapping[str, Field], partition: Partition) -
 
 
 def sync_files(directory: Path, fields: Mapping[str, Field], partition: Partition) -> None:
-    """Wait until the rows of a partition are on the disk."""
+    """Wait until the rows of a partition are on disk."""
     for name in fields:
         files.sync_file(partition.path(directory, name))
 
 
 def remove_files(directory: Path, fields: Mapping[str, Field], partition: Partition) -> None:
-    """Remove the files of a partition that the manifest no longer lists, also from the disk."""
+    """Remove the files of a partition that the manifest no longer lists, and sync the folder."""
     for name in fields:
         files.remove(partition.path(directory, name))
     files.sync_folder(directory)

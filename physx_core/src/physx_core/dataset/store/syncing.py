@@ -1,4 +1,4 @@
-"""Syncs written files to the disk about once a second, in a thread beside the writer."""
+"""Syncs written files to disk about once a second, in a background thread."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ class Written(Protocol):
 
 
 class Syncer:
-    """Syncs files that were written to, in a thread that starts with the first of them.
+    """Syncs written files in a thread that starts with the first of them.
 
-    A power cut costs at most the rows of about the last second, while the writer never waits for
+    A power failure loses at most the rows of about the last second, yet the writer never waits for
     the disk.
     """
 
@@ -38,7 +38,7 @@ class Syncer:
         self._error: OSError | None = None
 
     def note(self, partition: Written) -> None:
-        """Schedule an open partition, whose rows are synced and marked."""
+        """Schedule an open partition; its rows are synced and marked."""
         if partition not in self._partitions:
             with self._lock:
                 self._partitions[partition] = None
@@ -52,9 +52,9 @@ class Syncer:
             self._start()
 
     def check(self) -> None:
-        """Report the first failure of all.
+        """Raise the error of the first failed sync, if any.
 
-        Once a sync has failed, nothing that was written before may be taken for stored.
+        Once a sync has failed, nothing written before it can be considered stored.
         """
         if self._error is not None:
             raise self._error
@@ -69,7 +69,7 @@ class Syncer:
             for file in chain.from_iterable(partition.files.values() for partition in opened):
                 _sync_marked(file)
             for path in paths:
-                with contextlib.suppress(FileNotFoundError):  # its partition has been removed
+                with contextlib.suppress(FileNotFoundError):  # its partition was removed
                     files.sync_file(path)
             for folder in {path.parent for path in paths}:  # a sealed copy may have its name now
                 files.sync_folder(folder)
@@ -77,7 +77,7 @@ class Syncer:
             self._error = self._error or error
 
     def close(self) -> None:
-        """Sync everything that is left, and end the thread."""
+        """Sync everything that is left and stop the thread."""
         self._end.set()
         self._wake.set()
         if self._thread is not None:

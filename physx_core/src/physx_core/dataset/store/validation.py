@@ -1,4 +1,4 @@
-"""Validates values of untrusted files: types, limits, names that no path can be built from."""
+"""Validates values from untrusted files: types, limits, and names that cannot form a path."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import numpy as np
 from physx_core.fields import Field
 
 SESSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}")
-"""What file names can begin with; no path can be built from it."""
+"""Valid prefix of file names; it cannot form a path."""
 
 _MOST = 2**62
 _WIDEST_ROW = 2**40
@@ -22,21 +22,21 @@ T = TypeVar("T")
 
 
 def checked(kind: type[T], value: Any, what: str) -> T:
-    """Return a value that is of exactly one type."""
+    """Return a value after checking that it has exactly this type."""
     if type(value) is not kind:
         raise ValueError(f"{what} cannot be {value!r:.60}")
     return value
 
 
 def whole(value: Any, what: str, most: int = _MOST) -> int:
-    """Return an integer between 0 and `most`."""
+    """Return a value after checking that it is an integer between 0 and `most`."""
     if not 0 <= checked(int, value, what) <= most:
         raise ValueError(f"{what} cannot be {value!r:.60}")
     return int(value)
 
 
 def parse_field(plain: Any) -> Field:
-    """Return the field that plain data describe."""
+    """Return the field described by plain data."""
     name, shape, role = parse_name(plain["name"], "a field"), plain.get("shape"), plain["role"]
     if shape is not None:
         if len(checked(list, shape, f"the shape of {name!r}")) > _MOST_AXES:

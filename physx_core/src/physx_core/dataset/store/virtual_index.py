@@ -1,8 +1,8 @@
 """Writes the virtual index ``<session>.h5``: all sealed rows in one file, for other tools.
 
-It holds ``/<mode>/<field>`` as virtual datasets that refer to the partitions beside it. If several
-sessions wrote the dataset, there is one index named after each, and each shows all rows. physx
-itself never reads them.
+It holds ``/<mode>/<field>`` as virtual datasets that refer to the partitions in the same folder. If
+several sessions wrote the dataset, there is one index named after each, and each shows all rows.
+physx itself never reads them.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ FORMAT = "physx index"
 
 
 def write_index(directory: Path, session: str, manifest: Manifest, *, wait: bool = False) -> None:
-    """Write the index of all rows that are sealed.
+    """Write the index of all sealed rows.
 
     Args:
         directory: The dataset's folder.
@@ -58,6 +58,6 @@ def _add(group: Any, mode: Mode, field: Field) -> None:
             source_file = partition.file_name(field.name)
             source = h5py.VirtualSource(source_file, "data", source_shape, dtype)
             layout[span.among(0, span.rows, 0)] = source
-        missing = np.nan if dtype.kind == "f" else None  # how rows of a lost partition read
+        missing = np.nan if dtype.kind == "f" else None  # value of rows of a lost partition
         entry = group.create_virtual_dataset(field.name, layout, fillvalue=missing)
     entry.attrs["unit"], entry.attrs["role"] = field.unit, field.role

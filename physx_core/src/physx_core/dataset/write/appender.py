@@ -16,7 +16,7 @@ from physx_core.rows import RowBuffer, infer_shapes
 
 
 class Appender:
-    """Converts users' rows to the form that the writer stores: see `Dataset` for the methods.
+    """Converts users' rows to the form the writer stores: see `Dataset` for the methods.
 
     Attributes:
         writer: Stores the rows.
@@ -32,13 +32,14 @@ class Appender:
         self.define_modes({mode: fields})
 
     def define_modes(self, modes: Mapping[str, Iterable[Field]]) -> None:
-        """Define the fields of several modes; of none if one of them has other fields already."""
+        """Define the fields of several modes; of none if one already has different fields."""
         wanted = {name: {field.name: field for field in fields} for name, fields in modes.items()}
         for name, given in wanted.items():
             if not name.isidentifier() or not given:
                 names = sorted(given) or "no fields"
                 raise ConfigError(
-                    f"A mode needs an identifier and fields, not {name!r} with {names}."
+                    "A mode needs an identifier as its name and at least one field, not "
+                    f"{name!r} with {names}."
                 )
         known = self._manifest.modes
         if all(
@@ -79,7 +80,7 @@ class Appender:
             self._flush(mode)
 
     def _begin(self, mode: str, sample: Mapping[str, Any]) -> RowBuffer:
-        """Return a mode's buffer with its first sample, from which open shapes become known."""
+        """Return a mode's buffer with its first sample, which determines undefined shapes."""
         known = self._manifest.modes.get(mode)
         fields = known.fields.values() if known else infer_fields(sample, axes=0)
         shaped = infer_shapes(fields, sample)
@@ -97,7 +98,7 @@ class Appender:
             self.writer.append(mode, buffer.take(), count)
 
     def _is_settled(self, mode: str) -> bool:
-        """Return whether all fields of a mode are known, with their shapes."""
+        """Return whether all fields of a mode and their shapes are known."""
         known = self._manifest.modes.get(mode)
         return known is not None and all(f.shape is not None for f in known.fields.values())
 

@@ -1,7 +1,7 @@
 """Adds whole partitions of another dataset, and removes partitions.
 
-Both take effect with one change of the manifest: the files of partitions that are being added or
-removed are listed as dropped, so that the next writer after a crash removes what is left of them.
+Either takes effect with a single change of the manifest: partitions that are being added or removed
+are listed as dropped, so that after a crash the next writer removes their leftover files.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ Pairs = list[tuple[Partition, Partition]]
 
 
 def add_partitions(writer: Writer, source: Path, given: Manifest) -> None:
-    """Copy all partitions of another dataset; afterwards all of its rows are there, or none.
+    """Add either all partitions of another dataset or none.
 
     Args:
-        writer: Writes the dataset; the modes that get rows have the other's fields and no open
-            partition.
+        writer: Writes the dataset; the modes that receive rows must have the other's fields and no
+            open partition.
         source: Folder of the other dataset.
         given: Manifest of the other dataset.
     """
@@ -47,7 +47,7 @@ def add_partitions(writer: Writer, source: Path, given: Manifest) -> None:
 
 
 def drop_partition(writer: Writer, mode_name: str, session: str | None, index: int) -> int:
-    """Seal all partitions of a mode, remove one, and return how many rows it had."""
+    """Seal all partitions of a mode, remove one, and return its number of rows."""
     _find(writer, mode_name, session, index)  # an invalid call changes nothing
     writer.finish(mode_name)
     found = _find(writer, mode_name, session, index)
@@ -77,7 +77,7 @@ def _find(writer: Writer, mode_name: str, session: str | None, index: int) -> Pa
 
 
 def _reserve(writer: Writer, given: Manifest) -> dict[str, Pairs]:
-    """List the partitions to add as dropped, so that their names are taken."""
+    """List the partitions to add as dropped, to reserve their names."""
     pairs: dict[str, Pairs] = {}
     with writer.store.change() as manifest:
         for name, other in given.modes.items():
@@ -110,7 +110,7 @@ def _copy_files(
 
 
 def _accept(mode: Mode, other: Mode, pairs: Pairs) -> None:
-    """Make copied partitions part of the mode, with the statistics that the other knows."""
+    """Make copied partitions part of the mode, with the other's statistics if complete."""
     arrived = {new.key: new for _, new in pairs}
     mode.dropped = [partition for partition in mode.dropped if partition.key not in arrived]
     known = all(old.counted for old, _ in pairs)

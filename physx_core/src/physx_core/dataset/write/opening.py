@@ -1,4 +1,4 @@
-"""Locks a dataset and prepares it for its writer."""
+"""Locks a dataset and prepares it for writing."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class WriterOptions:
             raise ConfigError(f"max_file_size is {self.max_file_size} GB but must be positive.")
 
     def writer(self, folder: Path, manifest: Manifest, lock: int) -> Writer:
-        """Return the writer; without a session's name, it continues the last session."""
+        """Return the writer; without a session name, it continues the last session."""
         session = self.session or next(reversed(manifest.sessions), "run")
         store = ManifestStore(folder, manifest, self.shared)
         return Writer(store, session, self.max_file_size, self.durable, lock)
@@ -55,11 +55,11 @@ def create(folder: Path, options: WriterOptions, info: Mapping[str, Any]) -> Wri
             try:
                 if recovery.holds_dataset(folder):
                     raise DatasetError(
-                        f"There is a dataset in {folder} already. Extend it with "
+                        f"There is already a dataset in {folder}. Extend it with "
                         "Dataset.open(directory, writable=True), or choose another folder."
                     )
                 manifest_file.save(folder, manifest)
-                files.sync_folder(folder.parent)  # the caller may just have made the folder
+                files.sync_folder(folder.parent)  # the caller may have just created the folder
                 if options.shared:
                     locks.share(folder, lock)
             except BaseException:

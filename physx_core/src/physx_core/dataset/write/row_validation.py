@@ -1,4 +1,4 @@
-"""Checks blocks of rows before anything of them is stored."""
+"""Checks blocks of rows before any of them is stored."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ def infer_fields(values: Mapping[str, Any], axes: int = 1) -> list[Field]:
 
     Args:
         values: Field name to value.
-        axes: How many axes come before the field's own: 1 for rows, 0 for a sample.
+        axes: Number of axes before the field's own: 1 for rows, 0 for a sample.
     """
     fields = []
     for name, value in values.items():
@@ -40,10 +40,10 @@ def infer_fields(values: Mapping[str, Any], axes: int = 1) -> list[Field]:
 def check_rows(
     fields: Mapping[str, Field], rows: Mapping[str, Any], *, checked: bool = False
 ) -> tuple[Batch, int]:
-    """Return rows as contiguous arrays of the fields' types, and how many there are.
+    """Return rows as contiguous arrays of the fields' types, and their number.
 
     Args:
-        fields: The fields of the mode; a shape of None takes that of the rows.
+        fields: The fields of the mode; a shape of None is taken from the rows.
         rows: Field name to rows, shape (n, *field shape).
         checked: Whether rows of the fields' types are known to be finite.
     """

@@ -1,4 +1,4 @@
-"""Writes one stripe of a mode's rows, in a process beside the one that keeps the manifest."""
+"""Writes one stripe of a mode's rows, in a process other than the one that keeps the manifest."""
 
 from __future__ import annotations
 
@@ -22,15 +22,15 @@ from physx_core.typing import Batch
 
 
 class StripeWriter(Closeable):
-    """Writes and seals the partitions of one stripe, in their order; close it after use.
+    """Writes and seals the partitions of one stripe in order; close it after use.
 
-    What `append` has written survives if the process dies at any later moment, and a power cut
-    about a second later.
+    Rows written by `append` survive if the process dies later, and after about a second also a
+    power failure.
 
     Attributes:
-        rows: How many rows the stripe has, in all its partitions.
+        rows: Number of rows of the stripe, in all its partitions.
         fields: The fields of the rows.
-        capacity: How many rows fit into a partition.
+        capacity: Number of rows that fit into a partition.
     """
 
     def __init__(self, directory: Path, fields: Sequence[Field], capacity: int) -> None:
@@ -39,7 +39,7 @@ class StripeWriter(Closeable):
         Args:
             directory: The dataset's folder.
             fields: The fields of the rows, with their shapes.
-            capacity: How many rows fit into a partition.
+            capacity: Number of rows that fit into a partition.
         """
         self.rows = 0
         self.fields = list(fields)
@@ -52,19 +52,20 @@ class StripeWriter(Closeable):
         self._sealing: deque[tuple[int, Future[Partition]]] = deque()
 
     def add(self, number: int, entry: Partition) -> None:
-        """Learn of the partition that gets rows ``number * capacity`` and those after it."""
+        """Register the partition for the rows from ``number * capacity`` on."""
         self._entries[number] = entry
 
     def resume(self, told: int) -> int:
         """Continue a stripe that another process has begun.
 
-        The rows of its partitions that are not sealed are compared with their digests.
+        The rows of its unsealed partitions are compared with their digests.
 
         Args:
-            told: How many rows it is said to have; it may have more, or have lost some.
+            told: Number of rows it is supposed to have; the actual number may be larger or, if
+                rows were lost, smaller.
 
         Returns:
-            How many rows it has.
+            Number of rows it has.
         """
         self.rows = told
         with files.storing("The rows of an earlier process"):
@@ -80,12 +81,12 @@ class StripeWriter(Closeable):
 
     @property
     def room(self) -> int:
-        """How many rows more fit into the partitions that are known."""
+        """Number of rows that still fit into the known partitions."""
         known = (max(self._entries) + 1) * self.capacity if self._entries else 0
         return max(0, known - self.rows)
 
     def append(self, rows: Batch, count: int) -> None:
-        """Write and commit rows, for which there is room.
+        """Write and commit rows that fit into `room`.
 
         Raises:
             DatasetError: If the disk is full or fails; `rows` says how many are stored.
@@ -111,15 +112,15 @@ class StripeWriter(Closeable):
                 try:
                     found.append((number, work.result()))
                 except OSError as error:
-                    if error.errno not in files.FULL:  # else it is sealed when there is space
+                    if error.errno not in files.FULL:  # else it is sealed once there is space
                         raise
         return found
 
     def finish(self, rows: int) -> list[tuple[int, Partition]]:
-        """Seal the last partition, and return all that have been sealed since the last call.
+        """Seal the last partition and return all that have been sealed since the last call.
 
         Args:
-            rows: How many rows the stripe keeps. Those of earlier partitions stay in any case.
+            rows: Number of rows to keep in the stripe; rows of earlier partitions always stay.
         """
         if self._opened is not None:
             number = (self.rows - self._opened.partition.rows) // self.capacity
@@ -129,7 +130,7 @@ class StripeWriter(Closeable):
         return self.take_sealed(wait=True)
 
     def close(self) -> None:
-        """Close the files, without sealing them, when they are on the disk."""
+        """Sync and close the files without sealing them."""
         self._sealer.shutdown()
         self._digester.close()
         opened, self._opened = self._opened, None
@@ -139,7 +140,7 @@ class StripeWriter(Closeable):
             self._syncer.close()
 
     def _count(self, entry: Partition) -> int:
-        """Return how many rows a partition really has, in all fields."""
+        """Return the actual number of rows that a partition has in all fields."""
         found = []
         for field in self.fields:
             _, commit = entry.find_rows(self._directory, field, thorough=True)
@@ -161,7 +162,7 @@ class StripeWriter(Closeable):
         return OpenPartition(entry, self.capacity, parts, self._syncer)
 
     def _retire(self, rows: int | None = None) -> None:
-        """Close the open partition, and have it sealed in the background."""
+        """Close the open partition and seal it in the background."""
         opened = self._opened
         if opened is None:
             return

@@ -1,9 +1,9 @@
-"""The partitions that several processes write in turn, as the one that keeps the manifest sees it.
+"""Partitions that several processes write in turn: the side of the process with the manifest.
 
-Row r of all that they write comes from process ``r % count``. Partitions are begun for all of them
-together: a group, in which each has a stripe of the same consecutive rows. Every process commits
-the rows of its own files, and says so; the rows up to the first one that is missing belong to the
-dataset. `physx_core.dataset.write.stripe_writer` is the other side.
+Of all rows they write, row r comes from process ``r % count``. Partitions are begun for all of them
+together, as a group in which each has a stripe of the same consecutive rows. Every process commits
+the rows of its own files and reports them; the dataset consists of the rows before the first
+missing one. `physx_core.dataset.write.stripe_writer` is the other side.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ from physx_core.fields import Field
 from physx_core.statistics import RunningStatistics
 
 PROOF = "dataset.clients"
-"""File with a random text, by which other processes prove that they see the same folder."""
+"""File with a random string, by which other processes prove that they see the same folder."""
 
 
 @dataclass
@@ -43,9 +43,9 @@ class _Group:
     """Partitions that were begun together.
 
     Attributes:
-        first_row: Row of the mode that is the first of the first one.
+        first_row: Number of the group's first row in the mode.
         partitions: Their entries in the manifest, in the order of the stripes.
-        sealed: Those that their writers have sealed, by the place of the stripe.
+        sealed: The partitions that their writers have sealed, by the place of the stripe.
     """
 
     first_row: int
@@ -54,7 +54,7 @@ class _Group:
 
 
 class Beginning(Protocol):
-    """What begins partitions: the dataset's writer.
+    """Begins partitions; implemented by the dataset's writer.
 
     Attributes:
         store: The manifest.
@@ -65,26 +65,26 @@ class Beginning(Protocol):
     session: str
 
     def capacity(self, mode: Mode) -> int:
-        """Return how many rows of a mode fit into a partition."""
+        """Return the number of rows of a mode that fit into a partition."""
 
     def new_partition(self, mode_name: str, mode: Mode) -> Partition:
         """Return a partition with the first number whose files do not exist yet."""
 
     def create_file(self, entry: Partition, field: Field, capacity: int) -> PartitionFile:
-        """Create a file of a new partition, under its temporary name."""
+        """Create a file of a new partition under its temporary name."""
 
 
 class Stripes:
     """The partitions of one mode that other processes write, one stripe each.
 
     Attributes:
-        count: How many processes there are.
+        count: Number of processes.
         mode_name: Name of the mode.
         session: Session that the partitions are named after.
         directory: The dataset's folder.
         proof: Content of the file `PROOF` in that folder.
-        capacity: How many rows fit into a partition; 0 before `define`.
-        begun: How many groups have been begun.
+        capacity: Number of rows that fit into a partition; 0 before `define`.
+        begun: Number of groups begun so far.
     """
 
     def __init__(self, writer: Beginning, mode_name: str, count: int) -> None:
@@ -95,7 +95,7 @@ class Stripes:
         self.proof = secrets.token_hex(16)
         self.capacity = self.begun = 0
         self._writer, self._store = writer, writer.store
-        self._groups: dict[int, _Group] = {}  # those that the manifest does not call sealed yet
+        self._groups: dict[int, _Group] = {}  # not yet sealed according to the manifest
         self._written = [0] * count
         self._fields: list[Field] = []
         with files.storing(f"Rows in {self.directory}"):
@@ -110,7 +110,7 @@ class Stripes:
         """Define the fields of the rows, with their shapes.
 
         Raises:
-            FieldsMismatchError: If the mode has other fields already.
+            FieldsMismatchError: If the mode already has different fields.
         """
         given = {field.name: field for field in fields}
         with (
@@ -124,7 +124,7 @@ class Stripes:
         self.capacity = self._writer.capacity(mode)
 
     def begin(self) -> None:
-        """Begin a group: create the files of a partition for each stripe, and list them."""
+        """Begin a group: create and list a partition for each stripe."""
         created: list[PartitionFile] = []
         with files.storing(f"New partitions of mode {self.mode_name!r}"):
             try:
@@ -139,7 +139,7 @@ class Stripes:
         self.begun += 1
 
     def entries(self, place: int) -> dict[int, Partition]:
-        """Return the partitions of a stripe that are not sealed yet, by their number."""
+        """Return the partitions of a stripe that are not sealed yet, by number."""
         return {
             number: group.partitions[place]
             for number, group in self._groups.items()
@@ -147,16 +147,16 @@ class Stripes:
         }
 
     def note(self, place: int, rows: int) -> None:
-        """Note how many rows a stripe has, in all its partitions together."""
+        """Record the number of rows of a stripe, in all its partitions together."""
         self._written[place] = rows
 
     @property
     def whole(self) -> int:
-        """How many rows there are, from the first, of which none is missing."""
+        """Number of rows before the first missing one."""
         return whole_stripes(self._written)
 
     def commit(self, total: int) -> None:
-        """Let the first `total` rows be read in this process; none of them is missing."""
+        """Make the first `total` rows readable in this process; none of them may be missing."""
         for number, group in self._groups.items():
             for place, partition in enumerate(group.partitions):
                 rows = rows_of_stripe(total, place, self.count) - number * self.capacity
@@ -179,10 +179,10 @@ class Stripes:
         checksums: dict[str, int],
         running: dict[str, RunningStatistics],
     ) -> bool:
-        """Take over a partition that its writer has sealed, with checksums and statistics.
+        """Accept a partition that its writer has sealed, with checksums and statistics.
 
         Returns:
-            Whether it is one that was open, and its files say the same.
+            Whether the partition was open and its files agree.
         """
         group = self._groups.get(number)
         if group is None or place in group.sealed:
@@ -205,7 +205,7 @@ class Stripes:
         return True
 
     def close(self) -> None:
-        """Keep all rows of which none before is missing, and seal what the writers have not."""
+        """Keep all rows before the first missing one, and seal what the writers have not."""
         if not self._groups:
             return
         told, mode = self.whole, self._store.manifest.modes[self.mode_name]
@@ -230,12 +230,12 @@ class Stripes:
         missing = told - before_listed - (mode.rows - before)
         if missing > 0:
             raise DatasetError(
-                f"{missing} rows that clients have written to {self.directory} are not there. Was "
-                "one of their machines switched off? The rows before them are intact."
+                f"{missing} rows that clients wrote to {self.directory} are missing. Was one of "
+                "their machines switched off? The rows before them are intact."
             )
 
     def forget(self) -> None:
-        """Remove the file that proves the folder; nothing is written any more."""
+        """Remove the `PROOF` file; nothing is written any more."""
         self._groups.clear()
         with contextlib.suppress(OSError):
             files.remove(self.directory / PROOF)
@@ -264,7 +264,7 @@ class Stripes:
         return group
 
     def _list(self, sealed: list[Partition], empty: Iterable[Partition] = ()) -> None:
-        """Have the manifest call partitions sealed, and drop those that are empty."""
+        """Mark partitions as sealed in the manifest and drop empty ones."""
         with self._store.change() as manifest:
             mode = manifest.modes[self.mode_name]
             for partition in sealed:

@@ -1,4 +1,4 @@
-"""Updates rows in place, in the files that hold them."""
+"""Updates rows in place in the partition files."""
 
 from __future__ import annotations
 
@@ -34,7 +34,7 @@ def check_update(
         single: Whether the index was a single number.
     """
     if not values:
-        raise MissingFieldError("No field to update is given.")
+        raise MissingFieldError("No fields to update are given.")
     unknown = [name for name in values if name not in fields]
     if unknown:
         check_names(fields, unknown)
@@ -85,7 +85,7 @@ def update_rows(
         elif not partition.sealed:
             raise DatasetError(
                 f"Partition {partition.index} of mode {mode_name!r} could not be sealed. Free some "
-                "space on the disk and open the dataset again before you update its rows."
+                "disk space and reopen the dataset before you update its rows."
             )
         for name, block in rows.items():
             path = partition.path(store.directory, name)
@@ -95,7 +95,7 @@ def update_rows(
 
 
 def _invalidate(store: ManifestStore, mode_name: str, touched: list[Partition]) -> None:
-    """Drop, before anything is written, the checksums and statistics of the rows."""
+    """Drop the checksums and statistics of the rows before anything is written."""
     for partition in touched:
         partition.running = {}
     sealed = [partition for partition in touched if partition.checksums or partition.counted]
@@ -110,7 +110,7 @@ def _invalidate(store: ManifestStore, mode_name: str, touched: list[Partition]) 
 
 
 def _write(path: Path, offset: int, places: Index, rows: Array) -> None:
-    """Write rows to places counted from `offset`, consecutive ones at once."""
+    """Write rows to places counted from `offset`, each consecutive run at once."""
     row_nbytes = rows[:1].nbytes
     descriptor = files.open_regular(path, os.O_WRONLY)
     try:
@@ -122,7 +122,7 @@ def _write(path: Path, offset: int, places: Index, rows: Array) -> None:
 
 
 def _runs(places: Index) -> Iterator[tuple[int, int]]:
-    """Yield where runs of consecutive places begin and end."""
+    """Yield the start and end of each run of consecutive places."""
     ends = np.flatnonzero(np.diff(places) != 1) + 1
     bounds = [0, *ends.tolist(), len(places)]
     yield from itertools.pairwise(bounds)

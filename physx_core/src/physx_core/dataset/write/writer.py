@@ -1,4 +1,4 @@
-"""Writes rows to partitions, which begin and end at the same row in all fields of a mode."""
+"""Writes rows to partitions; they begin and end at the same rows in all fields of a mode."""
 
 from __future__ import annotations
 
@@ -31,11 +31,11 @@ _HEADER = 2**14
 
 
 class OpenPartition:
-    """The files of the partition of one mode that is being written.
+    """The files of the partition of a mode that is being written.
 
     Attributes:
         partition: Its entry in the manifest.
-        capacity: How many rows fit in.
+        capacity: Number of rows that fit in.
         files: The files by field.
     """
 
@@ -53,11 +53,11 @@ class OpenPartition:
 
     @property
     def free(self) -> int:
-        """How many rows still fit in."""
+        """Number of rows that still fit in."""
         return self.capacity - self.partition.rows
 
     def append(self, rows: Batch, start: int, count: int) -> None:
-        """Write and commit rows `start` to `start + count` of a block; all of them, or none."""
+        """Write and commit all rows `start` to `start + count` of a block, or none of them."""
         parts, durable = self.files.values(), self._syncer is None
         first = self.partition.rows
         last = first + count
@@ -74,7 +74,7 @@ class OpenPartition:
                 for file in parts:
                     file.sync()
             self.partition.rows = last
-        except BaseException:  # an interrupt, too: the next rows go to the same offsets
+        except BaseException:  # also an interrupt: the next rows go to the same offsets
             self.partition.rows = first
             for file, commit in zip(parts, before, strict=True):
                 file.withdraw(commit)
@@ -100,7 +100,7 @@ class Writer:
     """Appends checked rows to the modes of a dataset.
 
     Attributes:
-        store: The manifest, kept up to date in memory and on the disk.
+        store: The manifest, kept up to date in memory and on disk.
         session: Name of the session that writes.
     """
 
@@ -113,8 +113,8 @@ class Writer:
             store: The manifest.
             session: Name of the session that writes.
             max_file_size: Size in GB at which a partition is full.
-            durable: Whether a commit waits for the disk; otherwise files are synced about once a
-                second.
+            durable: Whether each commit waits for the disk; otherwise files are synced about once
+                a second.
             lock: Descriptor of the dataset's lock, which `close` releases.
         """
         self.store = store
@@ -143,8 +143,8 @@ class Writer:
         for name in mode_names:
             if name in self._stripes:
                 raise UsageError(
-                    f"Other processes write the rows of mode {name!r}: nothing else changes them "
-                    "until the dataset has been closed and opened again."
+                    f"Other processes write the rows of mode {name!r}: nothing else may change "
+                    "them until the dataset has been closed and reopened."
                 )
 
     def append(self, mode_name: str, rows: Batch, count: int) -> None:
@@ -153,7 +153,7 @@ class Writer:
         Args:
             mode_name: Name of a mode whose fields all have shapes.
             rows: Field name to checked rows.
-            count: How many rows there are.
+            count: Number of rows.
         """
         done = 0
         self.check_alone([mode_name])
@@ -197,13 +197,13 @@ class Writer:
                     files.sync_file(path)
 
     def refresh(self) -> None:
-        """Learn what other writers have committed."""
+        """Load what other writers have committed."""
         if self.store.shared:
-            with files.storing("What other writers did"), locks.lock_manifest(self._directory):
+            with files.storing("Rows of other writers"), locks.lock_manifest(self._directory):
                 self.store.reload(recovery.load(self._directory))
 
     def finish(self, mode_name: str) -> None:
-        """Seal the open partition of a mode, if there is one, and wait until all are sealed."""
+        """Seal the open partition of a mode, if any, and wait until all are sealed."""
         self.check_alone([mode_name])
         if mode_name in self._open:
             self._retire(mode_name)
@@ -214,10 +214,10 @@ class Writer:
         self._collect(wait=True)
 
     def close(self) -> None:
-        """Seal what is open, write manifest and index, and release the lock.
+        """Seal open partitions, write manifest and index, and release the lock.
 
-        On a full disk the last partitions remain unsealed: all their rows can be read, and the
-        next writer seals them. So do those of a disk that has failed.
+        If the disk is full or has failed, the last partitions remain unsealed: all their rows can
+        be read, and the next writer seals them.
         """
         try:
             with files.storing("The dataset's last partition"):
@@ -248,7 +248,7 @@ class Writer:
                 files.close(self._lock)
 
     def _check(self) -> None:
-        """Refuse to go on after a sync has failed."""
+        """Refuse to continue after a failed sync."""
         if self._syncer is not None:
             self._syncer.check()
         if self.store.failure is not None:
@@ -260,10 +260,10 @@ class Writer:
             self.store.failure = error
 
     def _retire(self, mode_name: str) -> None:
-        """Close the open partition of a mode and have it sealed in the background."""
+        """Close the open partition of a mode and seal it in the background."""
         opened = self._open.pop(mode_name)
         entry = opened.partition
-        entry.writing = not opened.free  # one that is full keeps its files as they are
+        entry.writing = not opened.free  # the files of a full one do not change
         opened.close()
         self._filled[mode_name] = entry
         fields = self.store.manifest.modes[mode_name].fields
@@ -271,7 +271,7 @@ class Writer:
         self._sealing.append(work)
 
     def _collect(self, *, wait: bool) -> None:
-        """Note in the manifest which partitions have been sealed."""
+        """Record in the manifest which partitions have been sealed."""
         while self._sealing and (wait or self._sealing[0].done()):
             try:
                 self._sealed.append(self._sealing.popleft().result())
@@ -296,7 +296,7 @@ class Writer:
             remove_files(self._directory, self.store.manifest.modes[entry.mode].fields, entry)
 
     def _begin(self, mode_name: str) -> OpenPartition:
-        """Create the files of a partition, then list it; only then may rows be committed."""
+        """Create the files of a partition, then list it; rows may be committed only after that."""
         parts: dict[str, PartitionFile] = {}
         try:
             with self.store.change() as manifest:
@@ -318,12 +318,12 @@ class Writer:
         return OpenPartition(entry, capacity, parts, self._syncer)
 
     def capacity(self, mode: Mode) -> int:
-        """Return how many rows of a mode fit into a partition."""
+        """Return the number of rows of a mode that fit into a partition."""
         row_nbytes = max(1, *(field.nbytes for field in mode.fields.values()))
         return max(1, self._max_nbytes // row_nbytes)
 
     def create_file(self, entry: Partition, field: Field, capacity: int) -> PartitionFile:
-        """Create a file of a new partition, under its temporary name."""
+        """Create a file of a new partition under its temporary name."""
         identity = entry.identity(field)
         file = PartitionFile.create(self._directory, identity, capacity, self._digester)
         entry.offsets[field.name] = file.data_offset
@@ -340,7 +340,7 @@ class Writer:
         return entry
 
     def _find_unsealed_before(self, mode_name: str, mode: Mode) -> tuple[int, int] | None:
-        """Return number and rows of the partition before a new one, if it is still unsealed."""
+        """Return number and rows of the partition before a new one if it is still unsealed."""
         before = self._filled.get(mode_name)
         if before is None:
             return None
@@ -356,7 +356,7 @@ class Writer:
         for name, mode in manifest.modes.items():
             if any(partition.sealed and not partition.counted for partition in mode.partitions):
                 changed = True
-                with contextlib.suppress(DatasetError):  # a partition is damaged: not now
+                with contextlib.suppress(DatasetError):  # a partition is damaged: skip for now
                     compute_statistics(self._reader, name)
         if changed:
             manifest_file.save(self._directory, manifest)

@@ -1,1 +1,1 @@
-"""Robots and objects as engines load them: files, shapes, meshes."""
+"""Robots and objects as loaded by engines: files, shapes, meshes."""

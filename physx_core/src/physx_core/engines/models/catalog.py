@@ -1,4 +1,4 @@
-"""Catalog of the robots that a world may name, described without loading a mesh."""
+"""Catalog of the robots that a world may refer to by name, described without loading meshes."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def describe(name: str, path: Path) -> RobotInfo:
 
     Args:
         name: Name of the robot.
-        path: Its URDF file; if it cannot be loaded, the result says why.
+        path: Its URDF file; if it cannot be loaded, the result gives the reason.
     """
     try:
         model = read_robot(Robot(path))
@@ -52,7 +52,7 @@ def _kind(primitives: int, meshes: int) -> str:
 
 
 def _warning(path: Path, meshes: list[Element]) -> str:
-    """Return a warning about collision meshes; their files are looked up, not read."""
+    """Return a warning about collision meshes; their files are located but not read."""
     if not meshes:
         return ""
     files = {mesh_path(path, mesh.get("filename", ""), _NO_DIRS) for mesh in meshes}

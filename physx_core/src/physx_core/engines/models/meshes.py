@@ -16,7 +16,7 @@ from physx_core.typing import Vector
 
 _FORMATS = (".stl", ".obj", ".dae")
 _LARGEST = 2**27
-"""Bytes of a mesh file; loading takes several times as much memory."""
+"""Maximum size of a mesh file, in bytes; loading takes several times as much memory."""
 _GEOMETRY = ([b"v"], [b"vn"], [b"vt"], [b"f"], [b"o"], [b"g"])
 
 
@@ -25,7 +25,11 @@ def read_vertices(path: Path, scale: Sequence[float]) -> Vector:
 
     Args:
         path: Path of an stl, obj, or dae file.
-        scale: Factors of the lengths along each axis.
+        scale: Scale factor along each axis.
+
+    Raises:
+        ModelError: If the file is missing, too large, damaged, or in another format, has no
+            vertices or some that are not finite, or the package coal is not installed.
     """
     if not path.is_file():
         raise ModelError(f"There is no mesh file {path}.")
@@ -53,9 +57,9 @@ def read_vertices(path: Path, scale: Sequence[float]) -> Vector:
 
 @contextmanager
 def geometry_file(path: Path) -> Iterator[Path]:
-    """Yield a file with the vertices and faces of a mesh, which names no other file.
+    """Yield a file with the vertices and faces of a mesh that refers to no other file.
 
-    An obj file can name files of materials, anywhere, which the engines' libraries would read.
+    An obj file can refer to material files anywhere, which the engines' libraries would read.
     """
     if path.suffix.lower() != ".obj":
         yield path
@@ -70,17 +74,17 @@ def geometry_file(path: Path) -> Iterator[Path]:
 
 
 def bounding_box(vertices: Vector) -> tuple[Vector, Vector]:
-    """Return center and full size, shape (3,) each, of the box around vertices (n, 3)."""
+    """Return the center and full size, shape (3,) each, of the bounding box of vertices (n, 3)."""
     lowest, highest = vertices.min(axis=0), vertices.max(axis=0)
     return 0.5 * (lowest + highest), np.maximum(highest - lowest, 1e-4)
 
 
 def bounding_capsule(vertices: Vector) -> tuple[Vector, Vector, Vector]:
-    """Return a capsule around vertices (n, 3), along the longest edge of their bounding box.
+    """Return a capsule that bounds vertices (n, 3), along their bounding box's longest edge.
 
     Returns:
-        Center (3,), axes (3, 3) whose last column is the capsule's, and radius and length of the
-        cylinder alone (2,), in m; a length of 0 is a sphere.
+        Center (3,), axes (3, 3) with the capsule's axis as last column, and radius and length of
+        the cylindrical part (2,), in m; a length of 0 means a sphere.
     """
     center, size = bounding_box(vertices)
     axis = int(np.argmax(size))

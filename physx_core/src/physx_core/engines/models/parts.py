@@ -1,4 +1,4 @@
-"""Parts of a world as engines load them: movers as robot models, and static things."""
+"""Parts of a world as loaded by engines: movers as robot models, and static bodies."""
 
 from __future__ import annotations
 
@@ -75,7 +75,12 @@ class Parts:
 
 
 def read_parts(world: World) -> Parts:
-    """Read the files of a world."""
+    """Read a world's files.
+
+    Raises:
+        ModelError: If a robot or mesh cannot be loaded, or a robot with a fixed base has no movable
+            joint.
+    """
     movers = []
     for robot in world.robots:
         model = read_robot(robot, touching=_touches(world, robot.self_collisions))
@@ -114,7 +119,7 @@ def _object(thing: WorldObject) -> Mover:
 
 
 def static_poses(parts: Parts) -> np.ndarray:
-    """Return the poses of static things, shape (statics, 7)."""
+    """Return the poses of static bodies, shape (statics, 7)."""
     poses = [[*static.position, *static.orientation] for static in parts.statics]
     found = np.array(poses, np.float64).reshape(-1, 7)
     found[found[:, 6] < 0, 3:] *= -1
@@ -122,7 +127,7 @@ def static_poses(parts: Parts) -> np.ndarray:
 
 
 def layout_of(parts: Parts) -> Layout:
-    """Return names and places of everything in the state."""
+    """Return the names and indices of everything in the state."""
     several = len(parts.world.robots) > 1
     joints: list[Joint] = []
     joint_names: list[str] = []

@@ -14,7 +14,7 @@ from physx_core.typing import Vector
 
 
 class Reach:
-    """The collision shapes of a robot or object, prepared for queries."""
+    """Collision shapes of a robot or object, prepared for extent queries."""
 
     def __init__(self, mover: Mover) -> None:
         links = {name: i for i, name in enumerate(mover.model.links)}
@@ -22,10 +22,10 @@ class Reach:
         self._corners: list[Vector | None] = [_corners(shape) for _, shape in self._shapes]
 
     def along(self, direction: Vector, poses: Vector) -> float:
-        """Return the largest product of a direction with a point of the shapes; -inf: none.
+        """Return the largest dot product of a direction with a point of the shapes; -inf: none.
 
         Args:
-            direction: CollisionShape (3,).
+            direction: Shape (3,).
             poses: Poses of the links, shape (links, 7).
         """
         found = [-math.inf]
@@ -42,7 +42,7 @@ class Reach:
 
 
 def _corners(shape: CollisionShape) -> Vector | None:
-    """Return the corners of a box or mesh about its center, shape (n, 3)."""
+    """Return the corners of a box or mesh relative to its center, shape (n, 3)."""
     if shape.mesh is not None:
         return read_vertices(shape.mesh, shape.size)
     if shape.kind == "box":

@@ -1,4 +1,4 @@
-"""Rigid bodies: the links of a robot as numbers, for engines that read no URDF."""
+"""Rigid bodies: the links of a robot as numbers, for engines that do not read URDF."""
 
 from __future__ import annotations
 
@@ -18,20 +18,20 @@ _MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
 
 @dataclass(frozen=True, eq=False)
 class RigidBody:
-    """A link, and what connects it to its parent.
+    """A link and its connection to its parent.
 
     Attributes:
         name: Name of the link.
-        parent: Place of its parent among the links; -1: it is the root.
-        pose: Its frame in its parent's where the joint is at 0, a homogeneous matrix of shape
+        parent: Index of its parent among the links; -1: it is the root.
+        pose: Its frame relative to its parent's with the joint at 0, a homogeneous matrix of shape
             (4, 4), in m.
         joint: The joint about or along whose axis it moves; None: it is fixed to its parent, or is
             the root.
-        axis: Axis of the joint in its own frame, shape (3,), of length 1; zeros without a joint.
+        axis: Unit axis of the joint in its own frame, shape (3,); zeros without a joint.
         mass: In kg.
         center: Center of mass in its own frame, shape (3,), in m.
-        inertia: Moments of inertia about the center of mass along its own axes, shape (3, 3), in
-            kg m². Those of a file may be such as no body has.
+        inertia: Moments of inertia about the center of mass in its own frame, shape (3, 3), in
+            kg m². A file may contain values that are physically impossible.
     """
 
     name: str
@@ -65,7 +65,7 @@ def rigid_bodies(model: RobotModel) -> tuple[RigidBody, ...]:
 
 
 def _inertial(where: str, link: Element) -> tuple[float, Vector, Vector]:
-    """Return mass, center of mass, and moments of inertia of a link of the engines' text."""
+    """Return the mass, center of mass, and moments of inertia of a link in the engines' text."""
     (inertial,), (mass,), (given,) = (link.findall(path) for path in _INERTIAL)
     (number,) = numbers_of(where, mass, "value", "", 1)
     xx, yy, zz, xy, xz, yz = (numbers_of(where, given, name, "", 1)[0] for name in _MOMENTS)

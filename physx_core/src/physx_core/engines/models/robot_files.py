@@ -1,4 +1,4 @@
-"""Look-up of robot descriptions and of the meshes that they name."""
+"""Lookup of robot descriptions and the meshes they refer to."""
 
 from __future__ import annotations
 
@@ -12,17 +12,21 @@ from physx_core.errors import MissingMeshesError, ModelError, nearest
 from physx_core.origin import install_hint
 
 EXAMPLE_DATA = "example-robot-data"
-"""Distribution with many robots; also the package that their mesh names begin with."""
+"""Distribution with many robots; also the package name at the start of their mesh names."""
 OWN_ROBOTS = Path(__file__).parents[1] / "robots"
-"""Folder of physx's own robots."""
+"""Folder with physx's own robots."""
 
 
 def find_robot(urdf: str | Path) -> Path:
     """Return the URDF file of a robot.
 
     Args:
-        urdf: A path; or the name of a robot of physx, as in ``"cartpole"``, or of
-            ``example-robot-data``, as in ``"a1/a1"``; ``physx robots`` lists the names.
+        urdf: A path, or the name of a robot of physx, such as ``"cartpole"``, or of
+            ``example-robot-data``, such as ``"a1/a1"``; ``physx robots`` lists the names.
+
+    Raises:
+        ModelError: If there is no such file or robot. A `Path`, or a name that ends in ``.urdf``,
+            is not checked.
     """
     path = Path(urdf).absolute()
     if isinstance(urdf, Path) or urdf.lower().endswith(".urdf") or path.is_file():
@@ -37,7 +41,7 @@ def find_robot(urdf: str | Path) -> Path:
 
 
 def robot_path(name: str) -> Path | None:
-    """Return the URDF file of the robot of a name, None if there is none."""
+    """Return the URDF file of a named robot, or None if there is none."""
     own = OWN_ROBOTS / f"{name}.urdf"
     if own.is_file() and "/" not in name:
         return own
@@ -46,13 +50,13 @@ def robot_path(name: str) -> Path | None:
 
 
 def named_robots() -> dict[str, Path]:
-    """Return the files of all robots with a name: those of physx, then installed ones."""
+    """Return the files of all named robots: those of physx, then installed ones."""
     own = {path.stem: path for path in sorted(OWN_ROBOTS.glob("*.urdf"))}
     return own | _installed()
 
 
 def _installed(wanted: str | None = None) -> dict[str, Path]:
-    """Return the files of installed robots by name, of one family or all."""
+    """Return the files of installed robots by name, of one family or of all."""
     folder = example_data_dir()
     found: dict[str, Path] = {}
     for root in sorted((folder / "robots").iterdir()) if folder is not None else ():
@@ -63,7 +67,7 @@ def _installed(wanted: str | None = None) -> dict[str, Path]:
 
 
 def example_data_dir() -> Path | None:
-    """Return the folder of the package ``example-robot-data``, None if it is not installed."""
+    """Return the folder of the package ``example-robot-data``, or None if it is not installed."""
     try:
         distribution = importlib.metadata.distribution(EXAMPLE_DATA)
     except importlib.metadata.PackageNotFoundError:
@@ -83,7 +87,10 @@ def example_robot(name: str) -> Path:
     """Return the path of a robot of ``example-robot-data``.
 
     Args:
-        name: Path in its folder ``robots``, as in ``"panda_description/urdf/panda.urdf"``.
+        name: Path in its folder ``robots``, such as ``"panda_description/urdf/panda.urdf"``.
+
+    Raises:
+        ModelError: If the package is not installed, or has no such robot.
     """
     folder = example_data_dir()
     if folder is None:
@@ -98,7 +105,7 @@ def example_robot(name: str) -> Path:
 
 
 def check_meshes(model: Path, root: Element, package_dirs: Mapping[str, str | Path]) -> None:
-    """Check that all mesh files of a robot exist, those for drawing and those for collisions.
+    """Check that all mesh files of a robot exist, both visual and collision meshes.
 
     Args:
         model: Path of the robot's URDF file.
@@ -115,9 +122,9 @@ def check_meshes(model: Path, root: Element, package_dirs: Mapping[str, str | Pa
 
 
 def mesh_path(model: Path, name: str, package_dirs: Mapping[str, str | Path]) -> Path | None:
-    """Return the file that a mesh name stands for, None if its package is not found.
+    """Return the file that a mesh name refers to, or None if its package is not found.
 
-    As `physx_core.simulation.mesh_path`, which does not know of ``example-robot-data``.
+    Like `physx_core.simulation.mesh_path`, but also finds ``example-robot-data``.
     """
     found = simulation.mesh_path(model, name, package_dirs)
     if found is None and name.startswith(f"package://{EXAMPLE_DATA}/"):

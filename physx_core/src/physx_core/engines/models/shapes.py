@@ -21,8 +21,8 @@ class CollisionShape:
 
     Attributes:
         kind: ``box``, ``sphere``, ``capsule``, ``cylinder`` or ``mesh``.
-        size: In m: edges of a box (3,); radius of a sphere (1,); radius and length of the cylinder
-            alone (2,). For a mesh the factors of its lengths (3,).
+        size: In m: edges of a box (3,); radius of a sphere (1,); radius and length of the
+            cylindrical part (2,). For a mesh, its scale factors (3,).
         position: Position of its center in the body's frame, shape (3,), in m.
         rotation: Rotation matrix of its axes there, shape (3, 3).
         body: Name of the link or object.
@@ -133,7 +133,7 @@ def _round_moments(shape: CollisionShape, mass: float) -> tuple[float, float, fl
 
 
 def _simplify(shape: CollisionShape, collisions: str) -> CollisionShape:
-    """Return the bounding box or capsule of a mesh, if that is wanted, else the shape itself."""
+    """Return the bounding box or capsule of a mesh if requested, else the shape itself."""
     if shape.mesh is None:
         return shape
     vertices = read_vertices(shape.mesh, shape.size)

@@ -1,14 +1,14 @@
-"""Robot models from URDF files: names, joints, collision shapes, and a text for the engines.
+"""Robot models from URDF files: names, joints, collision shapes, and URDF text for the engines.
 
 All engines load the same text, rebuilt from the file: links with their inertia, joints with their
-origin and axis. Everything else is read here, so that it has the same meaning in each:
+origin and axis. Everything else is read here, so it means the same in every engine:
 
 - Shapes are omitted; `physx_core.engines.models.shapes` reads those for collisions. All meshes must
   exist.
-- A link without inertia, or of mass 0, gets 1e-9 kg and 1e-12 kg m².
-- Mimic joints are joints like any other.
-- A position limit whose ends are equal or absent, and a velocity or effort limit that is 0 or
-  absent, is not a limit: many files contain zeros instead of unknown limits.
+- A link without inertia, or with mass 0, gets 1e-9 kg and 1e-12 kg m².
+- Mimic joints are treated as ordinary joints.
+- A position limit whose ends are equal or absent, or a velocity or effort limit that is 0 or
+  absent, counts as no limit: many files contain zeros for unknown limits.
 """
 
 from __future__ import annotations
@@ -50,12 +50,12 @@ class Joint:
     Attributes:
         name: Name in the file.
         lower: Lower position limit, in rad or m; -inf: none.
-        upper: Upper position limit, likewise.
+        upper: Upper position limit, in rad or m; inf: none.
         max_velocity: Limit of the velocity, in rad/s or m/s.
         max_torque: Limit of the torque, in N m or N.
         damping: Viscous damping, in N m s/rad or N s/m.
         friction: Coulomb friction, in N m or N.
-        settings: The world's settings of it.
+        settings: The world's settings for it.
         unit: Unit of its position, rad or m.
     """
 
@@ -75,11 +75,11 @@ class RobotModel:
     """The model of a robot.
 
     Attributes:
-        path: The file, absolute.
+        path: Absolute path of the file.
         text: URDF text for the engines.
-        links: Names of all links, parents before children, in the order of the tree.
-        joints: The joints with one degree of freedom, in the order of the tree.
-        shapes: Collision shapes; none if there is nothing to touch.
+        links: Names of all links, parents before children, in tree order.
+        joints: The joints with one degree of freedom, in tree order.
+        shapes: Collision shapes; empty if there is nothing to touch.
     """
 
     path: Path
@@ -92,11 +92,15 @@ class RobotModel:
 def read_robot(robot: Robot, *, touching: bool = False) -> RobotModel:
     """Read a robot's URDF file.
 
-    The tree is walked depth first, the children of a link in the order of their joints' names.
+    The tree is walked depth first, with the children of a link sorted by joint name.
 
     Args:
         robot: The robot's description.
         touching: Whether to read its collision shapes.
+
+    Raises:
+        ModelError: If the file or a mesh is missing, the file is invalid or has joints that are not
+            supported, or the robot's options do not fit it.
     """
     path = find_robot(robot.urdf)
     root = parse_urdf(path)
@@ -196,13 +200,13 @@ def _engine_text(tree: UrdfTree, mass_factors: Mapping[str, float]) -> str:
 def _quote(name: str) -> str:
     if not _SPECIAL.search(name):
         return f'"{name}"'
-    from xml.sax.saxutils import quoteattr  # a slow import that is seldom needed
+    from xml.sax.saxutils import quoteattr  # a slow import that is rarely needed
 
     return quoteattr(name)
 
 
 def _inertial(name: str, link: Element, factor: float) -> str:
-    """Return the text of a link's inertia times a factor, with each number validated."""
+    """Return the text of a link's inertia scaled by a factor, with each number validated."""
     given, where = link.find("inertial"), f'link "{name}"'
     mass = None if given is None else given.find("mass")
     if given is None or mass is None or _checked_text(where, mass, "value", "0", 1) == "0":
@@ -230,7 +234,7 @@ def _origin(where: str, given: Element) -> str:
 
 
 def _checked_text(where: str, element: Element, attribute: str, default: str, count: int) -> str:
-    """Return the text of an attribute that must be finite numbers; "0" for a number that is 0."""
+    """Return the text of an attribute that must be finite numbers; "0" for a number equal to 0."""
     numbers = numbers_of(where, element, attribute, default, count)
     return element.get(attribute, default) if any(numbers) or count > 1 else "0"
 

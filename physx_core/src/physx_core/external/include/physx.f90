@@ -1,4 +1,4 @@
-! physx: gives the samples of a simulation in Fortran to physx. See docs/external.md of physx.
+! physx: sends the samples of a simulation in Fortran to physx. See docs/external.md of physx.
 !
 !     use physx
 !     real(c_double), target :: u(n, n), t, alpha
@@ -16,7 +16,7 @@
 !     if (physx_close(run) /= 0) stop 1
 !
 ! Each function returns 0, or -1 if the run is over or after a mistake, which is written to stderr;
-! then all further calls return -1, too. One process of an MPI program calls them.
+! all later calls then return -1 as well. In an MPI program only one process calls them.
 
 module physx
     use, intrinsic :: iso_c_binding
@@ -28,7 +28,7 @@ module physx
     public :: c_double_complex, c_float_complex
 
     integer(c_int), parameter :: physx_any_shape = -1
-    !! Rank of a field whose shape the first sample tells: sample(1)%rank = physx_any_shape.
+    !! Rank of a field whose shape is taken from the first sample: sample(1)%rank = physx_any_shape.
 
     ! As in physx.h.
     type, bind(c) :: physx_array
@@ -88,8 +88,8 @@ module physx
 
 contains
 
-    !> Name a variable or a contiguous array, which must be a target and stay where it is. Physx
-    !> sees u(i, j) as u[j, i], as the memory lies.
+    !> Name a variable or a contiguous array, which must be a target and must not move. Following
+    !> the memory layout, physx sees u(i, j) as u[j, i].
     function physx_field(name, values) result(array)
         character(kind=c_char, len=*), intent(in) :: name
         type(*), dimension(..), target :: values
@@ -97,14 +97,14 @@ contains
         call c_describe(array, name, values)
     end function
 
-    !> Connect to the run that started this program, and tell it the fields of a sample.
+    !> Connect to the run that started this program, and declare the fields of a sample.
     integer(c_int) function physx_open(run, fields) result(status)
         type(physx_run), intent(inout) :: run
         type(physx_array), intent(in) :: fields(:)
         status = c_open(run, fields, size(fields, kind=c_int))
     end function
 
-    !> Receive parameters by name. A call after a sample begins a new episode: it waits until that
+    !> Receive parameters by name. A call after a sample begins a new episode, and waits until it
     !> is due.
     integer(c_int) function physx_parameters(run, wanted) result(status)
         type(physx_run), intent(inout) :: run
@@ -119,8 +119,8 @@ contains
         status = c_send(run, sample, size(sample, kind=c_int))
     end function
 
-    !> Receive what the run's network predicts for the inputs into the outputs; both are named as
-    !> its fields.
+    !> Receive the network's prediction for the inputs into the outputs. Both have the names of its
+    !> fields.
     integer(c_int) function physx_predict(run, inputs, outputs) result(status)
         type(physx_run), intent(inout) :: run
         type(physx_array), intent(in) :: inputs(:), outputs(:)
@@ -128,8 +128,8 @@ contains
             size(outputs, kind=c_int))
     end function
 
-    !> Say that the program has sent all its samples, and disconnect. Without this call its end is
-    !> an error.
+    !> Report that the program has sent all its samples, and disconnect. A program that ends without
+    !> this call has failed.
     integer(c_int) function physx_close(run) result(status)
         type(physx_run), intent(inout) :: run
         status = c_close(run)

@@ -1,4 +1,4 @@
-/* physx.h: gives the samples of a simulation in C99 or C++ to physx.
+/* physx.h: sends the samples of a simulation in C99 or C++ to physx.
 
    Copy it, or compile with -I"$(physx include)":
 
@@ -16,8 +16,8 @@
        return physx_close(&run) ? 1 : 0;
 
    Each function returns 0, or -1 if the run is over or after a mistake, which is written to stderr;
-   then all further calls return -1, too. One process of an MPI program calls them, and one thread
-   at a time. The page docs/external.md of physx says more. */
+   all later calls then return -1 as well. In an MPI program only one process calls them, and only
+   one thread at a time. For more, see docs/external.md of physx. */
 
 #ifndef PHYSX_H
 #define PHYSX_H
@@ -40,13 +40,13 @@ extern "C" {
 #define PHYSX_API static inline
 #endif
 
-#define PHYSX_ARRAYS 64 /* most arrays in one call */
-#define PHYSX_RANK 8    /* most axes of an array */
-#define PHYSX_NAME 52   /* longest name, with its closing zero */
-#define PHYSX_OPEN (-1) /* rank of a field whose shape the first sample tells */
-#define PHYSX_LARGEST_ ((int64_t)1 << 31) /* bytes; products of two do not overflow */
+#define PHYSX_ARRAYS 64 /* maximum number of arrays in one call */
+#define PHYSX_RANK 8    /* maximum number of axes of an array */
+#define PHYSX_NAME 52   /* maximum length of a name, including the terminating zero */
+#define PHYSX_OPEN (-1) /* rank of a field whose shape is taken from the first sample */
+#define PHYSX_LARGEST_ ((int64_t)1 << 31) /* bytes; the product of two does not overflow */
 
-/* Type of the numbers of an array: NumPy's letter for their kind, and their bytes. */
+/* Type of the numbers of an array: NumPy's letter for their kind, and their size in bytes. */
 typedef enum {
     PHYSX_BOOL = 'b' * 256 + 1,
     PHYSX_INT8 = 'i' * 256 + 1,
@@ -63,7 +63,7 @@ typedef enum {
     PHYSX_COMPLEX128 = 'c' * 256 + 16
 } physx_type;
 
-/* A named array in the program's memory: contiguous, the last axis fastest. A number has rank 0. */
+/* A named array in the program's memory: contiguous, last axis fastest. A number has rank 0. */
 typedef struct {
     char name[PHYSX_NAME];
     physx_type type;
@@ -77,26 +77,26 @@ typedef struct {
     int socket;
 } physx_run;
 
-/* Connect to the run that started this program, and tell it the fields of a sample. */
+/* Connect to the run that started this program, and declare the fields of a sample. */
 PHYSX_API int physx_open(physx_run *run, const physx_array *fields, int count);
 
-/* Receive parameters, by name, into the arrays. A call after a sample begins a new episode: it
-   waits until that is due. */
+/* Receive parameters, by name, into the arrays. A call after a sample begins a new episode, and
+   waits until it is due. */
 PHYSX_API int physx_parameters(physx_run *run, const physx_array *wanted, int count);
 
 /* Send a sample: all fields. It is one step of the environment. */
 PHYSX_API int physx_send(physx_run *run, const physx_array *sample, int count);
 
-/* Receive what the run's network predicts for the inputs into the outputs; both are named as its
+/* Receive the network's prediction for the inputs into the outputs. Both have the names of its
    fields. */
 PHYSX_API int physx_predict(physx_run *run, const physx_array *inputs, int input_count,
                             const physx_array *outputs, int output_count);
 
-/* Say that the program has sent all its samples, and disconnect. Without this call its end is an
-   error. */
+/* Report that the program has sent all its samples, and disconnect. A program that ends without
+   this call has failed. */
 PHYSX_API int physx_close(physx_run *run);
 
-/* What follows is not for programs. ---------------------------------------------------------- */
+/* Internals, not for use by programs. -------------------------------------------------------- */
 
 enum {
     PHYSX_FIELDS_ = 1,
@@ -107,11 +107,11 @@ enum {
     PHYSX_ANSWER_ = 6
 };
 
-static const char physx_magic_[4] = {'p', 'h', 'y', 1}; /* the last one: the protocol's version */
+static const char physx_magic_[4] = {'p', 'h', 'y', 1}; /* last byte: the protocol's version */
 
 typedef struct {
     char magic[4];
-    uint16_t kind, count; /* of the message; of the arrays that it describes */
+    uint16_t kind, count; /* kind of message; number of arrays that it describes */
     uint64_t size;        /* in bytes, of the data after the descriptions */
 } physx_header_;
 
@@ -119,7 +119,7 @@ typedef struct {
     char name[PHYSX_NAME];
     uint32_t type;
     int32_t rank;
-    uint32_t wanted; /* 1: its data do not follow */
+    uint32_t wanted; /* 1: requested, its data does not follow */
     int64_t shape[PHYSX_RANK];
 } physx_description_;
 
@@ -141,7 +141,7 @@ static inline int physx_mistake_(physx_run *run, const char *call, const char *n
     return physx_end_(run);
 }
 
-/* Return the bytes of an array, or -1 with the mistake in its description. */
+/* Return the size of an array in bytes, or -1 and the mistake in its description. */
 static inline int64_t physx_size_(const physx_array *array, const char **mistake)
 {
     int64_t size = (int64_t)((unsigned)array->type & 255u);
@@ -256,7 +256,7 @@ static inline int physx_message_(physx_run *run, const char *call, int kind,
     if (physx_read_(run, &answer, sizeof answer)) return -1;
     if (memcmp(answer.magic, physx_magic_, sizeof answer.magic) || answer.kind != PHYSX_ANSWER_ ||
         answer.size != (uint64_t)asked)
-        return physx_mistake_(run, call, "", "the answer is not the one that was asked for");
+        return physx_mistake_(run, call, "", "the answer does not match the request");
     for (index = 0; index < counts[1]; index++)
         if (physx_read_(run, groups[1][index].data, (size_t)sizes[counts[0] + index]))
             return -1;
@@ -274,7 +274,7 @@ PHYSX_API int physx_open(physx_run *run, const physx_array *fields, int count)
     run->socket = -1;
     if (!path)
         return physx_mistake_(run, "physx_open", "PHYSX_SOCKET is not set",
-                              "no run of physx has started this program");
+                              "this program was not started by a physx run");
     memset(&address, 0, sizeof address);
     address.sun_family = AF_UNIX;
     if (!*(const unsigned char *)&one || strlen(path) >= sizeof address.sun_path)
@@ -284,7 +284,7 @@ PHYSX_API int physx_open(physx_run *run, const physx_array *fields, int count)
     run->socket = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
     if (run->socket < 0 || connect(run->socket, (const struct sockaddr *)&address, sizeof address))
         return physx_mistake_(run, "physx_open", strerror(errno),
-                              "the run is over, or this program has called it before (only one "
+                              "the run is over, or this program has already called it (only one "
                               "process of an MPI program may)");
     groups[0] = groups[1] = fields;
     counts[0] = 0;

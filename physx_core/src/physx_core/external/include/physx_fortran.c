@@ -1,4 +1,4 @@
-/* physx_fortran.c: what physx.f90 calls. Compile it with the Fortran compiler's C companion. */
+/* physx_fortran.c: the functions that physx.f90 calls. Compile it with the companion C compiler. */
 
 #define PHYSX_API
 #include "physx.h"
@@ -20,13 +20,13 @@ int physx_fortran_type(const CFI_cdesc_t *values)
     return kind ? kind * 256 + size : 0;
 }
 
-/* Fortran's first index is the fastest, NumPy's the last: the axes are in reverse order. */
+/* Fortran's first index varies fastest, NumPy's last index does: the axes are reversed. */
 void physx_fortran_describe(physx_array *array, const CFI_cdesc_t *name, const CFI_cdesc_t *values)
 {
     size_t length = name->elem_len;
     int axis;
     memset(array, 0, sizeof *array);
-    if (length >= PHYSX_NAME) length = PHYSX_NAME; /* too long, which physx.h says */
+    if (length >= PHYSX_NAME) length = PHYSX_NAME; /* too long: physx.h reports it */
     memcpy(array->name, name->base_addr, length);
     if (length < PHYSX_NAME)
         while (length && array->name[length - 1] == ' ') array->name[--length] = 0;

@@ -18,7 +18,7 @@ def create_network(config: NetworkConfig) -> Network:
     """Return the network of a configuration.
 
     Raises:
-        ConfigError: If its class is not complete, or rejects its arguments.
+        ConfigError: If its class is incomplete, or rejects its arguments.
     """
     reference = config.network
     make, arguments = resolve_network(reference, config.network_kwargs)
@@ -37,7 +37,7 @@ def create(kind: str, reference: Any, arguments: Mapping[str, Any], base: type[A
         base: Class that it must derive from.
 
     Raises:
-        ConfigError: If its class is not complete, or rejects its arguments.
+        ConfigError: If its class is incomplete, or rejects its arguments.
     """
     return _make(kind, reference, resolve(kind, reference), arguments, base)
 
@@ -79,10 +79,10 @@ def _make(
 
 
 def _missing(make: Any, arguments: Mapping[str, Any]) -> list[str]:
-    """Return the arguments that a component needs and is not given."""
+    """Return the required arguments that a component is not given."""
     try:
         parameters = inspect.signature(make).parameters.values()
-    except (TypeError, ValueError):  # not known, for example of a class in C
+    except (TypeError, ValueError):  # unknown, for example for a class in C
         return []
     named = (inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
     return [
@@ -93,7 +93,7 @@ def _missing(make: Any, arguments: Mapping[str, Any]) -> list[str]:
 
 
 def _check_fields(network: Network) -> None:
-    """Check the names of the fields that a network reads, predicts, and is compared with."""
+    """Check the names of a network's input, predicted, and target fields."""
     for option in ("net_fields", "opt_fields", "pred_fields"):
         names = getattr(network, option)
         if isinstance(names, str) or not all(isinstance(name, str) for name in names):

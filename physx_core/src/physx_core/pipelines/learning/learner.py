@@ -37,7 +37,7 @@ from physx_core.typing import Array, Batch, Index, Tensors
 
 
 class _Step(NamedTuple):
-    """A batch on its way through the network, as tensors."""
+    """The intermediate results of a batch, as tensors."""
 
     data: Tensors
     prediction: Tensors
@@ -55,8 +55,7 @@ class Learner:
         optimization: Improves the network; None if nothing is trained.
         fields: The fields that the network was bound to, by name.
         group: The processes that train the network together.
-        row_losses: Loss of each row of the last batch, shape (rows,), if `optimize` was asked for
-            them.
+        row_losses: Loss of each row of the last batch, shape (rows,), if requested from `optimize`.
     """
 
     def __init__(
@@ -71,9 +70,9 @@ class Learner:
 
         Args:
             config: The components and their arguments.
-            trains: Whether an optimization is created too.
-            stops_at_nan: Whether `optimize` raises for a loss or gradient that is not finite.
-            network: The network, if it was created already.
+            trains: Whether to create an optimization too.
+            stops_at_nan: Whether `optimize` raises an error if a loss or gradient is not finite.
+            network: The network, if it already exists.
 
         Raises:
             ConfigError: If no network is configured, or a component rejects its arguments.
@@ -147,7 +146,7 @@ class Learner:
         return list(dict.fromkeys(names))
 
     def _compute_loss(self, optimization: Optimization, batch: Batch) -> _Step:
-        """Return the loss of a batch in physical units, and what it was computed from."""
+        """Return the loss of a batch in physical units, with the intermediate results."""
         network, transformation = self.network, self.transformation
         data = network.numpy_to_tensor(batch)
         inputs = {name: data[name] for name in network.net_fields}
@@ -167,12 +166,13 @@ class Learner:
     ) -> dict[str, float]:
         """Train on a batch and return the statistics of the step, ``loss`` first.
 
-        In a group of processes each trains on its share; the statistics are those of the batch.
+        In a group of processes, each trains on its share; the statistics are of the whole batch.
 
         Args:
             batch: The batch, the same in all processes, or this process's share of it.
-            weight: Weight of that share in the mean over the whole batch; None: it is the batch.
-            by_row: Whether to compute `row_losses`, too.
+            weight: Weight of that share in the mean over the whole batch; None: `batch` is the
+                whole batch.
+            by_row: Whether to compute `row_losses` as well.
 
         Raises:
             DivergedError: If the loss or a gradient is not finite, unless
@@ -216,7 +216,7 @@ class Learner:
         return losses
 
     def _explain(self, found: str, step: _Step) -> str:
-        """Return what is not finite, and the first place on the way to it that is not either."""
+        """Return what is not finite, and the first value leading to it that is not finite."""
         for what, tensors in (
             ("the field", step.data),
             ("the network's prediction", step.prediction),
@@ -229,7 +229,7 @@ class Learner:
     def mean_losses(self, batches: Iterable[Batch]) -> dict[str, float]:
         """Return the mean statistics over all samples of some batches, ``loss`` first.
 
-        The network is not changed. In a group of processes each evaluates its share of a batch.
+        The network is not changed. In a group of processes, each evaluates its share of a batch.
         """
         self.network.set_eval()
         optimization = self._trainer()
@@ -263,7 +263,7 @@ class Learner:
         return self._trainer().learning_rate()
 
     def join(self, group: Group) -> None:
-        """Train in a group of processes from now on; fields and parameters are known.
+        """Train in a group of processes from now on; fields and parameters must be known.
 
         Raises:
             ConfigError: If the optimization does not support several processes.
@@ -277,17 +277,18 @@ class Learner:
         self._trainer().epoch_end(loss)
 
     def predict_in_training(self, batch: Batch) -> Batch:
-        """Return the prediction of the current network, between two optimization steps.
+        """Return the current network's prediction between two optimization steps.
 
-        The network stays in evaluation mode until the next step, as there may be many predictions.
+        The network stays in evaluation mode until the next step, because there may be many
+        predictions.
 
         Raises:
             UsageError: If the fields' shapes are not known yet.
         """
         if not self.fields:
             raise UsageError(
-                "get_prediction() before the first batch is made needs the shapes of the network's "
-                "fields: set the step's training and additional data before it, or define the "
+                "Before the first batch, get_prediction() needs the shapes of the network's "
+                "fields: set the step's training and additional data first, or define the "
                 'fields with Field("name", shape=...).'
             )
         self._is_between_steps = True
@@ -295,9 +296,10 @@ class Learner:
         return self.answer(batch)
 
     def compare(self, batch: Batch) -> tuple[Batch, Batch]:
-        """Return the predictions for a batch, between two optimization steps, and their truth.
+        """Return predictions for a batch, between two optimization steps, and the true values.
 
-        Both are by the names of the true fields; what has no truth of its shape is left out.
+        The keys of both are the names of the true fields; predictions without a true value of the
+        same shape are left out.
         """
         network, answer = self.network, self.predict_in_training(batch)
         pairs = zip(network.opt_fields, network.pred_fields, strict=False)
@@ -310,7 +312,7 @@ class Learner:
 
         Raises:
             MissingFieldError: If the batch lacks a field that the network reads.
-            FieldShapeError: If the network fails because a field has another shape.
+            FieldShapeError: If the network fails because a field has the wrong shape.
         """
         network = self.network
         try:
@@ -325,16 +327,16 @@ class Learner:
             return network.tensor_to_numpy(self._predict_tensors(network.numpy_to_tensor(read)))
         except PhysxError:
             raise
-        except Exception:  # a library's own; shapes that networks accept beside those are fine
+        except Exception:  # from a library; other shapes are fine as long as the network takes them
             self._check_shapes(read)
             raise
 
     def answer(self, request: Batch) -> Batch:
-        """Return the prediction for inputs that an environment made, after checking them.
+        """Return the prediction for inputs from an environment, after checking them.
 
         Raises:
-            MissingFieldError: If a field is missing that the network reads.
-            FieldShapeError: If a field has another shape than the network was trained with.
+            MissingFieldError: If a field that the network reads is missing.
+            FieldShapeError: If a field's shape differs from the one in training.
             FieldTypeError: If a value is not an array of numbers.
         """
         self._check_shapes(request)
@@ -372,10 +374,10 @@ class Learner:
 
         Args:
             network_dir: Folder of the checkpoints.
-            progress: Progress of the training; None: it did not train here.
-            buffer: State of the buffer that draws its batches, if there is one.
-            sampler: State of the sampler that learns from it, if there is one.
-            best: Whether it is the best one so far, which replaces the last best one.
+            progress: Progress of the training; None: the network was not trained here.
+            buffer: State of the buffer that draws the batches, if any.
+            sampler: State of the sampler that learns from the training, if any.
+            best: Whether the network is the best so far, which replaces the previous best one.
 
         Raises:
             CheckpointError: If it cannot be stored.
@@ -394,18 +396,18 @@ class Learner:
         )
 
     def rehearse(self, place: Path) -> None:
-        """Check that the network can be saved; writes into a folder of `place` and removes it.
+        """Check that the network can be saved, using a temporary folder in `place`.
 
         Raises:
-            CheckpointError: If it cannot.
+            CheckpointError: If it cannot be saved.
         """
         checkpoint.rehearse(place, self.network, self._trainer())
 
     def export(self, path: str | Path, form: str) -> None:
-        """Write network and transformation into one file that other programs run.
+        """Write network and transformation to one file that other programs can run.
 
         The file's inputs are `Network.net_fields` and its outputs `Network.pred_fields`, in
-        physical units and by these names, for any number of samples.
+        physical units, with these names, for any number of samples.
 
         Args:
             path: The file; an existing one is replaced.
@@ -413,7 +415,7 @@ class Learner:
 
         Raises:
             ConfigError: If the network cannot be exported in this form.
-            MissingLibraryError: If a library that the form needs is not installed.
+            MissingLibraryError: If a library required by the form is not installed.
         """
         network = self.network
         if form not in network.export_forms:
@@ -428,13 +430,13 @@ class Learner:
         """Read the network's parameters from a checkpoint.
 
         Raises:
-            CheckpointError: If it belongs to another network, or was replaced meanwhile.
+            CheckpointError: If it belongs to another network, or was replaced in the meantime.
         """
         self.network.load_parameters(found.path / self.network.parameters_file)
         checkpoint.check_unchanged(found)
 
     def resume(self, found: checkpoint.Checkpoint) -> None:
-        """Continue a training exactly where a checkpoint was written; the fields are bound.
+        """Continue training exactly where a checkpoint was written; fields must be bound.
 
         Raises:
             CheckpointError: If it is damaged, or belongs to another network or optimization.
@@ -448,20 +450,20 @@ class Learner:
 def load_learner(
     folder: str | Path, config: NetworkConfig | None = None, *, trust: bool = False
 ) -> Learner:
-    """Return the trained network of a session, ready to predict.
+    """Return a session's trained network, ready to predict.
 
-    A checkpoint may only name components of installed plugins. Any other network, such as a class
-    of your own, is named in `config`; if it is the one of the checkpoint, and no arguments are
-    given, it gets those of the checkpoint.
+    A checkpoint may only name components of installed plugins. Name any other network, such as your
+    own class, in `config`; if it is the checkpoint's network and no arguments are given, it gets
+    the checkpoint's arguments.
 
     Args:
-        folder: The session's folder, that of its checkpoints, or that of one checkpoint.
+        folder: The folder of the session, of its checkpoints, or of one checkpoint.
         config: The checkpoint to load, and options that replace its own; None: the last one.
-        trust: Whether to import whatever the checkpoint names. That can be any code.
+        trust: Whether to import whatever code the checkpoint names.
 
     Raises:
-        CheckpointError: If there is no checkpoint, or it is damaged or of another network.
-        UntrustedReferenceError: If it names other code, which is neither trusted nor named in
+        CheckpointError: If there is no checkpoint, or it is damaged or belongs to another network.
+        UntrustedReferenceError: If it names other code that is neither trusted nor named in
             `config`.
         FieldsMismatchError: If the network reads other fields.
     """
@@ -473,7 +475,7 @@ def load_learner(
         chosen |= _choose(kind, found, config, trust)
     try:
         merged = dataclasses.replace(config, **chosen)
-    except ConfigError as error:  # the user's own options are valid
+    except ConfigError as error:  # not from the user's options, which are valid
         raise CheckpointError(
             f"{found.path / checkpoint.DESCRIPTION} is invalid: {error}"
         ) from error
@@ -495,11 +497,11 @@ def _create_recorded(config: NetworkConfig, found: checkpoint.Checkpoint) -> Net
         if isinstance(make, type) and issubclass(make, Network):
             make.check_arguments(arguments, found.path / make.parameters_file)
         return create_network(config)
-    except Exception as error:  # whatever a component raises for arguments of a damaged file
+    except Exception as error:  # a component may raise anything for arguments of a damaged file
         if isinstance(error, PhysxError) and not isinstance(error, ConfigError):
             raise
         raise CheckpointError(
-            f'{found.path / checkpoint.DESCRIPTION} describes no "{config.network}" that can be '
+            f'{found.path / checkpoint.DESCRIPTION} describes a "{config.network}" that cannot be '
             f"created: {str(error).removesuffix('.')}."
         ) from error
 
@@ -507,7 +509,7 @@ def _create_recorded(config: NetworkConfig, found: checkpoint.Checkpoint) -> Net
 def _choose(
     kind: str, found: checkpoint.Checkpoint, config: NetworkConfig, trust: bool
 ) -> dict[str, Any]:
-    """Return reference and arguments of a component: the user's, or else the checkpoint's."""
+    """Return a component's reference and arguments: the user's, by default the checkpoint's."""
     given, own = getattr(config, kind), getattr(config, f"{kind}_kwargs")
     reference = found.network.get(kind)
     arguments = found.network.get(f"{kind}_kwargs", {})
@@ -529,7 +531,7 @@ def _check(
 
 
 def _numbers(optimization: Optimization, loss: Any, data: Tensors) -> dict[str, float]:
-    """Return the result of `Optimization.transform_loss` as numbers, without any graph."""
+    """Return the result of `Optimization.transform_loss` as plain numbers."""
     losses = optimization.transform_loss(loss, data)
     method = f"{type(optimization).__name__}.transform_loss()"
     if not isinstance(losses, Mapping) or "loss" not in losses:

@@ -1,4 +1,4 @@
-"""Opens parts of a training before its first batch."""
+"""Opens the parts of a training before its first batch."""
 
 from __future__ import annotations
 
@@ -41,7 +41,7 @@ from physx_core.workers.instance import NOTHING, Skip
 
 
 def join_group(config: NetworkConfig) -> tuple[Group, Any]:
-    """Join the group of processes that the network's library trains with.
+    """Join the group of processes in which the network's library trains.
 
     Returns:
         The group, and the class whose `Network.set_seed` seeds the library.
@@ -55,7 +55,7 @@ def join_group(config: NetworkConfig) -> tuple[Group, Any]:
 
 
 def open_dataset(session: Session, start: Start, group: Group) -> Dataset:
-    """Open the dataset; only the leading process writes to the one that rows are added to."""
+    """Open the dataset; if rows are added, only the leading process opens it for writing."""
     config = start.config
     if start.environment is None:
         return open_existing(session, config)
@@ -68,18 +68,18 @@ def open_dataset(session: Session, start: Start, group: Group) -> Dataset:
 
 @dataclass(eq=False)
 class DataOpening:
-    """Opens the data of a training, and the environments that make them.
+    """Opens a training's data, and the environments that generate them.
 
     Attributes:
         start: Where the training starts.
         session: Its session.
         group: The processes that train together; only the leading one has environments.
-        buffer: Decides what batches hold while environments generate; it has begun.
-        progress: How far the training was when it ended before.
+        buffer: Decides what batches contain while environments generate; already started.
+        progress: Progress when the training last ended.
         batch_nb: Batches in an epoch; None: one pass over the stored samples.
         batch_fields: Names of the fields of a batch.
-        data_type: Floating type of batches that are read.
-        ahead: Whether all batches of an epoch will be taken, so that they may be generated ahead.
+        data_type: Floating-point type of batches that are read.
+        ahead: Whether all batches of an epoch will be taken, and so may be generated ahead.
         open_source: Opens environments: `Pipeline._open_source` without its first argument.
         predict: The network's prediction for a batch; called in the training's thread.
         show: Receives drawing events; called in the training's thread.
@@ -104,8 +104,8 @@ class DataOpening:
         """Open the data.
 
         Args:
-            resources: Closes at the end what is opened here.
-            dataset: The dataset, open; for writing in the leading process if environments make
+            resources: Closes everything that is opened here.
+            dataset: The open dataset; writable in the leading process if environments generate
                 samples.
 
         Raises:
@@ -201,9 +201,9 @@ class DataOpening:
 
         Args:
             environment: The environment.
-            dataset: Is told where its samples come from.
-            offset: Number of samples that others had made before.
-            feeder: Has a thread that takes their samples; None: the training's thread does.
+            dataset: Dataset in which the samples' origin is recorded.
+            offset: Number of samples that existed before.
+            feeder: Takes their samples in its thread; None: the training's thread does.
             options: Further arguments of `open_source`.
         """
         seed = self._seed_of(environment)
@@ -224,7 +224,7 @@ class DataOpening:
     def _begin_generation(
         self, dataset: Dataset, environment: EnvironmentConfig
     ) -> tuple[Generation, Skip]:
-        """Keep what the environments' rows depend on; return those that an earlier run has had."""
+        """Record what the environments' rows depend on; return the rows that an earlier run had."""
         described = describe_environment(environment, self._seed_of(environment))
         now = Generation.begin(
             dataset,
@@ -245,7 +245,7 @@ class DataOpening:
         return self.progress.seed if environment.seed is None else environment.seed
 
     def _note_dependence(self, dataset: Dataset) -> None:
-        """Keep in the dataset that the environments' rows depend on the network that learns."""
+        """Record in the dataset that the environments' rows depend on the learning network."""
         if self._generation is not None and not self._generation.depends:
             self._generation = dataclasses.replace(self._generation, depends=True)
             self._generation.store(dataset)

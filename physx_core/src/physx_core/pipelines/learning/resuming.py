@@ -1,4 +1,4 @@
-"""Finds the checkpoint, the dataset and the environments that a training resumes from."""
+"""Finds the checkpoint, dataset, and environments that a training resumes from."""
 
 from __future__ import annotations
 
@@ -39,25 +39,25 @@ _SAME = (
 
 @dataclass(frozen=True)
 class Generation:
-    """What the rows that a training's environments generate depend on, beside the environment.
+    """Everything that determines the rows that a training's environments generate.
 
-    It is kept in the dataset, so that a run that was killed can go on: its environments generate
-    the same rows again.
+    It is stored in the dataset so that a killed run can be resumed: its environments generate the
+    same rows again.
 
     Attributes:
         mode: Mode in which the rows are stored.
         first: Number of rows that the mode had before.
-        first_wrong: Number of rejected samples that there were before.
-        first_set: Number of sets of parameters that there were before.
-        offset: Number of rows of the mode "training" before, which the seed is derived from.
+        first_wrong: Number of rejected samples that existed before.
+        first_set: Number of sets of parameters that existed before.
+        offset: Number of rows of the mode "training" before; the seed is derived from it.
         seed: Seed of the training.
         batch_size: Number of rows in a batch.
         batch_nb: Number of batches in an epoch.
         environment: Description of the environment: see `describe_environment`.
-        depends: Whether the rows depend on the network that learns, by its predictions for an
-            environment: then they cannot be generated again.
-        ended: Numbers of rows, rejected samples and sets that the mode and the whole dataset had
-            when another run began to add its own; None: there is none. See `end_generation`.
+        depends: Whether the rows depend on the learning network through its predictions for an
+            environment; if so, they cannot be generated again.
+        ended: Numbers of rows, rejected samples, and sets that the mode and the whole dataset had
+            when another run started to add its own; None: there is none. See `end_generation`.
     """
 
     mode: str
@@ -82,33 +82,33 @@ class Generation:
         batch_nb: int | None,
         environment: Mapping[str, Any],
     ) -> Self:
-        """Return the description of a training that begins now."""
+        """Return the description of a training that starts now."""
         counted = (mode, WRONG, SETS, "training")
         first, wrong, sets, offset = (dataset.num_samples(name) for name in counted)
         described = to_plain_info({name: environment.get(name) for name in _SAME})
         return cls(mode, first, wrong, sets, offset, seed, batch_size, batch_nb, described)
 
     def start(self, dataset: Dataset) -> None:
-        """Keep it in the dataset, and copy the parameters that environments have saved there."""
+        """Store it in the dataset, and back up the parameters that environments saved there."""
         keep_parameters(dataset.directory)
         self.store(dataset)
 
     def store(self, dataset: Dataset) -> None:
-        """Keep it in the dataset."""
+        """Store it in the dataset."""
         dataset.update_info(**{GENERATION: dataclasses.asdict(self)})
 
     def resume(
         self, dataset: Dataset, environment: EnvironmentConfig, now: Generation, needed: int
     ) -> Skip:
-        """Check that a training continues this one, and return the rows that it has had.
+        """Check that a training continues this one, and return the rows that it has already had.
 
-        The parameters that environments have saved are again those of when it began.
+        The parameters that environments saved are restored to those at its start.
 
         Args:
-            dataset: Has the rows.
+            dataset: Contains the rows.
             environment: The environment.
-            now: The description of the training if it began now.
-            needed: Number of rows that the training needs in all.
+            now: The description that the training would have if it started now.
+            needed: Total number of rows that the training needs.
         """
         before = {"batch_size": self.batch_size, "batch_nb": self.batch_nb, "mode": self.mode}
         after = {"batch_size": now.batch_size, "batch_nb": now.batch_nb, "mode": now.mode}
@@ -120,8 +120,8 @@ class Generation:
             if value != before[name]:
                 raise ConfigError(
                     f"The training cannot be resumed while environments generate its samples: "
-                    f"{name} was {before[name]!r} and is {value!r}, so other samples would follow. "
-                    "Give the same, or start another training."
+                    f"{name} was {before[name]!r} and is now {value!r}, so the samples would "
+                    "differ. Use the same value, or start another training."
                 )
         ends = now.first, now.first_wrong, now.first_set
         if self.ended is not None and tuple(self.ended) != ends:
@@ -129,8 +129,8 @@ class Generation:
             if ends[0] - self.first < needed:
                 raise ConfigError(
                     f"The training cannot be resumed while environments generate its samples: "
-                    f"{ends[0] - self.first} of {needed} are there, and other runs have added "
-                    f"theirs, so that no more can follow. {_advice(dataset.directory.parent)}"
+                    f"{ends[0] - self.first} of {needed} exist, and other runs have added theirs, "
+                    f"so no more can follow. {_advice(dataset.directory.parent)}"
                 )
         restore_parameters(dataset.directory)
         rejected: tuple[int, ...] = ()
@@ -150,9 +150,9 @@ class Generation:
             recorded = {name: view[name][part] for name in dataset.fields(SETS)}
             if environment.record_wrong_samples and recorded["failed"].any():
                 raise ConfigError(
-                    "The training cannot be resumed while environments generate its samples, as "
-                    f"{recorded['failed'].sum()} of their simulations failed (redraw) and rejected "
-                    f"samples are recorded. {_advice(dataset.directory.parent)}"
+                    "The training cannot be resumed while environments generate its samples, "
+                    f"because {recorded['failed'].sum()} of their simulations failed (redraw) and "
+                    f"rejected samples are recorded. {_advice(dataset.directory.parent)}"
                 )
         return Skip(rows, rejected, recorded, begun)
 
@@ -163,9 +163,9 @@ class Start:
 
     Attributes:
         config: Options of its dataset.
-        environment: Generates or replays samples; None: they are only read, from now on at least.
+        environment: Generates or replays samples; None: samples are only read from now on.
         session: The session that it continues; None: it gets a new one.
-        checkpoint: What it resumes from; None: it begins with its first batch.
+        checkpoint: What it resumes from; None: it starts with its first batch.
         generation: Description of the samples that environments have generated; None if there are
             none.
     """
@@ -210,8 +210,8 @@ def find_start(
     generation = _parse(info.get(GENERATION))
     if generation is None:
         raise ConfigError(
-            "A training cannot be resumed while environments generate its samples, as they would "
-            f"start over. {_advice(session.path)}"
+            "A training cannot be resumed while environments generate its samples, because they "
+            f"would start over. {_advice(session.path)}"
         )
     _check_repeatable(generation, session)
     return Start(config, environment, session, found, generation)
@@ -220,22 +220,22 @@ def find_start(
 def _check_repeatable(generation: Generation | None, session: Session) -> None:
     if generation is not None and generation.depends:
         raise ConfigError(
-            "A training cannot be resumed while environments generate its samples if they depend "
-            "on the network that learns, as these do, by its predictions (get_prediction). So they "
+            "A training cannot be resumed while environments generate its samples if the samples "
+            "depend on the learning network's predictions (get_prediction), as they do here: they "
             f"cannot be generated again. {_advice(session.path)}"
         )
 
 
 def _advice(session: Path) -> str:
     return (
-        "Leave the environment out to train on the stored samples, or start another training with "
+        "Leave out the environment to train on the stored samples, or start another training from "
         f"its network: NetworkConfig.network_dir={str(session)!r} (--network.network-dir "
         f"{session})."
     )
 
 
 def _parse(plain: Any) -> Generation | None:
-    """Return the description in a dataset's info; None if there is none that is valid."""
+    """Return the description in a dataset's info; None if it is missing or invalid."""
     try:
         return Generation(**plain)
     except TypeError:
@@ -243,7 +243,7 @@ def _parse(plain: Any) -> Generation | None:
 
 
 def can_resume(environment: EnvironmentConfig | None, epochs: int) -> bool:
-    """Return whether a training that has finished some epochs needs its environments no more."""
+    """Return whether a training that has finished some epochs no longer needs environments."""
     if environment is None:
         return True
     replays = environment.load_samples and not environment.only_first_epoch
@@ -251,7 +251,7 @@ def can_resume(environment: EnvironmentConfig | None, epochs: int) -> bool:
 
 
 def _without_copied_dataset(session: Session, config: DatasetConfig) -> DatasetConfig:
-    """Return the configuration without an existing dataset that the session has a copy of."""
+    """Return the configuration, without the existing dataset if the session has a copy of it."""
     if config.existing_dir is None or not is_copy(session.dataset_dir):
         return config
     return dataclasses.replace(config, existing_dir=None)

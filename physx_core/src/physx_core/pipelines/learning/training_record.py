@@ -1,4 +1,4 @@
-"""TrainingRecord and BestEpoch: running statistics of a training, and its best epoch."""
+"""TrainingRecord and BestEpoch: a training's running statistics and its best epoch."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ class TrainingRecord:
     """Sums over the current epoch, and the losses of the last batches and epochs."""
 
     def __init__(self, state: Mapping[str, Any]) -> None:
-        """Start, or continue from a `state`; an empty one starts."""
+        """Start, or continue from a `state`; an empty state starts."""
         self._count: int = state.get("count", 0)
         self._sums: dict[str, float] = dict(state.get("sums", {}))
         self._recent = deque[float](state.get("recent", ()), RECENT)
@@ -34,7 +34,7 @@ class TrainingRecord:
     def add(self, losses: Mapping[str, float]) -> dict[str, float]:
         """Add a batch and return the values to record.
 
-        These are ``<name>/batch`` for each entry, and mean and sample variance of the loss over the
+        These are ``<name>/batch`` for each entry, and the loss's mean and sample variance over the
         last `RECENT` batches, ``loss/mean`` and ``loss/variance``.
 
         Args:
@@ -52,8 +52,8 @@ class TrainingRecord:
     def take_epoch(self) -> dict[str, float]:
         """Return the values to record for the epoch, and start a new one.
 
-        These are ``<name>/training`` for each entry, its mean over the batches, and mean and sample
-        variance of the loss over the last `RECENT` epochs, ``loss/training_mean`` and
+        These are ``<name>/training``, the mean of each entry over the batches, and the loss's mean
+        and sample variance over the last `RECENT` epochs, ``loss/training_mean`` and
         ``loss/training_variance``. Empty if there was no batch.
         """
         if not self._count:
@@ -66,7 +66,7 @@ class TrainingRecord:
 
 
 def _spread(recent: Collection[float]) -> tuple[float, float]:
-    """Return mean and sample variance, 0 for a single value."""
+    """Return the mean and the sample variance; the variance of a single value is 0."""
     size = len(recent)
     mean = sum(recent) / size
     squares = sum([(value - mean) * (value - mean) for value in recent])
@@ -78,7 +78,7 @@ class BestEpoch:
 
     Attributes:
         loss: The smallest loss so far.
-        epoch: Number of epochs that were finished then.
+        epoch: Number of epochs finished at that time.
         waited: Number of epochs judged since the loss last improved by `min_improvement`.
     """
 
@@ -87,7 +87,7 @@ class BestEpoch:
 
         Args:
             state: See `state`; an empty one starts.
-            min_improvement: Least decrease of the loss that counts as an improvement.
+            min_improvement: Smallest decrease of the loss that counts as an improvement.
         """
         self.loss: float = state.get("loss", math.inf)
         self.epoch: int = state.get("epoch", 0)
@@ -106,7 +106,7 @@ class BestEpoch:
         }
 
     def judge(self, loss: float, epoch: int) -> bool:
-        """Account for an epoch's loss and return whether it is the smallest.
+        """Record an epoch's loss and return whether it is the smallest so far.
 
         Args:
             loss: Validation loss, or training loss. NaN is not an improvement.
@@ -122,7 +122,7 @@ class BestEpoch:
         return True
 
     def reason_to_stop(self, patience: int) -> str:
-        """Return why to stop after `patience` epochs without improvement; empty: do not stop."""
+        """Return why to stop after `patience` epochs without improvement; empty: continue."""
         if self.waited < patience:
             return ""
         return (

@@ -1,7 +1,7 @@
 """Ground of a world, which never moves: a plane, stairs, or a height field.
 
-Of two things that touch, the smaller coefficient of friction counts, and the product of their
-coefficients of restitution: by default, things bounce from the ground by their own.
+A contact uses the smaller coefficient of friction and the product of the coefficients of
+restitution. By default, the restitution of the body that touches the ground decides.
 """
 
 from __future__ import annotations
@@ -21,9 +21,12 @@ class Ground:
 
     Attributes:
         friction: Coefficient of friction.
-        restitution: Coefficient of restitution; 1: that of the other thing counts.
+        restitution: Coefficient of restitution; 1: that of the other body decides.
         height: Height of the plane above the world's origin along the normal, in m.
         normal: Direction away from the ground, of any length.
+
+    Raises:
+        ConfigError: If an option is out of range, or the normal is 0.
     """
 
     friction: float = 1.0
@@ -53,7 +56,10 @@ class Stairs:
         begin: Position of the first step along x, in m.
         landing: Length of the last step beyond `run`, in m.
         friction: Coefficient of friction.
-        restitution: Coefficient of restitution; 1: that of the other thing counts.
+        restitution: Coefficient of restitution; 1: that of the other body decides.
+
+    Raises:
+        ConfigError: If an option is out of range.
     """
 
     steps: int = 5
@@ -68,13 +74,13 @@ class Stairs:
     def __post_init__(self) -> None:
         checks.options(checks.not_negative, "Stairs.", self, "friction", "restitution")
         if not isinstance(self.steps, int) or self.steps < 1:
-            raise ConfigError(f"Stairs.steps is {self.steps!r} but must be an integer from 1.")
+            raise ConfigError(f"Stairs.steps is {self.steps!r} but must be a positive integer.")
         checks.options(checks.positive, "Stairs.", self, "rise", "run", "width")
         checks.finite("Stairs.begin", self.begin)
         checks.not_negative("Stairs.landing", self.landing)
 
     def boxes(self) -> list[tuple[tuple[float, float, float], tuple[float, float, float]]]:
-        """Return center and full size, in m, of the box under each step, from height 0 up."""
+        """Return the center and full size, in m, of the box under each step, from height 0 up."""
         found = []
         for step in range(self.steps):
             last = self.landing if step == self.steps - 1 else 0.0
@@ -86,17 +92,21 @@ class Stairs:
 
 @dataclass(frozen=True, eq=False)
 class HeightField:
-    """Ground whose height is given at the points of a grid.
+    """Ground with heights given on a grid of points.
 
-    Each cell of the grid is two triangles, split along the diagonal from its corner at the lowest x
-    and y. There is no ground beyond the grid.
+    Each grid cell consists of two triangles, split along the diagonal from its corner with the
+    lowest x and y. There is no ground beyond the grid.
 
     Attributes:
         heights: In m, shape (nx, ny), at least 2 each; kept read-only.
-        spacing: Distance of neighboring points along x and along y, in m.
-        origin: x and y of the point ``heights[0, 0]``, in m; None: the grid's middle is at 0, 0.
+        spacing: Distance between neighboring points along x and along y, in m.
+        origin: x and y of the point ``heights[0, 0]``, in m; None: the grid is centered at 0, 0.
         friction: Coefficient of friction.
-        restitution: Coefficient of restitution; 1: that of the other thing counts.
+        restitution: Coefficient of restitution; 1: that of the other body decides.
+
+    Raises:
+        ConfigError: If the heights are not a grid of at least 2 x 2 finite numbers, or an option is
+            out of range.
     """
 
     heights: NDArray[np.float64]

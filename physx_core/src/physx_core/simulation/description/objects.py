@@ -12,20 +12,20 @@ from physx_core.errors import ConfigError
 
 @dataclass(frozen=True, kw_only=True)
 class WorldObject:
-    """Options of all objects. The shape's center is its center of mass.
+    """Options common to all objects. The shape's center is its center of mass.
 
     Attributes:
         name: Name of the object in the world, and of its body in the state.
-        mass: Mass of uniform density, in kg.
-        static: Whether it never moves; then its mass has no effect.
+        mass: In kg, at uniform density.
+        static: Whether it never moves; its mass then has no effect.
         position: Initial position of its center, in m.
         orientation: Initial orientation: quaternion x, y, z, w.
-        friction: Coefficient of friction; the smaller one of a pair counts.
-        restitution: Coefficient of restitution; the product of a pair counts.
+        friction: Coefficient of friction; a contact uses the smaller of the two.
+        restitution: Coefficient of restitution; a contact uses the product of the two.
     """
 
     lengths: ClassVar[tuple[str, ...]] = ()
-    """Names of the options that are positive lengths."""
+    """Names of the options that must be positive lengths."""
 
     name: str
     mass: float = 1.0
@@ -51,7 +51,7 @@ class Box(WorldObject):
     """A box.
 
     Attributes:
-        size: Full lengths of its edges, in m.
+        size: Full edge lengths, in m.
     """
 
     size: tuple[float, ...]
@@ -78,11 +78,11 @@ class Sphere(WorldObject):
 
 @dataclass(frozen=True, kw_only=True)
 class Capsule(WorldObject):
-    """A cylinder along the object's z axis with a hemisphere at either end.
+    """A cylinder along the object's z axis with a hemisphere at each end.
 
     Attributes:
         radius: In m.
-        length: Length of the cylinder alone, in m.
+        length: Length of the cylindrical part, in m.
     """
 
     lengths: ClassVar[tuple[str, ...]] = ("radius", "length")
@@ -106,11 +106,14 @@ class Cylinder(WorldObject):
 
 @dataclass(frozen=True, kw_only=True)
 class Mesh(WorldObject):
-    """A triangle mesh from a file; its moments of inertia are those of its bounding box.
+    """A triangle mesh from a file, with the moments of inertia of its bounding box.
 
     Attributes:
         path: Path of an stl, obj, or dae file. Its origin is the object's center.
-        scale: Factor of all lengths.
+        scale: Scale factor for all lengths.
+
+    Raises:
+        ConfigError: If `path` is neither a string nor a `Path`, or an option is out of range.
     """
 
     lengths: ClassVar[tuple[str, ...]] = ("scale",)

@@ -1,4 +1,4 @@
-"""Robots: a URDF file and the options that a world adds to it."""
+"""Robots: a URDF file plus the options that a world adds to it."""
 
 from __future__ import annotations
 
@@ -22,14 +22,18 @@ class JointSettings:
         mode: Meaning of a command to the joint. ``"force"``: a torque, in N m or N.
             ``"servo"``: a velocity, in rad/s or m/s, that the joint's motor reaches as far as its
             torque limit allows. ``"velocity"``: a velocity that is imposed on the joint.
-            ``"position"``: a position, in rad or m, that a servo approaches.
-        gain: In the mode ``"position"``, the servo's velocity per position error, in 1/s, clipped
-            at the velocity limit; at most 1 / period.
+            ``"position"``: a position, in rad or m, that a servo tracks.
+        gain: In ``"position"`` mode, the servo's velocity per position error, in 1/s, clipped to
+            the velocity limit; at most 1 / period.
         damping: Viscous damping, in N m s/rad or N s/m.
         friction: Coulomb friction, in N m or N.
         stiffness: Stiffness of a spring between the links, in N m/rad or N/m.
-        rest: Position at which the spring is relaxed, in rad or m.
+        rest: Rest position of the spring, in rad or m.
         armature: Inertia of the motor's rotor as seen from the joint, in kg m² or kg.
+
+    Raises:
+        UnknownOptionError: If there is no such mode.
+        ConfigError: If another option is out of range.
     """
 
     mode: Mode = "force"
@@ -53,26 +57,31 @@ class JointSettings:
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot from a URDF file; links and joints of its options must exist there to build a world.
+    """A robot from a URDF file; links and joints named in its options must exist in that file.
 
     Attributes:
         urdf: Path of the URDF file.
         name: Name of the robot in the world.
         fixed_base: Whether the root link is welded to the world; otherwise it floats freely.
-        package_dirs: Folder of each package that mesh names ``package://<name>/...`` begin with.
+        package_dirs: Folder of each package in mesh names of the form ``package://<name>/...``.
         position: Initial position of the root link, in m; permanent if the base is fixed.
-        orientation: Its orientation, likewise: quaternion x, y, z, w.
+        orientation: Initial orientation of the root link, quaternion x, y, z, w; permanent if the
+            base is fixed.
         collisions: Collision shapes: ``"shapes"``, those of the file; ``"boxes"`` or
             ``"capsules"``, the same with each mesh replaced by its bounding box or capsule, which
             is many times faster; ``"none"``.
         self_collisions: Whether links that are not connected by a joint collide with each other.
-        feet: Links that collide as a sphere around their origin instead of with their own shapes:
-            the radius of each, in m.
-        friction: Coefficient of friction of all links; the smaller one of a pair counts.
-        restitution: Coefficient of restitution of all links; the product of a pair counts.
+        feet: Links that collide as a sphere around their origin instead of with their own shapes,
+            and the sphere's radius, in m.
+        friction: Coefficient of friction of all links; a contact uses the smaller of the two.
+        restitution: Coefficient of restitution of all links; a contact uses the product of the two.
         joints: Settings of joints, by their name in the URDF file.
-        mass_factors: Factors of the mass and the moments of inertia of links, by their name in the
-            URDF file; 1 for all others.
+        mass_factors: Scale factors for the mass and moments of inertia of links, by their name in
+            the URDF file; 1 for all others.
+
+    Raises:
+        UnknownOptionError: If there is no such choice of `collisions`.
+        ConfigError: If another option has the wrong type or is out of range.
     """
 
     urdf: str | Path

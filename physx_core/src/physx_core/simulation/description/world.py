@@ -1,4 +1,4 @@
-"""The world: robots and objects on a ground, and the options of their simulation."""
+"""The world: robots, objects, the ground, and the options of their simulation."""
 
 from __future__ import annotations
 
@@ -24,17 +24,22 @@ class World:
         robots: The robots.
         period: Length of one physics step, in s.
         gravity: Acceleration of free fall in the world frame, in m/s².
-        objects: Boxes, spheres, and the like; their names differ from each other and the robots'.
+        objects: Boxes, spheres, and the like; names must be unique among robots and objects.
         ground: `Ground`, `Stairs`, or `HeightField`; None: no ground.
-        contacts: Which contacts there are: ``"all"``; ``"static"``, only of moving things with
-            static ones; ``"none"``.
-        integrator: ``"euler"``, semi-implicit, which every engine has, or ``"rk4"``, of fourth
-            order, for robots without contacts, limits, and friction.
+        contacts: Which contacts to simulate: ``"all"``; ``"static"``, only between moving and
+            static bodies; ``"none"``.
+        integrator: ``"euler"``, semi-implicit, which every engine supports, or ``"rk4"``, of fourth
+            order, for robots without contacts, limits, or friction.
         detector: Name of the engine's collision detector; None: its default.
         solver: Name of the engine's contact solver; None: its default.
-        iterations: Most iterations of an iterative solver in a step; None: its default. Fewer are
-            faster, where it does not need them all, and less accurate in impacts and piles. An
-            engine that solves contacts exactly ignores it.
+        iterations: Maximum number of iterations of an iterative solver per step; None: its default.
+            Fewer are faster where they suffice, and less accurate for impacts and piles. Ignored by
+            engines that solve contacts exactly.
+
+    Raises:
+        UnknownOptionError: If there is no such choice of `contacts` or `integrator`.
+        ConfigError: If a robot, object, or ground has the wrong type, a name is used twice, nothing
+            can move, or another option is out of range.
     """
 
     robots: Sequence[Robot] = ()
@@ -71,7 +76,7 @@ class World:
         if self.iterations is not None and not (
             type(self.iterations) is int and self.iterations > 0
         ):
-            raise ConfigError(f"World.iterations is {self.iterations!r}, not an integer from 1.")
+            raise ConfigError(f"World.iterations is {self.iterations!r}, not a positive integer.")
         object.__setattr__(self, "gravity", checks.vector("World.gravity", self.gravity, 3))
         for option, known in (
             ("contacts", get_args(Contacts)),

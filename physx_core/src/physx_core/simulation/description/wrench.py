@@ -1,4 +1,4 @@
-"""External forces on a body: permanent, for some time, or along a profile."""
+"""External forces on a body: permanent, for a limited time, or following a profile."""
 
 from __future__ import annotations
 
@@ -19,17 +19,22 @@ class Wrench:
     """A force and a torque on a body.
 
     Without `duration` and `times` it acts until it is removed; with `duration` it is a pulse; with
-    `times` it follows a profile, linear between its points and 0 after the last.
+    `times` it follows a profile that is linear between its points and 0 after the last.
 
     Attributes:
         body: Name of the link or object.
-        force: In N, shape (3,), or (k, 3) along a profile.
-        torque: In N m, likewise.
+        force: In N, shape (3,), or (k, 3) for a profile.
+        torque: In N m, shape (3,), or (k, 3) for a profile.
         point: Point of application, in the body's frame, in m.
-        frame: Axes of force and torque: the world's, or the body's own.
+        frame: Frame of force and torque: ``"world"`` or ``"body"``.
         duration: Time for which it acts, in s, rounded to physics steps, at least one; None: until
-            it is removed, or to the profile's end.
+            it is removed or the profile ends.
         times: Times of the profile's points since it was applied, in s, shape (k,), increasing.
+
+    Raises:
+        UnknownOptionError: If there is no such frame.
+        ConfigError: If the body is not a name, a shape is wrong, the times do not increase, or a
+            number is out of range.
     """
 
     body: str
@@ -53,7 +58,7 @@ class Wrench:
         if self.times is not None:
             times = _array(f"{where}times", self.times)
             if times.ndim != 1 or len(times) < 1 or (np.diff(times) <= 0).any():
-                raise ConfigError(f"{where}times must be one axis of increasing numbers.")
+                raise ConfigError(f"{where}times must be a vector of increasing numbers.")
             object.__setattr__(self, "times", times)
             shape = (len(times), 3)
         for option in ("force", "torque"):
@@ -67,7 +72,7 @@ class Wrench:
             object.__setattr__(self, option, values)
 
     def at(self, time: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Return force and torque, shape (3,) each, at a time in s since it was applied."""
+        """Return force and torque, shape (3,) each, at a time in s after it was applied."""
         force, torque = np.asarray(self.force), np.asarray(self.torque)
         if self.times is None:
             return force, torque

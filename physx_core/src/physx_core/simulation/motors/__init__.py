@@ -1,4 +1,4 @@
-"""Motors, which turn commands into joint torques, the same on every engine.
+"""Motors that turn commands into joint torques, independent of the engine.
 
-A value out of range is a `ConfigError` as soon as a motor is described.
+An out-of-range value raises `ConfigError` when the motor's description is created.
 """

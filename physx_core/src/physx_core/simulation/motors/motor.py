@@ -16,22 +16,22 @@ from physx_core.simulation.description.world import World
 
 @dataclass(frozen=True, kw_only=True)
 class Motor:
-    """A motor with its gear on a joint that is driven by torques.
+    """A motor with its gear, on a torque-driven joint.
 
     Command, torque, velocity, friction and inertia are those of the motor's shaft. The joint turns
-    `reduction` times slower with a torque `reduction` times higher. On a joint that slides, read N
-    for N m and m for rad behind the gear.
+    `reduction` times slower with a torque `reduction` times higher. For a prismatic joint, read N
+    for N m and m for rad on the joint side of the gear.
 
-    The commanded torque is clipped at `max_torque` and, close to `max_velocity`, at
+    The commanded torque is clipped to `max_torque` and, close to `max_velocity`, to
     ``slope * (max_velocity - velocity)``, and never drives the shaft beyond `max_velocity`; then
     friction is subtracted. Dry friction of a rigid gear is ``dry * tanh(velocity /
-    dry_velocity)``, so it creeps; friction that sticks is `JointSettings.friction`, or that of an
+    dry_velocity)``, so it creeps; for friction that sticks, use `JointSettings.friction` or an
     elastic gear.
 
-    Without `stiffness` the gear is rigid and `inertia` belongs in the engine's mass matrix, by
-    `with_rotors`, on engines with the feature ``armature``. With `stiffness` the rotor is a
+    Without `stiffness` the gear is rigid and `inertia` belongs in the engine's mass matrix, added
+    by `with_rotors`, on engines with the feature ``armature``. With `stiffness` the rotor is a
     separate body, simulated here, that drives the joint through a spring and damper, possibly with
-    `backlash`: on all engines, with contacts too.
+    `backlash`. This works on all engines, including with contacts.
 
     Attributes:
         joint: Name of the joint in `Layout.joints`.
@@ -41,13 +41,17 @@ class Motor:
         viscous: Viscous friction, in N m s/rad; a pair: forward, backward.
         dry: Dry friction, in N m; a pair: forward, backward.
         dry_velocity: Velocity at which 76 % of the dry friction acts, in rad/s.
-        reduction: Turns of the motor for one of the joint; negative: the other way.
-        inertia: Of the rotor, in kg m².
-        stiffness: Of the gear at the joint, in N m/rad; None: rigid.
-        damping: Of an elastic gear at the joint, in N m s/rad.
+        reduction: Motor turns per joint turn; negative: in the opposite direction.
+        inertia: Inertia of the rotor, in kg m².
+        stiffness: Stiffness of the gear at the joint, in N m/rad; None: rigid.
+        damping: Damping of an elastic gear at the joint, in N m s/rad.
         backlash: Play of an elastic gear at the joint, from one flank to the other, in rad.
         period: Time between updates of the motor's command and measured velocity, in s; a
-            multiple of the physics' period; None: at every physics step.
+            multiple of the physics period; None: at every physics step.
+
+    Raises:
+        ConfigError: If the joint is not a name, a number is out of range, or there is damping or
+            backlash without `stiffness`.
     """
 
     joint: str
@@ -90,7 +94,7 @@ class Motor:
 
 
 def with_rotors(world: World, motors: Sequence[Motor]) -> World:
-    """Return the world with the rotors of motors with rigid gears added to its joints' armature.
+    """Return the world with the rotors of rigid-gear motors added to its joints' armature.
 
     Engines without the feature ``armature`` cannot build it.
 
@@ -110,13 +114,13 @@ def with_rotors(world: World, motors: Sequence[Motor]) -> World:
 
 
 def armature_in(world: World, joint: str) -> float:
-    """Return the armature that a world gives to a joint, by its name in the layout."""
+    """Return a joint's armature in a world, given the joint's name in the layout."""
     place, name = _robot_of(world, joint)
     return world.robots[place].joints.get(name, JointSettings()).armature
 
 
 def _robot_of(world: World, joint: str) -> tuple[int, str]:
-    """Return the place of a joint's robot, and the joint's name in its file."""
+    """Return the index of a joint's robot and the joint's name in the robot's file."""
     if len(world.robots) == 1:
         return 0, joint
     owner, _, name = joint.partition("/")

@@ -24,12 +24,12 @@ class MotorState:
     """A snapshot of motors; plain and picklable.
 
     Attributes:
-        commands: Shape (motors,), in N m of the shafts.
-        drives: Torques of the shafts, held until the motors' next period, likewise.
-        others: Commands of all joints, those with motors 0, shape (joints,).
+        commands: Shaft torques, shape (motors,), in N m.
+        drives: Shaft torques held until the motors' next period, shape (motors,), in N m.
+        others: Commands of all joints, 0 for those with motors, shape (joints,).
         torques: Torques on the motors' joints in the last step, shape (motors,), in N m or N.
-        rotor_positions: Of rotors behind elastic gears, in rad or m of the joint.
-        rotor_velocities: Likewise, in rad/s or m/s.
+        rotor_positions: Positions of rotors behind elastic gears, in rad or m at the joint.
+        rotor_velocities: Velocities of these rotors, in rad/s or m/s at the joint.
         fresh: Whether they have not run since they were created or reset.
     """
 
@@ -45,21 +45,21 @@ class MotorState:
 class Motors:
     """Motors on joints of a simulation: commands in, joint torques out before each physics step.
 
-    As a hook of the simulation they run by themselves, and command all of its joints from then on::
+    Attached as a hook of the simulation, they run automatically and command all of its joints::
 
         motors = Motors(simulation, world, [Motor(joint="knee", max_torque=30.0)])
         motors.attach(simulation)
         motors.set_commands([12.0])
         simulation.step(10)
 
-    Or call them before each single `step`. Attached motors without friction and with rigid gears
-    run at their periods only, and cost nothing at the steps between. Motors keep no reference to
-    the simulation and can be pickled. After `Simulation.set_state` call `reset`, and beside its
-    `snapshot` and `restore` their own, so that rotors behind elastic gears stay with their joints.
+    Alternatively, call them before each single `step`. Attached motors with rigid gears and no
+    friction run only at their periods and cost nothing in between. Motors keep no reference to the
+    simulation and can be pickled. Call `reset` after `Simulation.set_state`, and their `snapshot`
+    and `restore` along with the simulation's, so that elastic rotors stay with their joints.
 
     Attributes:
         motors: The motors, in the order of the commands.
-        joints: Names of their joints, likewise.
+        joints: Names of their joints, in the same order.
     """
 
     def __init__(self, simulation: Simulation, world: World, motors: Sequence[Motor]) -> None:
@@ -71,11 +71,11 @@ class Motors:
             motors: At most one for each joint.
 
         Raises:
-            ComponentNotFoundError: If the simulation has no joint of that name.
+            ComponentNotFoundError: If the simulation has no joint with a given name.
             ConfigError: If two motors share a joint, a joint's mode is not ``"force"``, a period is
-                not a multiple of the physics', a gear is too stiff for it, or a rotor's inertia is
-                missing in the world.
-            FeatureNotSupportedError: If the rotor of a rigid gear needs the feature ``armature``.
+                not a multiple of the physics period, a gear is too stiff for that period, or the
+                world lacks a rotor's inertia.
+            FeatureNotSupportedError: If a rotor behind a rigid gear needs the feature ``armature``.
         """
         self.motors = tuple(motors)
         self.joints = tuple(motor.joint for motor in motors)
@@ -127,14 +127,14 @@ class Motors:
                 )
             if armature_in(world, motor.joint) < motor.armature * (1 - 1e-9):
                 raise ConfigError(
-                    f'The inertia of the motor of "{motor.joint}" is missing in the world. Build '
-                    "the simulation from with_rotors(world, motors), and give that world here."
+                    f'The inertia of the motor of "{motor.joint}" is missing from the world. Build '
+                    "the simulation from with_rotors(world, motors), and pass that world here."
                 )
 
     # Commands -------------------------------------------------------------------------------
 
     def set_commands(self, commands: ArrayLike) -> None:
-        """Hold torques of the shafts; each motor adopts its own at its next period.
+        """Hold shaft torques; each motor applies its own at its next period.
 
         Args:
             commands: Shape (motors,), in N m.
@@ -145,10 +145,10 @@ class Motors:
         overwrite("commands", self._commands, commands)
 
     def set_others(self, commands: ArrayLike) -> None:
-        """Hold commands of the joints without motors; before, those at the motors' creation count.
+        """Hold commands of joints without motors; initially, those at the motors' creation apply.
 
         Args:
-            commands: Of all joints, shape (joints,); entries of joints with motors are ignored.
+            commands: For all joints, shape (joints,); entries of joints with motors are ignored.
 
         Raises:
             SimulationError: If the shape is wrong or a value is not finite.
@@ -158,7 +158,7 @@ class Motors:
 
     @property
     def commands(self) -> Vector:
-        """The held commands, shape (motors,), in N m of the shafts; a copy."""
+        """The held shaft torques, shape (motors,), in N m; a copy."""
         return self._commands.copy()
 
     @property
@@ -168,7 +168,7 @@ class Motors:
 
     @property
     def torques_view(self) -> Vector:
-        """The same as `torques`, without a copy: read-only, always the same memory."""
+        """The same as `torques` without a copy: read-only, always the same memory."""
         found = self._torques.view()
         found.flags.writeable = False
         return found
@@ -176,7 +176,7 @@ class Motors:
     # Running --------------------------------------------------------------------------------
 
     def __call__(self, simulation: Simulation) -> None:
-        """Set the torques for the next physics step; to be called once before each."""
+        """Set the torques for the next physics step; call this once before each step."""
         due = self._due(simulation.frame)
         if due is False and not self._reads:
             return
@@ -203,15 +203,15 @@ class Motors:
         self._send(simulation, torques)
 
     def _send(self, simulation: Simulation, torques: Vector) -> None:
-        """Clip torques at the joints' limits; command them and the joints without motors."""
-        if self._limited:  # elastic gears have acted on the rotors already
+        """Clip torques to the joints' limits; command them and the joints without motors."""
+        if self._limited:  # elastic gears have already acted on the rotors
             torques = np.minimum(np.maximum(torques, -self._joint_limit), self._joint_limit)
         self._torques[:] = torques
         self._sent[self._span] = torques
         simulation.set_commands(self._sent)
 
     def _due(self, frame: int) -> Vector | bool:
-        """Return which motors adopt their commands at a frame."""
+        """Return which motors update their commands at a frame."""
         if self._fresh:
             self._fresh = False
             return True
@@ -223,7 +223,7 @@ class Motors:
     # State ----------------------------------------------------------------------------------
 
     def reset(self, simulation: Simulation) -> None:
-        """Restart from the simulation's present state: commands 0, gears unloaded."""
+        """Restart from the simulation's current state with commands of 0 and unloaded gears."""
         self._commands[:] = self._drives[:] = 0.0
         self._send(simulation, self._drives)
         self._fresh = True
@@ -249,7 +249,7 @@ class Motors:
         """Return to a snapshot.
 
         Raises:
-            SimulationError: If the snapshot is of other motors.
+            SimulationError: If the snapshot belongs to other motors.
         """
         own = self.snapshot()
         for name, value in vars(own).items():
@@ -265,6 +265,6 @@ class Motors:
             self._rotors.velocities = state.rotor_velocities.copy()
 
     def attach(self, simulation: Simulation) -> Self:
-        """Run before a simulation's physics steps from now on; return these motors."""
+        """Run before each of a simulation's physics steps from now on; return these motors."""
         simulation.add_hook(self, self._hook_every)
         return self

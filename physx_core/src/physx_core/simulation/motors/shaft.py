@@ -1,6 +1,6 @@
-"""Shafts of motors: torque limits, friction, and rotors behind elastic gears.
+"""Motor shafts: torque limits, friction, and rotors behind elastic gears.
 
-Everything is an array with one entry for each motor.
+All arrays have one entry per motor.
 """
 
 from __future__ import annotations
@@ -14,16 +14,16 @@ from physx_core.simulation.motors.motor import Motor
 from physx_core.typing import Vector
 
 _SUDDEN = 1e200
-"""Slope of a step; finite, because infinity times 0 is NaN."""
+"""Slope that stands for a step; finite, because infinity times 0 is NaN."""
 
 
 def column(motors: Sequence[Motor], option: str) -> Vector:
-    """Return an option of all motors: shape (motors,), or (motors, 2) for pairs."""
+    """Return an option of all motors, shape (motors,), or (motors, 2) for pairs."""
     return np.array([getattr(motor, option) for motor in motors], np.float64)
 
 
 class TorqueLimits:
-    """Torque limits of motors, which depend on their velocities."""
+    """Velocity-dependent torque limits of motors."""
 
     def __init__(self, motors: Sequence[Motor]) -> None:
         self._most = column(motors, "max_torque")
@@ -33,7 +33,7 @@ class TorqueLimits:
         self._acts = self.needs_velocity or bool(np.isfinite(self._most).any())
 
     def cut(self, commands: Vector, velocities: Vector) -> Vector:
-        """Return the torques of commands, shape (motors,), at the shafts' velocities."""
+        """Return commands, shape (motors,), limited to the available torque at shaft velocities."""
         if not self._acts:
             return commands
         if not self.needs_velocity:
@@ -43,14 +43,14 @@ class TorqueLimits:
         return np.minimum(np.maximum(commands, -backward), forward)
 
     def _remaining(self, margin: Vector) -> Vector:
-        """Return the torque available at a distance, in rad/s, from the highest velocity."""
+        """Return the torque available at a given margin, in rad/s, below the velocity limit."""
         with np.errstate(over="ignore"):
             left: Vector = np.minimum(self._slope * np.maximum(margin, 0.0), self._most)
         return left
 
 
 class Friction:
-    """Friction on shafts of rigid gears."""
+    """Friction on the shafts of motors with rigid gears."""
 
     def __init__(self, motors: Sequence[Motor]) -> None:
         rigid = np.array([motor.stiffness is None for motor in motors])[:, None]
@@ -60,7 +60,7 @@ class Friction:
         self.acts = bool(self._viscous.any() or self._dry.any())
 
     def torques(self, velocities: Vector) -> Vector:
-        """Return the torques against the shafts' velocities, shape (motors,)."""
+        """Return the torques that oppose the shafts' velocities, shape (motors,)."""
         forward = velocities > 0
         viscous = np.where(forward, self._viscous[0], self._viscous[1])
         dry = np.where(forward, self._dry[0], self._dry[1])
@@ -69,22 +69,22 @@ class Friction:
 
 
 class Rotors:
-    """Rotors behind elastic gears, seen from the joints: bodies of one degree of freedom each.
+    """Rotors behind elastic gears, as seen from the joints: bodies with one degree of freedom each.
 
     A rotor is integrated like the joints, with semi-implicit Euler; its friction is implicit, so
     dry friction sticks. A gear with backlash pushes but never pulls.
 
     Attributes:
-        positions: Of the rotors, in rad or m of the joint.
-        velocities: Likewise, in rad/s or m/s.
+        positions: Rotor positions, in rad or m at the joint.
+        velocities: Rotor velocities, in rad/s or m/s at the joint.
     """
 
     def __init__(self, motors: Sequence[Motor], period: float, limits: Vector) -> None:
         """Place the rotors at 0.
 
         Args:
-            motors: Those with elastic gears.
-            period: The physics' period, in s.
+            motors: The motors with elastic gears.
+            period: The physics period, in s.
             limits: Torque limits of the joints, in N m or N, at which the gears slip.
         """
         self._period, self._limits = period, limits
@@ -106,17 +106,17 @@ class Rotors:
             if each >= 4:
                 raise ConfigError(
                     f'Motor of "{motor.joint}": its gear is too stiff or too strongly damped for '
-                    f"the physics' period {self._period:g} s: (stiffness * period² + 2 * damping * "
+                    f"the physics period {self._period:g} s: (stiffness * period² + 2 * damping * "
                     f"period) / (inertia * reduction²) is {each:.3g} but must be below 4."
                 )
 
     def step(self, torques: Vector, positions: Vector, velocities: Vector) -> Vector:
-        """Move the rotors by one physics step; return the torques of the gears on the joints.
+        """Move the rotors by one physics step; return the gears' torques on the joints.
 
         Args:
-            torques: Of the motors, seen from the joints, in N m or N.
-            positions: Of the joints, in rad or m.
-            velocities: Of the joints, in rad/s or m/s.
+            torques: Motor torques as seen from the joints, in N m or N.
+            positions: Joint positions, in rad or m.
+            velocities: Joint velocities, in rad/s or m/s.
         """
         twist = self.positions - positions
         stretch = twist - np.minimum(np.maximum(twist, -self._half), self._half)

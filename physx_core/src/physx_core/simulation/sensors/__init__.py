@@ -1,4 +1,4 @@
-"""Sensors of a robot, with their imperfections, the same on every engine.
+"""Sensors of a robot, with their imperfections, independent of the engine.
 
-A value out of range is a `ConfigError` as soon as a sensor is described.
+An out-of-range value raises `ConfigError` when the sensor's description is created.
 """

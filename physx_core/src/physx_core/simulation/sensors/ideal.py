@@ -1,6 +1,6 @@
 """Ideal sensors: noise-free measurements, one class for all sensors of a kind.
 
-They use nothing but the interface of `Simulation`, so they are the same on every engine.
+They only use the interface of `Simulation`, so they are independent of the engine.
 """
 
 from __future__ import annotations
@@ -54,7 +54,7 @@ class IdealEncoders:
 
 
 class IdealImus:
-    """Orientation, angular velocity, and acceleration of points on bodies."""
+    """Orientations, angular velocities, and accelerations of points on bodies."""
 
     def __init__(self, sensors: Sequence[Imu], simulation: Simulation, world: World) -> None:
         _require("accelerations", simulation, "An Imu")
@@ -78,7 +78,7 @@ class IdealImus:
             out[row] = self._components_of(motion, self._arms[row], self._rotations[row])
 
     def _measure_bases(self, simulation: Simulation, out: Vector) -> None:
-        """Measure sensors that are all on floating bases, whose motion is a part of the state."""
+        """Measure sensors that are all on floating bases, whose motion is part of the state."""
         state = simulation.positions(), simulation.velocities(), simulation.accelerations()
         for row, base in enumerate(self._bases):
             first = base.velocities.start
@@ -124,7 +124,7 @@ class IdealImus:
 
 
 class IdealContactSensors:
-    """Forces of contacts on bodies."""
+    """Contact forces on bodies."""
 
     def __init__(self, sensors: Sequence[ContactSensor], simulation: Simulation) -> None:
         _require("contacts", simulation, "A ContactSensor")
@@ -149,7 +149,7 @@ class IdealContactSensors:
 
 
 class IdealForceTorqueSensors:
-    """Wrenches that joints carry."""
+    """Wrenches transmitted by joints."""
 
     def __init__(self, sensors: Sequence[ForceTorqueSensor], simulation: Simulation) -> None:
         _require("joint_wrenches", simulation, "A ForceTorqueSensor")
@@ -172,7 +172,7 @@ class IdealEffortSensors:
             if layout.modes and layout.modes[place] != "force":
                 raise ConfigError(
                     f'EffortSensor "{sensor.name}": the joint "{sensor.joint}" has the mode '
-                    f'"{layout.modes[place]}", so its torque is not known.'
+                    f'"{layout.modes[place]}", so its torque is unknown.'
                 )
         self._joints = as_slice(places)
 
@@ -201,15 +201,15 @@ def ideal_sensors(
 
 @dataclass(frozen=True, eq=False)
 class SensorGroup:
-    """All sensors of one kind, and the place of their components.
+    """All sensors of one kind, and where their components are stored.
 
     Attributes:
         kind: Their class.
         ideal: Their noise-free measurements.
-        components: Their part of the values.
-        shape: Of their block: sensors, components of each.
+        components: Their slice of the values.
+        shape: Shape of their block: sensors, components of each.
         every: Frames between two measurements of each, shape (sensors,).
-        shared_every: That of all of them; None where it differs.
+        shared_every: The value of `every` shared by all of them; None if it differs.
     """
 
     kind: type[Sensor]
@@ -220,7 +220,7 @@ class SensorGroup:
     shared_every: int | None
 
     def block(self, values: Vector) -> Vector:
-        """Return their part of all values, as a view."""
+        """Return their part of all values as a view."""
         return values[self.components].reshape(self.shape)
 
     def measure(self, simulation: Simulation, out: Vector, frame: int, first: bool) -> bool:
@@ -228,9 +228,9 @@ class SensorGroup:
 
         Args:
             simulation: The simulation that they measure.
-            out: Their block of the ideal values; rows of sensors that are not due stay.
+            out: Their block of the ideal values; rows of sensors that are not due stay unchanged.
             frame: The current frame.
-            first: Whether all are due in any case.
+            first: Whether all are due regardless of the frame.
         """
         if first or (self.shared_every is not None and frame % self.shared_every == 0):
             self.ideal.measure(simulation, out)

@@ -1,4 +1,4 @@
-"""Imperfections of sensors: delay, jitter, bias, random walk, and noise, of all sensors at once."""
+"""Imperfections of all sensors at once: delay, jitter, bias, random walk, and noise."""
 
 from __future__ import annotations
 
@@ -15,14 +15,14 @@ Mask = NDArray[np.bool_]
 
 
 class Components:
-    """Places of the sensors' components and errors in flat vectors.
+    """Indices of the sensors' components and errors in flat vectors.
 
     Attributes:
-        count: Number of all components.
+        count: Total number of components.
         owners: Sensor of each component.
         orientations: Components of the orientations, shape (n, 4).
         switches: Components that are 0 or 1.
-        error_count: Number of all errors.
+        error_count: Total number of errors.
         error_owners: Sensor of each error.
         shifted: Components with an additive error.
         shifts: Their additive errors.
@@ -57,12 +57,12 @@ class Components:
 
 
 class Delays:
-    """Delays of sensors, with the past values that they need.
+    """Delays of sensors, and the past values that they need.
 
     Attributes:
         acts: Whether any sensor has a delay.
-        past: The last ideal values, shape (kept, components), a ring buffer of each component.
-        counts: Number of values that each sensor has had, shape (sensors,).
+        past: The last ideal values, shape (kept, components), a ring buffer for each component.
+        counts: Number of values each sensor has measured, shape (sensors,).
     """
 
     def __init__(self, sensors: Sequence[Sensor], components: Components, periods: Vector) -> None:
@@ -79,7 +79,7 @@ class Delays:
         self.clear()
 
     def clear(self) -> None:
-        """Forget the past."""
+        """Discard all past values."""
         self.past = np.zeros((self._kept, self._components.count))
         self.past[:, self._components.orientations[:, 3]] = 1.0
         self.counts = np.zeros(len(self._lag), np.int64)
@@ -89,7 +89,7 @@ class Delays:
 
         Args:
             ideal: Shape (components,).
-            due: Shape (sensors,); the values of the others have no meaning.
+            due: Which sensors are due, shape (sensors,); values of the others are meaningless.
             rng: For the jitter.
         """
         owners = self._components.owners
@@ -100,7 +100,7 @@ class Delays:
         if self.draws and rng is not None:
             lag = lag.copy()
             lag[self._shaken] += rng.random(len(self._shaken)) * self._jitter[self._shaken]
-        lag = np.minimum(lag, self.counts)  # before the first value there was the first value
+        lag = np.minimum(lag, self.counts)  # the first value also stands for all times before it
         nearest = np.rint(lag)
         lag = np.where(np.abs(lag - nearest) < 1e-9 * (1 + lag), nearest, lag)
         whole = np.where(self._linear, np.floor(lag), np.ceil(lag)).astype(np.int64)
@@ -128,7 +128,7 @@ class Errors:
 
     Attributes:
         bias: Constant errors, given and drawn, shape (errors,).
-        walk: Random walks, likewise.
+        walk: Random walks, shape (errors,).
     """
 
     def __init__(self, sensors: Sequence[Sensor], components: Components, periods: Vector) -> None:
@@ -156,7 +156,7 @@ class Errors:
             self.bias[self._varied] += self._deviation[self._varied] * drawn
 
     def add(self, seen: Vector, due: Mask, rng: np.random.Generator | None) -> Vector:
-        """Return values with the errors of this measurement; random walks of what is not due rest.
+        """Return values with the errors of this measurement; only walks of due sensors advance.
 
         Args:
             seen: Shape (components,).

@@ -10,37 +10,39 @@ from physx_core import checks
 from physx_core.errors import ConfigError, UnknownOptionError
 
 Amounts = float | Mapping[str, Any]
-"""A number for all components; or for each quantity a number, or one number for each component."""
+"""A number for all components, or for each quantity one number or a number for each component."""
 
 
 @dataclass(frozen=True, kw_only=True)
 class Sensor:
-    """Options of all sensors.
+    """Options common to all sensors.
 
-    A measurement is the ideal value of `delay` plus a random share of `jitter` ago, plus bias,
+    A measurement is the ideal value from `delay` plus a random fraction of `jitter` ago, plus bias,
     random walk, and noise. Errors are in the units of the quantity; those of an orientation are
     small rotations about the sensor's own axes, in rad.
 
     Attributes:
         name: Name of the sensor.
-        period: Time between two measurements, in s; a multiple of the physics' period; None: the
-            physics' period.
+        period: Time between two measurements, in s; a multiple of the physics period; None: the
+            physics period.
         noise: Standard deviation of the white noise of each measurement.
         bias: Constant error.
-        bias_deviation: Standard deviation of a further constant error, drawn at the beginning and
+        bias_deviation: Standard deviation of an additional constant error, drawn at the start and
             at each reset.
         random_walk: Standard deviation of the random walk after 1 s; it starts at 0 and grows with
             the square root of time.
-        delay: In s.
+        delay: Delay of each measurement, in s.
         jitter: Largest random addition to the delay, drawn uniformly for each measurement, in s.
-        interpolation: Value between two measurements: 0, that of the earlier one; 1, linear
-            interpolation.
+        interpolation: Value between two measurements: 0, the earlier one; 1, linear interpolation.
+
+    Raises:
+        ConfigError: If it is not of a subclass, its name is empty, or an option is out of range.
     """
 
     quantities: ClassVar[Mapping[str, int]] = {}
     """Number of components of each quantity, in the measurement's order."""
     exact: ClassVar[frozenset[str]] = frozenset()
-    """Quantities without errors."""
+    """Quantities that have no errors."""
 
     name: str
     period: float | None = None
@@ -72,7 +74,7 @@ class Sensor:
                     checks.not_negative(where + option, value)
 
     def amounts(self, option: str) -> list[float]:
-        """Return the amounts of an error, as ``"noise"``, by component; 3 for an orientation.
+        """Return the amounts of an error, such as ``"noise"``, by component; 3 for an orientation.
 
         Raises:
             ConfigError: If a quantity does not exist or has no errors, or a value is not a number.
@@ -107,7 +109,10 @@ class Encoder(Sensor):
 
     Attributes:
         joint: Name of the joint in `Layout.joints`.
-        reduction: Turns of the measured shaft for one of the joint, for an encoder on the motor.
+        reduction: Turns of the measured shaft per joint turn, for an encoder on the motor.
+
+    Raises:
+        ConfigError: If an option is out of range, or `reduction` is 0.
     """
 
     quantities: ClassVar[Mapping[str, int]] = {"position": 1, "velocity": 1}
@@ -131,8 +136,8 @@ class Imu(Sensor):
 
     Attributes:
         body: Name of the link or object.
-        position: Of the sensor in the body's frame, in m.
-        rotation: Of the sensor in the body's frame: quaternion x, y, z, w.
+        position: Position of the sensor in the body's frame, in m.
+        rotation: Rotation of the sensor in the body's frame: quaternion x, y, z, w.
     """
 
     quantities: ClassVar[Mapping[str, int]] = {
@@ -172,10 +177,10 @@ class ContactSensor(Sensor):
 
 @dataclass(frozen=True, kw_only=True)
 class ForceTorqueSensor(Sensor):
-    """Measures the reaction of a joint: ``force`` in N and ``torque`` in N m, in the last step.
+    """Measures the reaction of a joint in the last step: ``force`` in N and ``torque`` in N m.
 
-    They act on the joint's child link, at its origin and along its axes. Static loads, motion,
-    contacts, and wrenches all count. Needs an engine with the feature ``joint_wrenches``.
+    They act on the joint's child link, at its origin and in its frame. Static loads, motion,
+    contacts, and wrenches are all included. Needs an engine with the feature ``joint_wrenches``.
 
     Attributes:
         joint: Name of the joint in `Layout.joints`.
@@ -188,7 +193,7 @@ class ForceTorqueSensor(Sensor):
 
 @dataclass(frozen=True, kw_only=True)
 class EffortSensor(Sensor):
-    """Measures the ``torque`` that drives a joint with the mode ``"force"``, in N m or N.
+    """Measures the ``torque`` that drives a joint in ``"force"`` mode, in N m or N.
 
     Attributes:
         joint: Name of the joint in `Layout.joints`.

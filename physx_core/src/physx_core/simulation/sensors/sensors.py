@@ -1,4 +1,4 @@
-"""Sensors of a simulation: they measure at their periods, with their imperfections."""
+"""Sensors of a simulation, which measure at their own periods and with imperfections."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class SensorState:
         bias: Constant errors.
         walk: Random walks.
         frame: Frame of the last measurement; -1: none yet.
-        rng: State of the random generator; None: nothing is drawn.
+        rng: State of the random generator; None if nothing is drawn.
     """
 
     values: Vector
@@ -48,8 +48,8 @@ class SensorState:
 class Sensors:
     """Sensors of a simulation: each measures at its own period.
 
-    As a hook of the simulation they run by themselves before each physics step; `update` measures
-    what is due after the last step, and nothing twice::
+    As a hook of the simulation they run automatically before each physics step; `update` measures
+    what is due after the last step, and never measures twice::
 
         sensors = Sensors(simulation, world, [Encoder(name="knee", joint="knee", noise=1e-3)], rng)
         simulation.add_hook(sensors)
@@ -57,18 +57,19 @@ class Sensors:
         sensors.update(simulation)
         sensors["knee"]["position"]
 
-    All sensors measure at the first update, whatever their periods, then at the frames that are
-    multiples of their periods. They keep no reference to the simulation and can be pickled. After
-    `Simulation.set_state` call `reset`, and beside its `snapshot` and `restore` their own.
+    All sensors measure at the first update, regardless of their periods, then at frames that are
+    multiples of their periods. They keep no reference to the simulation and can be pickled. Call
+    `reset` after `Simulation.set_state`, and their `snapshot` and `restore` along with the
+    simulation's.
 
     `view` and `block` give the measurements without a copy, always in the same memory. Sensors
-    without noise, bias, and delay cost the least.
+    without noise, bias, and delay are the cheapest.
 
     Attributes:
         sensors: The sensors, in the order of the values: grouped by kind, in the given order.
-        dtype: Record of all values: a record for each sensor, by its name, and in it its
-            quantities by their names. All are float64, without gaps.
-        size: Number of values of all sensors.
+        dtype: Record of all values: a nested record for each sensor, by name, with its quantities
+            by name. All are float64, without gaps.
+        size: Total number of values.
     """
 
     def __init__(
@@ -87,10 +88,10 @@ class Sensors:
             rng: Source of biases, noise, random walks, and jitter.
 
         Raises:
-            ComponentNotFoundError: If the simulation has no joint or body of that name.
-            ConfigError: If two sensors share a name, a period is not a multiple of the physics', a
-                joint's torque is not known, or `rng` is missing.
-            FeatureNotSupportedError: If the engine lacks what a sensor needs.
+            ComponentNotFoundError: If the simulation has no joint or body with a given name.
+            ConfigError: If two sensors share a name, a period is not a multiple of the physics
+                period, a joint's torque is unknown, or `rng` is missing.
+            FeatureNotSupportedError: If the engine lacks a feature that a sensor needs.
         """
         kinds = list(dict.fromkeys(type(sensor) for sensor in sensors))
         sensors = sorted(sensors, key=lambda sensor: kinds.index(type(sensor)))
@@ -111,7 +112,7 @@ class Sensors:
         self._errors = Errors(sensors, self._components, periods)
         if rng is None and (self._delays.draws or self._errors.draws):
             raise ConfigError(
-                "Noise, bias_deviation, random_walk, and jitter are drawn at random: give "
+                "Noise, bias_deviation, random_walk, and jitter need random numbers: pass "
                 "Sensors(..., rng=np.random.default_rng(seed))."
             )
         self._rng, self._frame = rng, -1
@@ -122,7 +123,7 @@ class Sensors:
         self._errors.begin(rng)
 
     def _arrange(self) -> None:
-        """Create the views of the groups, which are not pickled."""
+        """Create the groups' views, which are not pickled."""
         self._blocks = [(group, group.block(self._ideal)) for group in self._groups]
 
     def __getstate__(self) -> dict[str, Any]:
@@ -137,7 +138,7 @@ class Sensors:
     # Measuring ------------------------------------------------------------------------------
 
     def update(self, simulation: Simulation) -> None:
-        """Measure what is due in the current frame, unless that is done already."""
+        """Measure what is due in the current frame, unless already done."""
         frame = simulation.frame
         if frame == self._frame:
             return
@@ -171,7 +172,7 @@ class Sensors:
     __call__ = update
 
     def attach(self, simulation: Simulation) -> Self:
-        """Run before a simulation's steps from now on; return these sensors."""
+        """Run before each of a simulation's steps from now on; return these sensors."""
         simulation.add_hook(self, self._hook_every)
         return self
 
@@ -179,13 +180,13 @@ class Sensors:
 
     @property
     def view(self) -> Vector:
-        """The measurements, shape (size,): read-only, always the same memory; NaN at first."""
+        """The measurements, shape (size,): read-only, always the same memory, initially NaN."""
         return _read_only(self._values)
 
     def block(self, kind: type[Sensor]) -> Vector:
         """Return the measurements of one kind of sensor, shape (sensors, components).
 
-        This is a part of `view`: read-only, always the same memory; NaN at first. Rows are in the
+        This is part of `view`: read-only, always the same memory, initially NaN. Rows are in the
         order of `sensors`.
 
         Raises:
@@ -230,7 +231,7 @@ class Sensors:
         """Return the last measurement of one sensor: a record of its quantities; a copy.
 
         Raises:
-            ComponentNotFoundError: If there is no sensor of that name.
+            ComponentNotFoundError: If there is no sensor with that name.
             SimulationError: If nothing has been measured yet.
         """
         if name not in (self.dtype.names or ()):
@@ -248,7 +249,7 @@ class Sensors:
         """Discard all measurements and draw new biases.
 
         Args:
-            rng: New source of random numbers; None: keep the present one.
+            rng: New source of random numbers; None: keep the current one.
         """
         if rng is not None:
             self._rng = rng
@@ -272,10 +273,10 @@ class Sensors:
         )
 
     def restore(self, state: SensorState) -> None:
-        """Return to a snapshot, the state of the random generator included.
+        """Return to a snapshot, including the state of the random generator.
 
         Raises:
-            SimulationError: If the snapshot is of other sensors.
+            SimulationError: If the snapshot belongs to other sensors.
         """
         for name, own in vars(self.snapshot()).items():
             given: Any = getattr(state, name, None)

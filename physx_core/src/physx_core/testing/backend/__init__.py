@@ -1,1 +1,1 @@
-"""Checks that a physics engine does what physx and its users expect of one."""
+"""Contract checks for physics engines."""

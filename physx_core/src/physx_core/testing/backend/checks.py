@@ -1,4 +1,4 @@
-"""All checks of engines, by their names."""
+"""All checks of engines, by name."""
 
 from __future__ import annotations
 
@@ -21,19 +21,19 @@ def check_backend(
     timeout: float = TIMEOUT,
     **kwargs: Any,
 ) -> Report:
-    """Check that an engine keeps the contract of `Backend` and `Simulation`.
+    """Check that an engine satisfies the contract of `Backend` and `Simulation`.
 
-    What its simulations do not claim in `Simulation.features` is left out.
+    Features that its simulations do not claim in `Simulation.features` are not checked.
 
     Args:
         component: Its class, a function that returns it, or a reference.
-        expected_failures: Names of checks that may fail, and why.
-        timeout: Time in s after which a check that has not ended has failed.
-        kwargs: Arguments of its constructor.
+        expected_failures: Names of checks that may fail, each with the reason.
+        timeout: Time limit for each check, in s; a check that exceeds it fails.
+        kwargs: Arguments for its constructor.
 
     Raises:
-        UsageError: If there is no check of an expected name, or no other process can find the
-            component or take its arguments.
+        UsageError: If `expected_failures` names an unknown check, or another process cannot find
+            the component or receive its arguments.
     """
     return run_checks(
         "backend",

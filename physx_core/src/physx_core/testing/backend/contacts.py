@@ -1,4 +1,4 @@
-"""Checks of things that touch each other, or the limits of their joints."""
+"""Checks of bodies that touch each other or reach their joint limits."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ def _rests(subject: Subject) -> None:
             expect(len(contacts) > 0, "a box that rests on the ground has no contacts")
             total += contacts["force"].sum(axis=0) / 20
         expect_close(
-            total, [0, 0, 2 * GRAVITY], 1e-2, "the forces on a box at rest are not its weight: off"
+            total, [0, 0, 2 * GRAVITY], 1e-2, "forces on a box at rest do not equal its weight: off"
         )
         names = simulation.layout.names
         for contact in contacts:
             pair = (names[contact["body_a"]], names[contact["body_b"]])
             expect(pair == ("box", "ground"), f"the box on the ground touches as {pair}")
             expect(contact["normal"][2] > 0.99, f"the normal is {contact['normal']}, not up")
-            expect(abs(contact["depth"]) < 1e-2, f"the box is {contact['depth']:.3g} m deep")
+            expect(abs(contact["depth"]) < 1e-2, f"the box penetrates by {contact['depth']:.3g} m")
             expect(abs(contact["point"][2]) < 1e-2, f"it touches at {contact['point']}")
 
 
@@ -89,14 +89,14 @@ def _stacks(subject: Subject) -> None:
         places = {name: float(simulation.body_poses([name])[0][2]) for name in ("low", "high")}
         expect(
             abs(places["low"] - 0.1) < 5e-3 and abs(places["high"] - 0.3) < 5e-3,
-            f"two boxes, one on the other, rest at {places} m, not at 0.1 and 0.3 m",
+            f"two stacked boxes rest at {places} m, not at 0.1 and 0.3 m",
         )
     with build(subject, dataclasses.replace(world, contacts="static")) as simulation:
         simulation.step(800)
         height = float(simulation.body_poses(["high"])[0][2])
         expect(
             height < 0.2,
-            f'with contacts="static" boxes touch the ground alone, but one stays at {height:.3f} m',
+            f'with contacts="static" boxes only touch the ground, but one stays at {height:.3f} m',
         )
 
 
@@ -124,7 +124,7 @@ def _ball_on_ground() -> World:
 def _rays(subject: Subject) -> None:
     need(subject, "raycast")
     with build(subject, _ball_on_ground()) as simulation:
-        simulation.step()  # some engines place shapes then
+        simulation.step()  # some engines place shapes only then
         begins, ends = [[0, 0, 4.0], [3, 0, 4.0], [0, 0, 4.0]], [[0, 0, 1.0], [3, 0, -1], [0, 0, 5]]
         hits = simulation.raycast(np.array(begins), np.array(ends))
         names = simulation.layout.names
@@ -133,8 +133,10 @@ def _rays(subject: Subject) -> None:
             found == ["ball", "ground", ""],
             f"rays at a ball, at the ground, and at nothing hit {found}",
         )
-        expect_close(hits[0]["point"], [0, 0, 2.1], 1e-3, "a ray hits the ball elsewhere: off")
-        expect_close(hits[1]["fraction"], 0.8, 1e-3, "a ray hits the ground elsewhere: off")
+        expect_close(
+            hits[0]["point"], [0, 0, 2.1], 1e-3, "a ray hits the wrong point of a ball: off"
+        )
+        expect_close(hits[1]["fraction"], 0.8, 1e-3, "a ray hits the ground too early or late: off")
 
 
 def _untouched(subject: Subject) -> None:
@@ -146,7 +148,10 @@ def _untouched(subject: Subject) -> None:
 
 def _expect_falling(simulation: Simulation) -> None:
     height = float(simulation.positions()[2])
-    expect(height < 0.08, f'with contacts="none" a box falls through the ground, not to {height} m')
+    expect(
+        height < 0.08,
+        f'with contacts="none" a box must fall through the ground, but is at {height} m',
+    )
 
 
 CHECKS: dict[str, Check] = {

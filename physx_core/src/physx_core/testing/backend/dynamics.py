@@ -37,7 +37,7 @@ def _agree(subject: Subject) -> None:
                 simulation.inverse_dynamics(q, v, rates),
                 torques,
                 1e-7,
-                "inverse_dynamics() does not give back the torques of forward_dynamics(): off",
+                "inverse_dynamics() does not recover the torques of forward_dynamics(): off",
             )
             expect(np.array_equal(simulation.positions(), before), "the dynamics changed the state")
 
@@ -67,7 +67,7 @@ def _jacobian(subject: Subject) -> None:
         expect_close(
             matrix @ v, wanted, 1e-8, "jacobian() times the velocities and body_velocities() differ"
         )
-    with build(subject, arm()) as simulation:  # whose velocities are derivatives of its positions
+    with build(subject, arm()) as simulation:  # its velocities are derivatives of its positions
         q, v = state_of(simulation, 3)
         (before,), (after,) = (
             simulation.body_poses(["hand"], q + sign * _SMALL * v) for sign in (-1, 1)
@@ -100,7 +100,7 @@ def _derivatives(subject: Subject) -> None:
                 found[number],
                 np.array(columns).T,
                 1e-5,
-                f"the derivatives by the {name} differ from finite differences",
+                f"the derivatives w.r.t. {name} differ from finite differences",
             )
 
 
@@ -124,5 +124,5 @@ CHECKS: dict[str, Check] = {
     "has a mass matrix that agrees with the dynamics": _mass,
     "has Jacobians that agree with velocities": _jacobian,
     "has derivatives that agree with finite differences": _derivatives,
-    "computes batches as single states": _batches,
+    "computes batches like single states": _batches,
 }

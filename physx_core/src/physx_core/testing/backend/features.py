@@ -1,4 +1,4 @@
-"""Checks that an engine can do what its features say, and says what it cannot do."""
+"""Checks that an engine supports the features it claims, and claims all that it supports."""
 
 from __future__ import annotations
 
@@ -77,7 +77,7 @@ def _known(subject: Subject) -> None:
     with build(subject, busy(subject)) as simulation:
         unknown = simulation.features - FEATURES.keys()
         expect(not unknown, f"there are no features {sorted(unknown)}: see FEATURES")
-        expect(simulation.engine, "its simulations have no name of their engine")
+        expect(simulation.engine, "its simulations do not name their engine")
 
 
 def _honest(subject: Subject) -> None:
@@ -124,7 +124,7 @@ def _spring(subject: Subject) -> None:
         simulation.step(2500)
         place = simulation.layout.position_index["elbow"]
         angle = float(simulation.positions()[place])
-    expect(abs(angle - 0.5) < 0.02, f"a spring with its rest at 0.5 rad rests at {angle:.3f} rad")
+    expect(abs(angle - 0.5) < 0.02, f"a spring with rest=0.5 rad settles at {angle:.3f} rad")
 
 
 CHECKS: dict[str, Check] = {

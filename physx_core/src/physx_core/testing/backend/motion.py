@@ -1,4 +1,4 @@
-"""Checks of the motion of things that touch nothing."""
+"""Checks of the motion of bodies that touch nothing."""
 
 from __future__ import annotations
 
@@ -30,20 +30,20 @@ def _falls(subject: Subject) -> None:
     gravity = np.array([0.3, -0.2, -GRAVITY])
     with build(subject, ball(gravity=tuple(gravity))) as simulation:
         begin = simulation.positions()[:3].copy()
-        expect_close(begin, [0, 0, 2.0], 1e-12, "a ball does not begin where the world says")
+        expect_close(begin, [0, 0, 2.0], 1e-12, "a ball does not start where the world says")
         simulation.step(_STEPS)
         wanted = begin + gravity * PERIOD**2 * _STEPS * (_STEPS + 1) / 2
         expect_close(
             simulation.positions()[:3],
             wanted,
             1e-9,
-            "a ball that falls is not where semi-implicit Euler steps bring it: off",
+            "a falling ball is not where semi-implicit Euler steps take it: off",
         )
         expect_close(
             simulation.velocities()[:3],
             gravity * PERIOD * _STEPS,
             1e-9,
-            "the velocity of a ball that falls differs",
+            "the velocity of a falling ball is off",
         )
         frames, time = simulation.frame, simulation.time
         expect(frames == _STEPS, f"after {_STEPS} steps frame is {frames}")
@@ -51,7 +51,7 @@ def _falls(subject: Subject) -> None:
 
 
 def _energy(simulation: Simulation) -> float:
-    """Return the energy of the pendulum over that between its lowest and its highest place."""
+    """Return the pendulum's energy relative to that between its lowest and highest point."""
     (angle,), (rate,) = simulation.positions(), simulation.velocities()
     weight = PENDULUM_MASS * GRAVITY * PENDULUM_LENGTH
     return float(0.5 * PENDULUM_INERTIA * rate**2 / weight - math.cos(angle))
@@ -74,7 +74,7 @@ def _swings(subject: Subject) -> None:
             "its length in 3 s; semi-implicit Euler steps of 1 ms: less than 3e-3",
         )
         expect(
-            crossings == 4, f"in 3 s a pendulum crosses its lowest place {crossings} times, not 4"
+            crossings == 4, f"in 3 s a pendulum crosses its lowest point {crossings} times, not 4"
         )
 
 
@@ -105,7 +105,7 @@ def _one_step(subject: Subject) -> None:
                 simulation.positions(),
                 positions + PERIOD * after,
                 1e-7,
-                "a step does not move the positions by the new velocities: off",
+                "a step does not move the positions with the new velocities: off",
             )
 
 
@@ -117,7 +117,7 @@ def _many_steps(subject: Subject) -> None:
         expect_equal(
             {"positions": other.positions(), "velocities": other.velocities()},
             {"positions": one.positions(), "velocities": one.velocities()},
-            "60 calls of step() and one of step(60) differ",
+            "60 calls of step() and one call of step(60) differ",
         )
 
 
@@ -131,15 +131,15 @@ def _holds_torques(subject: Subject) -> None:
         second = float(simulation.velocities()[0])
         expect(
             first > 0 and second > 1.8 * first,
-            f"a torque is not held: after 5 steps the joint turns with {first:.3g} rad/s, after 10 "
-            f"with {second:.3g}",
+            f"a torque is not held: after 5 steps the joint turns at {first:.3g} rad/s, after 10 "
+            f"at {second:.3g}",
         )
         simulation.set_torques(np.full(3, 1e6))
         expect_close(
             simulation.commands(),
             layout.max_torque,
             1e-9,
-            "torques are not clipped at the limits of the joints: commands() differ",
+            "torques are not clipped to the joints' limits: commands() differ",
         )
 
 
@@ -149,18 +149,18 @@ def _places(subject: Subject) -> None:
             simulation.set_state(np.array([angle]), np.array([0.5]))
             wanted = [-math.sin(angle), 0.0, -math.cos(angle)]
             (pose,) = simulation.body_poses(["tip"])
-            expect_close(pose[:3], wanted, 1e-9, f"at {angle} rad the tip is elsewhere: off")
+            expect_close(pose[:3], wanted, 1e-9, f"at {angle} rad the tip is misplaced: off")
             expect(pose[6] >= 0, f"the quaternion of a pose has a negative w: {pose[3:]}")
             turn = [0.0, math.sin(angle / 2), 0.0, math.cos(angle / 2)]
             expect_close(
                 pose[3:],
                 np.array(turn) * (1 if turn[3] >= 0 else -1),
                 1e-9,
-                f"at {angle} rad the tip is turned otherwise",
+                f"at {angle} rad the tip's orientation is off",
             )
             (velocity,) = simulation.body_velocities(["tip"])
             moving = [-0.5 * math.cos(angle), 0.0, 0.5 * math.sin(angle), 0.0, 0.5, 0.0]
-            expect_close(velocity, moving, 1e-9, "the velocity of the tip differs")
+            expect_close(velocity, moving, 1e-9, "the velocity of the tip is off")
 
 
 def _accelerations(subject: Subject) -> None:
@@ -176,7 +176,7 @@ def _accelerations(subject: Subject) -> None:
             simulation.accelerations(),
             (simulation.velocities() - before) / PERIOD,
             1e-6,
-            "accelerations() are not the change of the velocities over the period",
+            "accelerations() are not the velocity change divided by the period",
         )
 
 
@@ -192,7 +192,7 @@ def _wrenches(subject: Subject) -> None:
             simulation.velocities()[:3],
             [100 * PERIOD / 0.5, 0, 200 * PERIOD / 0.5],
             1e-9,
-            "1 N and 2 N for 0.1 s do not give a ball of 0.5 kg the momentum that they should",
+            "1 N and 2 N for 0.1 s do not give a ball of 0.5 kg the expected momentum",
         )
 
 
@@ -208,7 +208,7 @@ def _hooks(subject: Subject) -> None:
         simulation.step(7)
         simulation.remove_hook(hook)
         simulation.step(3)
-        expect(called == [0, 3, 6], f"a hook of every third step was called in the frames {called}")
+        expect(called == [0, 3, 6], f"a hook for every third step was called at frames {called}")
 
 
 CHECKS: dict[str, Check] = {

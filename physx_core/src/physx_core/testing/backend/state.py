@@ -1,4 +1,4 @@
-"""Checks of states: layout, snapshots, repetition, refusals, and the end."""
+"""Checks of states: layout, snapshots, repetition, refusals, and closing."""
 
 from __future__ import annotations
 
@@ -49,8 +49,8 @@ def _layout(subject: Subject) -> None:
         expect(layout.units == ("rad", "rad", "m"), f"the joints' units are {layout.units}")
         for link in ("trunk", "upper", "fore", "hand"):
             expect(link in layout.bodies, f'the link "{link}" is not among the bodies')
-        expect(simulation.positions().shape == (10,), "positions() has not the shape (nq,)")
-        expect(simulation.velocities().shape == (9,), "velocities() has not the shape (nv,)")
+        expect(simulation.positions().shape == (10,), "positions() does not have the shape (nq,)")
+        expect(simulation.velocities().shape == (9,), "velocities() does not have the shape (nv,)")
         quaternion = simulation.positions()[3:7]
         expect_close(quaternion, [0, 0, 0, 1], 1e-12, "the neutral orientation is not x, y, z, w")
 
@@ -65,7 +65,7 @@ def _copies(subject: Subject) -> None:
             expect(read(out) is out, f"{read.__name__}(out) does not return out")
             out += 7.0
         expect_equal(
-            _now(simulation), wanted, "the state changed when an array that was read was written to"
+            _now(simulation), wanted, "the state changed when a returned array was written to"
         )
         positions, velocities = state_of(simulation)
         given = positions.copy()
@@ -85,7 +85,7 @@ def _restores(subject: Subject) -> None:
         wanted = _now(simulation)
         simulation.set_torques(np.zeros(3))
         stored = pickle.loads(pickle.dumps(state))  # noqa: S301 - of this process
-        for name, one in (("it came from", simulation), ("another simulation of the world", other)):
+        for name, one in (("its simulation", simulation), ("another simulation", other)):
             one.restore(stored)
             expect(one.frame == 120, f"after restore() frame is {one.frame}, not 120")
             exactly = "exact_restore" in simulation.features
@@ -98,7 +98,7 @@ def _restores(subject: Subject) -> None:
                 expect_equal(
                     _now(one),
                     wanted,
-                    f"restored in {name}, what follows is not the same, bit for bit",
+                    f"restored in {name}, what follows is not bit-identical",
                 )
             else:
                 expect_close(
@@ -120,8 +120,8 @@ def _state_alone(subject: Subject) -> None:
         expect_equal(
             found[1],
             found[0],
-            "set to the same state, it moves otherwise after other motions: it keeps something of "
-            "what was before, as contacts or impulses",
+            "set to the same state after other motions, it moves differently: it keeps something "
+            "from before, such as contacts or impulses",
         )
 
 
@@ -132,7 +132,7 @@ def _repeats(subject: Subject) -> None:
             simulation.set_torques(np.array([2.0, -1.0, 1.0]))
             simulation.step(200)
             found.append(_now(simulation))
-    expect_equal(found[1], found[0], "a second simulation of the same world moves otherwise")
+    expect_equal(found[1], found[0], "a second simulation of the same world moves differently")
 
 
 def _independent(subject: Subject) -> None:
@@ -147,7 +147,9 @@ def _independent(subject: Subject) -> None:
             one.step(10)
             other.set_state(np.array([1.0]), np.array([3.0]))
             other.step(3)
-        expect_equal(_now(one), wanted, "beside another simulation it moves otherwise than alone")
+        expect_equal(
+            _now(one), wanted, "next to another simulation it moves differently than alone"
+        )
 
 
 def _refuses(subject: Subject) -> None:
@@ -158,9 +160,9 @@ def _refuses(subject: Subject) -> None:
         wrong: dict[str, Callable[[], object]] = {
             "positions with NaN": lambda: simulation.set_state(nan, zeros),
             "infinite velocities": lambda: simulation.set_state(zeros, infinite),
-            "positions of another shape": lambda: simulation.set_state(np.zeros(4), zeros),
+            "positions of the wrong shape": lambda: simulation.set_state(np.zeros(4), zeros),
             "torques with NaN": lambda: simulation.set_torques(nan),
-            "torques of another shape": lambda: simulation.set_torques(np.zeros(2)),
+            "torques of the wrong shape": lambda: simulation.set_torques(np.zeros(2)),
             "a body that does not exist": lambda: simulation.body_poses(["nobody"]),
             "a snapshot of another world": lambda: simulation.restore(other.snapshot()),
         }
@@ -174,17 +176,17 @@ def _refuses(subject: Subject) -> None:
                     f"for {what} it raised {type(error).__name__}: {error}; it must raise "
                     "SimulationError"
                 ) from error
-            raise AssertionError(f"it took {what}")
-        expect_equal(_now(simulation), wanted, "what it refused has changed the state")
+            raise AssertionError(f"it accepted {what}")
+        expect_equal(_now(simulation), wanted, "a call that it refused changed the state")
 
 
 def _needs_files(subject: Subject) -> None:
     try:
         build(subject, World(robots=[Robot(subject.folder / "nowhere.urdf")])).close()
     except ModelError as error:
-        expect("nowhere.urdf" in str(error), f"the error names no file: {error}")
+        expect("nowhere.urdf" in str(error), f"the error does not name the file: {error}")
         return
-    raise AssertionError("it built a robot of a file that does not exist")
+    raise AssertionError("it built a robot from a file that does not exist")
 
 
 def _ends(subject: Subject) -> None:

@@ -31,7 +31,7 @@ def build(subject: Subject, world: World) -> Simulation:
 
 
 def arm(*, robot: Mapping[str, Any] | None = None, **options: Any) -> World:
-    """Return a world with an arm alone: two hinges and a slide.
+    """Return a world with only an arm: two hinges and a slide.
 
     Args:
         robot: Options of the robot.
@@ -48,13 +48,13 @@ def pendulum(**options: Any) -> World:
 
 
 def ball(**options: Any) -> World:
-    """Return a world with a ball in the air, which touches nothing."""
+    """Return a world with a ball in the air that touches nothing."""
     sphere = Sphere(name="ball", radius=0.1, mass=0.5, position=(0.0, 0.0, 2.0))
     return World(objects=[sphere], period=PERIOD, contacts="none", **options)
 
 
 def box(height: float = 0.1, friction: float = 1.0, **options: Any) -> World:
-    """Return a world with a box of 0.2 m and 2 kg on the ground, or above it."""
+    """Return a world with a 0.2 m, 2 kg box on the ground or above it."""
     cube = Box(
         name="box", size=(0.2, 0.2, 0.2), mass=2.0, position=(0.0, 0.0, height), friction=friction
     )
@@ -62,9 +62,9 @@ def box(height: float = 0.1, friction: float = 1.0, **options: Any) -> World:
 
 
 def busy(subject: Subject) -> World:
-    """Return a world with an arm, a box and a ball, which fall on the ground if there are contacts.
+    """Return a world with an arm, a box and a ball that fall to the ground if there are contacts.
 
-    For an engine without contacts there is no ground, for one without objects the arm alone.
+    An engine without contacts gets no ground; one without objects gets only the arm.
     """
     cube = Box(name="box", size=(0.2, 0.2, 0.2), mass=2.0, position=(1.0, 0.0, 0.15))
     sphere = Sphere(name="ball", radius=0.1, mass=0.5, position=(-1.0, 0.0, 0.2))
@@ -80,7 +80,7 @@ def busy(subject: Subject) -> World:
 
 
 def state_of(simulation: Simulation, seed: int = 0) -> tuple[Vector, Vector]:
-    """Return a state within the limits, in which everything moves."""
+    """Return a state within the limits in which everything moves."""
     random, layout = np.random.default_rng(seed), simulation.layout
     positions = simulation.positions().copy()
     for name, place in layout.position_index.items():
@@ -97,10 +97,10 @@ def state_of(simulation: Simulation, seed: int = 0) -> tuple[Vector, Vector]:
 
 
 def need(subject: Subject, feature: str) -> None:
-    """Leave out a check if an engine lacks a feature.
+    """Skip a check if an engine lacks a feature.
 
     Raises:
-        NotApplicableError: If it does.
+        NotApplicableError: If it lacks the feature.
     """
     with build(subject, busy(subject)) as simulation:
         if feature not in simulation.features:

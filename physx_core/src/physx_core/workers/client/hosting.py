@@ -1,4 +1,4 @@
-"""Hosting: a client of an elastic run, which starts and ends workers as the server says."""
+"""Hosting: a client of an elastic run that starts and ends workers as the server directs."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ from physx_core.workers.launchers import ClientProcess, stop
 from physx_core.workers.tickets import instance_of
 
 _LOOK_EVERY = 0.05
-_NO_START = 127  # as of a shell that finds no program
+_NO_START = 127  # like a shell that does not find a program
 
 
 def host_workers(link: WorkerLink, address: str, token: str, say: Callable[[str], None]) -> None:
-    """Start and end workers as the server says, until it ends the run; none is left then.
+    """Start and end workers as the server directs, until it ends the run; then none is left.
 
     Args:
         link: Connection to the server.
@@ -48,7 +48,7 @@ class _Hosting:
         self._stopped: set[int] = set()
 
     def run(self) -> None:
-        """Obey the server until it ends the run, and leave the workers time for their ends."""
+        """Obey the server until it ends the run, then give the workers time to exit."""
         self._say("waits for instances to run")
         self._link.send(pack(Kind.HOST, encode(socket.gethostname())))
         while (patience := self._obey()) is None:
@@ -64,7 +64,7 @@ class _Hosting:
         stop(workers.values(), 0.0)
 
     def _obey(self) -> float | None:
-        """Obey what arrives within a moment; return the time for the end, in s, once ordered."""
+        """Obey orders that arrive soon; once told to end, return the time allowed for it, in s."""
         seconds = _LOOK_EVERY
         while self._link.has_message(seconds):
             frame = self._link.receive()
@@ -110,7 +110,7 @@ class _Hosting:
             how = describe_exit(status)
             if ticket in self._stopped:
                 self._stopped.discard(ticket)
-                how = "goes elsewhere, or is started again"
+                how = "moves to another client, or is restarted"
             self._say(f"instance {instance_of(ticket)} {how}")
             self._tell_end(ticket, status, worker.stderr())
 

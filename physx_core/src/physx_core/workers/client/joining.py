@@ -15,7 +15,7 @@ from physx_core.net.values import decode
 from physx_core.workers.client.link import RunEnded, WorkerLink
 
 PATIENCE = 10.0
-"""Time in s for which a client tries to join."""
+"""How long a client tries to join, in s."""
 
 _ANSWER_TIME = 10.0
 _PAUSE = 0.2
@@ -26,17 +26,17 @@ def join(
 ) -> tuple[WorkerLink, dict[str, Any] | None]:
     """Connect to a server and receive what to run.
 
-    It tries again if nothing listens, and if the server ends the connection during the handshake,
-    as it does with some connections while there are too many.
+    Retries if nothing listens, or if the server closes the connection during the handshake, as it
+    does with some connections while there are too many.
 
     Args:
         address: ``HOST:PORT``.
         token: Token of the run.
         instance: Number of the instance to run or a ticket for it, 0 for any that is free.
-        patience: Time in s for which to try again.
+        patience: How long to retry, in s.
 
     Returns:
-        The connection, and the arguments of the instance; None: the server wants workers.
+        The connection, and the arguments of the instance; None: the client hosts workers.
     """
 
     def attempt(seconds: float) -> tuple[WorkerLink, dict[str, Any] | None]:

@@ -22,7 +22,7 @@ from physx_core.processes import kill_descendants
 _SPIN_TIME = 2e-4
 _CLEANUP_TIME = 1.0
 _REST = 1 << 16
-_MOST_PARTS = 512  # a system call takes no more than 1024
+_MOST_PARTS = 512  # a system call takes at most 1024
 _HANGUP = getattr(select, "POLLRDHUP", 0)
 
 
@@ -35,17 +35,17 @@ class ServerGone(RunEnded):
 
 
 class WorkerLink:
-    """Connection to the server, authenticated; blocking.
+    """Authenticated, blocking connection to the server.
 
     A thread watches the connection: a process whose server is gone exits within about a second,
     even during a long step, and within about 15 s if the server's machine no longer answers.
 
     Attributes:
-        spins: Whether to look for an answer without sleeping, for 0.2 ms.
+        spins: Whether to spin-wait for an answer for up to 0.2 ms.
     """
 
     def __init__(self, connection: socket.socket, reader: FrameReader) -> None:
-        """Take a connection whose handshake is done.
+        """Take over a connection whose handshake is done.
 
         Args:
             connection: The socket.
@@ -70,10 +70,10 @@ class WorkerLink:
             raise ServerGone from error
 
     def send_parts(self, parts: Sequence[bytes | memoryview]) -> None:
-        """Send a message whose parts lie in several places.
+        """Send a message that is given in parts.
 
         Args:
-            parts: The bytes in their order; they may change once this returns.
+            parts: The bytes, in order; they may change once this returns.
         """
         waiting = [memoryview(part) for part in parts if len(part)]
         try:
@@ -92,7 +92,7 @@ class WorkerLink:
         return self._postponed.popleft() if self._postponed else self._next()
 
     def put_back(self, frame: Frame) -> None:
-        """Have `receive` return a message again that arrived too early."""
+        """Put back a message that arrived too early: `receive` returns it again."""
         self._postponed.appendleft(frame)
 
     def has_message(self, seconds: float = 0.0) -> bool:
@@ -134,7 +134,7 @@ class WorkerLink:
     def finish(self) -> None:
         """Wait until the server has read all that was sent and has closed the connection.
 
-        Unsent data of a socket are lost if it is closed and the other side sends to it.
+        Unsent data is lost if a socket is closed while the other side sends to it.
         """
         with contextlib.suppress(OSError):
             self._connection.shutdown(socket.SHUT_WR)
@@ -167,11 +167,11 @@ class WorkerLink:
         try:
             poll_peer(poll, self._connection, None)
         except TimeoutError:
-            with contextlib.suppress(OSError):  # end the wait of a call that sends or receives
+            with contextlib.suppress(OSError):  # unblock a call that sends or receives
                 self._connection.shutdown(socket.SHUT_RDWR)
         if self._over.wait(_CLEANUP_TIME):
             return
-        if os.getsid(0) == os.getpid():  # it was launched and has a process group of its own
+        if os.getsid(0) == os.getpid():  # it was launched, with its own process group
             os.killpg(os.getpid(), signal.SIGKILL)
         kill_descendants()
         os._exit(1)

@@ -22,7 +22,7 @@ class Producer:
     """Steps one instance and sends its rows.
 
     Attributes:
-        made: Number of generated rows, which is the number of the next one, counted from 0.
+        made: Number of generated rows, which is also the index of the next one.
         failure: Why generated rows cannot be sent; None while they can.
     """
 
@@ -45,9 +45,9 @@ class Producer:
             sink: Takes the rows.
             rows: How many rows the server has from earlier clients. They are generated again, but
                 not sent.
-            rejected: How many rejected rows it has that are generated again.
+            rejected: How many of the rejected rows that it has are generated again.
             made: How many of the rows are not generated again.
-            slow_until: Number of the trajectory before which each row is sent at once.
+            slow_until: Number of a trajectory: the rows of earlier ones are sent immediately.
         """
         self.made = made
         self.failure: PhysxError | None = None
@@ -61,7 +61,7 @@ class Producer:
         self._sent_at = 0.0
 
     def open(self) -> None:
-        """Begin with the rows that are where they go: these are generated again, but not put."""
+        """Open the sink; rows that it already has are generated again, but not put."""
         self._skip = self._sink.open(self._skip)
 
     def run(self) -> None:
@@ -84,9 +84,9 @@ class Producer:
                 self._listen()
 
     def flush(self) -> None:
-        """Send the rows that were not sent yet.
+        """Send the rows that have not been sent yet.
 
-        If one holds NaN or an infinite number, those before it are sent, and `failure` names it.
+        If one contains NaN or infinity, only those before it are sent, and `failure` names it.
         """
         self._send_rejected()
         buffer = self._buffer
@@ -107,7 +107,7 @@ class Producer:
             raise RunEnded
 
     def announce_early(self) -> None:
-        """Send the fields of the rows before the first row is done, if all shapes are known."""
+        """Send the fields of the rows before the first row is complete, if all shapes are known."""
         fields, steps = self._instance.fields, self._credit > 0
         if steps and self._buffer is None and all(field.shape is not None for field in fields):
             self._buffer = RowBuffer(fields)
@@ -119,7 +119,7 @@ class Producer:
         buffer = self._buffer
         if buffer is None:
             buffer = self._buffer = RowBuffer(infer_shapes(instance.fields, sample))
-        is_repeated = self.made < self._skip  # and fails again if it is not valid
+        is_repeated = self.made < self._skip  # and fails again if it is invalid
         numbers = (instance.instance_id, instance.last_episode, instance.last_step)
         buffer.put(sample, *numbers, finite=is_repeated)
         if is_repeated:
@@ -135,7 +135,7 @@ class Producer:
             self._link.send(pack(Kind.FIELDS, encode(table)))
 
     def _send_rejected(self) -> None:
-        """Send what `check_sample` rejected, once the fields' shapes are known."""
+        """Send the samples that `check_sample` rejected, once the fields' shapes are known."""
         rejected, buffer = self._instance.rejected, self._buffer
         if rejected is None or buffer is None or not self._announced:
             return
@@ -147,7 +147,7 @@ class Producer:
             self._link.send_parts(pack_rows(part, len(part["step"]), Kind.WRONG))
 
     def _send_last_rejected(self) -> None:
-        """Send the rejected samples of an instance that ended, even if it made no rows."""
+        """Send the rejected samples of an instance that ended, even if it generated no rows."""
         rejected = self._instance.rejected
         if rejected is None or self._announced:
             return
@@ -167,9 +167,9 @@ class Producer:
         )
 
     def _listen(self) -> None:
-        """Handle the server's messages, up to the first one for after the rows that it requested.
+        """Handle the server's messages, up to the first that applies after the requested rows.
 
-        A client that replaces another receives at once everything that the other one was sent.
+        A client that replaces another one immediately receives all that was sent to the former.
         """
         while self._link.has_message():
             frame = self._link.receive()
@@ -192,7 +192,7 @@ class Producer:
             self._stored.extend(copy_row(stored, row) for row in range(frame.number))
         elif frame.kind is Kind.CLOSE:
             raise RunEnded
-        elif frame.kind not in (Kind.ANSWER, Kind.REFUSAL):  # those of an abandoned request
+        elif frame.kind not in (Kind.ANSWER, Kind.REFUSAL):  # to an abandoned request
             raise ConnectionRefusedByPeerError(
                 f"The server sent {frame.kind.name}, which only a client sends."
             )

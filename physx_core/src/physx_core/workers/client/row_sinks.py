@@ -1,4 +1,4 @@
-"""Row sinks: where a client's rows go; here over the connection."""
+"""Row sinks: where a client's rows go. The one here sends them to the server."""
 
 from __future__ import annotations
 
@@ -12,25 +12,25 @@ from physx_core.workers.row_codec import pack_rows
 
 
 class RowSink(Protocol):
-    """Takes the rows that a client makes.
+    """Takes the rows that a client generates.
 
     Attributes:
-        ended: Whether no more rows are to be made.
+        ended: Whether no more rows are needed.
     """
 
     ended: bool
 
     def open(self, rows: int) -> int:
-        """Begin; return how many of the `rows` rows that the server has need not be put again."""
+        """Open; return how many of the server's `rows` rows do not have to be put again."""
 
     def put(self, rows: Batch, count: int, fields: list[Field]) -> None:
-        """Take a block of rows, in their order."""
+        """Take a block of rows, in order."""
 
     def tell(self) -> None:
-        """Tell the server of rows that it does not know of, if there are any."""
+        """Tell the server about rows that it does not know of, if any."""
 
     def take(self, frame: Frame) -> bool:
-        """Handle a message that is meant for it; return whether it was."""
+        """Handle a message if it is meant for the sink; return whether it was."""
 
     def close(self) -> None:
         """Release all resources."""
@@ -45,7 +45,7 @@ class SentRows:
         self._link = link
 
     def open(self, rows: int) -> int:
-        """Return `rows`: what was sent once is there."""
+        """Return `rows`: the server has everything that was sent."""
         return rows
 
     def put(self, rows: Batch, count: int, fields: list[Field]) -> None:
@@ -56,7 +56,7 @@ class SentRows:
         """Do nothing: the server has all rows."""
 
     def take(self, frame: Frame) -> bool:
-        """No message is meant for it."""
+        """Return False: no message is meant for this sink."""
         return False
 
     def close(self) -> None:

@@ -33,11 +33,11 @@ class StripedRows:
     """
 
     def __init__(self, link: WorkerLink, setup: dict[str, Any]) -> None:
-        """Keep what the server said.
+        """Store what the server sent.
 
         Args:
             link: The connection to the server.
-            setup: The folder and the partitions that there are already.
+            setup: The folder, and the partitions that already exist.
         """
         self._link, self._setup = link, setup
         self._directory = Path(setup["directory"])
@@ -49,7 +49,7 @@ class StripedRows:
         """Prove that this is the server's folder, and continue the partitions in it.
 
         Raises:
-            DatasetError: If the folder is not there, or is another one, or another process
+            DatasetError: If the folder is missing or a different one, or another process
                 writes the same rows.
         """
         path = self._directory / self._setup["file"]
@@ -67,7 +67,7 @@ class StripedRows:
         while done < count:
             writer = self._writer
             if writer is None or not writer.room or set(writer.fields) != set(fields):
-                self._wait()  # for a partition; or for the end, as other instances have other rows
+                self._wait()  # for a partition, or the end if other instances have other fields
                 continue
             part = min(count - done, writer.room)
             try:
@@ -78,7 +78,7 @@ class StripedRows:
             self._send_sealed(writer, writer.take_sealed())
 
     def tell(self) -> None:
-        """Tell the server how many rows there are, if it does not know."""
+        """Tell the server how many rows there are, if it does not know yet."""
         if self._writer is not None and self._writer.rows > self._told:
             self._told = self._writer.rows
             self._link.send(pack(Kind.WRITTEN, number=self._told))
@@ -94,7 +94,7 @@ class StripedRows:
         return frame.kind in (Kind.PARTITION, Kind.SEAL)
 
     def close(self) -> None:
-        """Close the files; another client may write the rows from then on."""
+        """Close the files; from then on another client may write the rows."""
         try:
             if self._writer is not None:
                 self._writer.close()
@@ -108,8 +108,8 @@ class StripedRows:
             proof = files.read_content(path, _LARGEST_PROOF)
         except OSError as error:
             raise DatasetError(
-                f"This client, on {socket.gethostname()}, is to write to {self._directory}, but "
-                f"the file {path.name} that the run on {self._setup['host']} has put there cannot "
+                f"This client, on {socket.gethostname()}, must write to {self._directory}, but "
+                f"the file {path.name} that the run on {self._setup['host']} put there cannot "
                 f"be read here: {error.strerror}. DatasetConfig.writers='clients' needs a folder "
                 "that all machines share under the same path; otherwise use writers='server'."
             ) from error
@@ -131,7 +131,7 @@ class StripedRows:
         self._writer.add(number, entry)
 
     def _wait(self) -> None:
-        """Wait for the server's next message about partitions; the others come later."""
+        """Wait for the server's next message about partitions; put back the others."""
         others: deque[Frame] = deque()
         while True:
             frame = self._link.receive()
@@ -148,7 +148,7 @@ class StripedRows:
     def _send_sealed(self, writer: StripeWriter, sealed: list[tuple[int, Partition]]) -> None:
         for number, partition in sealed:
             if number * writer.capacity + partition.rows > self._told:
-                continue  # the server, which does not know of all these rows, seals it
+                continue  # the server does not know of all these rows yet, and seals it
             plain = {
                 "rows": partition.rows,
                 "checksums": partition.checksums,

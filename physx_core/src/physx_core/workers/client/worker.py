@@ -35,20 +35,19 @@ def run_client(
 ) -> int:
     """Run one instance of the environment for a server until it ends the run.
 
-    If the run is elastic, it runs as many instances as the server says, each in a process of its
-    own.
+    In an elastic run it runs as many instances as the server assigns, each in its own process.
 
     Args:
         address: The server's ``HOST:PORT``.
         token: Token of the run.
         instance: Number of the instance to run, counted from 1, or a ticket for it; None: any that
-            is free. If the run is elastic, number of the client.
-        patience: Time in s for which to try again if nothing listens.
+            is free. In an elastic run, the number of the client.
+        patience: How long to retry if nothing listens, in s.
         say: Called with a description of what happens.
 
     Returns:
-        Exit status of the process: 0 once the run has ended, 1 if the environment failed or the
-        server is gone; the server knows why.
+        Exit status of the process: 0 once the run has ended, 1 if the environment failed (the
+        server knows why) or the server is gone.
     """
     say(f"looks for the server at {address}")
     link, setup = join(address, token, instance or 0, patience)
@@ -69,7 +68,7 @@ def _serve(link: WorkerLink, setup: dict[str, Any], say: Callable[[str], None]) 
     draw, skip, stripes = setup.pop("draw"), setup.pop("skip"), setup.pop("stripes", None)
     sink: RowSink = SentRows(link)
     if stripes is not None:
-        # Datasets take a quarter of the time in which a client starts; most clients have none.
+        # Importing datasets takes a quarter of a client's start time, and most clients need none.
         from physx_core.workers.client.striped_rows import StripedRows
 
         sink = StripedRows(link, stripes)
@@ -77,7 +76,7 @@ def _serve(link: WorkerLink, setup: dict[str, Any], say: Callable[[str], None]) 
     again = skip["rows"] - skip["made"]
     say(
         f"runs {setup['environment']}, instance {setup['instance_id']} of {setup['instance_nb']}"
-        + (f"; {again} rows are stored and are made again" if again else "")
+        + (f"; {again} stored rows are generated again" if again else "")
     )
     link.spins = has_core_for_each(setup["instance_nb"])
     client = _Client(link, Instance(**setup), sink, skip.pop("shown"), skip)
@@ -126,7 +125,7 @@ class _Client:
         self._services = RemoteServices(link, self._producer, shown)
 
     def live(self, draw: bool) -> None:
-        """Open the environment and make rows until the run ends or the environment fails."""
+        """Open the environment and generate rows until the run ends or the environment fails."""
         try:
             self._producer.open()
             self._instance.open(self._services, draw, self._services.choose)
@@ -161,11 +160,11 @@ class RemoteServices:
     """Services of the run, requested over the connection."""
 
     def __init__(self, link: WorkerLink, producer: Producer, shown: int = 0) -> None:
-        """Keep the connection.
+        """Store the connection.
 
         Args:
             link: Connection to the server.
-            producer: Makes the rows; those that wait are sent before each wait for an answer.
+            producer: Generates the rows; pending ones are sent before each wait for an answer.
             shown: How many messages with drawing events a predecessor sent.
         """
         self._link, self._producer, self._to_skip = link, producer, shown
@@ -177,11 +176,11 @@ class RemoteServices:
         return prediction
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
-        """Keep values of the instance: see `Services.save_parameters`."""
+        """Save values of the instance: see `Services.save_parameters`."""
         self._ask(Kind.SAVE, values, "save_parameters()")
 
     def load_parameters(self, instance_id: int) -> dict[str, Any]:
-        """Return the values that the instance kept: see `Services.load_parameters`."""
+        """Return the values that the instance saved: see `Services.load_parameters`."""
         values: dict[str, Any] = self._ask(Kind.LOAD, None, "load_parameters()")
         return values
 

@@ -11,8 +11,8 @@ from physx_core.processes import describe_exit
 from physx_core.workers.server.peer import Peer
 
 _LINES_TIME = 0.1  # for the last lines of its standard error to arrive
-_LAST_WORDS_TIME = 0.3  # for a hung client to write where it is
-_LEAVE_TIME = 0.8  # a process that goes on without a connection exits a little later
+_LAST_WORDS_TIME = 0.3  # for a hung client to write where it hangs
+_LEAVE_TIME = 0.8  # a process that loses its connection exits a little later
 
 
 def exit_error(
@@ -24,7 +24,7 @@ def exit_error(
         number: Its instance.
         peer: Its connection; None: it has not connected yet.
         handle: Its process; None if it was started by hand.
-        place: In an elastic run, what ran the instance: a client and its machine.
+        place: In an elastic run, the client that ran the instance, and its machine.
     """
     if peer is not None and peer.offense:
         if handle is not None:
@@ -58,14 +58,14 @@ def timeout_error(
     timeout: float,
     place: str = "",
 ) -> ClientError:
-    """Return the error for a client that kept the server waiting for too long.
+    """Return the error for a client that kept the server waiting too long.
 
     Args:
         number: Its instance.
-        peer: Its connection, or the last one that it had; None: it has not connected.
+        peer: Its current or last connection; None: it has not connected.
         handle: Its process; None if it was started by hand.
         timeout: How long the server waited, in s.
-        place: In an elastic run, what ran the instance: a client and its machine.
+        place: In an elastic run, the client that ran the instance, and its machine.
     """
     state = "" if handle is None else handle.state()
     waited = f"for {timeout:g} s while the server waited for it" + (state and f": {state}")
@@ -77,7 +77,7 @@ def timeout_error(
     else:
         how = f"sent nothing {waited}. If its steps take"
     if handle is not None:
-        handle.terminate()  # it writes where it was
+        handle.terminate()  # it writes where it hung
         handle.wait(time.monotonic() + _LAST_WORDS_TIME)
     return ClientError(
         number,

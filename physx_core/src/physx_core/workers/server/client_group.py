@@ -42,7 +42,7 @@ _TICK = 0.1
 _GRACE = 1.0
 _EXIT_TIME = 5.0
 _SAY_EVERY = 5.0
-_PASSING = (EnvironmentFailedError, ProgramError, ClientError)  # what may not come again
+_PASSING = (EnvironmentFailedError, ProgramError, ClientError)  # errors that may not recur
 _LOG = logging.getLogger("physx")
 
 
@@ -66,7 +66,7 @@ class ClientGroup:
         total: int | None = None,
         written: WrittenRows | None = None,
     ) -> None:
-        """Keep the arguments; `open` starts the clients.
+        """Store the arguments; `open` starts the clients.
 
         Args:
             config: The environment, the number of clients, and their launcher.
@@ -74,8 +74,8 @@ class ClientGroup:
             seed: Seed of all instances.
             sets: Chooses the instances' parameters.
             accept_all: Whether samples that `check_sample` rejects count like the others.
-            skip: What an earlier run has had: clients generate it again, but do not send it.
-            total: Number of rows of the whole run, with those to skip; None: unknown.
+            skip: What an earlier run already got: clients generate it again, but do not send it.
+            total: Number of rows of the whole run, including those to skip; None: unknown.
             written: Counts the rows that the clients write themselves; None: they send them.
         """
         self._written = written
@@ -116,7 +116,7 @@ class ClientGroup:
 
     def open(self) -> None:
         """Start the clients and wait until their environments are ready."""
-        self._encode(1)  # an argument that cannot be sent is an error before anything is started
+        self._encode(1)  # raise for arguments that cannot be sent before anything is started
         self._host = self._launcher.open()
         self.server.open(self._host if is_loopback(self.config.ip_address) else None)
         numbers = list(self._numbers)
@@ -138,14 +138,14 @@ class ClientGroup:
         self.wait(lambda: [number for number in numbers if not self._is_ready(number)])
 
     def peer(self, instance_id: int) -> Peer:
-        """Return the connection of an instance's client, or of the last one that it had."""
+        """Return the connection of an instance's current or last client."""
         return self.server.peers[instance_id]
 
     def wait(self, missing: Callable[[], Sequence[int]]) -> None:
-        """Serve the clients until none is waited for.
+        """Serve the clients until no instance is missing.
 
         Args:
-            missing: Returns the instances that are waited for; called after each round.
+            missing: Returns the instances to wait for; called after each round.
         """
         began = self._began = time.monotonic()
         if began - self._served > _TICK / 10:
@@ -165,11 +165,11 @@ class ClientGroup:
                         self._lose(number, timeout_error(number, peer, handle, timeout, place))
 
     def close(self, *, orderly: bool) -> None:
-        """Have the clients close their environments, and end them; no process is left behind.
+        """Make the clients close their environments, then end them; no process is left behind.
 
         Args:
-            orderly: Wait for as long as a client may be silent, and raise errors; otherwise wait
-                for a moment and raise nothing.
+            orderly: Wait as long as a client may be silent, and raise errors; otherwise wait
+                briefly and raise nothing.
         """
         patience = 0.0
         self._closing = True
@@ -211,17 +211,17 @@ class ClientGroup:
             raise ClientError(
                 without[0],
                 f"was not started: {type(self._launcher).__name__}.launch() returned no handle "
-                "for it. A launcher that starts nothing says by_hand = True.",
+                "for it. A launcher that starts nothing must set by_hand = True.",
             )
 
     def _address(self) -> str:
-        """Return ``HOST:PORT`` as the clients that the launcher starts reach it."""
+        """Return the ``HOST:PORT`` at which clients that the launcher starts reach the server."""
         if self._host is None or self.config.ip_address not in _ALL:
             return self.server.address
         return format_address(self._host, parse_address(self.server.address)[1])
 
     def _public_address(self) -> str:
-        """Return ``HOST:PORT`` as other machines reach it."""
+        """Return the ``HOST:PORT`` at which other machines reach the server."""
         if self._host is not None or self.config.ip_address not in _ALL:
             return self._address()
         return f"{socket.gethostname()}:{self.server.address.rpartition(':')[2]}"
@@ -240,7 +240,7 @@ class ClientGroup:
         while self._unfinished() and time.monotonic() < until:
             try:
                 self.server.pump(_TICK)
-            except Exception:  # the run has failed already, with its own error
+            except Exception:  # the run has already failed, with its own error
                 continue
 
     def _unfinished(self) -> list[int]:
@@ -277,7 +277,7 @@ class ClientGroup:
                     continue
                 self._lose(number, self._exit_error(number, peer, handle), left=left)
             elif handle is not None and handle.exit_status() is not None:
-                # What it sent before its end may still be on its way, or wait to be read.
+                # What it sent before it ended may still be in transit or unread.
                 since = self._exits.setdefault(number, now)
                 if peer is None or (now - since > 2 * _TICK and peer.heard < listened_since):
                     self._lose(number, self._exit_error(number, peer, handle))
@@ -290,7 +290,7 @@ class ClientGroup:
     # Clients of an elastic run -----------------------------------------------------------
 
     def _check_clients(self, now: float) -> None:
-        """Have others run the instances of clients that are lost, or that have too many."""
+        """Give the instances of clients that are lost or run too many to other clients."""
         if self._pool is None:
             return
         for number in self._pool.check(now, self._began, ending=self._closing):
@@ -309,11 +309,11 @@ class ClientGroup:
         return made, mine - made
 
     def _place(self, number: int) -> str:
-        """Return the client of an instance and its machine; empty if each has one of its own."""
+        """Return an instance's client and its machine; empty if each instance has its own."""
         return "" if self._pool is None else self._pool.place(number)
 
     def _look_for_laggards(self, waited: Sequence[int]) -> None:
-        """Name clients that the run waits for because they are much slower than the others."""
+        """Report clients that the run waits for because they are much slower than the others."""
         now = self._served
         if len(self._numbers) < 2 or now - self._looked < _TICK:
             return
@@ -358,7 +358,7 @@ class ClientGroup:
         return self._sets.can_redraw(number, error)
 
     def _repeats(self, number: int) -> bool:
-        """Return whether a client failed at a row that an earlier run has had, or may have."""
+        """Return whether a client failed at a row that an earlier run got, or may have got."""
         peer = self.server.peers.get(number)
         had = self._skip.rows_of(number, self.config.num_clients)
         if peer is None or not had:
@@ -366,7 +366,7 @@ class ClientGroup:
         return peer.received <= had if peer.failure is None else peer.failed_row < had
 
     def _lose(self, number: int, error: PhysxError, *, left: bool = False) -> None:
-        """Have another client take the place of one that is lost.
+        """Replace a lost client.
 
         Args:
             number: The instance.
@@ -374,7 +374,7 @@ class ClientGroup:
             left: Whether it closed the connection, as clients that were started by hand may.
         """
         if self._pool is not None and self._pool.is_lost(number):
-            return  # which was noticed while its error was looked for
+            return  # noticed while its error was being determined
         absent = self._is_by_hand and self._pool is None and self._find_peer(number) is None
         if absent or not self._replaces(number, None if left else error):
             self._sets.fail(number, self._episode(number), error)
@@ -386,11 +386,11 @@ class ClientGroup:
         else:
             follows = self._redraw(self.server.peers[number], error)
         _LOG.warning("%s. %s%s", text.rstrip("."), follows, details and "\n" + details)
-        closes = not isinstance(error, ClientError)  # and needs a moment for it
+        closes = not isinstance(error, ClientError)  # which takes a moment
         self._replace(number, self._handles.pop(number, None), _GRACE if closes else 0.0)
 
     def _replace(self, number: int, former: ClientHandle | None, patience: float = 0.0) -> None:
-        """Have another client run an instance in place of a former one, which is ended."""
+        """End an instance's former client, and start another one in its place."""
         self.server.vacate(number)
         stop([] if former is None else [former], patience)
         self._exits.pop(number, None)
@@ -402,11 +402,12 @@ class ClientGroup:
         return -1 if peer is None else peer.episode
 
     def _redraw(self, peer: Peer, error: PhysxError) -> str:
-        """Have the next client of an instance begin with its next parameters; say so.
+        """Make an instance's next client start with the next parameters; return a text for the log.
 
-        A client that ended without a word may have made rows that it did not send. So the same
-        parameters are simulated once more, and each row is sent at once: where it ends then depends
-        on the parameters alone. If an earlier run has had rows of the next ones, it is known.
+        A client that ended without reporting an error may have generated rows that it did not
+        send. So the same parameters are simulated once more and each row is sent immediately:
+        where the simulation ends then depends only on the parameters. If an earlier run already
+        got rows of the next parameters, this is known.
         """
         last_step, row = peer.last_step, None
         number, had = peer.instance_id, self._skip.rows_of(peer.instance_id, len(self._numbers))
@@ -425,7 +426,7 @@ class ClientGroup:
 
     def _describe_next(self, number: int, left: bool) -> str:
         if self._closing:
-            return "The run was at its end, and all its rows are there."
+            return "The run was ending, and it has all its rows."
         text = "Another client takes its place."
         if self._is_by_hand and self._pool is None:
             text = (
@@ -436,7 +437,7 @@ class ClientGroup:
         return text if left else f"{restart} {text}"
 
     def _report_missing(self, waited: Sequence[int], began: float) -> None:
-        """Report now and then which clients are missing."""
+        """Report from time to time which clients are missing."""
         now = time.monotonic()
         if now - max(began, self._said) < _SAY_EVERY:
             return
@@ -449,14 +450,14 @@ class ClientGroup:
         if absent:
             self._said = now
             _LOG.warning(
-                "The run waits for a client to run instance %s, since %.0f s, at %s%s. "
+                "The run has been waiting for a client to run instance %s for %.0f s, at %s%s. "
                 "It waits no longer than %g s%s.",
                 ", ".join(map(str, absent)),
                 max(times[number] for number in absent),
                 self._public_address(),
                 describe_states([self._handles[n] for n in absent if n in self._handles]),
                 self.config.timeout,
-                " once it is not queued any more" if queued else "",
+                " once it has left the queue" if queued else "",
             )
 
     def _heard(self, number: int) -> float:
@@ -466,12 +467,12 @@ class ClientGroup:
         return max(launched, peer.heard if peer is not None else 0.0)
 
     def _with_client(self, numbers: Iterable[int]) -> list[int]:
-        """Return the instances that do not wait for a client, of which the pool speaks."""
+        """Return the instances that do not wait for a client; the pool reports those that do."""
         pool = self._pool
         return sorted(n for n in numbers if pool is None or not pool.waits(n))
 
     def _find_silent(self, waited: Sequence[int], began: float) -> list[int]:
-        """Return the instances that keep the server waiting for too long."""
+        """Return the instances that have kept the server waiting too long."""
         now = time.monotonic()
         numbers = self._with_client(self.server.holding_up(waited))
         self._queued |= {number: now for number in numbers if self._is_queued(number)}
@@ -479,12 +480,12 @@ class ClientGroup:
         return [number for number in numbers if since[number] < now - self.config.timeout]
 
     def _is_queued(self, number: int) -> bool:
-        """Return whether an instance's client waits for its turn; its time begins after that."""
+        """Return whether an instance's client waits for its turn; its time starts after that."""
         handle = self._handles.get(number)
         return handle is not None and self._find_peer(number) is None and handle.is_queued()
 
     def _encode_setup(self, peer: Peer) -> bytes:
-        """Return the first message to a client: its instance, and what the server has of it."""
+        """Return the first message to a client: its instance, and what the server has from it."""
         origin = peer.origin
         skip = {
             "rows": peer.received,

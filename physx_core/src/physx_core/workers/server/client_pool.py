@@ -33,7 +33,7 @@ Progress = Callable[[int], tuple[int, int | None]]
 
 
 class Serving(Protocol):
-    """What the pool needs of the server."""
+    """The part of the server that the pool uses."""
 
     token: str
 
@@ -45,21 +45,21 @@ class Serving(Protocol):
 
 
 class ClientPool(Launcher):
-    """Has clients run the workers of instances, whichever clients there are.
+    """Distributes the workers of instances over whichever clients are connected.
 
-    Instances wait while there are too few clients. Clients that are lost are replaced by the run's
-    launcher, `EnvironmentConfig.restarts` times each; their instances go to others at once.
+    Instances wait while there are too few clients. The run's launcher replaces lost clients, up to
+    `EnvironmentConfig.restarts` times each; their instances go to others immediately.
     """
 
     def __init__(
         self, config: EnvironmentConfig, launcher: Launcher, *, is_open: bool = False
     ) -> None:
-        """Keep the arguments.
+        """Store the arguments.
 
         Args:
             config: How many clients there may be, and how long they may be silent.
             launcher: Starts the clients.
-            is_open: Whether others than the launcher may start clients: they know the token.
+            is_open: Whether others who know the token may start clients, besides the launcher.
 
         Raises:
             ConfigError: If more clients are needed than may join.
@@ -69,7 +69,7 @@ class ClientPool(Launcher):
         if self.least > self.most:
             raise ConfigError(
                 f"EnvironmentConfig.min_clients is {self.least}, but max_clients lets only "
-                f"{self.most} join: the run could not begin."
+                f"{self.most} join: the run could not start."
             )
         self._config, self._launcher, self.elsewhere = config, launcher, launcher.elsewhere
         launcher.elastic = True
@@ -92,7 +92,7 @@ class ClientPool(Launcher):
     # Clients -----------------------------------------------------------------------------------
 
     def open(self) -> str | None:
-        """Reach what starts the clients: see `Launcher.open`."""
+        """Connect to what starts the clients: see `Launcher.open`."""
         return self._launcher.open()
 
     def close(self) -> None:
@@ -104,7 +104,7 @@ class ClientPool(Launcher):
 
         Args:
             address: ``HOST:PORT`` of the server.
-            public: The same as other machines reach it.
+            public: The same for clients on other machines.
             server: The server, open.
         """
         self._address, self._public, self._server = address, public, server
@@ -116,14 +116,14 @@ class ClientPool(Launcher):
         return [client.peer for client in self._clients.values()]
 
     def admit(self, peer: Peer, wanted: int) -> None:
-        """Take a client that knows the token.
+        """Admit a client that knows the token.
 
         Args:
             peer: Its connection.
             wanted: The number that it asks for, 0 for any.
 
         Raises:
-            ConnectionRefusedByPeerError: If there is no place for it; it is told so.
+            ConnectionRefusedByPeerError: If there is no place for it; it gets the error too.
         """
         self._bury_lost()
         free = [n for n in range(1, self.most + 1) if n not in self._clients]
@@ -131,11 +131,11 @@ class ClientPool(Launcher):
             name = f"client {wanted}" if wanted else "another client"
             refusal = ConnectionRefusedByPeerError(
                 f"The server has no place for {name}: at most {self.most} may join "
-                f"(max_clients), and {len(self._clients)} are here."
+                f"(max_clients), and {len(self._clients)} already joined."
             )
             peer.send(pack(Kind.ERROR, encode_error(refusal)))
             raise refusal
-        # Those that nobody starts come first: a number that the launcher uses is asked for.
+        # Prefer numbers that the launcher does not use: its clients ask for theirs.
         foreign = [number for number in free if number not in self._handles]
         peer.client = wanted or (foreign or free)[0]
         peer.reader.limit = _LONGEST_MESSAGE
@@ -146,7 +146,7 @@ class ClientPool(Launcher):
         """Return the instance that a worker may run.
 
         Raises:
-            ConnectionRefusedByPeerError: If its ticket is not the last one for the instance.
+            ConnectionRefusedByPeerError: If its ticket is not the latest one for the instance.
         """
         worker = self._workers.get(instance_of(ticket))
         if worker is None or worker.ticket != ticket:
@@ -156,7 +156,7 @@ class ClientPool(Launcher):
         return worker.instance_id
 
     def take(self, peer: Peer, frame: Frame) -> None:
-        """Take a message of a client."""
+        """Handle a message from a client."""
         client = self._clients[peer.client]
         client.unanswered = None
         if frame.kind is Kind.HOST and not client.host:
@@ -167,7 +167,7 @@ class ClientPool(Launcher):
         elif frame.kind is Kind.ENDED:
             status, stderr = parse_end(frame.payload)
             worker = client.workers.get(frame.number)
-            if worker is not None:  # it was not given up before
+            if worker is not None:  # it has not been given up
                 worker.end(status, stderr)
         elif frame.kind is Kind.BYE:
             peer.finished = True
@@ -178,15 +178,15 @@ class ClientPool(Launcher):
             )
 
     def check(self, now: float, served_since: float, *, ending: bool = False) -> list[int]:
-        """Ask the clients whether they are there; replace those that are not.
+        """Ping the clients; replace those that do not answer.
 
         Args:
             now: Monotonic s.
             served_since: Since when the run has listened to its clients, in monotonic s.
-            ending: Whether all rows are there, so that nobody has to be replaced.
+            ending: Whether all rows have arrived, so no client has to be replaced.
 
         Returns:
-            The instances that such clients ran: others must start them.
+            The instances that lost clients ran: others must start them.
 
         Raises:
             TooFewClientsError: If there have been fewer clients than `min_clients` for too long.
@@ -207,7 +207,7 @@ class ClientPool(Launcher):
         return moved
 
     def suspects(self, number: int, served_since: float) -> bool:
-        """Return whether the client of a silent instance is silent, too; if so it is given up."""
+        """Return whether the client of a silent instance is silent too; if so, give it up."""
         worker = self._workers.get(number)
         client = None if worker is None else worker.client
         if client is None or client.unanswered is None:
@@ -219,14 +219,14 @@ class ClientPool(Launcher):
         return True
 
     def cut_off(self, number: int) -> None:
-        """Give up the client of an instance, whose machine no longer answers."""
+        """Give up an instance's client, whose machine no longer answers."""
         client = self._workers[number].client
         if client is not None and not client.peer.closed:
             client.peer.has_vanished = True
             client.peer.close()
 
     def end(self, patience: float) -> None:
-        """Have all clients end their workers and themselves; none is left that was started here.
+        """Make all clients end their workers and exit; none that was started here is left.
 
         Args:
             patience: How long the workers may take, in s.
@@ -240,7 +240,7 @@ class ClientPool(Launcher):
             while any(not client.peer.closed for client in clients) and time.monotonic() < until:
                 try:
                     self._server.pump(_TICK)
-                except Exception:  # of a run that has failed already
+                except Exception:  # of a run that has already failed
                     continue
         finally:
             handles, self._handles = self._handles, {}
@@ -263,7 +263,7 @@ class ClientPool(Launcher):
         client.peer.close()
 
     def _bury_lost(self) -> None:
-        """Forget the clients that are lost, and have the launcher replace them."""
+        """Forget lost clients, and have the launcher replace them."""
         for client in [*self._clients.values()]:
             if client.peer.closed:
                 self._bury(client)
@@ -304,11 +304,11 @@ class ClientPool(Launcher):
         instances: Sequence[int],
         stderr: str,
     ) -> None:
-        """Say how a client was lost, and have the launcher replace it."""
+        """Log how a client was lost, and have the launcher replace it."""
         self._lost = f"{name} {how}."
         text = self._lost
         if self._is_ending:
-            text += " The run was at its end, and all its rows are there."
+            text += " The run was ending, and it has all its rows."
         elif instances:
             several = "s" if len(instances) > 1 else ""
             text += (
@@ -323,11 +323,11 @@ class ClientPool(Launcher):
                 text += f" Restart {self._restarts[number]} of {self._config.restarts}."
                 self._start_clients([number])
             else:
-                text += f" It is not started again: restarts is {self._config.restarts}."
+                text += f" It is not restarted: restarts is {self._config.restarts}."
         _LOG.warning("%s%s", text, stderr and "\nLast lines of its standard error:\n" + stderr)
 
     def _check_count(self, now: float, served_since: float) -> None:
-        """Say now and then that there are too few clients, and end the run after a while."""
+        """Report from time to time that clients are missing, and end the run after a while."""
         count = len(self._ready)
         if count >= self.least:
             self._short_since = None
@@ -337,7 +337,7 @@ class ClientPool(Launcher):
         waited = now - max(self._short_since, served_since)
         hopeless = not self._is_open and len(self._handles.keys() | self._clients) < self.least
         if waited > self._config.timeout or hopeless:
-            what = "none can come any more" if hopeless else f"no other joined for {waited:.0f} s"
+            what = "no more can join" if hopeless else f"no other joined for {waited:.0f} s"
             raise TooFewClientsError(
                 count,
                 self.least,
@@ -349,7 +349,7 @@ class ClientPool(Launcher):
             self._said = now
             absent = self._handles.keys() - self._clients
             _LOG.warning(
-                "The run has %s and waits for others, since %.0f s, at %s%s. It needs %d "
+                "The run has %s and has been waiting for others for %.0f s, at %s%s. It needs %d "
                 "(min_clients), and waits no longer than %g s.",
                 _count(count),
                 waited,
@@ -362,7 +362,7 @@ class ClientPool(Launcher):
     # Instances ---------------------------------------------------------------------------------
 
     def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
-        """Have clients start workers for instances, at once or when there are enough clients."""
+        """Have clients start workers for instances, now or once there are enough clients."""
         handles: list[ClientHandle] = []
         for number in instances:
             self._starts[number] += 1
@@ -376,10 +376,10 @@ class ClientPool(Launcher):
         return handles
 
     def find_move(self, progress: Progress) -> int | None:
-        """Return an instance to stop so that a client with less to do starts it; None: none.
+        """Return an instance to move to a client with less to do; None: none.
 
-        It makes its rows again there, so it moves only if it is done earlier then, should the time
-        for a row be in proportion to how many instances a client runs.
+        It generates its rows again there, so it moves only if it then finishes earlier, assuming
+        that the time per row is proportional to the number of instances that a client runs.
 
         Args:
             progress: How far an instance is.
@@ -397,7 +397,7 @@ class ClientPool(Launcher):
         left = made if left is None else left
         if (made + left) * (least.load + 1) > left * most.load:
             return None
-        _LOG.info("Instance %d goes from %s to %s.", number, most, least)
+        _LOG.info("Instance %d moves from %s to %s.", number, most, least)
         return number
 
     def waits(self, number: int) -> bool:
@@ -429,7 +429,7 @@ class ClientPool(Launcher):
         return [c for c in self._clients.values() if c.host and not c.peer.closed]
 
     def _assign(self) -> None:
-        """Have the clients with least to do start the instances that wait."""
+        """Have the clients with the least to do start the waiting instances."""
         ready = self._ready
         if len(ready) < self.least:
             return

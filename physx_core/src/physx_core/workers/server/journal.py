@@ -11,24 +11,24 @@ _IN_MEMORY = 1 << 22
 
 
 class Journal:
-    """Answers by the number of their request, and orders in the order in which they were given.
+    """Keeps answers by request number, and orders in the order in which they were given.
 
     Orders are the messages that a client obeys between two rows: credit, predictions to apply,
-    stored rows. Of successive credits only the last is kept, so that the journal of an instance
-    that only makes rows does not grow. Other messages are kept as they were sent, in a temporary
-    file once there are many.
+    stored rows. Of successive credits only the last is kept, so the journal of an instance that
+    only generates rows does not grow. Other messages are kept unmodified, in a temporary file once
+    there are many.
     """
 
     def __init__(self) -> None:
         """Start empty."""
         self._messages = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115 - see close
         self._size = 0
-        self._answers = array("Q")  # request number - 1 to the place of its answer + 1; 0: none
+        self._answers = array("Q")  # request number - 1 to the offset of its answer + 1; 0: none
         self._orders = array("Q")
         self._credit = b""
 
     def record(self, message: bytes) -> bool:
-        """Keep a message if a successor must be told again; return whether it is an order."""
+        """Keep a message if a successor will need it; return whether it is an order."""
         _, kind, _, number = HEADER.unpack_from(message)
         if kind == Kind.CREDIT:
             self._credit = bytes(message)
@@ -44,7 +44,7 @@ class Journal:
         return kind in (Kind.CREDIT, Kind.APPLY, Kind.STORED)
 
     def answer(self, number: int) -> bytes | None:
-        """Return the answer to a request, None if it was not answered yet.
+        """Return the answer to a request; None if there is none yet.
 
         Args:
             number: Number of the request, counted from 1.
@@ -53,12 +53,12 @@ class Journal:
         return self._read(place - 1) if place else None
 
     def order(self, index: int) -> bytes | None:
-        """Return an order that others followed, counted from 0; None if there are no more."""
+        """Return an order other than a final credit, counted from 0; None if there are no more."""
         return self._read(self._orders[index]) if index < len(self._orders) else None
 
     @property
     def credit(self) -> bytes:
-        """The credit that was given after all other orders; empty if there is none."""
+        """The credit given after all other orders; empty if there is none."""
         return self._credit
 
     def close(self) -> None:

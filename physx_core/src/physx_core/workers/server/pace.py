@@ -1,4 +1,4 @@
-"""Pace: how fast each client makes rows, and which of them the run has to wait for."""
+"""Pace: how fast each client generates rows, and which clients hold up the run."""
 
 from __future__ import annotations
 
@@ -8,15 +8,15 @@ from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
-_HELD = 5.0  # s that the run has waited for an instance before anything is said
+_HELD = 5.0  # s that the run waits for an instance before it is reported
 _SLOW = 2.0
-_LONGEST = 0.2  # s, of a wait between two looks; more would be that of somebody else
+_LONGEST = 0.2  # s, limit for the time between two looks; any excess has other causes
 
 
 class Pace:
-    """Time that a client takes for its rows, without that in which it waits for the server.
+    """Time that a client spends on its rows, without its waits for the server.
 
-    It counts from the first rows that arrive: what came before may have been made again.
+    Counting starts when the first rows arrive: earlier rows may have been generated again.
     """
 
     def __init__(self) -> None:
@@ -27,7 +27,7 @@ class Pace:
 
     @property
     def per_row(self) -> float | None:
-        """Time for a row in s, None before it is known."""
+        """Time per row in s; None until it is known."""
         return self._seconds / self._rows if self._rows else None
 
     def rows(self, count: int, *, goes_on: bool) -> None:
@@ -35,7 +35,7 @@ class Pace:
 
         Args:
             count: How many.
-            goes_on: Whether the client makes more now.
+            goes_on: Whether the client now generates more.
         """
         if self._since is not None:
             self._rows += count
@@ -61,7 +61,7 @@ class Laggard(NamedTuple):
 
     Attributes:
         instance_id: Its number.
-        per_row: Time that it takes for a row, in s.
+        per_row: Its time per row, in s.
         median: Median of that time over the instances, in s.
     """
 
@@ -71,29 +71,29 @@ class Laggard(NamedTuple):
 
 
 class Laggards:
-    """Finds the instances that are much slower than the others, and that the run waits for."""
+    """Finds instances that are much slower than the others and hold up the run."""
 
     def __init__(self) -> None:
-        """Start without any."""
+        """Start with none."""
         self._held: defaultdict[int, float] = defaultdict(float)
         self._looked = time.monotonic()
 
     def note(self, waited: Iterable[int], now: float) -> None:
-        """Note which instances the run waits for now, while it does not wait for most of them."""
+        """Note which instances the run waits for now; none if it waits for most of them."""
         elapsed = min(now - self._looked, _LONGEST)
         self._looked = now
         for number in waited:
             self._held[number] += elapsed
 
     def find(self, paces: Mapping[int, float], loads: Mapping[int, int]) -> list[Laggard]:
-        """Return those that have held up the run since they were last returned.
+        """Return the instances that have held up the run since they were last returned.
 
-        An instance is slow if it takes twice as long as the median, and as many times longer as
-        its client runs more instances than others do.
+        An instance is slow if its time per row is at least twice the median; the limit grows in
+        proportion if its client runs more instances than others do.
 
         Args:
-            paces: Instance to time for a row, in s.
-            loads: Instance to how many instances its client runs.
+            paces: Instance to time per row, in s.
+            loads: Instance to number of instances that its client runs.
         """
         held = [number for number, seconds in self._held.items() if seconds >= _HELD]
         if not held or len(paces) < 2:

@@ -1,4 +1,4 @@
-"""Peer: one connection of the server and what its client has sent, a stranger at first."""
+"""Peer: a connection of the server, at first a stranger's, and what its client has sent."""
 
 from __future__ import annotations
 
@@ -21,14 +21,14 @@ _PIECE = 1 << 16
 
 
 class Origin(NamedTuple):
-    """Where the clients of an instance begin: how much others had sent before.
+    """Where the next clients of an instance start: how much others had sent before.
 
     Attributes:
         rows: Number of rows.
         rejected: Number of rejected rows.
         shown: Number of messages with drawing events.
         step: Number of the first step.
-        episode: Number of the first episode; None: that of the environment.
+        episode: Number of the first episode; None: the environment decides.
     """
 
     rows: int = 0
@@ -48,27 +48,27 @@ class Peer(Connection):
         fields: The environment's fields; empty before it is ready.
         row_fields: Fields of its rows, all shapes known; empty before the first sample.
         rows: Rows that arrived.
-        received: How many rows arrived in all.
-        granted: How many rows it may make in all.
-        wanted: How many of them the run waits for, or has had; the others it makes ahead.
-        rejected: Rows that arrived and that its environment rejected.
-        rejected_limit: How many of those it may send in all.
+        received: How many rows arrived in total.
+        granted: How many rows it may generate in total.
+        wanted: How many of them the run waits for or already got; it generates the others ahead.
+        rejected: Rejected rows that arrived.
+        rejected_limit: How many of those it may send in total.
         failure: The error that it sent.
-        failed_row: Row, counted from 0, that the error kept it from making.
+        failed_row: Row, counted from 0, at which the error occurred.
         last_step: Step of its last row, -1 before the first.
-        offense: The violation of the protocol for which it was cut off; empty if there is none.
+        offense: The protocol violation for which it was cut off; empty if there is none.
         has_vanished: Whether its machine no longer answers.
         finished: Whether it reported that its environment is closed.
         vacant: Whether another client may take the instance's place.
         has_told_fields: Whether it sent the fields of its rows.
         requests: How many requests it sent.
-        shown: How many messages with drawing events arrived in all.
+        shown: How many messages with drawing events arrived in total.
         journal: Messages for a client that takes its place; None if none can.
         parameters: The parameters that its environment defines.
         episode: Last episode that it was given parameters for; -1: none.
-        origin: Where a client that takes its place begins.
-        slow_until: Episode before which that client sends each row at once.
-        pace: How fast this client makes rows.
+        origin: Where a client that takes its place starts.
+        slow_until: That client sends the rows of earlier episodes immediately, one by one.
+        pace: How fast this client generates rows.
     """
 
     reader: FrameReader
@@ -100,29 +100,29 @@ class Peer(Connection):
         self.origin = Origin()
         self.slow_until = 0
         self.pace = Pace()
-        self._arrived = 0  # of a long frame, when the peer was last heard of
-        self._next_order: int | None = None  # of the journal's, for this client; None: it had all
+        self._arrived = 0  # of a long frame, when the peer was last heard from
+        self._next_order: int | None = None  # of the journal's, for this client; None: it got all
 
     @property
     def is_awaited(self) -> bool:
-        """Whether its environment is starting or making rows that the run waits for.
+        """Whether its environment is starting, or generating rows that the run waits for.
 
-        Or would be if it were not lost.
+        For a lost client: whether it would be.
         """
         return not self.finished and (not self.fields or self.received < self.wanted)
 
     @property
     def is_ahead(self) -> bool:
-        """Whether its environment is making a row that the run does not wait for yet."""
+        """Whether its environment is generating a row that the run does not wait for yet."""
         return bool(self.fields) and self.wanted <= self.received < self.granted
 
     @property
     def is_lost(self) -> bool:
-        """Whether this client makes no more rows."""
+        """Whether this client generates no more rows."""
         return self.closed or self.failure is not None
 
     def succeed(self, former: Peer) -> None:
-        """Take the place of another client of the instance, with everything it sent."""
+        """Take the place of the instance's former client, with everything that it sent."""
         self.rows, self.received, self.granted = former.rows, former.received, former.granted
         self.wanted = former.wanted
         self.rejected, self.rejected_limit = former.rejected, former.rejected_limit
@@ -133,11 +133,11 @@ class Peer(Connection):
         self._next_order = None if self.journal is None else 0
 
     def move_origin(self, step: int, row: int | None = None) -> None:
-        """Have a client that takes its place begin with the next episode.
+        """Make a client that takes its place start with the next episode.
 
         Args:
             step: Number of its first step.
-            row: Its first row; None: the one after those that arrived, or that could not be made.
+            row: Its first row; None: the one after those that arrived, or the one that failed.
         """
         if row is None:
             row = self.received if self.failure is None else self.failed_row
@@ -148,9 +148,9 @@ class Peer(Connection):
             self.journal.record(pack(Kind.CREDIT, number=self.granted))
 
     def hear(self, *, whole: bool) -> None:
-        """Note a sign of life: a whole frame, or a good piece of a long one.
+        """Note a sign of life: a whole frame, or a substantial part of a long one.
 
-        A few bytes now and then do not count.
+        A few bytes from time to time do not count.
         """
         arrived = 0 if whole else self.reader.arrived
         if whole or arrived - self._arrived >= _PIECE:
@@ -159,8 +159,8 @@ class Peer(Connection):
     def send(self, message: bytes) -> None:
         """Send as much as the connection takes now; `flush` sends the rest.
 
-        What a successor must be told again goes into the journal. A client that has just taken a
-        place is told the orders from there, one after the other.
+        What a successor will need goes into the journal. A client that has just taken a place gets
+        the orders from there, one after another.
         """
         is_order = self.journal is not None and self.journal.record(message)
         if self._next_order is None or not is_order:
@@ -174,7 +174,7 @@ class Peer(Connection):
             self.send(message)
 
     def send_once(self, message: bytes) -> None:
-        """Send a message that no successor needs to know."""
+        """Send a message that no successor needs."""
         if self.closed:
             return
         if self.outgoing or self._next_order is not None:
@@ -183,14 +183,14 @@ class Peer(Connection):
         else:
             try:
                 self.write(message)
-            except OSError:  # reading finds its end
+            except OSError:  # reading notices its end
                 self.outgoing.clear()
-        self.heard = time.monotonic()  # its time to react begins now
+        self.heard = time.monotonic()  # its time to react starts now
 
     def flush(self) -> int:
-        """Send what waits, and the orders of the journal, as far as the connection takes them."""
+        """Send what is pending, then the journal's orders, as far as the connection takes them."""
         total = 0
-        with contextlib.suppress(OSError):  # reading finds its end
+        with contextlib.suppress(OSError):  # reading notices its end
             while self.outgoing or self._take_order():
                 sent = super().flush()
                 if not sent:

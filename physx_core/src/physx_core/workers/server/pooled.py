@@ -1,4 +1,4 @@
-"""The clients of an elastic run, and their workers, as the server knows them."""
+"""The clients of an elastic run, and their workers, as the server sees them."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ class PooledClient:
     Attributes:
         number: Its number, from 1.
         peer: Its connection.
-        host: Name of its machine; empty: it has not told it yet, so it is not ready.
+        host: Name of its machine; empty: not reported yet, so the client is not ready.
         workers: The workers that it runs, by their tickets.
-        unanswered: Since when it has not answered, in monotonic s; None: it has.
-        pinged: When it was last asked whether it is there.
+        unanswered: Time since which an answer is due, in monotonic s; None: it has answered.
+        pinged: When it was last pinged, in monotonic s.
     """
 
     def __init__(self, number: int, peer: Peer) -> None:
@@ -41,11 +41,11 @@ class PooledClient:
 
 
 class PooledWorker(ClientHandle):
-    """A worker of a client of the pool.
+    """A worker that a client of the pool runs.
 
     Attributes:
         instance_id: Number of its instance.
-        ticket: What it shows to run the instance.
+        ticket: Ticket that it presents to run the instance.
         client: The client that runs it, or ran it; None: it waits for one.
         started: When the client was told to start it, in monotonic s.
     """
@@ -66,11 +66,11 @@ class PooledWorker(ClientHandle):
         return self.client is not None and self.client.peer.closed
 
     def exit_status(self) -> int | None:
-        """Return the exit status that its client told: see `ClientHandle`."""
+        """Return the exit status that its client reported: see `ClientHandle`."""
         return self._status
 
     def stderr(self) -> str:
-        """Return its last lines, once it has ended."""
+        """Return the last lines of its standard error, once it has ended."""
         return self._stderr
 
     def end(self, status: int, stderr: str) -> None:
@@ -90,7 +90,7 @@ class PooledWorker(ClientHandle):
             self.end(-signal.SIGKILL, "")
 
     def wait(self, until: float) -> bool:
-        """Listen to its client until that tells its end: see `ClientHandle.wait`."""
+        """Listen to its client until that reports its end: see `ClientHandle.wait`."""
         while self.client is not None and not self.is_orphan and self._status is None:
             left = until - time.monotonic()
             if left <= 0:

@@ -48,7 +48,7 @@ _REQUESTS = (Kind.PREDICT, Kind.SAVE, Kind.LOAD, Kind.SHOW, Kind.CHOOSE)
 
 
 class Server:
-    """The connections of the clients; all work is done in calls of `pump`.
+    """Serves the clients' connections; all work is done in calls to `pump`.
 
     Attributes:
         peers: Instance number to the connection of its client.
@@ -69,7 +69,7 @@ class Server:
         pool: ClientPool | None = None,
         written: WrittenRows | None = None,
     ) -> None:
-        """Keep the arguments; `open` starts to listen.
+        """Store the arguments; `open` starts listening.
 
         Args:
             ip_address: Address to listen at.
@@ -79,9 +79,9 @@ class Server:
             setup: Returns the payload that tells an instance's client what to run.
             token: Secret of the run.
             sets: Chooses the instances' parameters.
-            replaces: Whether another client takes the place of one that failed with an error, or
-                left without one.
-            skip: What an earlier run has had of the instances.
+            replaces: Returns whether another client takes the place of one that failed with an
+                error, or left without one.
+            skip: What an earlier run already got from the instances.
             pool: The clients, if they run workers for several instances; None: each runs one.
             written: Counts the rows that the clients write themselves; None: they send them.
         """
@@ -110,13 +110,13 @@ class Server:
         }
 
     def open(self, host: str | None = None) -> None:
-        """Start to listen, at another address than that of the constructor if one is given."""
+        """Start listening, at `host` if given, else at the constructor's address."""
         host = host or self._ip_address
         try:
             self._listener.listen(host, self._port)
         except OSError as error:
             raise ConfigError(
-                f"The server cannot listen at {host} port {self._port}: {error}. "
+                f"The server cannot listen on {host} port {self._port}: {error}. "
                 "Choose EnvironmentConfig.port=0 for any free port, or an ip_address of this "
                 "machine; ports below 1024 need privileges, and another run may use this one."
             ) from error
@@ -131,9 +131,9 @@ class Server:
         return format_address(host, port)
 
     def pump(self, timeout: float) -> None:
-        """Handle what has arrived; wait up to `timeout` s for the first of it.
+        """Handle what has arrived; wait up to `timeout` s for the first message.
 
-        It goes on as long as predictions are requested and answered and nothing else happens, but
+        Continues as long as predictions are requested and answered and nothing else happens, but
         no longer than `timeout`.
         """
         until = time.monotonic() + timeout
@@ -150,11 +150,11 @@ class Server:
             self._read(peer)
 
     def _answer_at_once(self, timeout: float, spin: float) -> bool:
-        """Handle what has arrived; return whether it was requests, all answered, and nothing else.
+        """Handle what has arrived; return whether it was only requests, all answered.
 
         Args:
-            timeout: How long to wait for the first of it, in s.
-            spin: How long to look for it without sleeping before that, in s.
+            timeout: How long to wait for the first message, in s.
+            spin: How long to spin-wait for it before that, in s.
         """
         self._has_news = False
         self._requests.choose()
@@ -181,11 +181,11 @@ class Server:
         """Tell all clients to close their environments."""
         self._ending = True
         for peer in self.peers.values():
-            peer.wanted = peer.granted  # nothing is held any more
+            peer.wanted = peer.granted  # nothing is held any longer
             peer.send(pack(Kind.CLOSE))
 
     def vacate(self, number: int) -> None:
-        """Have the next client of an instance continue where the present one failed or left."""
+        """Free an instance for its next client, which continues where this one failed or left."""
         peer = self.peers.get(number)
         if peer is not None:
             self._drop(peer)
@@ -204,9 +204,9 @@ class Server:
         self._listener.close()
 
     def holding_up(self, waited: Iterable[int]) -> set[int]:
-        """Return the instances that cause the wait when the server waits for some instances.
+        """Return the instances that hold up the server while it waits for some instances.
 
-        Those that wait for a prediction wait for the others that are awaited.
+        Those that wait for a prediction are held up by the other awaited instances.
         """
         waited = set(waited)
         others = self._awaited() if waited & self.asking else set()
@@ -218,11 +218,11 @@ class Server:
         return bool(due) and not (due < self._instance_nb and self._expects_more_requests())
 
     def _expects_more_requests(self) -> bool:
-        """Return whether a client makes an awaited row, and may yet ask for a prediction.
+        """Return whether a client is generating an awaited row and may yet ask for a prediction.
 
         A batch is predicted once every client has asked or owes no row. So the requests in a
-        batch depend on the environments, not on their speed: the rounding of a network's result
-        may depend on the size of the batch.
+        batch depend on the environments, not on their speed: the rounding of a network's output
+        may depend on the batch size.
         """
         if self._ending or not self._requests.batches:
             return False
@@ -257,7 +257,7 @@ class Server:
                     return
                 enough = turns >= _TURNS or len(frame.payload) > _LONG
                 if enough and not peer.reader.has_buffered:
-                    # The others get their turn; the selector finds the rest. And rows are moved to
+                    # Give the others a turn; the selector finds the rest. Also, rows are moved to
                     # their places while they are in the processor's cache.
                     return
         except EOFError as error:
@@ -334,7 +334,7 @@ class Server:
         if not (self._ending or peer.failure):
             raise ConnectionRefusedByPeerError("It reported its end, but nobody ended the run.")
         peer.finished = peer.failure is None
-        self._drop(peer)  # for which it waits
+        self._drop(peer)  # it waits for this
 
 
 def _take_parameters(peer: Peer, frame: Frame) -> None:
@@ -358,7 +358,7 @@ def _take_fields(peer: Peer, frame: Frame) -> None:
     check_row_fields(fields, peer.fields)
     if peer.row_fields and fields != peer.row_fields:
         raise ConnectionRefusedByPeerError(
-            "Its rows have other fields than those of its predecessor."
+            "The fields of its rows differ from those of its predecessor."
         )
     peer.row_fields, peer.has_told_fields = fields, True
 
@@ -384,7 +384,7 @@ def _take_wrong(peer: Peer, frame: Frame) -> None:
 
 
 def _take_again(peer: Peer, frame: Frame) -> None:
-    """Do nothing: the message is a sign of life of a client that has no rows to send."""
+    """Do nothing: the message is a sign of life from a client that has no rows to send."""
 
 
 def _take_error(peer: Peer, frame: Frame) -> None:

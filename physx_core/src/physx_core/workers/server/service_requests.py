@@ -1,4 +1,4 @@
-"""ServiceRequests: requests of environments in workers, answered by the services of the run."""
+"""ServiceRequests: requests of environments in workers, answered by the run's services."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.validation import parse_choice, parse_events, parse_values
 
 _MOST_UNREAD = 1 << 26
-_KEPT = "the kept parameters"
+_KEPT = "the saved parameters"
 
 Signature: TypeAlias = tuple[tuple[str, tuple[int, ...], str], ...]
 Request: TypeAlias = tuple[Peer, int, Sample]
@@ -29,10 +29,8 @@ class ServiceRequests:
     """Answers the requests of clients; those for predictions are collected and answered together.
 
     A request for a prediction is *due* when the run waits for the row that its environment is
-    making. Until then it is held, so that what a network answers does not depend on how far clients
-    run ahead.
-
-    So are requests for parameters whose choice depends on losses that were not told yet.
+    generating. Until then it is held, so the network's answers do not depend on how far clients run
+    ahead. Requests for parameters that depend on losses not known yet are held too.
 
     If the services have a method ``predict_batch(batch) -> batch``, simultaneous requests with the
     same fields go through it as one batch. Otherwise each goes through `predict`.
@@ -42,7 +40,7 @@ class ServiceRequests:
     """
 
     def __init__(self, services: Services, sets: ParameterSets) -> None:
-        """Keep the services.
+        """Store the services.
 
         Args:
             services: The services of the run.
@@ -70,8 +68,8 @@ class ServiceRequests:
     def take(self, peer: Peer, frame: Frame) -> None:
         """Answer a request, or keep it for `predict`.
 
-        Errors of physx that the services raise are sent to the environment, others are raised.
-        A request that the predecessor of this client made gets the same answer.
+        Physx errors that the services raise are sent to the environment, others are raised. A
+        request that this client's predecessor made gets the same answer.
         """
         if frame.kind is not Kind.SHOW:
             peer.pace.rest()
@@ -138,7 +136,7 @@ class ServiceRequests:
         self._waiting.append((peer, frame.number, sample))
 
     def forget(self, peer: Peer) -> None:
-        """Forget the requests of a client that is lost."""
+        """Forget the requests of a lost client."""
         self._waiting = [request for request in self._waiting if request[0] is not peer]
         self._choices = [request for request in self._choices if request[0] is not peer]
 
@@ -173,7 +171,7 @@ class ServiceRequests:
             return
         except Exception as error:
             numbers = ", ".join(str(peer.instance_id) for peer, _, _ in requests)
-            error.add_note(f"while the prediction for instance {numbers} was made")
+            error.add_note(f"while handling the prediction for instance {numbers}")
             raise
         for (peer, _, _), message in zip(requests, messages, strict=True):
             peer.send(message)
@@ -205,7 +203,7 @@ class ServiceRequests:
         except PhysxError as error:
             message = pack(Kind.REFUSAL, encode_error(error), number)
         except Exception as error:
-            error.add_note(f"while {what} for instance {peer.instance_id} was made")
+            error.add_note(f"while handling {what} for instance {peer.instance_id}")
             raise
         peer.send(message)
         peer.pace.go_on()

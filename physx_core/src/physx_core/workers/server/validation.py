@@ -1,7 +1,7 @@
 """Validation of client messages.
 
 A client knows the token, but it may be broken or a different implementation: its messages are
-accepted only if they are consistent with those before them.
+accepted only if they are consistent with the earlier ones.
 """
 
 from __future__ import annotations
@@ -59,12 +59,12 @@ def parse_parameters(payload: bytes | bytearray) -> list[Parameter]:
 
 
 def parse_choice(payload: bytes | bytearray, last: int, received: int) -> tuple[int, int]:
-    """Return the episode whose parameters a message asks for, and the row that is being made.
+    """Return the episode whose parameters a message asks for, and the row being generated.
 
     Args:
         payload: The message.
         last: Episode of the last such message, -1 if there was none.
-        received: How many rows of the instance arrived, or were there before.
+        received: How many rows of the instance arrived or existed before.
     """
     plain = decode(payload)
     given = plain if isinstance(plain, dict) else {}
@@ -91,7 +91,7 @@ def _is_field(plain: Any) -> bool:
 
 
 def check_environment_fields(fields: Sequence[Field]) -> None:
-    """Check the fields that an environment is said to define."""
+    """Check the fields that an environment defines, according to its client."""
     reserved = [field.name for field in fields if field.name in RESERVED]
     if reserved:
         raise ConnectionRefusedByPeerError(f'It defined the reserved field "{reserved[0]}".')
@@ -121,20 +121,20 @@ def check_row_fields(fields: Sequence[Field], environment: Sequence[Field]) -> N
 
 
 def parse_host(payload: bytes | bytearray) -> str:
-    """Return the name of the machine that a message tells."""
+    """Return the machine name that a message contains."""
     name = decode(payload)
     if not isinstance(name, str) or not _HOST.fullmatch(name):
-        raise ConnectionRefusedByPeerError("It did not tell the name of its machine.")
+        raise ConnectionRefusedByPeerError("It did not report the name of its machine.")
     return name
 
 
 def parse_end(payload: bytes | bytearray) -> tuple[int, str]:
-    """Return exit status and last words of a worker that a message tells."""
+    """Return the exit status and last output of a worker that a message reports."""
     plain = decode(payload)
     given = plain if isinstance(plain, dict) else {}
     status, stderr = given.get("status"), given.get("stderr")
     if type(status) is not int or type(stderr) is not str:
-        raise ConnectionRefusedByPeerError("It did not tell how a worker ended.")
+        raise ConnectionRefusedByPeerError("It did not report how a worker ended.")
     return status, stderr
 
 
@@ -165,7 +165,7 @@ def _is_event(parts: Any) -> bool:
 
 
 def check_rows(block: Batch, fields: Sequence[Field], instance_id: int, last_step: int) -> int:
-    """Check received rows, as the client must have done before it sent them.
+    """Check received rows, as the client should have done before sending them.
 
     Args:
         block: Rows of a client, at least one.

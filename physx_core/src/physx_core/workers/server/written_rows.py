@@ -1,4 +1,4 @@
-"""WrittenRows: the rows that clients write to partitions of their own, as the server sees them."""
+"""WrittenRows: the server's view of the rows that clients write to their own partitions."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class WrittenRows:
     """
 
     def __init__(self, stripes: Stripes) -> None:
-        """Keep the partitions' side of it."""
+        """Store the stripes, which keep the partitions."""
         self._stripes = stripes
         self._proven: set[Peer] = set()
         self.dispatch: dict[Kind, Callable[[Peer, Frame], None]] = {
@@ -37,7 +37,7 @@ class WrittenRows:
         }
 
     def describe(self, peer: Peer) -> dict[str, Any]:
-        """Return what a client has to know when it starts: the folder, and its partitions."""
+        """Return what a client needs to know when it starts: the folder, and its partitions."""
         stripes = self._stripes
         known = stripes.entries(peer.instance_id - 1)
         return {
@@ -53,7 +53,7 @@ class WrittenRows:
         self._stripes.define(fields)
 
     def extend(self, granted: Mapping[Peer, int]) -> None:
-        """Have partitions for the rows that clients may make, before they may make them."""
+        """Begin partitions for the rows that clients will be allowed to generate."""
         stripes = self._stripes
         while stripes.begun * stripes.capacity < max(granted.values()):
             number = stripes.begun
@@ -63,11 +63,11 @@ class WrittenRows:
                 peer.send_once(pack(Kind.PARTITION, encode(self._plain(entry)), number))
 
     def commit(self, total: int) -> None:
-        """Let the first `total` rows be part of the dataset."""
+        """Make the first `total` rows part of the dataset."""
         self._stripes.commit(total)
 
     def end(self, peers: Iterable[Peer]) -> None:
-        """Order clients to seal what they wrote: the rows before which none is missing."""
+        """Order clients to seal what they wrote, up to the first missing row."""
         for peer in peers:
             share = rows_of_stripe(self._stripes.whole, peer.instance_id - 1, self._stripes.count)
             peer.send_once(pack(Kind.SEAL, number=share))

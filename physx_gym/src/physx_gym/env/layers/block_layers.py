@@ -16,12 +16,12 @@ from physx_gym.spaces import neutral
 
 
 class Schedule:
-    """When a block runs, and what it calls: in one place, as attributes of layers are slow.
+    """When a block runs, and what it calls; kept here because attributes of layers are slow.
 
     Attributes:
         run: Runs the block.
-        act: Computes commands in the next environment below that overrides it.
-        observe: Observes in the next environment below that overrides it.
+        act: `compute_command` of the next environment below that overrides it.
+        observe: `refresh_observation` of the next environment below that overrides it.
         target: Action of the environment that `act` belongs to.
         stepper: Progress of the episode.
         every: Period of the block, in physics steps.
@@ -72,8 +72,8 @@ class BlockLayer(Layer):
         for below in env.layers:
             if isinstance(below, BlockLayer) and below.block.name == block.name:
                 raise ConfigError(
-                    f'The pipeline already has a block "{block.name}". Give each block a name of '
-                    "its own."
+                    f'The pipeline already has a block "{block.name}". Give each block a different '
+                    "name."
                 )
         self.block = block
         self._basis: tuple[Any, ...] = ()
@@ -82,7 +82,7 @@ class BlockLayer(Layer):
         super().__init__(env)
 
     def _initialize_action_space(self) -> None:
-        """Connect the block to the simulator, unless that is unchanged."""
+        """Connect the block to the simulator, unless the simulator is unchanged."""
         self.block.refresh_connection()
         self._initialize_actions()
 
@@ -91,7 +91,7 @@ class BlockLayer(Layer):
         super()._initialize_action_space()
 
     def _initialize_observation_space(self) -> None:
-        """Add the block's parts to the observation below, unless that is unchanged."""
+        """Add the block's parts to the observation below, unless the latter is unchanged."""
         build = self.block.connected_to
         basis = (self.env.observation_space, self.env.observation, self.action)
         if build == self._build and all(a is b for a, b in zip(self._basis, basis, strict=True)):
@@ -112,7 +112,7 @@ class BlockLayer(Layer):
         self._schedule.observe(measurement)
 
     def compute_command(self, action: Any, command: Vector) -> None:
-        """Let the layers below compute the command of this layer's action."""
+        """Have the layers below compute the command for this layer's action."""
         self._schedule.act(action, command)
 
     def _initialize_buffers(self) -> None:
@@ -167,7 +167,7 @@ class ObservedEnv(BlockLayer):
         self.register_variable("feature", observer.observation, observer.fieldnames, observer.name)
 
     def refresh_observation(self, measurement: Mapping[str, Any]) -> None:
-        """Update the observation of the layers below, then run the block, if it is due."""
+        """Update the observation of the layers below, then run the block if it is due."""
         schedule = self._schedule
         schedule.observe(measurement)
         frame = schedule.stepper.iter
@@ -177,7 +177,7 @@ class ObservedEnv(BlockLayer):
 
 
 class ControlledEnv(BlockLayer):
-    """Takes a controller's actions instead of those of the environment below.
+    """Takes a controller's actions in place of those of the environment below.
 
     The controller's state, if it has one, is added to the observation as ``states.<block>``, and,
     with `augment_observation`, its action as ``actions.<block>``.
@@ -219,7 +219,7 @@ class ControlledEnv(BlockLayer):
             self._add_part("actions", self.action_space, self.action)
 
     def compute_command(self, action: Any, command: Vector) -> None:
-        """Run the block, if it is due, then let the layer below command the motors."""
+        """Run the block if it is due, then have the layer below command the motors."""
         schedule = self._schedule
         target, frame = schedule.target, schedule.stepper.iter
         if frame != schedule.last and frame % schedule.every == 0:

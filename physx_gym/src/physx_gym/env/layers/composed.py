@@ -1,4 +1,4 @@
-"""Layers of rewards and terminations."""
+"""The layer of rewards and terminations."""
 
 from __future__ import annotations
 
@@ -33,17 +33,17 @@ class ComposedEnv(Layer):
         terminations: Sequence[Termination] | Termination = (),
         trajectory: Trajectory | None = None,
     ) -> None:
-        """Put rewards and terminations on an environment.
+        """Add a reward and terminations to an environment.
 
         Args:
             env: The environment.
             reward: The reward to add.
-            terminations: One or several further terminations, with different names.
-            trajectory: The reference that quantities may be compared to; None: that of a layer
+            terminations: One or more terminations to add, with different names.
+            trajectory: The reference that quantities may be compared with; None: that of a layer
                 below, if there is one.
 
         Raises:
-            ConfigError: If a reward or termination is not one, two terminations have the same name,
+            ConfigError: If an argument is of the wrong type, two terminations have the same name,
                 or the trajectory is of another robot.
         """
         if isinstance(terminations, Termination):

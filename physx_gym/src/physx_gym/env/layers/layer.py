@@ -26,20 +26,24 @@ def _property_of_base(name: str) -> property:
 class Layer(PipelineEnv):
     """An environment on top of another one; it forwards what it does not override.
 
-    Attributes that it does not have are those of the layer below. Subclasses with memory override
-    `_memory` and `_recall`; those with their own action or observation set the space in
-    `_initialize_action_space` or `_initialize_observation_space`, and the buffer there too.
+    Attributes that it does not have are looked up in the layer below. Subclasses with memory
+    override `_memory` and `_recall`; those with their own action or observation set both the space
+    and the buffer in `_initialize_action_space` or `_initialize_observation_space`.
 
     Attributes:
         env: The layer below.
     """
 
     def __init__(self, env: PipelineEnv) -> None:
-        """Put a layer on an environment, and make it the outermost of the pipeline."""
+        """Put a layer on an environment, and make it the outermost of the pipeline.
+
+        Raises:
+            ConfigError: If `env` is neither a `RobotEnv` nor a layer of one.
+        """
         if not isinstance(env, PipelineEnv):
             raise ConfigError(
                 f"{type(self).__name__} goes on a RobotEnv or a layer of one, not on {env!r}. "
-                "Wrappers of gymnasium go around the whole pipeline."
+                "Gymnasium wrappers go around the whole pipeline."
             )
         self.env = env
         self._base: RobotEnv = env.unwrapped
@@ -64,7 +68,7 @@ class Layer(PipelineEnv):
         self.env.refresh_observation(measurement)
 
     def compute_command(self, action: Any, command: Vector) -> None:
-        """Let the layer below compute the command of this layer's action."""
+        """Have the layer below compute the command for this layer's action."""
         self.env.compute_command(action, command)
 
     def has_terminated(self, info: Info) -> tuple[bool, bool]:
@@ -116,7 +120,7 @@ class Layer(PipelineEnv):
         return self._base.run_step(self, action)
 
     def restore(self, state: Any) -> None:
-        """Return to a snapshot; see `PipelineEnv.restore`."""
+        """Restore a snapshot; see `PipelineEnv.restore`."""
         self._base.run_restore(self, state)
 
     def stop(self) -> None:
@@ -124,7 +128,7 @@ class Layer(PipelineEnv):
         self.env.stop()
 
     def close(self) -> None:
-        """Free what the environment holds; see `RobotEnv.close`."""
+        """Free the environment's resources; see `RobotEnv.close`."""
         self.env.close()
 
     def render(self) -> Any:

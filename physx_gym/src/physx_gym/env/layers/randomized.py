@@ -15,17 +15,17 @@ from physx_gym.tasks.randomizations.randomization import Nominal
 
 
 class RandomizedEnv(Layer):
-    """Draws properties of the world anew for each episode, from ranges.
+    """Draws properties of the world from ranges, anew for each episode.
 
-    What is drawn depends on the environment's seed and the number of the episode alone: first
-    states, noise and all else that is random stay as they are without this layer. Factors are those
-    of the values that the environment had when it was put under this layer. New masses, friction,
-    delays and noise need a new simulation, some milliseconds; gains and pushes do not.
+    The draws depend only on the environment's seed and the number of the episode: initial states,
+    noise and all other randomness stay as they are without this layer. Factors apply to the values
+    that the environment had when this layer was put on it. New masses, friction, delays and noise
+    require a new simulation, which takes some milliseconds; gains and pushes do not.
 
     Attributes:
         randomizations: What is drawn.
         every: Number of episodes between two draws.
-        drawn: What was drawn for the present episode, by the randomizations' names; also in the
+        drawn: Values drawn for the present episode, by the randomizations' names; also in the
             constants of the log, as ``"randomization"``.
     """
 
@@ -36,17 +36,17 @@ class RandomizedEnv(Layer):
         randomizations: Sequence[Randomization] | Randomization,
         every: int = 1,
     ) -> None:
-        """Put randomizations on an environment.
+        """Add randomizations to an environment.
 
         Args:
             env: The environment.
-            randomizations: One or several, with different names.
-            every: Number of episodes that share what is drawn.
+            randomizations: One or more, with different names.
+            every: Number of episodes that share the drawn values.
 
         Raises:
             ConfigError: If one is not a `Randomization`, two have the same name, the environment is
                 randomized already, or lacks what is randomized.
-            ComponentNotFoundError: If the environment lacks something that is named.
+            ComponentNotFoundError: If a randomization names something that is not there.
         """
         given = [randomizations] if isinstance(randomizations, Randomization) else randomizations
         self.randomizations = tuple(given)
@@ -56,7 +56,7 @@ class RandomizedEnv(Layer):
         super().__init__(env)
         self._check()
         self._nominal_options = env.simulator.get_options()
-        self._draw_from(0, 0)  # so that what is missing is noticed here
+        self._draw_from(0, 0)  # to notice here what is missing
 
     def _check(self) -> None:
         if type(self.every) is not int or self.every < 1:
@@ -71,7 +71,7 @@ class RandomizedEnv(Layer):
             raise ConfigError(f"Two randomizations have the same name: {sorted(names)}.")
         if any(isinstance(layer, RandomizedEnv) for layer in self.env.layers):
             raise ConfigError(
-                "The pipeline has a RandomizedEnv already: give all randomizations to one."
+                "The pipeline already has a RandomizedEnv: pass all randomizations to one."
             )
 
     @property
@@ -79,7 +79,7 @@ class RandomizedEnv(Layer):
         return Nominal(self.env, self._nominal_options)
 
     def _draw(self, number: int) -> dict[str, Any]:
-        """Return what is drawn for the episodes of a number."""
+        """Draw the values for a group of `every` episodes, given its number."""
         seed = self.np_random_seed
         if seed < 0:  # the random generator was set, so the seed is not known
             seed = int(self.np_random.integers(2**32))

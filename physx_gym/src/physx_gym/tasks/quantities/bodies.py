@@ -108,7 +108,11 @@ class MeanPose(BodiesQuantity):
 
 @dataclass(frozen=True)
 class RelativePoses(BodiesQuantity):
-    """Poses of at least two bodies relative to their mean pose, shape (bodies, 7)."""
+    """Poses of at least two bodies relative to their mean pose, shape (bodies, 7).
+
+    Raises:
+        ConfigError: If there are fewer than two bodies.
+    """
 
     def __post_init__(self) -> None:
         """Check the number of bodies."""
@@ -190,7 +194,7 @@ class BaseVelocity(Quantity):
 class OdometryVelocity(Quantity):
     """Velocity over the last step: forward and to the left in m/s, yaw rate in rad/s, shape (3,).
 
-    Along the heading halfway between start and end of the step.
+    Resolved along the heading halfway between the start and end of the step.
     """
 
     def compute(self, moment: Moment) -> Vector:

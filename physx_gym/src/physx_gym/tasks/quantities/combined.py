@@ -32,7 +32,7 @@ class Masked(Quantity):
 
 @dataclass(frozen=True)
 class Joined(Quantity):
-    """Several quantities, concatenated to one flat array.
+    """Several quantities, concatenated into one flat array.
 
     Attributes:
         quantities: Numbers or arrays.
@@ -50,7 +50,7 @@ class Computed(Quantity):
     """A function of other quantities.
 
     Attributes:
-        function: Called with their values; a named function, so that equal quantities are shared.
+        function: Called with their values; must be a named function, for equal ones to be shared.
         quantities: Its arguments.
     """
 
@@ -64,11 +64,14 @@ class Computed(Quantity):
 
 @dataclass(frozen=True)
 class Stacked(Remembering):
-    """The values of another quantity after the last steps, the latest last.
+    """The values of another quantity after the last steps, oldest first.
 
     Attributes:
         quantity: A number or array.
         steps: Number of steps; at the start of an episode there are fewer.
+
+    Raises:
+        ConfigError: If `steps` is less than 1, or `quantity` is not a quantity.
     """
 
     quantity: Quantity
@@ -92,7 +95,7 @@ class Delta(Remembering):
 
     Attributes:
         quantity: A number or array.
-        steps: Number of steps, or all that there were.
+        steps: Number of steps; fewer at the start of an episode.
         difference: Takes the later and the earlier value; for angles, one along the shorter arc.
     """
 
@@ -129,7 +132,7 @@ class Mean(Quantity):
 
     Attributes:
         quantity: A number or array.
-        steps: Number of steps, or all that there were.
+        steps: Number of steps; fewer at the start of an episode.
     """
 
     quantity: Quantity
@@ -141,6 +144,6 @@ class Mean(Quantity):
 
 
 def _push(stack: Any, value: Any, size: int) -> Vector:
-    """Return the newest values of a stack, with one more."""
+    """Return the newest values of a stack after adding one."""
     new = as_array(value)[np.newaxis].copy()
     return new if stack is None else np.concatenate([stack, new])[-size:]

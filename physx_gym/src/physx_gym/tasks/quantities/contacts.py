@@ -15,7 +15,7 @@ from physx_gym.tasks.quantities.quantity import Moment
 
 @dataclass(frozen=True)
 class ContactForces(BodiesQuantity):
-    """Sum of the contact forces on each of some bodies, shape (bodies, 3), in N, in the world."""
+    """Total contact force on each body, shape (bodies, 3), in N, in the world frame."""
 
     def compute(self, moment: Moment) -> Vector:
         """Return the forces."""
@@ -31,7 +31,7 @@ class ContactForces(BodiesQuantity):
 
 @dataclass(frozen=True)
 class VerticalForceShares(BodiesQuantity):
-    """Fraction of the robot's weight that each of some bodies carries, shape (bodies,).
+    """Fraction of the robot's weight that each body carries, shape (bodies,).
 
     They sum to 1 if the robot stands still on these bodies alone.
     """
@@ -45,7 +45,7 @@ class VerticalForceShares(BodiesQuantity):
 
 @dataclass(frozen=True)
 class BodiesInContact(BodiesQuantity):
-    """Whether two of some bodies, including static objects, touch each other."""
+    """Whether any two of the bodies, which may be static objects, touch each other."""
 
     def compute(self, moment: Moment) -> bool:
         """Return whether there is a contact between two of them."""
@@ -59,7 +59,7 @@ class BodiesInContact(BodiesQuantity):
 
 @dataclass(frozen=True)
 class HighestContactForce(BodiesQuantity):
-    """The largest contact force on any of some bodies, in N."""
+    """The largest contact force on any of the bodies, in N."""
 
     def compute(self, moment: Moment) -> float:
         """Return the force."""
@@ -68,9 +68,9 @@ class HighestContactForce(BodiesQuantity):
 
 @dataclass(frozen=True)
 class SlipVelocity(BodiesQuantity):
-    """Speed, in m/s, of the fastest contact of some bodies along the surface that it touches.
+    """Speed, in m/s, of the bodies' fastest contact along the surface that it touches.
 
-    The touched surfaces count as resting; 0 without contacts.
+    The touched surfaces are assumed to be at rest; 0 without contacts.
     """
 
     def compute(self, moment: Moment) -> float:
@@ -90,7 +90,7 @@ class SlipVelocity(BodiesQuantity):
 
 
 def _places(moment: Moment, bodies: tuple[str, ...]) -> dict[int, int]:
-    """Return the row of each body by its place in `Layout.names`."""
+    """Return the row of each body by its index in `Layout.names`."""
     names = moment.simulator.layout.names
     for body in bodies:
         if body not in names:

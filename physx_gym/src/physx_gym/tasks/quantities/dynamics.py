@@ -21,14 +21,18 @@ from physx_gym.tasks.quantities.quantity import Moment, Quantity
 class MassAndMomentum(Quantity):
     """Mass and momentum of a robot whose base floats, shape (10,), from its mass matrix.
 
-    Mass in kg; center of mass in m, in the world; linear momentum in kg m/s; angular momentum about
-    the center of mass in kg m²/s, both along the world's axes.
+    Mass in kg; center of mass in m, in the world; linear momentum in kg m/s and angular momentum
+    about the center of mass in kg m²/s, both along the world's axes.
     The first six rows of the mass matrix are the spatial inertia of the whole robot about its base
     (Featherstone, "Rigid Body Dynamics Algorithms", 2008, section 9.3).
     """
 
     def compute(self, moment: Moment) -> Vector:
-        """Return the numbers."""
+        """Return mass, center of mass and momentum.
+
+        Raises:
+            FeatureNotSupportedError: If the base is fixed.
+        """
         if not moment.robot.floating:
             raise FeatureNotSupportedError(
                 "A robot with a fixed base", "a center of mass", (), "Its base must float."
@@ -82,7 +86,7 @@ class CapturePoint(Quantity):
     by sqrt(gravity / height) (Pratt et al., "Capture Point", 2006).
 
     Attributes:
-        feet: Bodies on which it stands: the height is above the lowest; none: above z = 0.
+        feet: Bodies it stands on: the height is above the lowest of them; none: above z = 0.
     """
 
     feet: tuple[str, ...] = ()
@@ -99,8 +103,8 @@ class CapturePoint(Quantity):
 class ZeroMomentPoint(Quantity):
     """Point on z = 0 at which the total ground reaction force acts, shape (2,), in m.
 
-    From the change of the momentum over the last step; below the center of mass if the ground
-    carries nothing.
+    Computed from the change in momentum over the last step; below the center of mass if the ground
+    carries no load.
     """
 
     def compute(self, moment: Moment) -> Vector:
@@ -122,9 +126,12 @@ class MechanicalPower(Quantity):
     """Power consumed by the motors, in W.
 
     Attributes:
-        braking: Use of the power of braking. ``"regained"``: all of it is regained; ``"lost"``: all
-            of it is lost; ``"shared"``: other motors use it, the rest is lost; ``"penalized"``:
-            braking costs as much as driving.
+        braking: Use of braking power. ``"regained"``: all of it is regained; ``"lost"``: all of it
+            is lost; ``"shared"``: other motors use it, the rest is lost; ``"penalized"``: braking
+            costs as much as driving.
+
+    Raises:
+        ConfigError: If `braking` is none of these.
     """
 
     braking: Literal["regained", "lost", "shared", "penalized"] = "lost"

@@ -34,13 +34,13 @@ def pose_difference(later: Vector, earlier: Vector) -> Vector:
 
 
 def angle_difference(later: Vector, earlier: Vector) -> Vector:
-    """Return differences of angles in rad, the short way, within [-pi, pi)."""
+    """Return differences of angles in rad, along the shorter arc, within [-pi, pi)."""
     difference: Vector = (np.asarray(later) - earlier + np.pi) % (2 * np.pi) - np.pi
     return difference
 
 
 def odometry_difference(later: Vector, earlier: Vector) -> Vector:
-    """Return the planar motion between (x, y, yaw), in the frame half way between them."""
+    """Return the planar motion between (x, y, yaw), in the frame halfway between them."""
     turn = float(angle_difference(later[2], earlier[2]))
     heading = float(earlier[2]) + 0.5 * turn
     x, y = (later[:2] - earlier[:2]).tolist()

@@ -1,4 +1,4 @@
-"""Quantities, the moments that they are computed for, and the quantities of an environment."""
+"""Quantities, the moments they are computed for, and the quantities of an environment."""
 
 from __future__ import annotations
 
@@ -53,9 +53,9 @@ class Quantity(ABC):
 
 
 class Remembering(Quantity):
-    """A quantity of the present and of previous steps of the environment.
+    """A quantity of the present and previous steps of the environment.
 
-    Its value is updated once a step, whether it is used or not.
+    Its value is updated once a step, whether or not it is used.
     """
 
     @abstractmethod
@@ -63,7 +63,7 @@ class Remembering(Quantity):
         """Return the value after this step, and what to remember for the next.
 
         Args:
-            memory: What was remembered in the step before; None: this is the start of an episode.
+            memory: What was remembered in the previous step; None: start of an episode.
             moment: The state after this step.
         """
 
@@ -74,7 +74,7 @@ class Remembering(Quantity):
 
 @dataclass(frozen=True)
 class Reference(Quantity):
-    """Another quantity, at the state of the reference trajectory at this time.
+    """Another quantity, computed for the reference trajectory's state at this time.
 
     Attributes:
         quantity: A quantity that depends on positions and velocities only.
@@ -116,7 +116,7 @@ class Moment:
 
     @property
     def robot(self) -> Part:
-        """Place of the robot in the whole state."""
+        """The robot's part of the whole state."""
         return self.simulator.robot
 
     @property
@@ -126,7 +126,7 @@ class Moment:
 
     @property
     def step_dt(self) -> float:
-        """Time of a step of the environment, in s."""
+        """Duration of a step of the environment, in s."""
         return self._owner.step_dt
 
     def get(self, quantity: Quantity) -> Any:
@@ -142,15 +142,19 @@ class Moment:
         return self._owner.moment_of_reference(self.t)
 
     def remembered(self, quantity: Remembering) -> Any:
-        """Return the value that a quantity with memory had after the last step."""
+        """Return the value that a quantity with memory had after the last step.
+
+        Raises:
+            ConfigError: If the moment is on a trajectory.
+        """
         if not self.is_present:
             raise ConfigError(
                 f"{quantity} depends on previous steps, which Reference cannot provide: apply "
-                "Reference to the quantity in it."
+                "Reference to the quantity inside it."
             )
         return self._owner.remembered(quantity)
 
-    # What the simulation says --------------------------------------------------------------
+    # From the simulation -------------------------------------------------------------------
 
     def body_poses(self, names: tuple[str, ...]) -> Vector:
         """Return poses of bodies in the world, shape (names, 7): see `Simulation.body_poses`."""
@@ -202,7 +206,7 @@ class Quantities(Mapping[str, Any]):
 
         Args:
             simulator: The simulator of the environment.
-            step_dt: Time of a step of the environment, in s.
+            step_dt: Duration of a step of the environment, in s.
         """
         self.simulator, self.step_dt = simulator, step_dt
         self.trajectory: Trajectory | None = None
@@ -224,7 +228,7 @@ class Quantities(Mapping[str, Any]):
         """
         check_quantity(f'The quantity "{name}"', quantity)
         if self._named.get(name, quantity) != quantity:
-            raise ConfigError(f'There already is a quantity "{name}": {self._named[name]}.')
+            raise ConfigError(f'There is already a quantity "{name}": {self._named[name]}.')
         self._named[name] = quantity
         self.watch(quantity)
 
@@ -246,7 +250,7 @@ class Quantities(Mapping[str, Any]):
         return name in self._named
 
     def __iter__(self) -> Iterator[str]:
-        """Go through the names."""
+        """Iterate over the names."""
         return iter(self._named)
 
     def __len__(self) -> int:
@@ -273,7 +277,7 @@ class Quantities(Mapping[str, Any]):
         return self._present
 
     def moment_of_reference(self, t: float) -> Moment:
-        """Return the moment of the reference trajectory.
+        """Return the moment of the reference trajectory at a time, in s.
 
         Raises:
             ConfigError: If there is no trajectory.
@@ -288,7 +292,7 @@ class Quantities(Mapping[str, Any]):
         return self._on_reference
 
     def watch(self, quantity: Quantity) -> None:
-        """Compute a quantity at the start of each episode, so that its memories start there."""
+        """Compute a quantity at the start of each episode, so that its memory starts there."""
         self._watched.setdefault(quantity)
 
     def remembered(self, quantity: Remembering) -> Any:
@@ -308,7 +312,7 @@ class Quantities(Mapping[str, Any]):
     def clear(self) -> None:
         """Discard the values, and update the memories after a step.
 
-        The first time after `reset` the memories start, with the first state of the episode.
+        The first call after `reset` starts the memories with the initial state of the episode.
         """
         self._present = self._on_reference = None
         if self._begins:
@@ -317,7 +321,7 @@ class Quantities(Mapping[str, Any]):
                 self.get_value(watched)
         elif self._memories:
             moment = self.moment()
-            # In the order of their creation: the parts of a quantity come before it.
+            # In order of creation: the parts of a quantity come before it.
             for quantity, (_, memory) in [*self._memories.items()]:
                 self._memories[quantity] = quantity.advance(memory, moment)
 
@@ -333,7 +337,7 @@ class Quantities(Mapping[str, Any]):
 
 
 def check_quantity(where: str, value: Any) -> Quantity:
-    """Return a value that is a quantity.
+    """Return a value after checking that it is a quantity.
 
     Raises:
         ConfigError: If it is not.

@@ -22,7 +22,7 @@ from physx_gym.tasks.randomizations.randomization import (
 
 
 class RandomGains(Randomization):
-    """Multiplies the gains of a `PDController`, for each motor by factors of its own."""
+    """Multiplies the gains of a `PDController`, with different factors for each motor."""
 
     def __init__(
         self,
@@ -34,8 +34,8 @@ class RandomGains(Randomization):
         """Choose the controller.
 
         Args:
-            kp: Range of the factors of the torque for each unit of position error.
-            kd: Range of the factors of the torque for each unit of velocity error.
+            kp: Range of the factors of the torque per unit of position error.
+            kd: Range of the factors of the torque per unit of velocity error.
             block: Name of the controller, which is below this layer; None: the only one.
             name: Name in the log; None: that of the class.
         """
@@ -61,7 +61,7 @@ class RandomGains(Randomization):
             return next(iter(found.values()))
         if self.block is None:
             raise ConfigError(
-                f"RandomGains needs a PDController below it, or block= the name of one of several: "
+                f"RandomGains needs exactly one PDController below it, or block= the name of one: "
                 f"{listed(found)}."
             )
         if self.block not in found:
@@ -70,7 +70,7 @@ class RandomGains(Randomization):
 
 
 class RandomDelays(Randomization):
-    """Delays sensors, each by a time of its own."""
+    """Delays each sensor by a different time."""
 
     def __init__(
         self, delay: Range, sensors: Sequence[str] | None = None, name: str | None = None
@@ -107,10 +107,13 @@ class RandomNoise(Randomization):
         """Choose the quantities.
 
         Args:
-            deviation: Range of the standard deviation for each quantity, as ``"velocity"``, in its
-                unit.
+            deviation: Range of the standard deviation for each quantity, such as ``"velocity"``, in
+                its unit.
             sensors: Names of the sensors; None: all that measure one of the quantities.
             name: Name in the log; None: that of the class.
+
+        Raises:
+            ConfigError: If `deviation` is empty or not a mapping, or a range is invalid.
         """
         super().__init__(name)
         if not isinstance(deviation, Mapping) or not deviation:
@@ -125,7 +128,12 @@ class RandomNoise(Randomization):
         self.sensors = sensors
 
     def draw(self, nominal: Nominal, random: Generator) -> Drawn:
-        """Return the standard deviations of each sensor."""
+        """Return the standard deviations of each sensor.
+
+        Raises:
+            ComponentNotFoundError: If a sensor does not exist, or none of them measures one of the
+                quantities.
+        """
         every = {sensor.name: sensor for sensor in nominal.env.simulator.sensors}
         names = chosen("sensor", "The robot", self.sensors, list(every))
         measured = {quantity for each in names for quantity in every[each].error_widths()}
@@ -143,7 +151,7 @@ class RandomNoise(Randomization):
         return {each: own for each, own in found.items() if own}
 
     def options(self, nominal: Nominal, drawn: Drawn) -> Mapping[str, Any]:
-        """Return the noise of the sensors; that of other quantities stays."""
+        """Return the noise of the sensors; that of other quantities is unchanged."""
         every = {sensor.name: sensor for sensor in nominal.env.simulator.sensors}
         found = {}
         for each, own in drawn.items():

@@ -1,4 +1,4 @@
-"""Base class of what is drawn anew for an episode."""
+"""Base class of randomizations, whose values are drawn for an episode."""
 
 from __future__ import annotations
 
@@ -14,9 +14,9 @@ from physx_core.errors import ComponentNotFoundError, ConfigError
 from physx_gym.env.pipeline_env import PipelineEnv
 
 Range = Sequence[float]
-"""The lowest and the highest value that is drawn; all between are equally likely."""
+"""Lowest and highest value of a uniform distribution."""
 Drawn = dict[str, Any]
-"""What was drawn, by name: numbers, and lists of them."""
+"""Drawn values by name: numbers, and lists of them."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Nominal:
 
 
 class Randomization(ABC):
-    """Something that is drawn from ranges for an episode.
+    """Properties that are drawn from ranges for an episode.
 
     Subclasses implement `draw`, and `options` or `apply`.
 
@@ -42,27 +42,27 @@ class Randomization(ABC):
     """
 
     def __init__(self, name: str | None = None) -> None:
-        """Name it; None: by its class."""
+        """Set the name; None: that of the class."""
         self.name = type(self).__name__ if name is None else name
 
     @abstractmethod
     def draw(self, nominal: Nominal, random: Generator) -> Drawn:
-        """Return what is drawn for an episode: plain data, which the log will contain.
+        """Draw the values for an episode; return plain data, which goes into the log.
 
         Raises:
-            ComponentNotFoundError: If the environment lacks something that is named.
+            ComponentNotFoundError: If a name is not found in the environment.
         """
 
     def options(self, nominal: Nominal, drawn: Drawn) -> Mapping[str, Any]:
         """Return the options of the simulator that differ, as in `Simulator.set_options`."""
         return {}
 
-    def apply(self, env: PipelineEnv, drawn: Drawn) -> None:  # noqa: B027 - not all have this
-        """Apply to an environment what is not an option of its simulator; called at each reset."""
+    def apply(self, env: PipelineEnv, drawn: Drawn) -> None:  # noqa: B027 - not all need this
+        """Apply what is not an option of the environment's simulator; called at each reset."""
 
 
 def check_range(option: str, given: Any, lowest: float | None = 0.0) -> tuple[float, float]:
-    """Return a range whose values are not below a lowest one."""
+    """Return a range after checking that its values are not below the lowest allowed one."""
     low, high = checks.vector(option, given, 2)
     if low > high or (lowest is not None and low < lowest):
         limit = "" if lowest is None else f" and not below {lowest:g}"
@@ -73,7 +73,7 @@ def check_range(option: str, given: Any, lowest: float | None = 0.0) -> tuple[fl
 def chosen(
     kind: str, where: str, names: Iterable[str] | None, known: Sequence[str]
 ) -> tuple[str, ...]:
-    """Return the names that are given, if they are known; None: all."""
+    """Return the given names after checking that they are known; None: all."""
     if isinstance(names, str):
         names = (names,)
     wanted = tuple(known if names is None else names)

@@ -22,7 +22,7 @@ from physx_gym.tasks.randomizations.randomization import (
 
 
 class RandomMasses(Randomization):
-    """Multiplies masses, with the moments of inertia, each by a factor of its own."""
+    """Multiplies each mass, with its moments of inertia, by a different factor."""
 
     def __init__(
         self, factor: Range, of: Sequence[str] | None = None, name: str | None = None
@@ -72,7 +72,7 @@ def _links(env: PipelineEnv) -> list[str]:
 
 
 class RandomFriction(Randomization):
-    """Gives things one coefficient of friction, which is then that of any pair of them."""
+    """Gives things one coefficient of friction, which then applies to any pair of them."""
 
     def __init__(
         self, coefficient: Range, of: Sequence[str] | None = None, name: str | None = None
@@ -110,7 +110,7 @@ def _things(nominal: Nominal) -> list[str]:
 
 
 class RandomPushes(Randomization):
-    """Pushes a body now and then, horizontally, in random directions."""
+    """Pushes a body from time to time, horizontally, in random directions."""
 
     def __init__(
         self,
@@ -126,9 +126,9 @@ class RandomPushes(Randomization):
         Args:
             force: Range of the forces, in N.
             every: Range of the times from one push to the next, in s.
-            duration: Time for which each acts, in s.
+            duration: Duration of each push, in s.
             body: Name of the link or object; None: the root link of the controlled robot.
-            until: Time in the episode after which there are no more, in s.
+            until: Time in the episode after which there are no more pushes, in s.
             name: Name in the log; None: that of the class.
         """
         super().__init__(name)

@@ -1,4 +1,4 @@
-"""Rewards, to be composed from parts."""
+"""Rewards, and their composition from parts."""
 
 from __future__ import annotations
 

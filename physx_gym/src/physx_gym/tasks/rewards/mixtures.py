@@ -17,7 +17,7 @@ class _Mixture(Reward):
 
     Attributes:
         rewards: The parts.
-        weights: Weights of the parts, normalized if asked for.
+        weights: Weights of the parts, normalized if requested.
     """
 
     def __init__(
@@ -101,8 +101,8 @@ class Sum(_Mixture):
             rewards: Rewards, or the weight of each.
             name: Name of the sum.
             weights: Weights of a list of rewards, as in a pipeline's file; None: 1.
-            normalize: Divide by the sum of the weights; the result is then between 0 and 1, like
-                all of its parts, which must be normalized.
+            normalize: Whether to divide by the sum of the weights; all parts must be normalized,
+                and the result is then between 0 and 1 too.
 
         Raises:
             ConfigError: If there are no rewards, two have the same name, or they cannot be

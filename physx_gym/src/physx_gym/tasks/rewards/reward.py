@@ -28,7 +28,11 @@ class Reward(ABC):
     is_normalized: bool = False
 
     def __init__(self, name: str) -> None:
-        """Name the reward."""
+        """Name the reward.
+
+        Raises:
+            ConfigError: If the name is empty or not a string.
+        """
         if not isinstance(name, str) or not name:
             raise ConfigError(f"The name of a reward must be a string, not {name!r}.")
         self.name = name
@@ -69,7 +73,7 @@ class Survival(Reward):
 
 
 class Minimizing(Reward):
-    """1 if a quantity is 0, and less the larger it is: 0.01 at the cutoff.
+    """1 if a quantity is 0, decreasing as it grows: 0.01 at the cutoff.
 
     The reward is ``exp(ln(0.01) * (|quantity| / cutoff) ** 2)``, with the Euclidean norm of all
     entries.
@@ -123,7 +127,7 @@ class Tracking(Minimizing):
             quantity: A number or array.
             cutoff: Norm of the difference at which the reward is 0.01.
             target: A quantity or a constant; None: the quantity on the reference trajectory.
-            difference: Function of value and target; for angles, one that takes the shorter way.
+            difference: Function of value and target; for angles, one that takes the shorter arc.
             name: Name; None: that of the quantity's class.
         """
         super().__init__(quantity, cutoff, name)
@@ -137,7 +141,11 @@ class Tracking(Minimizing):
         return (self.quantity, target) if isinstance(target, Quantity) else (self.quantity,)
 
     def compute(self, quantities: Quantities, terminated: bool, info: dict[str, float]) -> float:
-        """Return the reward."""
+        """Return the reward.
+
+        Raises:
+            ConfigError: If the shapes of the quantity and its target do not fit.
+        """
         target = self.target
         wanted = quantities.get_value(target) if isinstance(target, Quantity) else target
         value = quantities.get_value(self.quantity)

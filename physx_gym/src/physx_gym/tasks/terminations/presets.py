@@ -42,12 +42,12 @@ def base_height(
 def lost_ground(
     feet: Sequence[str], highest: float, name: str = "lost_ground", **options: Any
 ) -> OutOfBounds:
-    """End the episode when the lowest of some bodies is too high above z = 0, in m."""
+    """End the episode when the lowest of the bodies is too high above z = 0, in m."""
     return OutOfBounds(LowestBody(tuple(feet)), None, highest, name, **options)
 
 
 def collision(bodies: Sequence[str], name: str = "collision", **options: Any) -> OutOfBounds:
-    """End the episode when two of the bodies touch each other."""
+    """End the episode when any two of the bodies touch each other."""
     return OutOfBounds(BodiesInContact(tuple(bodies)), None, 0.5, name, **options)
 
 
@@ -66,7 +66,7 @@ def slippage(
 
 
 def high_power(highest: float, steps: int, name: str = "high_power", **options: Any) -> OutOfBounds:
-    """End the episode when the motors take too much power, in W, averaged over some steps."""
+    """End the episode when the motors draw too much power, in W, averaged over some steps."""
     return OutOfBounds(Mean(MechanicalPower(), steps), None, highest, name, **options)
 
 
@@ -77,7 +77,7 @@ def unsafe_joints(
 
     Args:
         margin: Distance that counts as close, in rad or m.
-        fastest: Highest velocity there towards or away from the limit, in rad/s or m/s.
+        fastest: Highest velocity there toward or away from the limit, in rad/s or m/s.
         name: Name of the termination.
         options: Options of `Termination`.
     """
@@ -86,7 +86,7 @@ def unsafe_joints(
 
 @dataclass(frozen=True)
 class LowestBody(Quantity):
-    """Height of the lowest of some bodies' origins above z = 0, in m.
+    """Height of the lowest body's origin above z = 0, in m.
 
     Attributes:
         bodies: Names in the layout.

@@ -1,4 +1,4 @@
-"""Base class of terminations, and terminations by a single quantity."""
+"""Base class of terminations, and terminations on a single quantity."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Termination(ABC):
 
     Attributes:
         name: Its name in the info of the step.
-        grace_period: Time at the start of an episode in which it does not apply, in s.
+        grace_period: Time at the start of an episode during which it does not apply, in s.
         is_truncation: Whether it truncates the episode instead of terminating it.
         training_only: Whether it does not apply in evaluation.
     """
@@ -38,6 +38,7 @@ class Termination(ABC):
 
         Raises:
             UnknownOptionError: If there is no option of that name.
+            ConfigError: If the name is empty or not a string, or the grace period is invalid.
         """
         if unknown:
             known = ("grace_period", "is_truncation", "training_only")
@@ -91,8 +92,8 @@ class OutOfBounds(Termination):
             fits = False
         if not fits or (low is None and high is None):
             raise ConfigError(
-                f'The bounds of "{self.name}" are {low!r} and {high!r} but must be numbers, at '
-                "least one of them, the lower one first."
+                f'The bounds of "{self.name}" are {low!r} and {high!r} but must be numbers, the '
+                "lower one first; one of them may be None."
             )
 
     @property
@@ -117,7 +118,7 @@ class OutOfBounds(Termination):
 class Drift(OutOfBounds):
     """Ends the episode when a quantity's change differs too much from that of its reference.
 
-    The bounds apply to how much more it changed over a horizon than on the reference trajectory.
+    The bounds apply to its change over a horizon minus that on the reference trajectory.
     """
 
     def __init__(
@@ -139,7 +140,7 @@ class Drift(OutOfBounds):
             low: Lowest difference of the changes, as in `OutOfBounds`.
             high: Highest difference of the changes.
             name: Name; None: that of the quantity's class.
-            difference: Function of two values; for angles, one that takes the shorter way.
+            difference: Function of two values; for angles, one that takes the shorter arc.
             options: Options of `Termination`.
         """
         own = Delta(quantity, steps, difference)
@@ -149,7 +150,7 @@ class Drift(OutOfBounds):
 
 
 class Shift(Termination):
-    """Ends the episode when a quantity was too far from its reference for a whole horizon."""
+    """Ends the episode when a quantity has been too far from its reference for a horizon."""
 
     def __init__(
         self,
@@ -168,7 +169,7 @@ class Shift(Termination):
             steps: The horizon, in steps of the environment.
             farthest: Largest Euclidean distance, in the quantity's unit.
             name: Name; None: that of the quantity's class.
-            difference: Function of two values; for angles, one that takes the shorter way.
+            difference: Function of two values; for angles, one that takes the shorter arc.
             options: Options of `Termination`.
         """
         super().__init__(name or f"{type(quantity).__name__}_shift", **options)

@@ -1,1 +1,1 @@
-"""Read strategies: from memory, exactly shuffled from disk, or in windows from disk."""
+"""Read strategies: from memory, exactly shuffled from disk, or windowed from disk."""

@@ -1,4 +1,4 @@
-"""Caches the columns of a dataset that are in memory or mapped."""
+"""Caches columns of a dataset that are in memory or mapped."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class MemoryColumn:
         self._array = np.empty(self.shape, dtype)
 
     def extend(self, rows: int) -> None:
-        """Read those of the first `rows` rows that are not there yet."""
+        """Read those of the first `rows` rows that are not in memory yet."""
         have = self.shape[0]
         if rows > len(self._array):
             grown = np.empty((max(rows, 2 * have), *self.shape[1:]), self._array.dtype)
@@ -50,12 +50,12 @@ class MemoryColumn:
 
     def gather(self, index: Index, out: Array) -> None:
         """Copy the rows of an index array, all in range, into `out`."""
-        # Every mode but the default one writes straight to `out`.
+        # All modes but the default write directly to `out`.
         self._array.take(index, 0, out, "clip")
 
 
 class ColumnCache:
-    """The columns of a dataset, kept from one use to the next until stored rows change.
+    """The columns of a dataset, kept between uses until stored rows change.
 
     Attributes:
         reader: Reads the rows.
@@ -70,18 +70,18 @@ class ColumnCache:
     def choose_strategy(
         self, mode: str, names: Sequence[str], dtype: np.dtype[Any] | None = None
     ) -> Strategy:
-        """Return how the rows of fields are best read now.
+        """Return the best strategy to read the rows of fields now.
 
         Args:
             mode: Name of the mode.
             names: Names of the fields.
-            dtype: Type that floating fields are converted to; None: each keeps its own.
+            dtype: Type that floating-point fields are converted to; None: no conversion.
         """
         fields = [self.reader.field(mode, name) for name in names]
         return choose_strategy(sum(self.missing(mode, name, dtype) for name in names), fields)
 
     def load(self, mode: str, name: str, dtype: np.dtype[Any] | None = None) -> MemoryColumn:
-        """Return all rows of a field that are committed now, in memory."""
+        """Load all currently committed rows of a field into memory and return them."""
         self._drop_stale()
         field = self.reader.field(mode, name)
         key = mode, name, converted_dtype(field, dtype)
@@ -95,7 +95,7 @@ class ColumnCache:
         return column
 
     def map(self, mode: str, name: str) -> MappedColumn:
-        """Return all rows of a field that are committed now, mapped into the address space."""
+        """Map all currently committed rows of a field into the address space and return them."""
         self._drop_stale()
         field, rows = self.reader.field(mode, name), self.reader.rows(mode)
         column = self._mapped.get((mode, name))
@@ -105,7 +105,7 @@ class ColumnCache:
         return column
 
     def missing(self, mode: str, name: str, dtype: np.dtype[Any] | None) -> int:
-        """Return how many bytes of memory loading a field would take."""
+        """Return the number of bytes of memory that loading a field would take."""
         self._drop_stale()
         field = self.reader.field(mode, name)
         kind = converted_dtype(field, dtype)
@@ -114,7 +114,7 @@ class ColumnCache:
         return rows * (field.nbytes // np.dtype(field.dtype).itemsize) * kind.itemsize
 
     def clear(self) -> None:
-        """Free memory and addresses."""
+        """Free memory and address space."""
         self._loaded.clear()
         self._mapped.clear()
 
@@ -125,6 +125,6 @@ class ColumnCache:
 
 
 def converted_dtype(field: Field, dtype: np.dtype[Any] | None) -> np.dtype[Any]:
-    """Return the type in which a field is returned if floating ones are converted to `dtype`."""
+    """Return the type of a field's rows if floating-point fields are converted to `dtype`."""
     own = np.dtype(field.dtype)
     return own if dtype is None or own.kind != "f" else dtype

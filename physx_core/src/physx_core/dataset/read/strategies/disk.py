@@ -1,4 +1,4 @@
-"""Reads a field's rows from its files as they are needed, and announces them to the system."""
+"""Reads a field's rows from its files on demand, and announces reads to the operating system."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ _OPEN_FILES = 64
 
 
 class DiskColumn:
-    """A field on the disk; close it after use.
+    """A field on disk; close it after use.
 
     Rows are read with system calls, not through mapped memory: a file that becomes shorter raises
     an error instead of killing the process, and the memory of the process does not grow. Reading
@@ -28,18 +28,18 @@ class DiskColumn:
 
     Attributes:
         shape: (rows, *field shape).
-        dtype: Type of the rows that are returned.
+        dtype: Type of the returned rows.
         row_nbytes: Bytes of one stored row.
     """
 
     def __init__(self, reader: Reader, mode: str, name: str, dtype: np.dtype[Any] | None) -> None:
-        """Look up where the rows that are committed now are stored.
+        """Look up where the currently committed rows are stored.
 
         Args:
-            reader: Knows the partitions.
+            reader: Provides the partitions.
             mode: Name of the mode.
             name: Name of the field.
-            dtype: Type that floating rows are converted to; None: their own.
+            dtype: Type that floating-point rows are converted to; None: no conversion.
         """
         field = reader.field(mode, name)
         self.shape: tuple[int, ...] = (reader.rows(mode), *(field.shape or ()))
@@ -52,7 +52,7 @@ class DiskColumn:
         self._opened: dict[int, tuple[FileIO, int]] = {}
 
     def announce(self, start: int, count: int = 1) -> None:
-        """Tell the system that `count` rows from `start` on will be read soon."""
+        """Tell the operating system that `count` rows from `start` on will be read soon."""
         size = self.row_nbytes
         if not size or not hasattr(os, "posix_fadvise"):
             return
@@ -89,7 +89,7 @@ class DiskColumn:
         self._opened.clear()
 
     def _target(self, out: Array) -> Array:
-        """Return where rows of the field's own type can be read to."""
+        """Return an array of the field's own type to read into."""
         if out.dtype == self._own:
             return out
         if len(self._scratch) < len(out):
@@ -103,10 +103,10 @@ class DiskColumn:
             self._segments[number].read(file, offset + first * self.row_nbytes, view)
 
     def _parts(self, start: int, count: int) -> Iterator[tuple[int, int, int, builtins.slice]]:
-        """Yield which rows of which segments are `count` rows of the mode from `start` on.
+        """Locate `count` rows of the mode, from `start` on, in the segments.
 
         Yields:
-            Number of the segment, its first row, how many, and where they lie among the `count`.
+            Segment number, first row there, number of rows, and their places among the `count`.
         """
         if not count:
             return
@@ -123,7 +123,7 @@ class DiskColumn:
             number += 1
 
     def _open(self, number: int) -> tuple[FileIO, int]:
-        """Return the open file of a segment, and the offset of its first row."""
+        """Return the open file of a segment and the offset of its first row."""
         found = self._opened.get(number)
         if found is None:
             if len(self._opened) >= _OPEN_FILES:

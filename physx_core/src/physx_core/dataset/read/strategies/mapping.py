@@ -1,4 +1,4 @@
-"""Maps the rows of a field in all its partitions as one array, which the system reads on access."""
+"""Maps all partitions of a field into memory as one array; the system reads rows on access."""
 
 from __future__ import annotations
 
@@ -35,11 +35,10 @@ class _Mapped(NamedTuple):
 
 
 class MappedColumn:
-    """A field on the disk whose partitions are mapped side by side in the address space.
+    """A field on disk whose partitions are mapped one after another into the address space.
 
-    The place of a row follows from that of its partition, so that a batch is one gather however
-    many partitions there are. Processes that map the same files share the system's memory
-    for them.
+    The place of a row follows from that of its partition, so a batch is a single gather, however
+    many partitions there are. Processes that map the same files share the page cache.
 
     Attributes:
         shape: (rows, *field shape).
@@ -72,12 +71,12 @@ class MappedColumn:
         self._array.take(index, 0, out, "clip")
 
     def check(self) -> None:
-        """Check that no file became shorter: the system kills a process that reads past the end."""
+        """Check that no file was truncated: the system kills a process that reads past the end."""
         for part in self._mapped:
             try:
                 now = os.stat(part.path)  # noqa: PTH116 (quicker, and this is done often)
             except FileNotFoundError:
-                continue  # a file that was removed or replaced stays intact while it is mapped
+                continue  # a removed or replaced file stays intact while it is mapped
             if now.st_size < part.end and (now.st_dev, now.st_ino) == part.inode:
                 path, size = Path(part.path), self._row_nbytes
                 raise truncated(path, now.st_size, part.end, part.start, size)
@@ -103,9 +102,9 @@ class MappedColumn:
 
 
 def _places(segments: Sequence[Segment], row_nbytes: int) -> tuple[Index, int]:
-    """Return the place of each segment's first row, and the number of places in the array.
+    """Return the place of each segment's first row and the number of places in the array.
 
-    Each segment begins at the start of a page, and at a whole number of rows.
+    Each segment begins at a page boundary and at a whole number of rows.
     """
     step = mmap.PAGESIZE // math.gcd(mmap.PAGESIZE, max(1, row_nbytes))
     slots, end = [], 0
@@ -117,7 +116,7 @@ def _places(segments: Sequence[Segment], row_nbytes: int) -> tuple[Index, int]:
 
 
 def _place(address: int, count: int, descriptor: int, offset: int) -> None:
-    """Map `count` bytes of a file to an address; copy them if they do not begin with a page."""
+    """Map `count` bytes of a file to an address; copy them if they are not page-aligned."""
     if offset % mmap.PAGESIZE == 0:
         _mmap(address, count, mmap.PROT_READ, mmap.MAP_SHARED | _FIXED, descriptor, offset)
         return
@@ -131,14 +130,14 @@ def _bytes_at(address: int, count: int) -> memoryview:
 
 
 def _reserve(nbytes: int) -> int:
-    """Reserve addresses without memory behind them."""
+    """Reserve address space without allocating memory."""
     noreserve = getattr(mmap, "MAP_NORESERVE", 0)
     try:
         return _mmap(None, nbytes, mmap.PROT_READ, _ANONYMOUS | noreserve, -1, 0)
     except OSError as error:
         raise DatasetError(
-            f"Rows cannot be mapped: {error.strerror}. {nbytes} bytes of addresses are needed. "
-            "Raise the limit of the address space (ulimit -v), or read fewer fields."
+            f"Rows cannot be mapped: {error.strerror}. {nbytes} bytes of address space are needed. "
+            "Raise the limit on the address space (ulimit -v), or read fewer fields."
         ) from error
 
 

@@ -12,10 +12,10 @@ _CGROUPS = Path("/sys/fs/cgroup")
 
 
 def available_memory() -> int:
-    """Return how many bytes of memory this process may still allocate.
+    """Return the number of bytes of memory this process may still allocate.
 
-    Memory that only caches files counts as free. The machine's memory is bounded by the control
-    groups of the process (version 1 or 2) and by its limit of the address space (``ulimit -v``).
+    Memory that only caches files counts as free. In addition to the machine's memory, the process's
+    control groups (version 1 or 2) and address-space limit (``ulimit -v``) apply.
     """
     bounds = [_machine(), *_control_groups()]
     limit, _ = resource.getrlimit(resource.RLIMIT_AS)
@@ -34,7 +34,7 @@ def _machine() -> int:
 
 
 def _control_groups() -> Iterator[int]:
-    """Yield how many bytes each limited control group of this process has left."""
+    """Yield the number of bytes left in each limited control group of this process."""
     try:
         lines = (_PROC / "self/cgroup").read_text(encoding="utf-8").splitlines()
     except OSError:

@@ -1,4 +1,4 @@
-"""Shuffles rows on the disk exactly, while the system prefetches those that come next."""
+"""Shuffles rows on disk exactly while the system prefetches upcoming rows."""
 
 from __future__ import annotations
 
@@ -16,12 +16,12 @@ _AHEAD = 2**24  # bytes that the system is asked to read ahead
 
 
 class ExactEpoch:
-    """A pass over rows on the disk, in the same permutation as in memory.
+    """A pass over rows on disk, in the same permutation as in memory.
 
-    Fields with small rows are read into memory if they fit there beside the others.
+    Fields with small rows are read into memory if they fit there together.
 
     Attributes:
-        rows: How many rows there are.
+        rows: Number of rows.
     """
 
     def __init__(
@@ -36,12 +36,12 @@ class ExactEpoch:
         """Draw the permutation and open the columns.
 
         Args:
-            columns: Columns in memory, and the reader of the others.
+            columns: Columns in memory, and the reader for the others.
             mode: Name of the mode.
             names: Names of the fields.
-            dtype: Type that floating fields are converted to; None: each keeps its own.
+            dtype: Type that floating-point fields are converted to; None: no conversion.
             random: Draws the permutation.
-            subset: The only rows to read; None: all.
+            subset: Numbers of the rows to read; None: all.
         """
         self._order = random.permutation(columns.reader.rows(mode) if subset is None else subset)
         self.rows = len(self._order)
@@ -74,7 +74,7 @@ class ExactEpoch:
             column.close()
 
     def _announce(self, stop: int) -> None:
-        """Announce the rows up to `stop` of the permutation to the system."""
+        """Announce the permutation's rows up to `stop` to the operating system."""
         for row in self._order[self._announced : stop].tolist():
             for column in self._disk:
                 column.announce(row)
@@ -84,7 +84,7 @@ class ExactEpoch:
 def _small(
     columns: ColumnCache, mode: str, names: Sequence[str], dtype: np.dtype[Any] | None
 ) -> set[str]:
-    """Return the fields with small rows that fit into memory together, the smallest first."""
+    """Return the fields with small rows that fit into memory together, smallest fields first."""
     left, found = memory_budget(), set()
     for size, name in sorted((columns.missing(mode, name, dtype), name) for name in names):
         if size <= left and columns.reader.field(mode, name).nbytes < LARGE_ROW:

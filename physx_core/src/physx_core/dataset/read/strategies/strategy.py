@@ -1,4 +1,4 @@
-"""Read strategies: how batches are read, chosen by the sizes of the fields and the free memory."""
+"""Read strategies: how batches are read; chosen by the fields' sizes and the free memory."""
 
 from __future__ import annotations
 
@@ -13,21 +13,21 @@ Strategy: TypeAlias = Literal["memory", "disk exact", "disk windowed"]
 """How batches are read.
 
 - ``memory``: the fields are read into memory once; a shuffled epoch is an exact permutation.
-- ``disk exact``: the same permutation, read row by row; the system is told early which rows come
-  next.
+- ``disk exact``: the same permutation, read row by row; the system is asked to prefetch upcoming
+  rows.
 - ``disk windowed``: blocks of rows are read in random order, and the rows of 64 blocks at a time
-  are shuffled. Every row comes once in an epoch, but rows of the same block come near each other.
+  are shuffled. Every row occurs once per epoch, but rows of the same block stay close together.
 """
 Choice: TypeAlias = Strategy | Literal["auto"]
 
 LARGE_ROW = 4096
-"""Bytes from which a row is worth reading alone: a disk reads no less at a time."""
+"""Bytes from which reading a single row pays off: a disk never reads less at a time."""
 
 _SHARE = 0.5
 
 
 def choose_strategy(missing: int, fields: Sequence[Field]) -> Strategy:
-    """Choose how to read.
+    """Choose a read strategy.
 
     Args:
         missing: Bytes of the fields that are not in memory yet.
@@ -40,12 +40,12 @@ def choose_strategy(missing: int, fields: Sequence[Field]) -> Strategy:
 
 
 def memory_budget() -> int:
-    """Return how many bytes of memory rows may take now."""
+    """Return the number of bytes of memory that rows may take now."""
     return int(_SHARE * memory.available_memory())
 
 
 def check_strategy(choice: str) -> Strategy | None:
-    """Return the strategy that was chosen by name; None for ``auto``."""
+    """Return the strategy of the given name; None for ``auto``."""
     if choice == "auto":
         return None
     if choice in get_args(Strategy):

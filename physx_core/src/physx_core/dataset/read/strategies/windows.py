@@ -1,4 +1,4 @@
-"""Reads blocks of rows from the disk and shuffles them within a window of many blocks."""
+"""Reads blocks of rows from disk and shuffles rows within a window of many blocks."""
 
 from __future__ import annotations
 
@@ -7,21 +7,21 @@ import numpy as np
 from physx_core.dataset.read.strategies.disk import DiskColumn
 from physx_core.typing import Batch, Index
 
-# The order depends on these sizes, never on the free memory: a seed reproduces it on any machine.
+# The order depends on these sizes, not on the free memory, so a seed reproduces it on any machine.
 _BLOCK = 2**19
 _WINDOW_BLOCKS = 64
 
 
 class WindowedEpoch:
-    """A pass over rows on the disk, block by block.
+    """A pass over rows on disk, block by block.
 
-    Blocks of consecutive rows, half a megabyte each, come in random order; the rows of 64 of them
-    at a time are in memory and shuffled. So each row comes once, and a batch draws from 64 places
-    of the dataset. The order depends on the seed and on the fields that are read. Without a random
-    generator, the rows come in the order of writing.
+    Blocks of consecutive rows, half a megabyte each, are read in random order; 64 of them at a time
+    are held in memory and their rows shuffled. Each row thus occurs once, and a batch draws from 64
+    places of the dataset. The order depends on the seed and on the fields that are read. Without a
+    random generator, rows come in the order of writing.
 
     Attributes:
-        rows: How many rows there are.
+        rows: Number of rows.
     """
 
     def __init__(
@@ -34,8 +34,8 @@ class WindowedEpoch:
 
         Args:
             columns: The fields.
-            random: Draws the order; None: that of writing.
-            subset: The only rows to read, ascending; None: all.
+            random: Draws the order; None: the order of writing.
+            subset: Numbers of the rows to read, ascending; None: all.
         """
         self._total = columns[0].shape[0]
         self.rows = self._total if subset is None else len(subset)
@@ -76,7 +76,7 @@ class WindowedEpoch:
             column.close()
 
     def _read_window(self) -> None:
-        """Read the next window, and announce the one after it."""
+        """Read the next window and announce the one after it."""
         held = 0
         for start, count in self._next_window():
             for column, window in zip(self._columns, self._windows, strict=True):
@@ -89,7 +89,7 @@ class WindowedEpoch:
             self._order = self._random.permutation(held)
 
     def _keep(self, start: int, count: int, held: int) -> int:
-        """Move the block's rows that are in the subset to its front; return how many there are."""
+        """Move the block's rows that are in the subset to its front; return their number."""
         subset = self._subset if self._subset is not None else np.arange(0)
         first, last = np.searchsorted(subset, (start, start + count))
         kept = subset[first:last] - start
@@ -103,7 +103,7 @@ class WindowedEpoch:
                 column.announce(start, count)
 
     def _next_window(self) -> list[tuple[int, int]]:
-        """Return the first row and the number of rows of each block of the next window."""
+        """Return the first row and the number of rows of each block in the next window."""
         blocks = self._blocks[self._next_block : self._next_block + self._window_blocks]
         starts = (blocks * self._block).tolist()
         return [(start, min(self._block, self._total - start)) for start in starts]

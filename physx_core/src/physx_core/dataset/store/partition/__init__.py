@@ -1,1 +1,1 @@
-"""The files of a partition: their format, their writer, their reader, and what tells lost rows."""
+"""The files of a partition: format, writer, reader, and detection of lost rows."""

@@ -1,11 +1,11 @@
-"""Commits: how many rows of a partition file count, and what tells that they reached the disk.
+"""Commits: how many rows of a partition file count, and how to tell that they reached the disk.
 
-A writer's rows and its row count lie in different pages of the file, which the system brings to
-the disk in any order: after a power cut, the count may speak of rows that are not there. So each
-file keeps three records beside the count, in one sector of the disk: the newest commit, and two
-marks. A mark is made of the newest commit before the file is synced, in turn, so that one of them
-always speaks of rows that a completed sync has brought to the disk. A record's digest tells whether
-its rows are those that were written.
+A writer's rows and its row count are in different pages of the file, which the system writes to
+disk in any order: after a power failure, the count may include rows that are missing. Each file
+therefore keeps three records next to the count, in the same disk sector: the newest commit and two
+marks. Before each sync of the file, the newest commit is copied to one of the marks, alternately,
+so that one of them always covers rows that a completed sync has brought to disk. A record's digest
+shows whether the file's rows are the ones that were written.
 """
 
 from __future__ import annotations
@@ -25,9 +25,9 @@ RECORDS = 3
 RECORD = struct.Struct("<3Q")
 COUNT = struct.Struct("<Q")
 NBYTES = COUNT.size + RECORDS * RECORD.size
-"""Bytes of the row count and the records behind it."""
+"""Bytes of the row count and the records after it."""
 SECTOR = 512
-"""Bytes that a disk writes as a whole, or not at all."""
+"""Number of bytes that a disk writes atomically."""
 
 _NO_DIGEST = xxh3_64_intdigest(b"")
 _BLOCK = 2**20
@@ -37,10 +37,10 @@ class Commit(NamedTuple):
     """A record of committed rows.
 
     Attributes:
-        rows: How many of the file's first rows are committed.
-        base: The rows before this one have no digest, because they may be updated in place; they
-            were on the disk before the record was made.
-        digest: XXH3 of the bytes of rows `base` to `rows`, 64 bits.
+        rows: Number of committed rows, from the beginning of the file.
+        base: Rows before this one have no digest because they may be updated in place; they were
+            on disk before the record was made.
+        digest: 64-bit XXH3 of the bytes of rows `base` to `rows`.
     """
 
     rows: int
@@ -49,17 +49,17 @@ class Commit(NamedTuple):
 
     @classmethod
     def unchecked(cls, rows: int) -> Commit:
-        """Return a record of rows that have no digest."""
+        """Return a record of rows without a digest."""
         return cls(rows, rows, _NO_DIGEST)
 
 
 def encode(commit: tuple[int, int, int]) -> bytes:
-    """Return the row count and the records when all records are the same."""
+    """Return the bytes of the row count and the records, with all records equal to `commit`."""
     return COUNT.pack(commit[0]) + RECORD.pack(*commit) * RECORDS
 
 
 def decode(content: bytes) -> tuple[int, tuple[Commit, ...]]:
-    """Return the row count and the records, the newest first."""
+    """Return the row count and the records, newest first."""
     records = RECORD.iter_unpack(content[COUNT.size :])
     return COUNT.unpack_from(content)[0], tuple(Commit(*record) for record in records)
 
@@ -67,7 +67,7 @@ def decode(content: bytes) -> tuple[int, tuple[Commit, ...]]:
 def find_intact(
     descriptor: int, data_offset: int, row_nbytes: int, commits: Iterable[Commit]
 ) -> Commit | None:
-    """Return the record of most rows that the file really holds; None if it holds those of none.
+    """Return the record with the most rows that the file actually holds; None if there is none.
 
     Args:
         descriptor: The open file.
@@ -84,7 +84,7 @@ def find_intact(
 
 
 def digest_of(descriptor: int, start: int, stop: int) -> xxh3_64 | None:
-    """Return the digest of some bytes of a file; None if it does not have them."""
+    """Return the digest of some bytes of a file; None if the file lacks them."""
     if start > stop or stop > files.size(descriptor):
         return None
     digest, buffer = xxh3_64(), memoryview(bytearray(min(stop - start, _BLOCK)))
@@ -98,10 +98,10 @@ def digest_of(descriptor: int, start: int, stop: int) -> xxh3_64 | None:
 
 @functools.cache
 def boot_id() -> str:
-    """Return what changes when the machine starts; empty where the system does not tell.
+    """Return an identifier of the machine's current boot; empty if the system does not provide it.
 
-    Everything that a process has written since then can be read, whether it has reached the disk
-    or not.
+    Everything that a process has written since that boot can be read, whether or not it has reached
+    the disk.
     """
     try:
         return Path("/proc/sys/kernel/random/boot_id").read_text(encoding="ascii").strip()

@@ -1,4 +1,4 @@
-"""Computes the digests of large blocks beside the thread that writes them."""
+"""Computes digests of large blocks in parallel with the thread that writes them."""
 
 from __future__ import annotations
 
@@ -8,17 +8,17 @@ from queue import SimpleQueue
 from xxhash import xxh3_64
 
 LARGE = 2**17
-"""Bytes from which the time that a second thread saves is more than what it costs."""
+"""Bytes from which a second thread saves more time than it costs."""
 
 
 class Digester:
-    """Updates digests, those of large blocks in a thread that starts with the first of them.
+    """Updates digests; large blocks are hashed in a thread that starts with the first of them.
 
-    Hashing reads memory about as fast as the system copies it into the page cache: beside the
-    copying it takes no time, after it a fifth.
+    Hashing reads memory about as fast as the system copies it into the page cache: in parallel with
+    the copying it takes no extra time, after it a fifth more.
 
     Attributes:
-        pending: How many digests are not right yet.
+        pending: Number of updates that are not finished yet.
     """
 
     def __init__(self) -> None:
@@ -28,7 +28,7 @@ class Digester:
         self._thread: threading.Thread | None = None
 
     def update(self, digest: xxh3_64, content: memoryview) -> None:
-        """Add bytes to a digest, which is right once `wait` has returned."""
+        """Add bytes to a digest, which is up to date once `wait` has returned."""
         if len(content) < LARGE:
             self.wait()
             digest.update(content)
@@ -40,13 +40,13 @@ class Digester:
         self.pending += 1
 
     def wait(self) -> None:
-        """Wait until all digests are right."""
+        """Wait until all digests are up to date."""
         while self.pending:
             self._done.get()
             self.pending -= 1
 
     def close(self) -> None:
-        """End the thread."""
+        """Stop the thread."""
         self._blocks.put(None)
         if self._thread is not None:
             self._thread.join()

@@ -1,4 +1,4 @@
-"""Writes one field's file of the open partition."""
+"""Writes the file of one field in the open partition."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ _NEWEST = struct.Struct("<4Q")  # the row count and the newest record
 class PartitionFile:
     """Writes rows to their offsets and commits them with the row count.
 
-    A thread beside the writer may `mark` and sync the file meanwhile.
+    Another thread may `mark` and sync the file at the same time.
 
     Attributes:
-        identity: What the file is part of.
+        identity: Identity of the file.
         data_offset: Offset of the first row.
         descriptor: The open file; -1 if it is closed.
-        path: Its path, once it is published.
-        room: How many rows have their disk space already.
+        path: Its path once it is published.
+        room: Number of rows with allocated disk space.
         committed: The newest commit: rows, base and digest, as in `Commit`.
     """
 
@@ -64,12 +64,12 @@ class PartitionFile:
     def create(
         cls, directory: Path, identity: Identity, capacity: int, digester: Digester
     ) -> PartitionFile:
-        """Write an empty partition file under a temporary name and wait until it is on the disk.
+        """Write an empty partition file under a temporary name and wait until it is on disk.
 
         Args:
             directory: The dataset's folder.
-            identity: What the file is part of.
-            capacity: How many rows fit in.
+            identity: Identity of the file.
+            capacity: Number of rows that fit in.
             digester: Computes the digests.
         """
         header = make_header(identity, capacity)
@@ -87,23 +87,23 @@ class PartitionFile:
     def reopen(
         cls, directory: Path, identity: Identity, rows: int, digester: Digester
     ) -> PartitionFile:
-        """Open an existing partition file, to write the rows behind its first ones.
+        """Open an existing partition file to write rows after its first ones.
 
         Args:
             directory: The dataset's folder.
-            identity: What the file has to be part of.
-            rows: How many of its committed rows stay.
+            identity: Expected identity of the file.
+            rows: Number of its committed rows to keep.
             digester: Computes the digests.
 
         Raises:
-            DatasetError: If it is not that file, or does not have these rows.
+            DatasetError: If the file has a different identity or fewer rows.
         """
         path = directory / identity.file_name
         descriptor = files.open_regular(path, os.O_RDWR)
         try:
             found = inspect(path)
             if found.identity != identity or found.rows < rows:
-                raise DatasetError(f"{path} is not the partition that was to be continued.")
+                raise DatasetError(f"{path} is not the partition to be continued.")
         except BaseException:
             files.close(descriptor)
             raise
@@ -118,17 +118,17 @@ class PartitionFile:
         return file
 
     def publish(self) -> None:
-        """Give the file its name."""
+        """Rename the file to its final name."""
         files.rename(files.temporary_path(self.path), self.path)
 
     def discard(self) -> None:
-        """Close the file and remove it, whether it is published or not."""
+        """Close and remove the file, whether or not it is published."""
         self.close()
         files.remove(files.temporary_path(self.path))
         files.remove(self.path)
 
     def reserve(self, rows: int) -> None:
-        """Allocate disk space for the first `rows` rows, and for some more."""
+        """Allocate disk space for the first `rows` rows and some more."""
         needed = self.data_offset + rows * self._row_nbytes
         step = min(max(self._reserved, _SMALLEST_STEP), _LARGEST_STEP)
         ample = min(max(needed, self._reserved + step), self._size)
@@ -144,7 +144,7 @@ class PartitionFile:
                 raise
 
     def write(self, row: int, block: Array) -> None:
-        """Write rows, not yet committed.
+        """Write rows without committing them.
 
         Args:
             row: Number of the first one in the file.
@@ -160,11 +160,11 @@ class PartitionFile:
         files.write_at(self.descriptor, content, self.data_offset + row * self._row_nbytes)
 
     def commit(self, rows: int, *, durable: bool) -> None:
-        """Make the first `rows` rows part of the dataset, the last of which were just written.
+        """Make the first `rows` rows, including those just written, part of the dataset.
 
         Args:
-            rows: How many rows.
-            durable: Whether the caller syncs the file before it goes on.
+            rows: Number of rows.
+            durable: Whether the caller syncs the file before it continues.
         """
         if self._digester.pending:
             self._digester.wait()
@@ -182,7 +182,7 @@ class PartitionFile:
         """Return to an earlier commit, whatever has been written since.
 
         Args:
-            commit: The commit; its digest is computed again.
+            commit: The commit; its digest is recomputed.
         """
         self._digester.wait()
         rows, base, _ = commit
@@ -195,14 +195,14 @@ class PartitionFile:
             files.sync(self.descriptor)
 
     def is_checked(self, row: int) -> bool:
-        """Return whether the digest covers a row, so that `settle` has to precede its update."""
+        """Return whether the digest covers a row; if so, call `settle` before updating it."""
         return row >= self.committed[1]
 
     def mark(self) -> int:
-        """Make the newest commit a mark, which the next sync is to bring to the disk.
+        """Copy the newest commit to a mark, to be brought to disk by the next sync.
 
         Returns:
-            Another descriptor of the file, to sync it with; -1 if the file is closed.
+            A duplicate descriptor for syncing the file; -1 if the file is closed.
         """
         with self._lock:
             if self.descriptor < 0:
@@ -214,7 +214,7 @@ class PartitionFile:
             return files.duplicate(self.descriptor)
 
     def settle(self) -> None:
-        """Bring all rows to the disk and take their digest away, so that they may be updated."""
+        """Sync all rows and remove their digest, so that they may be updated."""
         with self._lock:
             files.sync(self.descriptor)
             settled = Commit.unchecked(self.committed[0])
@@ -223,7 +223,7 @@ class PartitionFile:
             self.committed, self._digest = settled, xxh3_64()
 
     def sync(self) -> None:
-        """Wait until everything written is on the disk."""
+        """Wait until everything written is on disk."""
         sync_named(self.descriptor, self.path)
 
     def close(self) -> None:
@@ -243,14 +243,14 @@ class PartitionFile:
 def copy(
     source: Path, source_offset: int, path: Path, identity: Identity, rows: int
 ) -> tuple[int, int]:
-    """Copy rows of a partition file to a new one, which gets its name when it is complete.
+    """Copy rows of a partition file to a new one, which gets its final name once it is complete.
 
     Args:
         source: The other file.
         source_offset: Offset of its first row.
         path: The new file; an existing one is replaced, even the source itself.
-        identity: What it is part of.
-        rows: How many of the first rows it gets.
+        identity: Its identity.
+        rows: Number of rows to copy, from the first.
 
     Returns:
         Offset of the first row in the new file, and the CRC-32 of the rows.
@@ -273,7 +273,7 @@ def copy(
 
 
 def sync_named(descriptor: int, path: Path) -> None:
-    """Wait until an open file is on the disk, and check that it still has a name there."""
+    """Wait until an open file is on disk, and check that it has not been removed."""
     files.sync(descriptor)
     if files.is_removed(descriptor):
         raise files.RemovedError(errno.ENOENT, "it was removed", str(path))

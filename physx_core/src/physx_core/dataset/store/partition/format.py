@@ -1,10 +1,10 @@
 """The partition file: an ordinary HDF5 file whose rows are written without HDF5.
 
-It holds contiguous datasets: ``data`` (capacity, *field shape), the scalar ``rows``, the
-number of committed rows, and ``commits``, the records that tell which rows have reached the disk.
-Its attributes say what it is part of; ``header`` says it again, with a digest of everything that
-never changes. h5py makes all of it once, in memory; from then on rows are written at known offsets
-of the file, so that HDF5 never runs while samples arrive, and h5py can open the file at any moment.
+It holds contiguous datasets: ``data`` (capacity, *field shape); the scalar ``rows``, the number of
+committed rows; and ``commits``, the records that show which rows have reached the disk. Its
+attributes state what it is part of; ``header`` repeats that, with a digest of everything that never
+changes. h5py creates all of it once, in memory; after that, rows are written at known file offsets,
+so that HDF5 never runs while samples arrive, and h5py can open the file at any time.
 """
 
 from __future__ import annotations
@@ -42,31 +42,31 @@ FORMAT = "physx partition"
 VERSION = 2
 STRIPED_VERSION = 3
 READABLE = (VERSION, STRIPED_VERSION)
-"""Versions of the header; `version_1` reads the files of version 1, which have none. Only files of
-stripes have version 3, so that a physx that does not know of stripes refuses them."""
+"""Versions of the header; `version_1` reads files of version 1, which have none. Only files of
+stripes have version 3, so that a physx that does not support stripes rejects them."""
 MOST_STRIPES = 2**24
 MAGIC = b"\x89physx\r\n"
-"""Beginning of the dataset ``header``, which tells physx what it needs without HDF5."""
+"""Start of the dataset ``header``, which physx reads without HDF5."""
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _PAGE = 4096
 _NUMBERS = struct.Struct("<5QI")  # digest and size of the header, offsets, capacity, length of text
-_ALIGNMENT = 16  # no number of the rows lies in two sectors
+_ALIGNMENT = 16  # no number in a row crosses a sector boundary
 _COMMON_HEADER = 2**14
 _LARGEST_HEADER = 2**20
 _INVALID = (
     OSError, ValueError, KeyError, TypeError, AttributeError, OverflowError, RecursionError,
     MemoryError, struct.error, PhysxError,
 )  # fmt: skip
-"""What reading and parsing raise for bytes that are not a header."""
-_END_OF_FILE = 40  # where the file's size stands in an HDF5 superblock of version 0
+"""Errors that reading and parsing raise for bytes that are not a header."""
+_END_OF_FILE = 40  # offset of the file's size in an HDF5 superblock of version 0
 
 
 class Stripe(NamedTuple):
-    """Which rows a partition has that shares consecutive rows of a mode with others, in turn.
+    """A partition's share of consecutive rows of a mode that several partitions hold in turn.
 
     Attributes:
-        place: Place of its first row among theirs, counted from 0.
-        of: How many partitions share the rows: it has every `of`-th.
+        place: Place of its first row among those of all partitions, counted from 0.
+        of: Number of partitions that share the rows: it has every `of`-th.
     """
 
     place: int
@@ -75,14 +75,14 @@ class Stripe(NamedTuple):
 
 @dataclass(frozen=True)
 class Identity:
-    """What a partition file is part of.
+    """The partition and field that a partition file belongs to.
 
     Attributes:
         session: Session that wrote it.
         mode: Mode of its rows.
         field: Its field, with a known shape.
         index: Number of the partition in its session and mode, counted from 0.
-        first_row: Row of the mode that is the partition's first.
+        first_row: Number of the partition's first row in the mode.
         stripe: Which rows from there on it has; None: all up to the next partition.
     """
 
@@ -126,7 +126,7 @@ class Header:
 
     Attributes:
         content: Beginning of the file; the rows may begin before its end.
-        rows_offset: Offset of the committed row count, behind which the records lie.
+        rows_offset: Offset of the committed row count, which the records follow.
         data_offset: Offset of the first row.
         size: Size of the whole file in bytes.
     """
@@ -139,16 +139,16 @@ class Header:
 
 @dataclass(frozen=True)
 class Inspection:
-    """What a partition file says of itself.
+    """Contents of a partition file's header.
 
     Attributes:
-        identity: What it is part of.
-        capacity: How many rows fit in.
-        rows: How many rows are committed.
+        identity: Its identity.
+        capacity: Number of rows that fit in.
+        rows: Number of committed rows.
         rows_offset: Offset of the committed row count.
         data_offset: Offset of the first row.
-        commits: The records of committed rows, the newest first.
-        boot: What `boot_id` returned when the file was made.
+        commits: The records of committed rows, newest first.
+        boot: `boot_id` when the file was created.
     """
 
     identity: Identity
@@ -161,7 +161,7 @@ class Inspection:
 
     @property
     def certain(self) -> bool:
-        """Whether all rows that the file counts can be read: the machine has not been off since."""
+        """Whether all counted rows can be read because the machine has not been off since."""
         if not self.commits:
             return True
         return self.rows == self.commits[0].rows and self.boot == boot_id() != ""
@@ -173,7 +173,7 @@ def partition_file(session: str, mode: str, field: str, index: int) -> str:
 
 
 def parse_stripe(plain: Any) -> Stripe:
-    """Return the stripe that plain data describe."""
+    """Return the stripe described by plain data."""
     place, count = checked(list, plain, "a stripe")
     count = whole(count, "the number of stripes", MOST_STRIPES)
     if count < 2:
@@ -182,12 +182,12 @@ def parse_stripe(plain: Any) -> Stripe:
 
 
 def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
-    """Have h5py make the header of a partition file.
+    """Make the header of a partition file with h5py.
 
     Args:
-        identity: What the file is part of.
-        capacity: How many rows fit in.
-        rows: Number of committed rows that the header states.
+        identity: Identity of the file.
+        capacity: Number of rows that fit in.
+        rows: Number of committed rows to record in the header.
     """
     import h5py
     from h5py import h5d, h5p, h5s, h5t
@@ -215,7 +215,7 @@ def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
         records = h5d.create(file.id, b"commits", h5t.STD_U64LE, table, layout)
         own = h5d.create(file.id, b"header", h5t.STD_U8LE, h5s.create_simple((block,)), layout)
         space = h5s.create_simple((capacity, *(field.shape or ())))
-        layout.set_alloc_time(h5d.ALLOC_TIME_LATE)  # behind everything that HDF5 needs
+        layout.set_alloc_time(h5d.ALLOC_TIME_LATE)  # after everything that HDF5 needs
         data = h5d.create(file.id, b"data", kind, space, layout)
         if capacity * field.nbytes:
             origin, one = (0,) * len(data.shape), (1,) * len(data.shape)
@@ -240,12 +240,12 @@ def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
 
 
 def inspect(path: Path, offset: int | None = None, row_nbytes: int = 0) -> Inspection:
-    """Read what a partition file says of itself.
+    """Read the header of a partition file.
 
     Args:
         path: The file.
-        offset: Where its rows begin, if that is known; only for error messages.
-        row_nbytes: Bytes of one row, likewise.
+        offset: Where its rows begin, if known; only for error messages.
+        row_nbytes: Bytes of one row; only for error messages.
     """
     with open_partition(path) as file:
         return inspect_open(file, path, offset, row_nbytes)
@@ -254,16 +254,16 @@ def inspect(path: Path, offset: int | None = None, row_nbytes: int = 0) -> Inspe
 def find_rows(
     path: Path, offset: int | None, row_nbytes: int, *, thorough: bool
 ) -> tuple[Inspection, Commit | None]:
-    """Read what an unsealed partition file says of itself, and find the rows that can be read.
+    """Read the header of an unsealed partition file and find the rows that can be read.
 
-    The record is None if the file was changed: its rows have the digests of none of its records.
+    The record is None if the file was changed: its rows match the digest of none of its records.
 
     Args:
         path: The file.
-        offset: Where its rows begin, if that is known; only for error messages.
-        row_nbytes: Bytes of one row, likewise.
-        thorough: Whether to compare the rows with the file's digests in any case; otherwise only if
-            the machine has been off since they were written.
+        offset: Where its rows begin, if known; only for error messages.
+        row_nbytes: Bytes of one row; only for error messages.
+        thorough: Whether to always compare the rows with the file's digests; otherwise only if the
+            machine has been off since they were written.
     """
     with open_partition(path) as file:
         before = None
@@ -282,7 +282,7 @@ def find_rows(
                 return found, intact
             if found == before:
                 return found, None
-            before = found  # a writer may have updated rows meanwhile
+            before = found  # a writer may have just updated rows
 
 
 def open_partition(path: Path) -> io.FileIO:
@@ -292,7 +292,7 @@ def open_partition(path: Path) -> io.FileIO:
     except FileNotFoundError:
         raise DatasetError(
             f"The partition {path.name} is missing from {path.parent}. Restore it: without it, "
-            "the rows of this partition cannot be read in any field."
+            "this partition's rows cannot be read in any field."
         ) from None
     except OSError as error:
         raise cannot_read(path, error) from error
@@ -301,7 +301,7 @@ def open_partition(path: Path) -> io.FileIO:
 def cannot_read(path: Path, error: OSError) -> DatasetError:
     """Return the error for a partition file that the system cannot open, map or read."""
     full = error.errno in (errno.EMFILE, errno.ENFILE)
-    advice = " Raise the limit of open files (ulimit -n)." if full else ""
+    advice = " Raise the limit on open files (ulimit -n)." if full else ""
     return DatasetError(f"The partition {path} cannot be read: {error.strerror}.{advice}")
 
 
@@ -334,8 +334,8 @@ def truncated(path: Path, actual: int, expected: int, offset: int, row_nbytes: i
     """Return the error for a partition file that is shorter than its rows."""
     kept = max(0, actual - offset) // row_nbytes if row_nbytes else 0
     return DatasetError(
-        f"The partition {path} is truncated: it has {actual} bytes, {expected} were expected. "
-        f"{kept} rows of this file are still there. Restore the whole file from a copy."
+        f"The partition {path} is truncated: it has {actual} bytes, but {expected} were expected. "
+        f"{kept} rows of this file are left. Restore the whole file from a backup."
     )
 
 
@@ -376,20 +376,20 @@ def _read_header(descriptor: int) -> bytes:
 
 
 def _parse_header(head: bytes) -> Inspection:
-    """Return what the first bytes of a file say of it.
+    """Return the header in the first bytes of a file.
 
-    HDF5 itself never sees them: what a power cut leaves of a header may let it loop for ever.
+    HDF5 never parses them: the remains of a header after a power failure may make it loop forever.
     """
     start = head.find(MAGIC)
     if start < 0:
-        raise ValueError("it has no header of physx")
+        raise ValueError("it has no physx header")
     numbers = _NUMBERS.unpack_from(head, start + len(MAGIC))
     digest, nbytes, rows_offset, data_offset, capacity, length = numbers
     for number in numbers[1:]:
         whole(number, "a number of its header")
     begin = start + len(MAGIC) + _NUMBERS.size
     if nbytes > len(head) or begin + length > nbytes or rows_offset + NBYTES > nbytes:
-        raise ValueError("its header is not complete")
+        raise ValueError("its header is incomplete")
     plain = json.loads(head[begin : begin + length])
     version = whole(plain["format_version"], "the format's version")
     if version not in READABLE:
@@ -401,7 +401,7 @@ def _parse_header(head: bytes) -> Inspection:
     if _digest_header(head[:nbytes], start, rows_offset, data_offset, capacity * field.nbytes) != (
         digest
     ):
-        raise ValueError("its header does not have the checksum that it states")
+        raise ValueError("its header does not match its checksum")
     session = checked(str, plain["session"], "a session")
     if not SESSION.fullmatch(session):
         raise ValueError(f"a session cannot be {session!r:.60}")
@@ -422,7 +422,7 @@ def _parse_header(head: bytes) -> Inspection:
 def _digest_header(
     content: bytes | bytearray, start: int, rows_offset: int, data_offset: int, data_nbytes: int
 ) -> int:
-    """Return the digest of a header, without itself and what changes later: counts and rows."""
+    """Return the digest of a header, excluding the digest itself, row counts and rows."""
     fixed = bytearray(content)
     place = start + len(MAGIC)
     for first, last in (

@@ -27,7 +27,7 @@ from physx_core.fields import Field
 from physx_core.typing import Array
 
 BLOCK = 2**20
-"""Bytes of the blocks that rows are read in."""
+"""Approximate size in bytes of the blocks that rows are read in."""
 
 
 @dataclass(frozen=True)
@@ -40,8 +40,8 @@ class Segment:
         span: Which rows of the mode they are.
         offset: Byte of the file at which they begin.
         certain: Whether `offset` can be relied on; otherwise it is read from the file, because
-            another process may replace the file by its final form at any moment.
-        checksum: CRC-32 of all its rows; None if it is not known.
+            another process may replace the file with its final form at any time.
+        checksum: CRC-32 of all its rows; None if unknown.
         commit: Record of all its rows, if the partition is open and was left by its writer.
     """
 
@@ -55,7 +55,7 @@ class Segment:
 
     @property
     def rows(self) -> int:
-        """How many rows there are to read."""
+        """Number of rows to read."""
         return self.span.rows
 
     def open(self) -> tuple[FileIO, int]:
@@ -100,7 +100,7 @@ class Segment:
     def compute_checksum(self) -> int:
         """Return the CRC-32 of all rows.
 
-        zlib-ng computes it several times faster than Python's zlib, and lets other threads run.
+        zlib-ng computes it several times faster than Python's zlib and lets other threads run.
         """
         crc = 0
         for block in self.blocks():
@@ -109,7 +109,7 @@ class Segment:
 
 
 class RowsCheck:
-    """Compares all rows of a segment, given in their order, with what is known of them."""
+    """Compares all rows of a segment, given in order, with their checksum or digest."""
 
     def __init__(self, segment: Segment) -> None:
         self._segment = segment
@@ -117,7 +117,7 @@ class RowsCheck:
         self._unchecked = segment.commit.base * segment.field.nbytes if segment.commit else 0
 
     def add(self, part: memoryview) -> None:
-        """Take the next rows."""
+        """Add the next rows."""
         if self._segment.checksum is not None:
             self._crc = crc32(part, self._crc)
         elif self._segment.commit is not None:
@@ -126,7 +126,7 @@ class RowsCheck:
 
     @property
     def passed(self) -> bool:
-        """Whether the rows that were taken are those of the segment."""
+        """Whether the added rows are those of the segment."""
         wanted, commit = self._segment.checksum, self._segment.commit
         if wanted is not None:
             return self._crc == wanted
@@ -134,5 +134,5 @@ class RowsCheck:
 
 
 def rows_per_block(row_nbytes: int, nbytes: int = BLOCK) -> int:
-    """Return how many rows of a size make a block of about `nbytes` bytes, at least one."""
+    """Return the number of rows, at least 1, in a block of about `nbytes` bytes."""
     return max(1, nbytes // max(1, row_nbytes))

@@ -1,6 +1,6 @@
-"""Reads the headers of partition files of version 1, which only HDF5 describes.
+"""Reads headers of partition files of version 1, which are readable only through HDF5.
 
-They have no records: their row count is all that is known of an open one.
+These files have no records: for an open one, only the row count is known.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ UNREADABLE = (
     OSError, RuntimeError, LookupError, TypeError, ValueError, ArithmeticError, AttributeError,
     MemoryError,
 )  # fmt: skip
-"""What h5py raises for damaged files."""
+"""Errors that h5py raises for damaged files."""
 
 
 _HEAP = b"GCOL\1\0\0\0"
@@ -29,7 +29,7 @@ _LONGEST = 2**16
 
 @dataclass(frozen=True)
 class HeaderV1:
-    """What a partition file of version 1 says of itself: see `Identity` and `Inspection`."""
+    """Contents of a version 1 header: see `Identity` and `Inspection`."""
 
     session: str
     mode: str
@@ -43,10 +43,10 @@ class HeaderV1:
 
 
 def read_header(file: io.FileIO) -> HeaderV1:
-    """Return what a partition file of version 1 says of itself.
+    """Return the header of a partition file of version 1.
 
     Raises:
-        ValueError: If it is none, or damaged.
+        ValueError: If the file is not such a partition, or is damaged.
     """
     import h5py
 
@@ -59,9 +59,9 @@ def read_header(file: io.FileIO) -> HeaderV1:
 
 
 def _check_heaps(head: bytes) -> None:
-    """Check that HDF5 gets to the end of the heaps that hold the texts of attributes.
+    """Check that HDF5 reaches the end of the heaps that hold the strings of attributes.
 
-    It would read an empty object, as lost sectors leave it, for ever.
+    It would read an empty object, as left by lost sectors, forever.
     """
     start = head.find(_HEAP)
     while start >= 0:
@@ -78,10 +78,10 @@ def _check_heaps(head: bytes) -> None:
 def _inspect(content: Any) -> HeaderV1:
     attributes = content.attrs
     if attributes["format"] != "physx partition" or int(attributes["format_version"]) != 1:
-        raise ValueError("it has no header of physx")
+        raise ValueError("it has no physx header")
     data, counter = _plain_dataset(content, "data"), _plain_dataset(content, "rows")
     if counter.shape != () or counter.dtype != np.dtype("<u8") or not data.shape:
-        raise ValueError("its datasets do not have the shapes or types of a partition's")
+        raise ValueError("its datasets do not have the shapes or types of a partition")
     field = Field(
         str(attributes["field"]),
         data.shape[1:],
@@ -108,7 +108,7 @@ def _inspect(content: Any) -> HeaderV1:
 
 
 def _plain_dataset(content: Any, name: str) -> Any:
-    """Return a dataset whose bytes are contiguous in this very file."""
+    """Return a dataset after checking that its bytes are contiguous in this file."""
     import h5py
 
     if not isinstance(content.get(name, getlink=True), h5py.HardLink):

@@ -21,7 +21,7 @@ _CHUNK = 4096
 
 @dataclass(frozen=True)
 class Block:
-    """Consecutive rows that environments generated; they are stored already.
+    """Consecutive rows that environments generated; they are already stored.
 
     Attributes:
         rows: The rows, field name to array with a leading row axis, in physical units; valid until
@@ -29,7 +29,7 @@ class Block:
         fields: The stored fields by name; empty before the first row.
         normalization: The normalization of all rows up to the last one of this block, by field;
             empty if nothing is to be normalized.
-        statistics: Mean, deviation and quantiles of the rows up to the last one of this block, if
+        statistics: Mean, deviation, and quantiles of the rows up to the last one of this block, if
             they are due: see `RowStatistics`.
     """
 
@@ -47,11 +47,11 @@ class Block:
 class Blocks:
     """Takes rows from environments in the order of their numbers, and stores them.
 
-    A run that continues another one first gets the rows that this one has stored, in the same
-    blocks and with the same normalization, bit for bit.
+    A run that continues another run first gets the rows that the other run stored, in the same
+    blocks and with bit-identical normalization.
 
-    With a feeder, blocks that are expected are generated and stored in its thread while the
-    training learns: the same calls of source and dataset in the same order, so the same blocks.
+    With a feeder, expected blocks are generated and stored in its thread while the network learns:
+    the calls of source and dataset and their order are the same, and so are the blocks.
     """
 
     def __init__(
@@ -68,14 +68,14 @@ class Blocks:
         """Keep the arguments.
 
         Args:
-            source: The environments; open.
+            source: The open environments.
             dataset: Stores the rows.
             mode: Mode to store them in.
             normalize: Whether the blocks have a normalization.
             first: Number of rows that the mode had before the first block.
-            statistics: Summarizes the rows; it has none yet.
-            feeder: Has a thread for it, not started yet; None: the rows are generated when they
-                are taken.
+            statistics: Summarizes the rows; still without any.
+            feeder: Generates rows in its thread, which is not started yet; None: the rows are
+                generated when they are taken.
         """
         self._source, self._dataset, self._mode = source, dataset, mode
         self._normalizes, self._summary = normalize, statistics
@@ -95,11 +95,11 @@ class Blocks:
 
     @property
     def waited(self) -> float | None:
-        """Time in s for which the environments waited; None: whenever the network learns."""
+        """Time in s for which the environments waited; None: they wait while the network learns."""
         return None if self._feeder is None else self._feeder.waited
 
     def expect(self, counts: Iterable[int]) -> None:
-        """Announce the sizes of the blocks that will be taken after those announced before."""
+        """Announce the sizes of the blocks to be taken after those already announced."""
         if self._feeder is not None:
             self._feeder.expect(counts)
 
@@ -107,7 +107,7 @@ class Blocks:
         """Return the next rows, generated and stored.
 
         Args:
-            count: Number of rows; with 0 no environment is asked for any.
+            count: Number of rows; 0 requests none from the environments.
 
         Raises:
             PhysxError: If an environment fails, or a row cannot be stored.
@@ -115,7 +115,7 @@ class Blocks:
         return self._make(count) if self._feeder is None else self._feeder.next(count)
 
     def skip(self, counts: Iterable[int]) -> None:
-        """Pass over the first blocks, which a checkpoint is ahead of; nothing is expected yet.
+        """Skip the first blocks, which precede a checkpoint; no block may be expected yet.
 
         Args:
             counts: Their numbers of rows.
@@ -125,7 +125,7 @@ class Blocks:
         self._last = Block({}, self._dataset.fields(self._mode), self._last.normalization)
 
     def close(self) -> None:
-        """Generate nothing more; rows that were generated ahead are stored."""
+        """Stop generating; rows that were generated ahead are stored."""
         if self._feeder is not None:
             self._feeder.close()
 

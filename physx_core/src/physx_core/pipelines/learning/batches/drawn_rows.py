@@ -1,8 +1,8 @@
-"""Drawn rows: which rows each batch held that a buffer drew, in a file of the session.
+"""Drawn rows: a session file that records the rows of each batch that a buffer drew.
 
-``stats/drawn_rows.bin`` consists of whole numbers of 8 bytes, the lowest byte first: a mark, the
-batch size, then a record for each batch: the rows' numbers in the dataset, and a CRC-32 of the
-batch's number and these. Records are only ever appended; an incomplete or damaged one ends them.
+``stats/drawn_rows.bin`` consists of 8-byte little-endian integers: a magic number, the batch size,
+then a record for each batch: the rows' indices in the dataset, and a CRC-32 of these and the batch
+number. Records are only appended; reading stops at an incomplete or damaged one.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ _LARGEST = 2**40
 
 
 class DrawnRows:
-    """Writes the file, from a batch on; what is there of it and later ones is dropped."""
+    """Writes the file, starting at a given batch; existing records from there on are dropped."""
 
     def __init__(self, session: Session, batch_size: int, first: int = 0) -> None:
         """Open the file.
@@ -36,7 +36,7 @@ class DrawnRows:
             first: Number of the first batch to write.
 
         Raises:
-            DatasetError: If it cannot be stored.
+            DatasetError: If the file cannot be written.
         """
         self._path, self._number = _path(session.path), first
         self._nbytes = (batch_size + 1) * _NUMBER.itemsize
@@ -58,10 +58,10 @@ class DrawnRows:
         """Write the next batch.
 
         Args:
-            rows: Numbers of its rows in the dataset.
+            rows: Indices of its rows in the dataset.
 
         Raises:
-            DatasetError: If it cannot be stored.
+            DatasetError: If it cannot be written.
         """
         record = np.empty(len(rows) + 1, _NUMBER)
         record[:-1] = rows
@@ -86,17 +86,17 @@ class DrawnRows:
 
 
 def read_drawn_rows(session_dir: str | Path, batches: int | None = None) -> Index:
-    """Return which rows the batches of a training held while environments generated them.
+    """Return the rows in each batch of a training while environments generated them.
 
     Batches are numbered over all epochs in which rows were generated. Those of the buffer
-    ``physx/stream`` are not recorded: batch n holds the rows from n times the batch size on.
+    ``physx/stream`` are not recorded: batch n starts at row n times the batch size.
 
     Args:
         session_dir: The training's session.
-        batches: Number of batches to read at most; None: all.
+        batches: Maximum number of batches to read; None: all.
 
     Returns:
-        The rows' numbers in the dataset, shape (batches, batch size).
+        The rows' indices in the dataset, shape (batches, batch size).
 
     Raises:
         SessionError: If the session has no such file.
@@ -106,12 +106,12 @@ def read_drawn_rows(session_dir: str | Path, batches: int | None = None) -> Inde
         content = files.read_content(path, _LARGEST)
     except OSError as error:
         raise SessionError(
-            f"{path} cannot be read: {error.strerror or error}. A training writes it whose batches "
-            "are drawn by a buffer that keeps rows (Training.online)."
+            f"{path} cannot be read: {error.strerror or error}. It is only written by a training "
+            "whose buffer keeps rows and draws batches from them (Training.online)."
         ) from error
     numbers = np.frombuffer(content, _NUMBER, len(content) // _NUMBER.itemsize)
     if len(numbers) < _HEAD or numbers[0] != _MARK or not 0 < numbers[1] < _LARGEST:
-        raise SessionError(f"{path} is damaged, or not a file of physx.")
+        raise SessionError(f"{path} is damaged, or was not written by physx.")
     width = int(numbers[1]) + 1
     records = numbers[_HEAD : _HEAD + (len(numbers) - _HEAD) // width * width].reshape(-1, width)
     count = 0

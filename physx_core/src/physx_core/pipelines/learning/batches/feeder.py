@@ -1,4 +1,4 @@
-"""Feeder: a thread that makes what a training needs next, while the training learns."""
+"""Feeder: a thread that produces a training's next items while the network learns."""
 
 from __future__ import annotations
 
@@ -14,11 +14,11 @@ _MOST_BYTES = 64 << 20
 
 
 class Item(Protocol):
-    """What a feeder makes."""
+    """An item that a feeder produces."""
 
     @property
     def nbytes(self) -> int:
-        """Size in memory."""
+        """Size in memory in bytes."""
 
 
 P = ParamSpec("P")
@@ -27,11 +27,11 @@ T = TypeVar("T", bound=Item)
 
 
 class _Closing(BaseException):
-    """The feeder is being closed: unwinds what its thread does."""
+    """The feeder is being closed: unwinds its thread."""
 
 
 class _Call:
-    """A call that the training's thread makes for the feeder's."""
+    """A call that the training's thread makes on behalf of the feeder's."""
 
     def __init__(self, function: Callable[[], Any], *, is_awaited: bool) -> None:
         self.is_awaited, self.is_done = is_awaited, False
@@ -40,7 +40,7 @@ class _Call:
         self._error: Exception | None = None
 
     def make(self) -> None:
-        """Call the function; its errors are those of `result`."""
+        """Call the function; `result` raises its errors."""
         try:
             self._result = self._function()
         except Exception as error:
@@ -55,16 +55,16 @@ class _Call:
 
 
 class Feeder(Generic[T]):
-    """Makes items in a thread of its own, in order, ahead of the training that takes them.
+    """Produces items in its own thread, in order, ahead of the training that takes them.
 
-    What may be called only in the training's thread, such as a network or an observer, is wrapped
-    with `calling` or `telling`: the feeder's thread then has it called there, when the training
-    waits for the next item. Items and these calls keep their order: when a call is made, all items
-    made before it were taken, and the training is done with them.
+    Functions that may be called only in the training's thread, such as those of a network or an
+    observer, are wrapped with `calling` or `telling`: when the feeder's thread calls them, they run
+    in the training's thread while it waits for the next item. Items and calls keep their order:
+    when a call is made, the training has taken all earlier items and is done with them.
 
     Attributes:
-        waited: Time in s for which nothing was made because there was no room for it; an item of
-            count 0 is not missed.
+        waited: Time in s for which nothing was produced for lack of space, except for items of
+            count 0.
     """
 
     def __init__(self) -> None:
@@ -73,15 +73,16 @@ class Feeder(Generic[T]):
         self._queue: deque[T | _Call | BaseException] = deque()
         self._counts: deque[int] = deque()
         self._taken = self._expected = 0
-        self._items = self._nbytes = 0  # that wait to be taken
+        self._items = self._nbytes = 0  # waiting to be taken
         self.waited = 0.0
         self._closes = False
         self._thread: threading.Thread | None = None
 
     def calling(self, function: Callable[P, R]) -> Callable[P, R]:
-        """Return a function that has another one called in the training's thread.
+        """Wrap a function so that it is called in the training's thread.
 
-        In the feeder's thread it waits for the result; in any other it is the function itself.
+        In the feeder's thread, the wrapper waits for the result; in any other, it calls the
+        function directly.
         """
 
         def call(*arguments: P.args, **options: P.kwargs) -> R:
@@ -97,7 +98,7 @@ class Feeder(Generic[T]):
         return call
 
     def telling(self, function: Callable[P, None]) -> Callable[P, None]:
-        """Return a function as `calling` does that does not wait, for one that never raises."""
+        """Wrap a function like `calling`, but without waiting; the function must never raise."""
 
         def tell(*arguments: P.args, **options: P.kwargs) -> None:
             if threading.current_thread() is not self._thread:
@@ -112,17 +113,17 @@ class Feeder(Generic[T]):
         """Start the thread.
 
         Args:
-            make: Makes the next item of a count.
-            cancel: Called by `close`; has a call of `make` that is in progress end soon.
+            make: Produces the next item of a given count.
+            cancel: Called by `close`; makes a running call of `make` end soon.
         """
         self._make, self._cancel = make, cancel
         self._thread = threading.Thread(target=self._run, name="physx-feeder", daemon=True)
         self._thread.start()
 
     def expect(self, counts: Iterable[int]) -> None:
-        """Have further items made, of these counts, as far as there is room for them.
+        """Produce further items of these counts, as far as there is space for them.
 
-        They wait in memory, up to 64 items and 64 MiB, one at least.
+        They wait in memory: up to 64 items and 64 MiB, but at least one.
         """
         with self._changed:
             before = len(self._counts)
@@ -131,13 +132,13 @@ class Feeder(Generic[T]):
             self._changed.notify_all()
 
     def next(self, count: int) -> T:
-        """Return the next item, and make the calls that come before it.
+        """Make the calls that come before the next item, and return the item.
 
         Args:
             count: Its count, if it was not expected yet.
 
         Raises:
-            BaseException: What its making raised.
+            BaseException: Whatever producing the item raised.
         """
         if self._taken == self._expected:
             self.expect((count,))
@@ -159,7 +160,7 @@ class Feeder(Generic[T]):
                 self._changed.notify_all()
 
     def close(self) -> None:
-        """End the thread, and make the calls that wait for no result; calling it again is allowed.
+        """End the thread, and make the pending calls without a result; idempotent.
 
         Items that were not taken are lost.
         """

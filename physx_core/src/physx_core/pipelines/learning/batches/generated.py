@@ -1,4 +1,4 @@
-"""GeneratedBatches: batches of samples that environments generate meanwhile."""
+"""GeneratedBatches: batches of samples that environments generate during training."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _IDENTITY = ("env_id", "episode")
 class GeneratedBatches:
     """Batches of samples that environments generate, stored before they are trained on.
 
-    In a group of processes only the leading one has the environments; each gets its share.
+    In a group of processes, only the leading one has the environments; each process gets its share.
 
     Attributes:
-        source: The environments; None but in the leading process.
-        online: Draws the batches; None but in the leading process.
+        source: The environments; None except in the leading process.
+        online: Draws the batches; None except in the leading process.
         repeats: Returns whether the environments would generate the same samples again.
-        learns: Whether a sampler learns from the losses of the rows.
+        learns: Whether a sampler learns from the row losses.
     """
 
     def __init__(
@@ -46,12 +46,11 @@ class GeneratedBatches:
         """Keep the arguments.
 
         Args:
-            stored: The samples of earlier runs, and from now on those that are generated.
-            source: The environments, open; None but in the leading process.
-            online: Draws batches of what they generate; None but in the leading process.
+            stored: The samples of earlier runs, and from now on the generated samples.
+            source: The open environments; None except in the leading process.
+            online: Draws batches of the generated samples; None except in the leading process.
             group: The processes that train together.
-            ahead: Whether all batches of an epoch will be taken, so that they may be generated
-                ahead.
+            ahead: Whether all batches of an epoch will be taken, and so may be generated ahead.
             repeats: Returns whether the environments would generate the same samples again.
         """
         self.source, self.online = source, online
@@ -66,7 +65,7 @@ class GeneratedBatches:
         """Prepare an epoch.
 
         Args:
-            names: Fields of the batches of a buffer that keeps rows.
+            names: Fields of the batches, for a buffer that keeps rows.
             batches: Number of batches that will be taken.
         """
         self._names = names
@@ -86,16 +85,16 @@ class GeneratedBatches:
         return self.online.next(names)
 
     def _drawn_fields(self, names: Sequence[str]) -> Sequence[str]:
-        """Return the fields of batches that are drawn: a sampler that learns knows rows by two."""
+        """Return the fields of drawn batches, with those that identify rows for the sampler."""
         return [*names, *_IDENTITY] if self.learns else names
 
     @property
     def weight(self) -> float | None:
-        """Weight of the last batch if it is this process's share of one; None: it is a whole."""
+        """Weight of the last batch if it is this process's share; None: it is a whole batch."""
         return None if self._shared is None else self._shared.weight
 
     def tell(self, batch: Batch, losses: Array) -> None:
-        """Have the sampler learn from the last batch.
+        """Pass the last batch's losses to the sampler, which learns from them.
 
         Args:
             batch: The batch, or this process's share of it.
@@ -130,10 +129,10 @@ class GeneratedBatches:
         return self._stored.normalization(recompute=False)
 
     def states(self, batches: int) -> tuple[Index | None, Array | None]:
-        """Return the states of buffer and sampler for a checkpoint, each None if it has none.
+        """Return the states of buffer and sampler for a checkpoint; None for one without a state.
 
         Args:
-            batches: Number of batches that were learned from: all, or all but the last one.
+            batches: Number of batches already learned from: all, or all but the last one.
         """
         if self.online is None or self.source is None:
             return None, None
@@ -147,7 +146,7 @@ class GeneratedBatches:
             names: Fields of the batches.
 
         Raises:
-            CheckpointError: If its states do not fit buffer and sampler.
+            CheckpointError: If its states do not match buffer and sampler.
         """
         if self.online is None or self.source is None:
             return
@@ -160,8 +159,8 @@ class GeneratedBatches:
             sets.restore(batches, checkpoint.read_sampler(found))
         except ValueError as error:
             raise CheckpointError(
-                "The training cannot be resumed: the state of the sampler in its checkpoint does "
-                f"not fit, as {error}. Resume with the same sampler and sampler_kwargs."
+                "The training cannot be resumed: the sampler state in its checkpoint does not "
+                f"match, because {error}. Resume with the same sampler and sampler_kwargs."
             ) from error
 
     def finish(self) -> None:

@@ -1,4 +1,4 @@
-"""OnlineBatches: the batches of a training while environments generate its rows."""
+"""OnlineBatches: a training's batches while environments generate the rows."""
 
 from __future__ import annotations
 
@@ -23,12 +23,12 @@ _LARGEST = 1024
 
 
 class OnlineBatches:
-    """Takes as many rows as the buffer needs for each batch, and draws the batch from those it has.
+    """For each batch, takes as many rows as the buffer needs, and draws the batch from the buffer.
 
     Attributes:
         block: The last block of rows.
         number: Number of batches drawn since the run began.
-        rows: Numbers of the last batch's rows since the run began.
+        rows: Indices of the last batch's rows, counted from the start of the run.
     """
 
     def __init__(
@@ -38,10 +38,10 @@ class OnlineBatches:
 
         Args:
             blocks: The rows.
-            buffer: Decides what batches hold; it has begun.
-            data_type: Floating type of the batches of a buffer that keeps rows.
-            drawn: Where to write which rows these are.
-            first: Number in the dataset of the run's first row.
+            buffer: Decides what batches contain; already started.
+            data_type: Floating-point type of the batches of a buffer that keeps rows.
+            drawn: Records the drawn rows.
+            first: Index of the run's first row in the dataset.
         """
         self.block = Block()
         self.number = 0
@@ -57,7 +57,7 @@ class OnlineBatches:
         """Return the next batch, in physical units; valid until the next call.
 
         Args:
-            names: Fields that a batch contains if the buffer keeps rows; otherwise all.
+            names: Fields that a batch contains if the buffer keeps rows; otherwise it contains all.
 
         Raises:
             PhysxError: If an environment fails, or rows cannot be stored.
@@ -81,7 +81,7 @@ class OnlineBatches:
         return self.block.rows
 
     def _draw(self, count: int, names: Sequence[str]) -> Batch:
-        """Return a batch that the buffer draws when some rows have arrived."""
+        """Return a batch that the buffer draws after `count` rows have arrived."""
         draw, placed = self._buffer.take(self.number, count), 0
         for size in self._split(count):
             rows = self._take(size)
@@ -104,19 +104,19 @@ class OnlineBatches:
         mode: str,
         names: Sequence[str],
     ) -> None:
-        """Continue after some batches, with the buffer as it was then.
+        """Continue after some batches, with the buffer in the state that it had then.
 
-        The blocks continue there, too; the record of drawn rows was opened there.
+        The blocks continue there as well; the record of drawn rows was opened there.
 
         Args:
             number: Number of batches drawn, at least one.
-            state: Returns the state of the buffer then; called if it keeps rows.
-            dataset: Has the rows that had arrived then.
+            state: Returns the buffer's state at that time; called if it keeps rows.
+            dataset: Contains the rows that had arrived by then.
             mode: Their mode.
             names: Fields that a batch contains if the buffer keeps rows.
 
         Raises:
-            CheckpointError: If it is not a state of this buffer.
+            CheckpointError: If the state does not match this buffer.
         """
         buffer = self._buffer
         arrived = buffer.needed(number - 1)
@@ -135,8 +135,8 @@ class OnlineBatches:
             self._buffer.restore(number, state)
         except ValueError as error:
             raise CheckpointError(
-                f"The training cannot be resumed: the state of its buffer does not fit "
-                f"{type(self._buffer).__name__}, as {error}. Resume with the same online, "
+                f"The training cannot be resumed: the state of its buffer does not match "
+                f"{type(self._buffer).__name__}, because {error}. Resume with the same online, "
                 "online_kwargs and batch_size."
             ) from error
 
@@ -149,7 +149,7 @@ class OnlineBatches:
 
         Args:
             batches: Their numbers.
-            most: Number of rows that arrive at most; a run that was shorter needed no more.
+            most: Maximum number of rows that arrive, because a shorter run needed no more.
         """
         before = self._arrived
         for batch in batches:
@@ -159,9 +159,9 @@ class OnlineBatches:
             before = needed
 
     def _split(self, count: int) -> Iterator[int]:
-        """Yield the sizes of the blocks in which rows for a batch of a buffer arrive.
+        """Yield the sizes of the blocks in which rows for a batch arrive.
 
-        The first batch may need many rows, which would take much memory in one piece.
+        The first batch may need many rows, which would take too much memory in one block.
         """
         largest = max(self._buffer.batch_size, _LARGEST)
         while self._buffer.capacity and count > largest:
@@ -170,10 +170,10 @@ class OnlineBatches:
         yield count
 
     def state(self, batches: int) -> Index | None:
-        """Return the buffer's state for a checkpoint; None: it keeps nothing.
+        """Return the buffer's state for a checkpoint; None: it keeps no rows.
 
         Args:
-            batches: Number of batches that were learned from: all, or all but the last one.
+            batches: Number of batches already learned from: all, or all but the last one.
         """
         if not self._buffer.capacity:
             return None
@@ -182,14 +182,14 @@ class OnlineBatches:
         return self._buffer.state(batches)
 
     def recent_statistics(self) -> dict[str, float]:
-        """Return how the rows, the buffer and both sides are doing; nothing if it is not due.
+        """Return statistics of the rows, the buffer, and the run's throughput, those that are due.
 
-        ``fields/...`` of the rows are those of `RowStatistics`; the others are due once a second:
-        ``online/rows_kept`` and ``online/mean_age`` of the buffer, the age in rows that came since;
-        ``online/views``, how many times a row was used on average; and of the time since the last
-        call: ``online/rows_per_s``, ``online/batches_per_s``, and the shares of it in which the
-        network waited for rows, ``online/network_waits``, and the environments for the network,
-        ``online/environments_wait``.
+        ``fields/...`` are those of `RowStatistics`. The others are due once a second:
+        ``online/rows_kept`` and ``online/mean_age`` describe the buffer, with the age in rows that
+        arrived since; ``online/views`` is the average number of times that a row was used. The rest
+        covers the time since the last call: ``online/rows_per_s``, ``online/batches_per_s``, and
+        the fractions of it in which the network waited for rows, ``online/network_waits``, and the
+        environments for the network, ``online/environments_wait``.
         """
         summary, self._summary = self._summary, {}
         rates = self._meter.read_recent()
@@ -214,7 +214,7 @@ class OnlineBatches:
             )
 
     def describe(self) -> Iterable[str]:
-        """Return a line on the epochs in which environments generated."""
+        """Return a line on the epochs in which environments generated samples."""
         if self.number:
             total = self._meter.read()
             yield (
@@ -242,7 +242,7 @@ class _State(NamedTuple):
 
 
 class _Meter:
-    """Rates of a run, and how long both sides waited."""
+    """A run's rates, and the times for which both sides waited."""
 
     def __init__(self) -> None:
         self._first = self._last = self._now = _State(time.monotonic(), 0, 0, 0.0, 0.0)
@@ -262,8 +262,8 @@ class _Meter:
 
         Args:
             rows: Number of rows that arrived for it.
-            held_back: Time in s for which the environments have waited so far; None: whenever the
-                network did not.
+            held_back: Time in s for which the environments have waited so far; None: the time for
+                which the network did not.
         """
         now = self._now
         if held_back is None:
@@ -278,7 +278,7 @@ class _Meter:
         return self.read(last)
 
     def read(self, since: _State | None = None) -> dict[str, float]:
-        """Return the rates since some moment; None: the start."""
+        """Return the rates since an earlier state; None: since the start."""
         now, before = self._now, since or self._first
         seconds = max(now.time - before.time, 1e-9)
         return {

@@ -17,7 +17,7 @@ from physx_core.typing import Batch
 
 
 class ReplayedBatches:
-    """Sends the stored samples through environments, and stores the results in their place.
+    """Sends the stored samples through environments and replaces them with the results.
 
     Attributes:
         source: The environments.
@@ -29,14 +29,14 @@ class ReplayedBatches:
         """Check that the stored samples have the environments' fields.
 
         Args:
-            source: The environments; open.
+            source: The open environments.
             stored: The samples.
             batch_size: Samples in a batch; fewer at the end of a pass.
             seed: Seed of the order of each pass; None: the order of writing.
 
         Raises:
             DatasetError: If there are no samples.
-            FieldsMismatchError: If they have other fields.
+            FieldsMismatchError: If their fields differ.
         """
         self.source = source
         self._stored, self._batch_size = stored, batch_size
@@ -50,10 +50,10 @@ class ReplayedBatches:
         compare_fields(f'The environment cannot replay mode "{stored.mode}", which', known, given)
 
     def begin_epoch(self, names: Sequence[str], batches: int) -> None:
-        """Prepare an epoch; nothing is to be done."""
+        """Prepare an epoch; there is nothing to do."""
 
     def next(self) -> Batch:
-        """Return what the environments make of the next samples, in physical units."""
+        """Return the environments' results for the next samples, in physical units."""
         with record_beside_rows(self.source, self._stored.dataset, self._stored.mode):
             index, rows = self._rows.take(self._batch_size)
             batch = self.source.batch(len(index), rows)
@@ -71,4 +71,4 @@ class ReplayedBatches:
         return self._stored.normalization()
 
     def finish(self) -> None:
-        """End the last epoch; nothing is to be done."""
+        """End the last epoch; there is nothing to do."""

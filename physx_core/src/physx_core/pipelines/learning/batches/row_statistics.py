@@ -1,4 +1,4 @@
-"""RowStatistics: mean, deviation and quantiles of the rows that environments generate."""
+"""RowStatistics: mean, deviation, and quantiles of the rows that environments generate."""
 
 from __future__ import annotations
 
@@ -15,9 +15,9 @@ from physx_core.typing import Array, Batch, Index
 Doubles = NDArray[np.float64]
 
 _SMALL = 9
-"""Largest number of components that have statistics of their own."""
+"""Largest number of components that have separate statistics."""
 _DRAWN = 32
-"""Number of components of each row that stand for those of a larger field."""
+"""Number of components drawn from each row of a larger field."""
 _KEPT = 1024
 """Number of rows that quantiles are computed from."""
 _CHUNK = 256
@@ -26,11 +26,12 @@ _QUANTILES = {"q05": 0.05, "median": 0.5, "q95": 0.95}
 
 
 class RowStatistics:
-    """Summarizes rows, in an amount of memory that does not grow with their number.
+    """Summarizes rows in constant memory.
 
-    A field of up to 9 components has statistics of each, a larger one of all together: of 32 of
-    each row, drawn at random. Mean and deviation are those of all rows, quantiles those of 1024,
-    drawn at random without replacement. All depends on the seed and the rows only.
+    A field of up to 9 components has statistics of each component. A larger field has common
+    statistics of 32 components of each row, drawn at random. Mean and deviation are over all rows,
+    quantiles over 1024 rows drawn at random without replacement. The results depend only on the
+    seed and the rows.
     """
 
     def __init__(self, seed: int, total: int) -> None:
@@ -38,27 +39,27 @@ class RowStatistics:
 
         Args:
             seed: Seed of the run.
-            total: Number of rows that there will be.
+            total: Total number of rows to expect.
         """
         self._seed, self._total = seed, total
         self._random = np.random.default_rng([seed, _STREAM])
         self._columns: dict[str, _Columns] = {}
-        self._priorities: Doubles = np.zeros(0)  # of the rows that are kept: the smallest ones
+        self._priorities: Doubles = np.zeros(0)  # of the kept rows, which have the smallest ones
         self._count = self._waiting = self._due = 0
 
     def add(self, rows: Batch, names: Iterable[str]) -> dict[str, float]:
-        """Add rows, and return the statistics if they are due; otherwise nothing.
+        """Add rows, and return the statistics if they are due, otherwise an empty dictionary.
 
-        They are due when there are a tenth more rows than the last time, and after the last row.
+        They are due when the number of rows has grown by a tenth, and after the last row.
 
         Args:
-            rows: Field name to array of shape (rows, *field shape), finite; one row at least.
-            names: The floating fields, always the same.
+            rows: Field name to array of shape (rows, *field shape), finite; at least one row.
+            names: The floating-point fields, the same in each call.
 
         Returns:
             ``fields/<field>/<component>/<figure>`` to value, in the field's unit; without the
             component if the field has one, or more than 9. The figures are ``mean``, ``std``,
-            ``q05`` (the quantile of 5 %), ``median`` and ``q95``.
+            ``q05`` (the 5 % quantile), ``median``, and ``q95``.
         """
         if not self._columns:
             self._columns = {
@@ -83,7 +84,7 @@ class RowStatistics:
         }
 
     def _take_waiting(self) -> None:
-        """Count the rows that wait, and keep those of all with the smallest random numbers."""
+        """Include the waiting rows, and keep the rows with the smallest random numbers."""
         known = np.concatenate([self._priorities, self._random.random(self._waiting)])
         kept: Index = np.arange(len(known))
         if len(known) > _KEPT:
@@ -94,7 +95,7 @@ class RowStatistics:
 
 
 class _Columns:
-    """Statistics of a field: of each component, or of one column of all if there are many."""
+    """A field's statistics: of each component, or of all in one column if there are many."""
 
     def __init__(self, shape: tuple[int, ...], seed: Sequence[int]) -> None:
         self._size = math.prod(shape)
@@ -116,10 +117,10 @@ class _Columns:
         return len(rows)
 
     def take_waiting(self, kept: Index) -> None:
-        """Count the rows that wait.
+        """Include the waiting rows.
 
         Args:
-            kept: The rows to keep, as positions among those kept before and those that wait.
+            kept: The rows to keep, as positions among those kept before and the waiting rows.
         """
         rows = np.concatenate(self._waiting)
         self._waiting.clear()
@@ -127,7 +128,7 @@ class _Columns:
         self._kept = np.concatenate([self._kept, rows])[kept]
 
     def figures(self) -> Iterator[tuple[tuple[str, ...], float]]:
-        """Yield label and name of each figure, and its value."""
+        """Yield each figure's label and name, and its value."""
         if not self._kept.size:
             return
         sample = self._kept.reshape(-1, len(self._labels))

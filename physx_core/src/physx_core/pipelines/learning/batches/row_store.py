@@ -15,7 +15,7 @@ _BLOCK = 4096
 
 
 class RowStore:
-    """One preallocated array per field, with a row for each slot of a buffer."""
+    """One preallocated array per field, with one row for each slot of a buffer."""
 
     def __init__(
         self,
@@ -32,7 +32,7 @@ class RowStore:
             batch_size: Number of rows in a batch.
             fields: The stored fields by name.
             names: Those that batches contain; unknown ones are left out.
-            data_type: Floating type of the batches.
+            data_type: Floating-point type of the batches.
         """
         kinds = {
             name: (fields[name].shape or (), converted_dtype(fields[name], np.dtype(data_type)))
@@ -45,12 +45,12 @@ class RowStore:
         }
 
     def put(self, slots: Index, rows: Batch) -> None:
-        """Copy rows into their slots; of several rows for a slot the last one stays."""
+        """Copy rows into their slots; if several rows share a slot, the last one stays."""
         for name, array in self._arrays.items():
             array[slots] = rows[name]
 
     def read(self, slots: Index, dataset: Dataset, mode: str, index: Index) -> None:
-        """Fill slots with the rows of a dataset that have these numbers."""
+        """Fill slots with the rows of a dataset at these indices."""
         view = dataset[mode]
         for start in range(0, len(slots), _BLOCK):
             part = slice(start, start + _BLOCK)

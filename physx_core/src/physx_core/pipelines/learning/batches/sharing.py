@@ -1,4 +1,4 @@
-"""SharedBatches: batches that one process draws and several learn from."""
+"""SharedBatches: batches drawn by one process for several that learn."""
 
 from __future__ import annotations
 
@@ -15,22 +15,22 @@ from physx_core.typing import Batch
 
 
 class SharedBatches:
-    """Gives each process of a group its share of the batches that the leading one draws.
+    """Gives each process of a group its share of the batches that the leading process draws.
 
     Attributes:
-        block: Fields and normalization after the last block; it has no rows.
+        block: Fields and normalization after the last block, without rows.
         number: Number of batches so far.
         weight: Weight of this process's share in the mean over the last batch.
         whole: The last batch, in the leading process; valid until the next one.
     """
 
     def __init__(self, group: Group, online: OnlineBatches | None, fields: Iterable[Field]) -> None:
-        """Tell all processes the fields.
+        """Send the fields to all processes.
 
         Args:
             group: The processes.
-            online: Draws the batches; None but in the leading process.
-            fields: The environments' fields; empty but in the leading process.
+            online: Draws the batches; None except in the leading process.
+            fields: The environments' fields; empty except in the leading process.
         """
         self.number, self.weight = 0, 1.0
         self.whole: Batch = {}
@@ -64,7 +64,7 @@ class SharedBatches:
         return share
 
     def finish(self, dataset: Dataset) -> None:
-        """Have all processes see the rows that were stored, to read them from now on."""
+        """Make the stored rows visible to all processes, which read them from now on."""
         if self._online is not None:
             dataset.flush()
         self._group.tell(None)

@@ -1,4 +1,4 @@
-"""StoredBatches: the stored samples of a training, and batches of them."""
+"""StoredBatches: a training's stored samples, and batches of them."""
 
 from __future__ import annotations
 
@@ -45,14 +45,14 @@ class StoredBatches:
 
         Args:
             dataset: The dataset.
-            config: Options of reading it.
+            config: Options for reading it.
             environment: Generates or replays the samples; None: they are only read.
             batch_size: Samples in a batch.
             seed: Seed of the order of samples.
-            data_type: Floating type of the batches.
+            data_type: Floating-point type of the batches.
 
         Raises:
-            ConfigError: If samples are to be held back that environments generate.
+            ConfigError: If samples should be held back, but environments generate them.
             DatasetError: If there are no samples to read.
         """
         self.dataset, self.mode = dataset, config.mode
@@ -83,7 +83,7 @@ class StoredBatches:
 
         Args:
             names: Fields of the batches.
-            batches: Number of batches that will be taken; ignored, as nothing is made ahead.
+            batches: Number of batches that will be taken; ignored, because nothing is read ahead.
         """
         if self._reader is None:
             part = self.parts.get("training")
@@ -101,7 +101,7 @@ class StoredBatches:
     def next(self) -> Batch:
         """Return the next batch, in physical units; valid until the next call."""
         if self._reader is None:
-            raise UsageError("next_batch() needs begin_epoch() before it.")
+            raise UsageError("Call begin_epoch() before next_batch().")
         self.count += 1
         return next(self._reader)
 
@@ -109,7 +109,7 @@ class StoredBatches:
         """Replace samples.
 
         Args:
-            index: Their numbers in the mode.
+            index: Their indices in the mode.
             rows: Their new values.
         """
         self.dataset.update(self.mode, index, rows)
@@ -153,7 +153,7 @@ class StoredBatches:
         """Return the normalization by field; empty if nothing is to be normalized.
 
         Args:
-            recompute: Whether it may be computed from all samples again, if so configured.
+            recompute: Whether it may be recomputed from all samples, if so configured.
         """
         self.has_changed = False
         if not self._config.normalize or not self.has_samples:
