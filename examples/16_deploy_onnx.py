@@ -35,7 +35,7 @@ for cloud in points[:200]:
     model.run(["prediction"], {"input": cloud[None]})
 took = (time.perf_counter() - begin) / len(points[:200])
 loaded = {"torch", "physx_core", "physx_torch"} & set(sys.modules)
-print(f"onnxruntime: {1e6 * took:7.1f} us a cloud; loaded of physx and PyTorch: {loaded or None}")
+print(f"onnxruntime: {1e6 * took:7.1f} µs per cloud; loaded of physx and PyTorch: {loaded or None}")
 sys.exit(bool(loaded))
 """
 
@@ -65,7 +65,7 @@ def main() -> int:
     files = [stored / name for name in ("spread.onnx", "clouds.npy", "guesses.npy")]
     learner.export(files[0], "onnx")
     np.save(files[1], clouds.astype(np.float32))
-    print(f"physx:       {1e6 * took:7.1f} us a cloud", flush=True)
+    print(f"physx:       {1e6 * took:7.1f} µs per cloud", flush=True)
     subprocess.run([sys.executable, "-c", PROGRAM, *map(str, files)], check=True)
     theirs = np.load(files[2])
     apart = np.abs(theirs - ours).max()

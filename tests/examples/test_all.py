@@ -15,9 +15,8 @@ pytestmark = pytest.mark.slow
 
 EXAMPLES = gallery.EXAMPLES
 SCRIPTS = sorted(EXAMPLES.glob("[0-9][0-9]_*.py"))
-LONG = dict.fromkeys(
-    ["07_field_on_a_grid", "09_robot_arm", "20_policy_on_a_cluster"], pytest.mark.faults
-)
+QUICK = ("01", "02", "03", "04", "15", "17", "18")
+"""Examples that always run; the others run with the campaigns."""
 SHARED = {path.stem for path in EXAMPLES.rglob("*.py")}
 PRINTED = {  # what an example has to print, as patterns
     "01_generate": (
@@ -81,7 +80,12 @@ def assert_same_film(path, kept):
 
 @pytest.mark.parametrize(
     "path",
-    [pytest.param(path, id=path.stem, marks=LONG.get(path.stem, ())) for path in SCRIPTS],
+    [
+        pytest.param(
+            path, id=path.stem, marks=() if path.stem.startswith(QUICK) else pytest.mark.faults
+        )
+        for path in SCRIPTS
+    ],
 )
 def test_an_example_runs_and_draws_its_picture(path, run, tmp_path):
     skip_without_libraries(path)

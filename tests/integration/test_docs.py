@@ -21,6 +21,12 @@ LONG = {
 }  # fmt: skip
 """Pages whose commands take many seconds; they run with the campaigns."""
 
+GENERATED = {"figures.md", "gallery.md"}
+"""Pages that scripts write."""
+
+WIDTH = 92
+"""Longest line of code that the site shows without cutting it off."""
+
 
 def books():
     """Each page, with those that it builds on."""
@@ -43,6 +49,18 @@ def test_the_code_of_a_page_runs(pages, tmp_path):
 @pytest.mark.parametrize("page", run_pages.LEARN, ids=lambda page: page.stem)
 def test_a_page_to_learn_from_is_short(page):
     assert sum(len(block.text.splitlines()) for block in run_pages.read(page)) <= 40
+
+
+def test_code_fits_the_page():
+    written = [page for page in run_pages.PAGES if page.name not in GENERATED]
+    blocks = [block for page in written for block in run_pages.read(page)]
+    code = [block for block in blocks if block.language not in ("", "text")]
+    assert [
+        f"{block.page.relative_to(run_pages.ROOT)}, line {block.line + number}: {line}"
+        for block in code
+        for number, line in enumerate(block.text.splitlines(), 1)
+        if len(line) > WIDTH
+    ] == []
 
 
 @pytest.mark.parametrize(

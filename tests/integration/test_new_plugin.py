@@ -44,8 +44,8 @@ def call(python, tmp_path):
     "kind",
     [
         "environment",
-        "visualizer",
-        "plugin",  # with an environment and a network
+        pytest.param("visualizer", marks=pytest.mark.faults),
+        pytest.param("plugin", marks=pytest.mark.faults),  # with an environment and a network
         pytest.param("network", marks=pytest.mark.faults),
         pytest.param("backend", marks=pytest.mark.faults),
     ],

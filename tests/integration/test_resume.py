@@ -67,7 +67,7 @@ def test_a_damaged_checkpoint_is_stepped_over(training, name):
     damaged = bytearray(file.read_bytes())
     damaged[len(damaged) // 2] ^= 4
     file.write_bytes(damaged)
-    with pytest.warns(UserWarning, match=f"network_0 is used.*\n.*network_1: {name}"):
+    with pytest.warns(UserWarning, match=f"network_0, because later.*\n.*network_1: {name}"):
         training(5, session_name="run", resume=True).execute()
     assert parameters("run", 2) == parameters("whole", 0)
     assert file.read_bytes() == damaged
@@ -154,7 +154,7 @@ def test_what_cannot_be_resumed(training):
         ({"num_clients": 2}, {}, "num_clients was 1 and is now 2"),
         ({"env_kwargs": {"mass": 2.0}}, {}, "env_kwargs was {}"),
         ({"seed": 3}, {}, "seed was"),
-        ({}, {"batch_size": 6}, "batch_size was 5 and is 6"),
+        ({}, {"batch_size": 6}, "batch_size was 5 and is now 6"),
     ):
         other = dataclasses.replace(spring, **changed)
         with pytest.raises(ConfigError, match=f"cannot be resumed .*{name}"):

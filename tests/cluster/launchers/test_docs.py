@@ -23,7 +23,9 @@ PAGE = Path(__file__).parents[3] / "docs" / "cluster.md"
 def test_three_commands_lead_to_two_nodes(runs, local_rows):
     text = PAGE.read_text(encoding="utf-8")
     block = re.search(r"three_commands.*?```sh\n(.*?)```", text, re.S)[1]
-    head, other, generate = (line.partition("  #")[0].split() for line in block.splitlines())
+    head, other, generate = (
+        line.partition("  #")[0].split() for line in block.replace("\\\n", " ").splitlines()
+    )
     expected = local_rows()
     folder, [port] = tempfile.mkdtemp(prefix="ray", dir="/tmp"), free_ports(1)
     place = f"127.0.0.1:{port}"

@@ -111,6 +111,7 @@ def test_nothing_is_left_on_any_node(way, runs, ray_cluster, eventually):
     eventually(lambda: not any(b"ray::Agent" in command for command in commands()))
 
 
+@pytest.mark.faults
 def test_a_cluster_is_started_for_the_run_and_ends_with_it(runs, eventually):
     folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")
     try:
@@ -170,6 +171,7 @@ def test_options_are_checked_before_anything_is_started(kwargs, text):
         RayLauncher(**kwargs).open()
 
 
+@pytest.mark.faults
 def test_the_run_says_what_its_clients_wait_for(runs, ray_cluster, eventually):
     first = runs.start(*on(ray_cluster), batches=10_000, pace=0.01, **ray_cluster.variables)
     runs.wait_for_clients(2, first)
@@ -185,6 +187,7 @@ def test_the_run_says_what_its_clients_wait_for(runs, ray_cluster, eventually):
     runs.finish(first)
 
 
+@pytest.mark.faults
 def test_more_clients_than_processors_share_them(runs, local_rows, ray_cluster):
     expected = local_rows(clients=5)
     assert runs.same(runs.rows(*on(ray_cluster), clients=5, **ray_cluster.variables), expected)

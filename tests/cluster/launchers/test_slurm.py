@@ -57,6 +57,7 @@ def test_local_jobs_make_the_rows_of_a_local_run(runs, local_rows, eventually):
     eventually(runs.nothing_is_left)
 
 
+@pytest.mark.faults
 def test_a_preempted_local_job_runs_again_and_the_rows_stay_the_same(runs, local_rows, eventually):
     expected = local_rows(batches=20)
     words = (*LOCAL, "--environment.restarts", "1")

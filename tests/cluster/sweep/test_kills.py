@@ -45,6 +45,7 @@ def test_killed_trials_are_continued_bit_for_bit(write, slow, whole, parameters_
     assert spent - 2 * EPOCHS * BATCHES <= lost <= kills * BATCHES
 
 
+@pytest.mark.faults
 def test_a_killed_sweep_is_continued_by_the_same_command(write, slow, whole, parameters_of):
     whole(seeds=[0, 1])
     write(run={"parallel": 2}, seeds=[0, 1])
@@ -112,6 +113,7 @@ def test_data_that_were_cut_short_are_generated_anew(write, slow, physx, paramet
     check(parameters_of)
 
 
+@pytest.mark.faults
 def test_trainings_that_generate_their_samples_are_continued(write, slow, physx, parameters_of):
     slow["dataset"] = {}
     slow["batch_nb"] = BATCHES

@@ -92,9 +92,9 @@ def test_a_late_client_takes_over_instances(local, by_hand, join, taking, said, 
     rows.check(local(WANDERER, **settings))
     texts = [process.communicate(timeout=60)[0] for process in ours]
     assert [process.returncode for process in ours] == [0, 0]
-    assert "waits for instances to run" in texts[0]
+    assert "waiting for instances to run" in texts[0]
     assert len(re.findall(r"instance \d moves to another client", texts[0])) == 2
-    assert len(re.findall(r"runs instance \d", texts[1])) == 2
+    assert len(re.findall(r"running instance \d", texts[1])) == 2
     assert "the run has ended" in texts[1]
     assert said()[0].startswith("The run waits for 1 client (at most 2 may join). Start each")
 

@@ -29,7 +29,7 @@ def test_the_commands_of_the_page_make_the_rows_of_a_run_alone(port, nothing_sta
         timeout=120,
     )
     assert done.returncode == 0, done.stderr
-    assert "runs instance 4, and 3 others" in done.stdout
+    assert "running instance 4, 4 in total" in done.stdout
     assert "(at most 8 may join)" in done.stderr
     found = []
     for path in sorted(Path("sessions").iterdir()):

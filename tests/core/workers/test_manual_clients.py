@@ -52,7 +52,7 @@ def test_clients_join_a_waiting_run_and_say_what_they_do(by_hand, join, port, ca
     said = [process.communicate(timeout=60)[0].splitlines() for process in ours]
     assert [process.returncode for process in ours] == [0, 0]
     assert batch["env_id"].tolist() == [1, 2] * 3
-    assert said[0][0] == f"physx client: looks for the server at 127.0.0.1:{port}"
+    assert said[0][0] == f"physx client: connecting to the server at 127.0.0.1:{port}"
     assert said[0][1].endswith("worker_envs.py:Plain, instance 2 of 2")
     assert said[0][-1] == "physx client: the run has ended"
     assert said[1][1].endswith("instance 1 of 2")
@@ -100,7 +100,7 @@ def test_another_client_takes_the_place_of_one_that_leaves(local, by_hand, join,
 
 def test_a_place_that_nobody_takes_ends_the_run(by_hand, join, unhurried):
     client, timeout = join(), unhurried(2.0)
-    assert "looks for the server" in client.stdout.readline()
+    assert "connecting to the server" in client.stdout.readline()
     with (
         pytest.raises(
             ClientError, match=r"Client 1 was lost after \d+ rows, and no other .* s while"

@@ -238,10 +238,10 @@ def test_an_error_in_each_request_of_one_segment(peer, message):
 
 def test_a_value_that_a_field_does_not_take_is_named(peer, scene):
     for values, said in (
-        ({"a": [1.0, "x"]}, 'The field "a" of AgentData does not take'),
-        ({"a": [[1.0], [2.0, 3.0]]}, 'The field "a" of AgentData does not take'),
+        ({"a": [1.0, "x"]}, 'The field "a" of AgentData does not accept'),
+        ({"a": [[1.0], [2.0, 3.0]]}, 'The field "a" of AgentData does not accept'),
         ({"b": 1}, 'has no field "b". It has: a, frame, d'),
-        ({"frame": "text"}, 'The field "frame" of AgentData does not take'),
+        ({"frame": "text"}, 'The field "frame" of AgentData does not accept'),
     ):
         scene.agent.get_data = lambda request, storage, values=values: fill(storage, **values)
         assert said in peer.error({"observation": {"agent": 1}})

@@ -37,7 +37,7 @@ def test_a_server_that_says_nothing_of_itself(in_thread, scene_class):
     with pytest.raises(RemoteError, match="Pass messages="):
         GodotGymEnv(service.address)
     messages = service.environment.messages
-    with pytest.raises(RemoteError, match="give action_space="):
+    with pytest.raises(RemoteError, match="pass action_space="):
         GodotGymEnv(service.address, messages=messages, observation_space=spaces.Discrete(2))
 
     class Walk(GodotGymEnv):

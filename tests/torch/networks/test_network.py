@@ -242,7 +242,7 @@ def test_state_that_is_no_tensor(tmp_path):
 
 
 def test_folder_that_does_not_exist(tmp_path):
-    with pytest.raises(CheckpointError, match="cannot be written"):
+    with pytest.raises(CheckpointError, match="Cannot write"):
         FC([2, 1]).save_parameters(tmp_path / "nowhere" / "p")
 
 

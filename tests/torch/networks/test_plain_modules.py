@@ -97,7 +97,7 @@ def test_arguments_that_are_not_the_modules():
 
 
 def test_clashing_names_are_an_error():
-    with pytest.raises(ConfigError, match='Greedy takes an argument "net_fields" itself'):
+    with pytest.raises(ConfigError, match='Greedy also takes an argument "net_fields"'):
         Learner(config(Greedy, {"net_fields": "x"}), trains=False)
     with pytest.raises(ConfigError, match="module_kwargs"):
         Learner(config(Greedy, {"module": "x"}), trains=False)

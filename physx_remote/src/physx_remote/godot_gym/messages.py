@@ -219,7 +219,7 @@ def _fill(storage: Any, values: Mapping[str, Any]) -> None:
         except (TypeError, ValueError, LookupError, OverflowError, AttributeError) as error:
             raise ConfigError(
                 f'The field "{name}" of {storage.DESCRIPTOR.name} does not accept {value!r:.100}: '
-                f"{error}."
+                f"{str(error).rstrip('.')}."
             ) from error
 
 

@@ -113,7 +113,7 @@ def _pictures(
     with TemporaryFolder("rerun-") as folder:
         viewer = start_viewer(size, folder.path, str(recording))
         try:
-            viewer.wait_until_ready(timeout)
+            viewer.wait_until_ready(timeout=timeout)
             camera = Camera(viewer, time.monotonic() + timeout)
             camera.wait_for_recording()
             for at in times:

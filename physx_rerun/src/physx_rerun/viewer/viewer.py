@@ -127,10 +127,10 @@ class Viewer:
         stream = self.process.stderr
         self._tail = None if stream is None else OutputTail(stream, _LINES)
 
-    def wait_until_ready(self, timeout: float = 30.0) -> None:
-        """Wait until the viewer is listening."""
+    def wait_until_ready(self, *others: str, timeout: float = 30.0) -> None:
+        """Wait until the viewer is listening at its address, and at any others it has."""
         deadline = time.monotonic() + timeout
-        while not is_listening(self.address):
+        while not all(map(is_listening, (self.address, *others))):
             self.check()
             if time.monotonic() > deadline:
                 self.end()
@@ -176,8 +176,7 @@ def start_web_viewer(port: int, page_port: int, *options: str) -> Viewer:
     """
     page_port = _choose_port(page_port)
     viewer = Viewer(port, ("--serve-web", "--web-viewer-port", str(page_port), *options))
-    viewer.page = (
-        f"http://127.0.0.1:{page_port}/?url={quote(f'rerun+http://{viewer.address}/proxy', '')}"
-    )
-    viewer.wait_until_ready()
+    page = f"127.0.0.1:{page_port}"
+    viewer.page = f"http://{page}/?url={quote(f'rerun+http://{viewer.address}/proxy', '')}"
+    viewer.wait_until_ready(page)
     return viewer

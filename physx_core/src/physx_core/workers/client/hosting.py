@@ -49,7 +49,7 @@ class _Hosting:
 
     def run(self) -> None:
         """Obey the server until it ends the run, then give the workers time to exit."""
-        self._say("waits for instances to run")
+        self._say("waiting for instances to run")
         self._link.send(pack(Kind.HOST, encode(socket.gethostname())))
         while (patience := self._obey()) is None:
             self._report()
@@ -98,7 +98,7 @@ class _Hosting:
             self._tell_end(ticket, _NO_START, str(error))
             return
         self._workers[ticket] = worker
-        self._say(f"runs instance {number}, and {len(self._workers) - 1} others")
+        self._say(f"running instance {number}, {len(self._workers)} in total")
 
     def _report(self) -> None:
         """Tell the server which workers ended."""

@@ -49,7 +49,7 @@ def run_client(
         Exit status of the process: 0 once the run has ended, 1 if the environment failed (the
         server knows why) or the server is gone.
     """
-    say(f"looks for the server at {address}")
+    say(f"connecting to the server at {address}")
     link, setup = join(address, token, instance or 0, patience)
     try:
         if setup is None:
@@ -75,7 +75,7 @@ def _serve(link: WorkerLink, setup: dict[str, Any], say: Callable[[str], None]) 
     _take_place(setup.pop("path"), setup.pop("directory"))
     again = skip["rows"] - skip["made"]
     say(
-        f"runs {setup['environment']}, instance {setup['instance_id']} of {setup['instance_nb']}"
+        f"running {setup['environment']}, instance {setup['instance_id']} of {setup['instance_nb']}"
         + (f"; {again} stored rows are generated again" if again else "")
     )
     link.spins = has_core_for_each(setup["instance_nb"])
