@@ -20,26 +20,37 @@ OTHERS = {"compare", "jiminy_zoo", "many_clients", "remote_servers", "robots", "
 FENCE = "<!-- not run: benchmarks take minutes -->\n```sh"
 
 
+LEARNED = [f"learning_{env}" for env in ("Cartpole", "Acrobot", "Ant", "Quadruped", "PushBox")]
+"""Parts of `learning`, which takes more than an hour: each environment is run, and kept, alone."""
+
+
 def names() -> list[str]:
-    """Return the names of all benchmarks."""
+    """Return the names of all benchmarks, and of the parts of `learning` in its place."""
     found = {
         path.stem
         for path in BENCHMARKS.glob("*.py")
         if '__name__ == "__main__"' in path.read_text(encoding="utf-8")
     }
-    return sorted(found - OTHERS)
+    listed = sorted(found - OTHERS)
+    place = listed.index("learning")
+    return [*listed[:place], *LEARNED, *listed[place + 1 :]]
 
 
 def run(name: str) -> int:
-    """Run a benchmark and return its exit status."""
-    return PAGE.keep(name, [sys.executable, str(BENCHMARKS / f"{name}.py")])
+    """Run a benchmark, or a part of one, and return its exit status."""
+    benchmark, _, env = name.partition("_") if name in LEARNED else (name, "", "")
+    words = ["--env", f"physx/{env}-v0"] if env else []
+    return PAGE.keep(name, [sys.executable, str(BENCHMARKS / f"{benchmark}.py"), *words])
 
 
 def section(name: str) -> str:
-    """Return a benchmark's section of the page."""
-    source = (BENCHMARKS / f"{name}.py").read_text(encoding="utf-8")
+    """Return a benchmark's section of the page; of its further parts, only what they printed."""
+    if name in LEARNED[1:]:
+        return PAGE.printed(name)
+    benchmark = "learning" if name in LEARNED else name
+    source = (BENCHMARKS / f"{benchmark}.py").read_text(encoding="utf-8")
     told = ast.get_docstring(ast.parse(source)) or ""
-    return f"### {name}\n\n{kept.markdown(told, FENCE)}\n\n{PAGE.printed(name)}"
+    return f"### {benchmark}\n\n{kept.markdown(told, FENCE)}\n\n{PAGE.printed(name)}"
 
 
 CLAIMS = {
@@ -91,14 +102,17 @@ UNITS = {"reward": "reward", "speed": "speed in m/s", "success": "share of succe
 
 def learned() -> str:
     """Return the table of docs/gym.md: what the policies of `learning` reached."""
-    text = (HERE / "figures" / "learning.txt").read_text(encoding="utf-8")
     rows = [
         "| environment | range over seeds | on DART | on Pinocchio | training, s |",
         "|---|---|---|---|---|",
     ]
-    for env, found in re.findall(r"^(physx/\S+), PPO on dart: (.*?)target", text, re.M | re.S):
-        times = [int(seconds) for seconds in re.findall(r"^\d+ on dart +(\d+) ", found, re.M)]
-        ranges = re.findall(r"^(?:dart|pinocchio): (\w+) (\S+) to (\S+) over", found, re.M)
+    for name in LEARNED:
+        found = (HERE / "figures" / f"{name}.txt").read_text(encoding="utf-8")
+        [env] = re.findall(r"^(physx/\S+), PPO on dart:", found, re.MULTILINE)
+        times = [
+            int(seconds) for seconds in re.findall(r"^\d+ on dart +(\d+) ", found, re.MULTILINE)
+        ]
+        ranges = re.findall(r"^(?:dart|pinocchio): (\w+) (\S+) to (\S+) over", found, re.MULTILINE)
         spans = " | ".join(f"{float(low):.3g} to {float(high):.3g}" for _, low, high in ranges)
         rows.append(f"| {env} | {UNITS[ranges[0][0]]} | {spans} | {min(times)} to {max(times)} |")
     return "\n".join(rows)
