@@ -313,18 +313,25 @@ def _restarts(subject: Subject) -> None:
 
 def _stubborn(subject: Subject) -> None:
     _by_hand(subject)
-    mark = secrets.token_hex(16)
-    config = _config(subject, "Stubborn", env_kwargs={"mark": mark}, timeout=1.0)
-    try:
-        with ClientSource(config, Services(), _SEED, total=_ROWS) as source:
-            expect(len(_marked(mark)) >= 2, "the clients' own processes are not running")
-            source.batch(_ROWS)
-    except ClientError:
+    mark, error = secrets.token_hex(16), None
+    for timeout in (1.0, 20.0):  # clients start slowly on a busy machine
+        config = _config(subject, "Stubborn", env_kwargs={"mark": mark}, timeout=timeout)
+        started = False
+        try:
+            with ClientSource(config, Services(), _SEED, total=_ROWS) as source:
+                expect(len(_marked(mark)) >= 2, "the clients' own processes are not running")
+                started = True
+                source.batch(_ROWS)
+        except ClientError as caught:
+            error = caught
+        except PhysxError as caught:
+            raise AssertionError(f"a client that hangs is reported as {caught}") from caught
+        else:
+            raise AssertionError("a client that hangs produced rows")
         _expect_gone(mark, "the end of a run whose clients hang and ignore SIGTERM")
-        return
-    except PhysxError as error:
-        raise AssertionError(f"a client that hangs is reported as {error}") from error
-    raise AssertionError("a client that hangs produced rows")
+        if started:
+            return
+    raise AssertionError(f"the clients did not start: {error}")
 
 
 def _quiet(subject: Subject) -> None:
