@@ -405,7 +405,7 @@ def test_either_side_that_is_killed_is_noticed_by_the_other(
         server = subprocess.Popen([sys.executable, "-c", program], stderr=subprocess.DEVNULL)
         try:
             client = join(f"{here}:{port}", another_machine.prefix)
-            while "runs" not in client.stdout.readline():
+            while "running" not in client.stdout.readline():
                 assert client.poll() is None
         finally:
             server.kill()
