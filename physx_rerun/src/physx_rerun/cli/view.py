@@ -39,13 +39,18 @@ class View:
 
 
 def run(words: Sequence[str]) -> None:
-    """Show the recording until its window is closed or Ctrl-C is pressed."""
+    """Show the recording until its window is closed or Ctrl-C is pressed.
+
+    Raises:
+        VisualizerError: If there is no recording, or if the viewer does not start or fails.
+    """
     options = tyro.cli(View, args=words, prog="physx view")
     with recording_of(options.place) as path:
         viewer = _open(path.resolve(), options)
         try:
             with contextlib.suppress(KeyboardInterrupt):  # the usual way to stop it
-                viewer.process.wait()
+                if viewer.process.wait():
+                    viewer.check()
         finally:
             viewer.end()
 
@@ -62,5 +67,4 @@ def _open(recording: Path, options: View) -> Viewer:
         )
     viewer = Viewer(options.port, (str(recording),))
     viewer.wait_until_ready()
-    viewer.check(wait=1.0)  # it listens before its window opens
     return viewer
