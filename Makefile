@@ -7,7 +7,7 @@
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 DEMO_ARGS ?=
-PYTEST_ARGS ?= -n 4 --dist worksteal
+PYTEST_ARGS ?= -n 3 --dist worksteal
 BIN := .venv/bin
 PACKAGES := -e ./physx_core -e "./physx_dart[robots]" -e "./physx_torch[export]" -e ./physx_rerun -e ./physx_gym -e ./physx_remote -e ./physx_cluster
 PROJECTS := $(wildcard physx_*/pyproject.toml) constraints.txt
