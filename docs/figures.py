@@ -120,7 +120,7 @@ def learned() -> str:
 
 def tables() -> dict[Path, str]:
     """Return the tables that pages show between the marks of `with_table`."""
-    short, long = ["| | physx / bare loop |", "|---|---|"], ["| | | benchmark |", "|---|---|---|"]
+    short, long = ["| | physx / baseline |", "|---|---|"], ["| | | benchmark |", "|---|---|---|"]
     for place, (text, (name, *values)) in enumerate(CLAIMS.items()):
         numbers = ", ".join(value(name, of) for of in values)
         long.append(f"| {text} | {numbers} | {name} |")

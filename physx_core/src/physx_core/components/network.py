@@ -119,8 +119,9 @@ class Network(ABC):
         }
         if missing:
             raise FieldsMismatchError(
-                f"{type(self).__name__} needs other fields. Name those that it reads and is "
-                "compared with in network_kwargs, net_fields and opt_fields",
+                f"{type(self).__name__} needs fields that the samples lack. Name its inputs and "
+                "targets with net_fields and opt_fields in network_kwargs "
+                '(--network.network-kwargs "net_fields=[a,b]" opt_fields=c)',
                 missing,
             )
 
