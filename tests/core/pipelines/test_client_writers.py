@@ -165,7 +165,10 @@ def test_runs_add_to_each_other(nothing_stays_behind):
 # Failures ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("step", [pytest.param(0, marks=pytest.mark.faults), 3])
+@pytest.mark.parametrize(
+    "step",
+    [pytest.param(0, marks=pytest.mark.faults), 3, pytest.param(29, marks=pytest.mark.faults)],
+)
 def test_a_client_that_was_killed_continues_its_partitions(step, nothing_stays_behind):
     wanted = rows(generate("server", "server", size=40))
     arguments = {"dies": (2, step)}

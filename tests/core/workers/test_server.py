@@ -27,7 +27,7 @@ def test_strangers_do_not_disturb_a_run(clients, port):
                     talked.append(1)
                     if listen:
                         connection.recv(1000)
-                    stop_it.wait(0.01 if listen else 0.3)
+                    stop_it.wait(0.001 if listen else 0.3)
             except OSError:
                 stop_it.wait(0.01)
 
