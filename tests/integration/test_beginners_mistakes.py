@@ -876,7 +876,7 @@ def gives_a_network_no_layers():
     train(of("torch/fc", **ADAM))
 
 
-@mistake(e.FieldsMismatchError, "input: missing", "network_kwargs, net_fields and opt_fields")
+@mistake(e.FieldsMismatchError, "input: missing", "net_fields and opt_fields in network_kwargs")
 def names_no_fields():
     train(of("torch/fc", network_kwargs={"layers": [2, 8, 2]}, **ADAM))
 
