@@ -60,7 +60,6 @@ class Cloud(Environment):
         points = self.rng.random((POINTS, 3)) if stored is None else stored["points"]
         self.set_training_data(points=points)
         self.factory.update_points("points", positions=points)
-        self.update_visualization()
 
 
 class Film:

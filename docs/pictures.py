@@ -102,12 +102,7 @@ def play(environment: Any, number: int, steps: int) -> Iterator[list[Event]]:
         number: Number of the instance, counted from 1.
         steps: Number of steps.
     """
-
-    class Alone(environment):  # type: ignore[misc]
-        def update_visualization(self) -> None:
-            """Leave the events to the caller."""
-
-    env = Alone(instance_id=number, seed=3)
+    env = environment(instance_id=number, seed=3)
     try:
         env.create()
         env.init()

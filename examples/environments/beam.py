@@ -73,4 +73,3 @@ class Beam(Environment):
         places, vectors = self.rest + self.exact.reshape(-1, 3) / 1e3, self.forces.reshape(-1, 3)
         self.factory.update_arrows("forces", positions=places, vectors=0.1 * vectors)
         self.factory.update_scalars("error", errors / np.linalg.norm(self.exact))
-        self.update_visualization()

@@ -63,7 +63,6 @@ class Cloud(Environment):
         self.factory.update_lines("spread", positions=list(self.lines(self.spread)))
         guess = self.lines(prediction["prediction"])
         self.factory.update_lines("guess", positions=list(guess))
-        self.update_visualization()
 
 
 def network(width: int = 128) -> NetworkConfig:

@@ -110,6 +110,8 @@ def drive():
             made.step()
             samples.append(made.take_sample())
             assert made.check_sample()
+            if made.factory.has_events:
+                made.update_visualization()
             made.step_index += 1
             if predict is not None:
                 made.apply_prediction(predict(samples[-1]))

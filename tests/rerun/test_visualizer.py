@@ -118,6 +118,14 @@ def test_nobody_listens(opened):
     assert visualizer.file.is_file()
 
 
+def test_an_environment_that_draws_nothing_is_named(opened, tmp_path):
+    visualizer = opened()
+    visualizer.events(1, 0, [])
+    with pytest.warns(UserWarning, match=r"draws nothing: add objects .* init_visualization"):
+        visualizer.close()
+    assert not list(tmp_path.rglob("*.rrd")) and not visualizer.outputs()
+
+
 def test_nothing_is_drawn_nor_written_in_the_mode_none(opened, tmp_path):
     visualizer = opened(mode="none")
     ball(visualizer)

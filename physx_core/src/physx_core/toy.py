@@ -108,7 +108,6 @@ class Spring(Environment):
         if self.predicted is not None:
             self.factory.update_sphere("prediction", position=[self.predicted[0], 0, 0])
         self.factory.update_lines("spring", positions=[[-3, 0, 0], [position, 0, 0]])
-        self.update_visualization()
 
 
 class Linear(Network):

@@ -8,6 +8,7 @@ import contextlib
 import re
 import shlex
 import time
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -88,7 +89,7 @@ class RerunVisualizer(Visualizer):
     def _reset(self) -> None:
         self.viewer: Viewer | None = None
         self._offscreen: OffscreenViewer | None = None
-        self._step, self._pictures = 0, 0
+        self._step, self._pictures, self._has_drawn = 0, 0, False
         self.file: Path | None = None
         self._announcements: list[str] = []
         self._outputs: list[str] = []
@@ -190,6 +191,7 @@ class RerunVisualizer(Visualizer):
         if clock is None:
             clock = self._clocks[instance_id] = SimulatedClock()
         events = clock.read(events)
+        self._has_drawn = self._has_drawn or bool(events)
         if self.every > 1:
             changes = self._changes.setdefault(instance_id, Changes())
             if changes.add(step, events) and step % self.every:
@@ -289,6 +291,12 @@ class RerunVisualizer(Visualizer):
             if self.mode == "web" and self.viewer is not None:
                 self.viewer.end()
         if self._recording is None:
+            if self._clocks and not self._has_drawn:
+                warnings.warn(
+                    "Nothing was recorded, as the environment draws nothing: add objects to its "
+                    "factory in init_visualization().",
+                    stacklevel=2,
+                )
             return
         self._recording = self._offscreen = None
         if self.file is None:

@@ -198,6 +198,29 @@ class Applying(Doubling):
         self.applied = int(1e6 * prediction["y"].item())
 
 
+class LeavesDrawn(Doubling):
+    """Draws in every method that may, and sends itself what it draws in every third step."""
+
+    def init_visualization(self):
+        self.factory.add_sphere("x", 0.1)
+        self.factory.add_text("told", "nothing")
+
+    def step(self):
+        super().step()
+        if self.step_index != 3:
+            self.factory.update_sphere("x", position=[self.step_index, 0, 0])
+        if self.step_index % 3 == 1:
+            self.update_visualization()
+
+    def check_sample(self):
+        if self.step_index == 4:
+            self.factory.update_text("told", "checked")
+        return self.step_index != 2
+
+    def apply_prediction(self, prediction):
+        self.factory.update_text("told", f"applied {len(prediction)}")
+
+
 class Broken(Doubling):
     """Fails in one method, and then cannot be closed either."""
 

@@ -76,6 +76,37 @@ def test_all_that_an_environment_does_is_the_same_over_tcp(
     assert any(row["last"].any() for row in rows) == apply
 
 
+@pytest.mark.parametrize("sub_steps", [1, 2])
+def test_what_an_environment_leaves_drawn_is_shown(local, clients, services, sub_steps):
+    for make in (local, lambda *a, **k: clients(*a, run_ahead=0, **k)):
+        services.shown = []
+        settings = {"visualizer": "any", "simulations_per_step": sub_steps}
+        with make(f"{ENVS}:LeavesDrawn", **settings) as source:
+            for _ in range(5):
+                source.batch(1)
+                source.apply({"y": np.zeros((1, 1))})
+        drawn = [
+            (step, [(event.action, event.kind) for event in events])
+            for _, step, events in services.shown
+        ]
+        ball, text = ("update", "sphere"), ("update", "text")
+        own = [(1, [ball])] * sub_steps  # those that it sends itself come from sub-steps, too
+        assert drawn == [
+            (0, [("add", "sphere"), ("add", "text")]),
+            (0, [ball]),
+            (1, [text]),  # drawn by a prediction, that is between two steps
+            *own,
+            (2, [text]),
+            (2, [ball]),  # of a sample that is rejected; there is nothing in step 3
+            (4, [text]),
+            *[(4, [ball])] * sub_steps,
+            (4, [text]),  # drawn by check_sample
+            (5, [text]),
+            (5, [ball]),
+            (6, [text]),
+        ]
+
+
 @pytest.mark.parametrize("method", ["create", "step"])
 def test_the_error_that_is_told_is_the_first_one(local, clients, method):
     for make in (local, clients):

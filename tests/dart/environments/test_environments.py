@@ -222,8 +222,7 @@ def test_stored_samples_are_replayed(environment, options, drive):
     shown = watch(viewer)
     for sample in stored:
         viewer.sample = sample
-        viewer.step()
-        replayed = viewer.take_sample()
+        (replayed,) = drive(viewer, 1)
         for name, value in sample.items():
             np.testing.assert_array_equal(replayed[name], value)
     assert len(shown) == 6

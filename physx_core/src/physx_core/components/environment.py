@@ -322,7 +322,10 @@ class Environment(Closeable):
         return self._run().load_parameters(self.instance_id)
 
     def update_visualization(self) -> None:
-        """Send the drawing events that `factory` collected since the last call to the viewers."""
+        """Send the drawing events that `factory` collected since the last call to the viewers.
+
+        physx calls it after `step` and `apply_prediction`; call it to show more in between.
+        """
         if self.factory:
             if self.step_time is not None:
                 self.factory.set_time(self.step_index * self.step_time)

@@ -259,6 +259,7 @@ class Instance(Closeable):
                 accepted = environment.check_sample()
                 if accepted is not True:
                     accepted = _verdict(accepted)
+                self._show(environment)
             except Exception as error:
                 raise self._failure(method, error) from error
             if stored is not None and not environment._has_read_sample:
@@ -283,6 +284,7 @@ class Instance(Closeable):
         """
         environment = self._alive()
         self._call("apply_prediction", environment.apply_prediction, PredictedFields(prediction))
+        self._show(environment)
 
     def close(self) -> None:
         """Close the environment; further calls do nothing.
@@ -314,6 +316,11 @@ class Instance(Closeable):
         for _ in range(self._sub_steps):
             self._finish(environment.step())
         environment.compute_training_data = True
+
+    def _show(self, environment: Environment) -> None:
+        """Send what the environment drew and did not send itself."""
+        if environment.factory.has_events:
+            environment.update_visualization()
 
     def _reject(self, sample: dict[str, Any], wrong: int) -> None:
         """Record a rejected sample, the `wrong`-th in a row; raise if there are too many."""

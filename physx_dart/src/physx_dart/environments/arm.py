@@ -164,7 +164,6 @@ class ArmEnvironment(Environment):
         self._steps += 1
         if self.factory and self._steps % self.draw_every == 0:
             self._draw_robots()
-            self.update_visualization()
 
     def apply_prediction(self, prediction: Sample) -> None:
         """Add a predicted torque to the controller during the next control period.

@@ -85,7 +85,6 @@ class DoublePendulumEnvironment(Environment):
             self._simulate()
         if self.factory:
             self.factory.update_robot("pendulum", poses=self.simulation.body_poses())
-            self.update_visualization()
 
     def close(self) -> None:
         """Free the simulation."""

@@ -27,8 +27,9 @@ _SEEN_AS = {"markers": "symbols"}
 class Factory:
     """Collects drawing events of an environment.
 
-    Add objects in `Environment.init_visualization`, change them in `Environment.step`, then call
-    `Environment.update_visualization`. Objects are identified by their names.
+    Add objects in `Environment.init_visualization`, change them in `Environment.step` or
+    `Environment.apply_prediction`; what they changed is shown when they return. Objects are
+    identified by their names.
     Lengths are in m, positions in the world frame; orientations are quaternions x, y, z, w.
 
     All objects in space have ``color`` (a CSS color name, ``"#rrggbb"``, or red, green and blue in
@@ -48,6 +49,11 @@ class Factory:
     def __bool__(self) -> bool:
         """Return whether what is drawn is visible."""
         return True
+
+    @property
+    def has_events(self) -> bool:
+        """Whether `take_events` would return any."""
+        return bool(self._events) or self._moves is not None
 
     def take_events(self) -> list[Event]:
         """Return and clear the events since the last call."""
