@@ -71,7 +71,7 @@ def main() -> int:
             follow(f"PD + network, width {width}", predicted(training.learner))
     follow(EXACT, "model")
     draw(show(session, training.session.name, steps), chosen.picture, steps)
-    what = {"what": "error in mrad, by seed", "form": ".3f", "references": [EXACT]}
+    what = {"what": "error in mrad", "form": ".3f", "references": [EXACT]}
     return int(verdict(errors, NETWORK, **what) and not chosen.small)
 
 

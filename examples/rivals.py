@@ -39,10 +39,10 @@ def relative_error(guess: np.ndarray, exact: np.ndarray) -> float:
 def table(
     errors: Mapping[str, Sequence[float]], what: str = "relative error", form: str = ".2%"
 ) -> None:
-    """Print the mean and the worst of each candidate's errors."""
-    print(f"\n{what:28}{'mean':>10}{'worst':>10}")
+    """Print each candidate's mean error over the seeds, and that of its worst seed."""
+    print(f"\n{what:28}{'mean':>10}{'worst seed':>12}")
     for name, found in errors.items():
-        print(f"{name:28}{np.mean(found):>10{form}}{max(found):>10{form}}")
+        print(f"{name:28}{np.mean(found):>10{form}}{max(found):>12{form}}")
 
 
 def verdict(
@@ -61,5 +61,6 @@ def verdict(
     others = errors.keys() - {network, *references}
     means = {name: np.mean(errors[name]) for name in errors if name in others}
     rival = min(means, key=means.get)
-    print(f"\n{network} by the best rival, {rival}: {np.mean(errors[network]) / means[rival]:.2f}")
+    ratio = np.mean(errors[network]) / means[rival]
+    print(f"\n{network}: {ratio:.2f} times the error of the best rival, {rival}")
     return int(max(errors[network]) >= means[rival])

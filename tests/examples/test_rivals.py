@@ -46,7 +46,8 @@ def test_the_worst_seed_has_to_beat_the_mean_of_the_best_rival(
     options = {"what": "error in m", "form": ".2f", "references": references}
     assert rivals.verdict(errors, "network", **options) == status
     lines = capsys.readouterr().out.splitlines()
-    assert lines[1].split() == ["error", "in", "m", "mean", "worst"]
+    assert lines[1].split() == ["error", "in", "m", "mean", "worst", "seed"]
     assert ["linear", "0.30", "0.40"] in [line.split() for line in lines]
     best = "linear" if references else "truth"
-    assert lines[-1].startswith(f"network by the best rival, {best}: ")
+    assert lines[-1].startswith("network: ")
+    assert lines[-1].endswith(f" times the error of the best rival, {best}")

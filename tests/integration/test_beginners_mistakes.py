@@ -519,9 +519,14 @@ def of(network, **options):
     return NetworkConfig(network, **options)
 
 
-@mistake(e.DatasetNotFoundError, "sessions/kepd")
+@mistake(e.DatasetNotFoundError, "sessions/kepd", 'Did you mean "kept"', "contains: ")
 def misspells_the_dataset():
     train(data=DatasetConfig(existing_dir="sessions/kepd"))
+
+
+@mistake(e.DatasetNotFoundError, "sesions does not exist", 'Did you mean "sessions"')
+def misspells_the_folder_of_the_dataset():
+    train(data=DatasetConfig(existing_dir="sesions/kept"))
 
 
 @mistake(e.DatasetError, 'no samples of mode "validation"', "It has: training")
@@ -879,6 +884,12 @@ def gives_a_network_no_layers():
 @mistake(e.FieldsMismatchError, "input: missing", "net_fields and opt_fields in network_kwargs")
 def names_no_fields():
     train(of("torch/fc", network_kwargs={"layers": [2, 8, 2]}, **ADAM))
+
+
+@mistake(e.FieldsMismatchError, "stat: missing; there are ", 'Did you mean "state"')
+def misspells_a_field_of_the_network():
+    named = {"net_fields": "stat", "opt_fields": "next_state"}
+    train(of("torch/fc", network_kwargs={"layers": [2, 8, 2], **named}, **ADAM))
 
 
 @mistake(e.ConfigError, "A training needs a loss", "--network.loss MSELoss")

@@ -134,8 +134,8 @@ class PluginNotFoundError(PhysxError):
     def __init__(self, name: str, installed: Sequence[str], hint: str) -> None:
         self.name, self.installed = name, list(installed)
         super().__init__(
-            f'No plugin "{name}" is installed. Installed: {listed(installed)}.'
-            f"{nearest(name, installed)} {hint}"
+            f'No plugin "{name}" is installed.{nearest(name, installed)} '
+            f"Installed: {listed(installed)}. {hint}"
         )
 
 

@@ -149,6 +149,13 @@ class Deaf(Environment):
         self.set_training_data(**inputs)
 
 
+class Breaks(Deaf):
+    def step(self):
+        if self.step_index:
+            raise ValueError("broken")
+        super().step()
+
+
 class Hears(Deaf):
     def apply_prediction(self, prediction):
         self.prediction = prediction
@@ -246,6 +253,16 @@ def test_a_visualizer_announces_its_screen_and_its_files_even_if_it_failed(fails
     lines = said()
     assert lines[:2] == ["session: sessions/spring", "screen: of spring"]
     assert "film: there.gif" in lines
+
+
+def test_a_prediction_that_failed_is_not_said_to_be_unused(said):
+    train(generate().session.path)
+    said()
+    config = EnvironmentConfig(Breaks, as_tcp_ip_client=False, visualizer=Filming)
+    with pytest.raises(EnvironmentFailedError):
+        Prediction(NetworkConfig(), config, step_nb=2).execute()
+    lines = said()
+    assert "film: there.gif" in lines and UNUSED not in lines
 
 
 def test_a_quiet_run_says_nothing(said):

@@ -19,6 +19,7 @@ from physx_core.errors import (
     FieldsMismatchError,
     UsageError,
     listed,
+    nearest,
 )
 from physx_core.fields import Field, is_finite
 from physx_core.typing import Batch, Tensors
@@ -113,7 +114,7 @@ class Network(ABC):
             FieldsMismatchError: If a field is missing, or its shape does not fit the network.
         """
         missing = {
-            name: f"missing; there are {listed(fields)}"
+            name: f"missing; there are {listed(fields)}.{nearest(name, fields)}"
             for name in (*self.net_fields, *self.opt_fields)
             if name not in fields
         }

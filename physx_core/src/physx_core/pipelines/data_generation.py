@@ -163,7 +163,7 @@ class DataGeneration(NewSessionPipeline):
             stripes=stripes,
         )
 
-    def _results(self) -> Iterable[str]:
+    def _results(self, error: BaseException | None) -> Iterable[str]:
         count, duration = self.batch_id, self._duration
         rate = count * self.batch_size / duration
         yield f"{count} of {self.batch_nb} batches in {duration:.2f} s, {rate:.0f} samples/s"

@@ -85,8 +85,12 @@ class Pipeline(ABC):
         """Return lines on what the run, now open, is about to do."""
         return ()
 
-    def _results(self) -> Iterable[str]:
-        """Return lines on what the run did and stored, even if it failed."""
+    def _results(self, error: BaseException | None) -> Iterable[str]:
+        """Return lines on what the run did and stored.
+
+        Args:
+            error: What ended the run; None: it finished.
+        """
         return ()
 
     def _next(self, error: BaseException | None) -> Iterable[str]:
@@ -155,7 +159,7 @@ class Pipeline(ABC):
             self._say(f"session: {self.session.path} was removed: the run stored nothing in it")
             return
         commands = (f"next: {command}" for command in self._next(error))
-        self._say(*self._results(), *outputs, *commands)
+        self._say(*self._results(error), *outputs, *commands)
 
     def _say(self, *lines: str) -> None:
         """Print lines to stderr, in the process that writes the session."""

@@ -203,11 +203,16 @@ class Prediction(Pipeline):
         if self.step_nb < 0:
             yield "runs until Ctrl-C; step_nb (--step-nb) limits the number of steps"
 
-    def _results(self) -> Iterable[str]:
+    @property
+    def _is_without_effect(self) -> bool:
+        """Whether nothing used the predictions; what subclasses do with them is unknown."""
+        return type(self) is Prediction and not self._is_asked and self.source.ignores_predictions
+
+    def _results(self, error: BaseException | None) -> Iterable[str]:
         yield f"{self.step_id} steps with {self.learner.config.network}"
         if self.dataset is not None:
             yield describe_samples(self.dataset.directory)
-        elif type(self) is Prediction and not self._is_asked and self.source.ignores_predictions:
+        elif error is None and self._is_without_effect:
             yield (
                 "nothing used the predictions: the environment does not define apply_prediction, "
                 "and record (--record) is off"

@@ -143,7 +143,7 @@ class Replay(NewSessionPipeline):
             accept_all=True,
         )
 
-    def _results(self) -> Iterable[str]:
+    def _results(self, error: BaseException | None) -> Iterable[str]:
         environment = self.environment_config
         yield f"{self.step_id} steps of {to_plain(environment)['environment']}"
 

@@ -572,7 +572,7 @@ class Training(NewSessionPipeline):
             total, each, count = self.batch_size * self.group.size, self.batch_size, self.group.size
             yield f"batches of {total} samples, {each} in each of {count} processes"
 
-    def _results(self) -> Iterable[str]:
+    def _results(self, error: BaseException | None) -> Iterable[str]:
         yield f"{self.epoch_id} of {self.epoch_nb} epochs in {self._duration:.2f} s"
         if self.epoch_id > self._resumed.epoch:
             yield f"training loss {self.training_loss:.6g}"

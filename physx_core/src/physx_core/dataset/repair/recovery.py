@@ -26,7 +26,13 @@ from physx_core.dataset.store.partition.format import (
     open_partition,
 )
 from physx_core.dataset.store.sealing import remove_files, scan, seal, sync_files
-from physx_core.errors import DatasetError, DatasetNotFoundError, FieldsMismatchError, listed
+from physx_core.errors import (
+    DatasetError,
+    DatasetNotFoundError,
+    FieldsMismatchError,
+    listed,
+    nearest,
+)
 from physx_core.fields import Field
 
 _ATTEMPTS = 20
@@ -44,9 +50,15 @@ def locate(directory: str | Path) -> Path:
     if given.is_file():
         what = "It is a file: give the folder of a session or dataset."
     elif not given.is_dir():
-        parent = given.absolute().parent
-        around = [p.name for p in parent.iterdir()] if parent.is_dir() else []
-        what = f"The folder does not exist. {parent} contains: {listed(around)}."
+        missing = given.absolute()
+        while not missing.parent.is_dir():
+            missing = missing.parent
+        around = [path.name for path in missing.parent.iterdir() if path.is_dir()]
+        meant = nearest(missing.name, around)
+        what = (
+            f"The folder {missing} does not exist.{meant} "
+            f"{missing.parent} contains: {listed(around)}."
+        )
     else:
         what = f"The folder contains: {listed(p.name for p in given.iterdir())}."
     raise DatasetNotFoundError(f"There is no dataset in {given}. {what}")
