@@ -20,6 +20,9 @@ from hypothesis import HealthCheck, settings
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 sys.dont_write_bytecode = False
 
+# The processors are busy with other tests: more threads would only be in their way.
+os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 # Tests write gigabytes, most of them synced: in memory, where there is room for them.
 MEMORY = Path("/dev/shm")
 if (

@@ -1,4 +1,3 @@
-import os
 import subprocess
 import sys
 from pathlib import Path
@@ -181,7 +180,6 @@ def test_everything_runs_without_a_script_file(tmp_path, how):
         [sys.executable, *words],
         input=text,
         cwd=tmp_path,
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
         capture_output=True,
         text=True,
         timeout=60,

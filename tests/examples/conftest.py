@@ -35,7 +35,7 @@ def run(tmp_path):
         return subprocess.run(
             [sys.executable, *map(str, words)],
             cwd=cwd,
-            env={"OMP_NUM_THREADS": "1", "MPLBACKEND": "agg", **os.environ},
+            env={"MPLBACKEND": "agg", **os.environ},
             capture_output=True,
             text=True,
             timeout=600,

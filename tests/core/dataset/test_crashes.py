@@ -139,7 +139,7 @@ def test_a_reader_beside_a_writer_sees_only_committed_rows(tmp_path):
 
 @pytest.mark.faults
 def test_a_reader_beside_a_writer_for_a_while(tmp_path, record_property):
-    record_property("opened", read_beside_a_writer(tmp_path, 15))
+    record_property("opened", read_beside_a_writer(tmp_path, 8))
 
 
 # Full disks -------------------------------------------------------------------------------------

@@ -159,7 +159,7 @@ def test_new_rows_are_seen_after_refresh(tmp_path):
 
 
 @pytest.mark.parametrize("large", [False, True])
-@pytest.mark.parametrize("seconds", [2, pytest.param(15, marks=pytest.mark.faults)])
+@pytest.mark.parametrize("seconds", [2, pytest.param(8, marks=pytest.mark.faults)])
 def test_reading_while_another_process_writes(tmp_path, seconds, large):
     folder, enough = tmp_path / "dataset", tmp_path / "enough"
     words = [sys.executable, "-c", WRITER, str(folder), str(enough), *(["large"] * large)]

@@ -46,7 +46,7 @@ from physx_core.errors import DatasetError
 
 FIELDS = [Field("n", (), "int64"), Field("x", (3,), unit="m"), Field("f", (), "bool")]
 QUICK = settings(database=None, deadline=None, max_examples=4, stateful_step_count=30)
-LONG = settings(QUICK, max_examples=10, stateful_step_count=50)
+LONG = settings(QUICK, max_examples=5, stateful_step_count=50)
 SYNCED = {}  # by a file's inode: see `sync`
 
 

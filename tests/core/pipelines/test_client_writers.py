@@ -295,7 +295,7 @@ def test_runs_that_are_killed_at_any_moments(run_killed, nothing_stays_behind):
             duration * chance.uniform(0.3, 1.0),
             wanted,
         )
-        for number in range(10)
+        for number in range(5)
     ]
     assert max(left) > 0
 

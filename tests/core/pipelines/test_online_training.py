@@ -406,7 +406,7 @@ def test_a_training_that_is_killed_while_environments_generate_is_resumed_bit_fo
 @pytest.mark.faults
 @pytest.mark.parametrize(
     ("words", "kills"),
-    [(("clients", "once", "fifo"), 20), (("clients", "always", "stream"), 10)],
+    [(("clients", "once", "fifo"), 10), (("clients", "always", "stream"), 5)],
     ids=["clients once fifo", "clients always stream"],
 )
 def test_a_training_survives_being_killed_at_many_moments(words, kills, run_killed):

@@ -105,7 +105,7 @@ def test_any_history_gives_the_same_rows(
 
 @pytest.mark.slow
 @pytest.mark.faults
-@settings(max_examples=8, **OPTIONS)
+@settings(max_examples=5, **OPTIONS)
 @given(st.lists(ACTION, min_size=5, max_size=12), st.booleans())
 def test_any_long_history_gives_the_same_rows(
     local, by_hand, join, process_ids, taking, said, caplog, history, asks

@@ -27,7 +27,7 @@ ENVS = Path(__file__).parents[1] / "programs" / "worker_envs.py"
 TOKEN = "a token for this test"
 MEGABYTE = 1 << 20
 LONG = pytest.mark.faults
-COUNTS = [3000, pytest.param(50_000, marks=LONG)]
+COUNTS = [3000, pytest.param(20_000, marks=LONG)]
 
 
 @pytest.fixture

@@ -151,7 +151,7 @@ class Arrival(RuleBasedStateMachine):
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 @pytest.mark.parametrize(
-    ("processes", "examples"), [(2, 15), pytest.param(5, 150, marks=pytest.mark.faults)]
+    ("processes", "examples"), [(2, 15), pytest.param(5, 75, marks=pytest.mark.faults)]
 )
 def test_each_goes_its_way_under_any_order_of_calls_and_arrivals(
     mode, processes, examples, nothing_stays_behind

@@ -171,7 +171,7 @@ def test_one_that_is_dropped_ends_its_processes_without_a_warning(nothing_stays_
 @pytest.mark.faults
 def test_processes_killed_at_any_moment(nothing_stays_behind):
     draw = random.Random(0)
-    for _ in range(40):
+    for _ in range(20):
         with vectors() as vector:
             pid = draw.choice(vector.get_attr("pid"))
             threading.Timer(draw.uniform(0.0, 0.05), os.kill, (pid, signal.SIGKILL)).start()

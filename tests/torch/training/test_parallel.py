@@ -1,7 +1,6 @@
 """Two processes that torchrun starts train one network as one process does."""
 
 import csv
-import os
 import runpy
 import shutil
 import signal
@@ -214,7 +213,6 @@ def start(code):
     launcher = ["-m", "torch.distributed.run", "--standalone", "--nproc-per-node=2"]
     return subprocess.Popen(
         [sys.executable, *launcher, "script.py", code],
-        env={**os.environ, "OMP_NUM_THREADS": "1"},
         stdout=subprocess.PIPE,
         stderr=subprocess.STDOUT,
         text=True,
