@@ -9,6 +9,8 @@ PYTHON ?= $(shell command -v python3.11 || command -v python3)
 DEMO_ARGS ?=
 PYTEST_ARGS ?= -n 3 --dist worksteal
 BIN := .venv/bin
+PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check
+COMPILE := $(BIN)/python -m compileall -q -j 0 .venv/lib >/dev/null 2>&1 || true  # pip uses one core
 PACKAGES := -e ./physx_core -e "./physx_dart[robots]" -e "./physx_torch[export]" -e ./physx_rerun -e ./physx_gym -e ./physx_remote -e ./physx_cluster
 PROJECTS := $(wildcard physx_*/pyproject.toml) constraints.txt
 
@@ -59,12 +61,14 @@ clean:
 	$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11) and "physx needs Python 3.11 or later: make PYTHON=...")'
 	@echo Installing into .venv: one to three minutes.
 	$(PYTHON) -m venv .venv
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -c constraints.txt $(PACKAGES)
+	$(PIP) -c constraints.txt $(PACKAGES)
+	$(COMPILE)
 	touch $@
 
 .venv/tools: .venv/packages requirements-dev.txt requirements-nodeps.txt requirements-lerobot.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check -r requirements-dev.txt
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps -r requirements-nodeps.txt
+	$(PIP) -r requirements-dev.txt
+	$(PIP) --no-deps -r requirements-nodeps.txt
 	rm -rf .venv/lerobot
-	$(BIN)/python -m pip install --quiet --disable-pip-version-check --no-deps --target .venv/lerobot -r requirements-lerobot.txt
+	$(PIP) --no-deps --target .venv/lerobot -r requirements-lerobot.txt
+	$(COMPILE)
 	touch $@
