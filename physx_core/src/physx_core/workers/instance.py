@@ -154,6 +154,7 @@ class Instance(Closeable):
         self._max_wrong_samples = max_wrong_samples
         self._accepts_all = accept_all
         self._first_step, self._first_episode = first_step, first_episode
+        self._draws = False
         self._runner: Any = None
 
     @property
@@ -199,6 +200,7 @@ class Instance(Closeable):
                 f"{type(environment).__name__}.init_database() defined no training fields: "
                 "call define_training_fields()."
             )
+        self._draws = draw
         if draw:
             environment.factory = Factory()
             self._call("init_visualization", environment.init_visualization)
@@ -241,10 +243,8 @@ class Instance(Closeable):
         """
         environment = self._alive()
         environment.sample = stored
-        if stored is not None and SET in stored:
-            self._replay(environment, stored)
-        if not environment._has_begun_episodes:
-            self._call("reset_parameters", environment.begin_episodes, self._first_episode)
+        if stored is not None or not environment._has_begun_episodes:
+            self._prepare(environment, stored)
         wrong = 0
         while True:
             method = "step"
@@ -259,7 +259,8 @@ class Instance(Closeable):
                 accepted = environment.check_sample()
                 if accepted is not True:
                     accepted = _verdict(accepted)
-                self._show(environment)
+                if self._draws:
+                    self._show(environment)
             except Exception as error:
                 raise self._failure(method, error) from error
             if stored is not None and not environment._has_read_sample:
@@ -300,6 +301,13 @@ class Instance(Closeable):
             if self._runner is not None:
                 self._runner.close()
                 self._runner = None
+
+    def _prepare(self, environment: Environment, stored: Sample | None) -> None:
+        """Give the environment the parameters of a stored row, and begin its first episode."""
+        if stored is not None and SET in stored:
+            self._replay(environment, stored)
+        if not environment._has_begun_episodes:
+            self._call("reset_parameters", environment.begin_episodes, self._first_episode)
 
     def _replay(self, environment: Environment, stored: Sample) -> None:
         """Give the environment a stored row, and the parameters that it was generated with."""
