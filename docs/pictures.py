@@ -1,6 +1,6 @@
 """Draws the documentation's pictures of environments and examples.
 
-python docs/pictures.py    # writes environments.png, replay.png, examples.png next to this file
+python docs/pictures.py    # writes environments, replay, examples, learn/spring, all .png
 python docs/pictures.py --demo PICTURE    # compares a picture of the demo with its kept film
 """
 
@@ -15,6 +15,7 @@ from typing import Any
 
 import gymnasium
 import numpy as np
+import run_pages
 from PIL import Image
 
 import physx_gym
@@ -182,6 +183,17 @@ def sheet(drawn: dict[str, np.ndarray]) -> Image.Image:
     return Image.fromarray(np.vstack(rows)).quantize(256)
 
 
+def spring() -> np.ndarray:
+    """Return the picture of docs/learn/5_viewer.md, drawn by the code of that page."""
+    pages = [page for page in run_pages.LEARN if page.stem in ("1_environment", "5_viewer")]
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        run_pages.run(pages, folder)
+        recording = folder / "sessions" / "drawn" / "drawn.rrd"
+        path = render_picture(recording, folder / "spring.png", (1000, 560))
+        return np.asarray(Image.open(path).convert("RGB"))
+
+
 def shares(picture: np.ndarray) -> dict[str, float]:
     """Return the share of a picture's pixels that have each of these colors."""
     red, green, blue = np.moveaxis(picture.astype(int), 2, 0)
@@ -219,4 +231,5 @@ if __name__ == "__main__":
     environments(HERE / "environments.png")
     replay(HERE / "replay.png")
     sheet(examples()).save(HERE / "examples.png", optimize=True)
+    Image.fromarray(spring()).quantize(256).save(HERE / "learn" / "spring.png", optimize=True)
     sys.exit(0)

@@ -58,6 +58,16 @@ def test_a_replay_with_contacts_plots_and_a_ghost_is_as_documented(tmp_path):
                 assert PICTURES["shares"](plot)["blue"] > 0.001, path
 
 
+@pytest.mark.faults
+def test_the_picture_of_the_page_about_the_viewer_is_what_its_code_draws():
+    drawn = drawn_or_skipped(PICTURES["spring"])
+    documented = np.asarray(Image.open(DOCS / "learn" / "spring.png").convert("RGB"))
+    assert drawn.shape == documented.shape
+    for picture in (drawn, documented):
+        assert PICTURES["shares"](picture)["orange"] > 0.001
+    assert np.abs(small(drawn) - small(documented)).mean() < 5
+
+
 SCENES = {  # rows and columns in the sheet, and the least shares of the colors of its objects
     "arm": ((30, 290), (0, 330), {"light": 0.01, "green": 0.005}),
     "beam": ((30, 290), (335, 665), {"orange": 0.01, "blue": 0.01, "light": 0.01}),
