@@ -53,7 +53,7 @@ def locate(directory: str | Path) -> Path:
         missing = given.absolute()
         while not missing.parent.is_dir():
             missing = missing.parent
-        around = [path.name for path in missing.parent.iterdir() if path.is_dir()]
+        around = [path.name for path in missing.parent.iterdir()]
         meant = nearest(missing.name, around)
         what = (
             f"The folder {missing} does not exist.{meant} "
