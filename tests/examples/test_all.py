@@ -17,8 +17,6 @@ EXAMPLES = gallery.EXAMPLES
 SCRIPTS = sorted(EXAMPLES.glob("[0-9][0-9]_*.py"))
 QUICK = ("01", "02", "03", "04", "15", "17", "18")
 """Examples that always run; the others run with the campaigns."""
-DEMO = "09_robot_arm"
-"""The example that `.ci/run` runs, and whose picture it checks."""
 SHARED = {path.stem for path in EXAMPLES.rglob("*.py")}
 PRINTED = {  # what an example has to print, as patterns
     "01_generate": (
@@ -87,7 +85,6 @@ def assert_same_film(path, kept):
             path, id=path.stem, marks=() if path.stem.startswith(QUICK) else pytest.mark.faults
         )
         for path in SCRIPTS
-        if path.stem != DEMO
     ],
 )
 def test_an_example_runs_and_draws_its_picture(path, run, tmp_path):
