@@ -4,6 +4,7 @@ import csv
 import math
 import statistics
 from pathlib import Path
+from typing import ClassVar
 
 import numpy as np
 import pytest
@@ -72,6 +73,7 @@ def training(losses, validation=None, *, network=None, **options):
         **(network or {}),
     )
     options = {"epoch_nb": len(losses), "batch_size": 5, "seed": 0, **options}
+    options.setdefault("validation_batch_size", 6)
     return Training(config, DATA, **options)
 
 
@@ -140,6 +142,85 @@ def test_without_validation_epochs_are_judged_by_their_training_loss(data):
     with pipeline:
         pipeline.execute()
         assert pipeline.learner.optimization.judged == [2, 1]
+
+
+class Measured(Linear):
+    """Notes how many rows it predicts at once, and whether it learns from them."""
+
+    def __init__(self, **options):
+        super().__init__(**options)
+        self.trains, self.sizes = False, {True: set(), False: set()}
+
+    def set_train(self):
+        self.trains = True
+
+    def set_eval(self):
+        self.trains = False
+
+    def predict(self, data):
+        self.sizes[self.trains].add(len(data["state"]))
+        return super().predict(data)
+
+
+@pytest.fixture
+def many():
+    """200 samples to learn from, and 3001 to validate with."""
+    rng = np.random.default_rng(0)
+    with Dataset.create("data") as dataset:
+        dataset.append("training", fields(rng, 200))
+        dataset.append("validation", fields(rng, 3001))
+
+
+def measured(**options):
+    """Train for two epochs; return the numbers of rows at once, and the validation losses."""
+    network = NetworkConfig(Measured, data_type="float64")
+    pipeline = Training(network, DATA, epoch_nb=2, batch_size=20, seed=0, **options)
+    with pipeline:
+        pipeline.execute()
+        sizes = pipeline.learner.network.sizes
+    return sizes[False], recorded(pipeline.session.path.name)["loss/validation"]
+
+
+def test_a_validation_takes_as_many_rows_at_once_as_the_training(many):
+    sizes, losses = measured()
+    assert sizes == {20, 1}
+    alone, expected = measured(validation_batch_size=3001)
+    assert alone == {3001}
+    assert losses == pytest.approx(expected, rel=1e-12)
+    assert measured(validation_batch_size=64)[0] == {64, 3001 % 64}
+    with pytest.raises(ConfigError, match="validation_batch_size"):
+        measured(validation_batch_size=0)
+
+
+def test_held_back_samples_are_taken_in_batches_of_the_same_size():
+    rng = np.random.default_rng(0)
+    with Dataset.create("data") as dataset:
+        dataset.append("training", fields(rng, 3000))
+    config = DatasetConfig(existing_dir="data", validation_split=0.5)
+    pipeline = Training(NetworkConfig(Measured), config, epoch_nb=1, batch_size=7, seed=0)
+    with pipeline:
+        pipeline.execute()
+        assert pipeline.learner.network.sizes[False] == {7, 1500 % 7}
+
+
+class Shown(Observer):
+    """Keeps the truth that predictions are compared with."""
+
+    truth: ClassVar = []
+
+    def predictions(self, predicted, truth, step, timeline):
+        assert {n: v.shape for n, v in predicted.items()} == {n: v.shape for n, v in truth.items()}
+        self.truth.append(truth["next_state"])
+
+
+def test_predictions_to_be_shown_are_made_in_batches_too(many):
+    with Dataset.open("data") as dataset:
+        chosen = np.linspace(0, 3000, 64).astype(int)
+        expected = dataset["validation"]["next_state"][chosen]
+    sizes, _ = measured(statistics=[Shown], validation_batch_size=10)
+    assert sizes == {10, 1, 4}
+    for truth in Shown.truth:  # of the whole validation set, the same in each epoch
+        np.testing.assert_array_equal(truth, expected)
 
 
 def test_histograms_of_weights_come_every_k_epochs(data):

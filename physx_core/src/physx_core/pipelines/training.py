@@ -123,6 +123,9 @@ class Training(NewSessionPipeline):
     validation_every: int = at_least(0, 1)
     """Number of epochs between validations, if the dataset has a validation mode or
     `validation_split` holds samples back; 0: never."""
+    validation_batch_size: int | None = at_least(1, None)
+    """Number of validation samples predicted at once, in each process; None: `batch_size`. It
+    changes the memory and the time that a validation takes, but not its losses."""
     patience: int | None = at_least(1, None)
     """Number of consecutive validations (epochs, if nothing is validated) without improvement of
     the loss after which to stop; None: never. The last network is kept in addition to "best"."""
@@ -320,7 +323,7 @@ class Training(NewSessionPipeline):
         self.validation_loss = losses["loss"]
         if self.observers.want_predictions:
             samples = self.data.validation_samples(self.learner.batch_fields)
-            compared = self.learner.compare(samples)
+            compared = self.learner.compare(samples, self.validation_batch_size or self.batch_size)
             self.observers.predictions(*compared, self.epoch_id, "epoch")
         if self.on_nan == "stop" and not math.isfinite(self.validation_loss):
             raise self._diverged(f"the validation loss is {self.validation_loss}", 0)
@@ -488,6 +491,7 @@ class Training(NewSessionPipeline):
             buffer,
             self._resumed,
             batch_nb=self.batch_nb,
+            validation_batch_size=self.validation_batch_size,
             batch_fields=self.learner.batch_fields,
             data_type=self.network_config.data_type,
             ahead=type(self).batch_condition is Training.batch_condition

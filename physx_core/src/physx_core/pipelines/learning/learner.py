@@ -32,6 +32,7 @@ from physx_core.pipelines.learning.components import create, create_network
 from physx_core.plugins import import_component
 from physx_core.plugins.networks import resolve_network
 from physx_core.plugins.references import check_recorded, is_of_plugin, is_recorded_as
+from physx_core.rows import concatenate
 from physx_core.statistics import Normalization
 from physx_core.typing import Array, Batch, Index, Tensors
 
@@ -295,13 +296,22 @@ class Learner:
         self.network.set_eval()
         return self.answer(batch)
 
-    def compare(self, batch: Batch) -> tuple[Batch, Batch]:
+    def compare(self, batch: Batch, batch_size: int) -> tuple[Batch, Batch]:
         """Return predictions for a batch, between two optimization steps, and the true values.
 
         The keys of both are the names of the true fields; predictions without a true value of the
         same shape are left out.
+
+        Args:
+            batch: The batch; at least one row.
+            batch_size: Largest number of rows to predict at once.
         """
-        network, answer = self.network, self.predict_in_training(batch)
+        network, rows = self.network, len(next(iter(batch.values())))
+        parts = [
+            self.predict_in_training({n: v[first : first + batch_size] for n, v in batch.items()})
+            for first in range(0, rows, batch_size)
+        ]
+        answer = concatenate(parts)
         pairs = zip(network.opt_fields, network.pred_fields, strict=False)
         predicted = {true: answer[name] for true, name in pairs if true in batch}
         same = [name for name, array in predicted.items() if array.shape == batch[name].shape]

@@ -77,6 +77,8 @@ class DataOpening:
         buffer: Decides what batches contain while environments generate; already started.
         progress: Progress when the training last ended.
         batch_nb: Batches in an epoch; None: one pass over the stored samples.
+        validation_batch_size: Samples in each process's share of a validation batch; None: as many
+            as in a training batch.
         batch_fields: Names of the fields of a batch.
         data_type: Floating-point type of batches that are read.
         ahead: Whether all batches of an epoch will be taken, and so may be generated ahead.
@@ -92,6 +94,7 @@ class DataOpening:
     progress: Progress
     _: KW_ONLY
     batch_nb: int | None
+    validation_batch_size: int | None
     batch_fields: Sequence[str]
     data_type: str
     ahead: bool
@@ -117,6 +120,7 @@ class DataOpening:
             self.start.config,
             environment,
             batch_size=size,
+            validation_batch_size=(self.validation_batch_size or 0) * self.group.size or size,
             seed=self.progress.seed,
             data_type=self.data_type,
         )

@@ -38,6 +38,7 @@ class StoredBatches:
         environment: EnvironmentConfig | None,
         *,
         batch_size: int,
+        validation_batch_size: int,
         seed: int,
         data_type: str,
     ) -> None:
@@ -47,7 +48,8 @@ class StoredBatches:
             dataset: The dataset.
             config: Options for reading it.
             environment: Generates or replays the samples; None: they are only read.
-            batch_size: Samples in a batch.
+            batch_size: Samples in a training batch.
+            validation_batch_size: Samples in a validation batch.
             seed: Seed of the order of samples.
             data_type: Floating-point type of the batches.
 
@@ -59,6 +61,7 @@ class StoredBatches:
         self.count = 0
         self.has_changed = False
         self._config, self._batch_size = config, batch_size
+        self._validation_batch_size = validation_batch_size
         self._seed, self._data_type = seed, data_type
         self._reader: Iterator[Batch] | None = None
         if environment is None and not self.has_samples:
@@ -119,14 +122,15 @@ class StoredBatches:
         """Return the validation batches, in the order of writing."""
         part = self.parts.get("validation")
         batches = part.batches if part else partial(self.dataset.batches, "validation")
-        return batches(1024, fields=names, dtype=self._data_type, reuse=True)
+        return batches(self._validation_batch_size, fields=names, dtype=self._data_type, reuse=True)
 
     def validation_samples(self, names: Sequence[str]) -> Batch:
-        """Return some of the validation samples, always the same ones."""
-        first = next(self.validation_batches(names))
-        count = len(next(iter(first.values())))
+        """Return some of the validation samples, always the same ones, from all parts of them."""
+        part = self.parts.get("validation")
+        count = part.num_samples if part else self.dataset.num_samples("validation")
         chosen = np.linspace(0, count - 1, min(count, _SHOWN)).astype(np.intp)
-        return {name: values[chosen] for name, values in first.items()}
+        view = part or self.dataset["validation"]
+        return {name: view[name][chosen] for name in names}
 
     @property
     def has_validation(self) -> bool:
