@@ -15,6 +15,7 @@ import stat
 from collections.abc import Iterator
 from pathlib import Path
 
+from physx_core.closeable import Closeable
 from physx_core.errors import DatasetError, PhysxError
 from physx_core.typing import Array
 
@@ -107,24 +108,72 @@ def size(descriptor: int) -> int:
     return os.fstat(descriptor).st_size
 
 
-def try_lock(path: Path) -> int | None:
-    """Lock a file, creating it if needed; return its descriptor, or None if it is already locked.
+class FileLock(Closeable):
+    """A lock on a file, created if needed, for the process that opens it.
 
-    Closing the descriptor unlocks the file, as does the end of the process, however it ends.
+    The end of that process releases it, too, however it ends. Processes forked meanwhile inherit
+    the descriptor, but neither keep the lock when it is closed, nor release it themselves.
+
+    Attributes:
+        descriptor: Descriptor of the file, which may hold a few bytes for others to read.
+    """
+
+    def __init__(self, path: Path) -> None:
+        """Open the file without locking it.
+
+        Raises:
+            OSError: If it cannot be opened.
+        """
+        self.descriptor = open_regular(path, os.O_RDWR | os.O_CREAT)
+        self._owner = os.getpid()
+
+    @property
+    def is_own(self) -> bool:
+        """Whether this process opened it, rather than having been forked from one that did."""
+        return os.getpid() == self._owner
+
+    def acquire(self, *, shared: bool = False, wait: bool = False) -> bool:
+        """Lock the file, or change the kind of the lock; return whether it is locked.
+
+        Args:
+            shared: Whether others may hold it at the same time, all of them shared.
+            wait: Whether to wait for others to release it.
+        """
+        kind = fcntl.LOCK_SH if shared else fcntl.LOCK_EX
+        try:
+            fcntl.flock(self.descriptor, kind | (0 if wait else fcntl.LOCK_NB))
+        except BlockingIOError:
+            return False
+        return True
+
+    def close(self) -> None:
+        """Release it; calling it again does nothing."""
+        descriptor, self.descriptor = self.descriptor, -1
+        if descriptor < 0:
+            return
+        try:
+            # An flock lasts until the last descriptor is closed, also those of forked processes.
+            if self.is_own:
+                fcntl.flock(descriptor, fcntl.LOCK_UN)
+        finally:
+            os.close(descriptor)
+
+
+def try_lock(path: Path) -> FileLock | None:
+    """Lock a file, creating it if needed; return None if it is already locked.
 
     Raises:
         OSError: If it cannot be opened or locked.
     """
-    descriptor = open_regular(path, os.O_RDWR | os.O_CREAT)
+    lock = FileLock(path)
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        os.close(descriptor)
-        return None
+        if lock.acquire():
+            return lock
     except BaseException:
-        os.close(descriptor)
+        lock.close()
         raise
-    return descriptor
+    lock.close()
+    return None
 
 
 def is_removed(descriptor: int) -> bool:

@@ -2,7 +2,9 @@
 
 import copy
 import csv
+import os
 import re
+import signal
 from pathlib import Path
 
 import pytest
@@ -131,6 +133,19 @@ def test_two_sweeps_do_not_share_a_folder(write):
     with Study.open(Path("study"), definition), pytest.raises(StudyError, match="Another sweep"):
         Study.open(Path("study"), definition)
     Study.open(Path("study"), definition).close()
+
+
+def test_a_process_forked_during_a_sweep_does_not_keep_its_folder(write):
+    definition = Definition.read(write())
+    with Study.open(Path("study"), definition):
+        sleeper = os.fork()
+        if not sleeper:
+            signal.pause()
+    try:
+        Study.open(Path("study"), definition).close()
+    finally:
+        os.kill(sleeper, signal.SIGKILL)
+        os.waitpid(sleeper, 0)
 
 
 def test_a_folder_that_is_no_study_is_named(physx):

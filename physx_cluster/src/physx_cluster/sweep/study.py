@@ -61,7 +61,7 @@ class Study(Closeable):
         self.folder, self.definition = folder, definition
         self.trials: dict[int, Trial] = {}
         self.results: dict[int, Result] = {}
-        self._lock: int | None = None
+        self._lock: files.FileLock | None = None
         for path in sorted(folder.glob(f"trial_*/{TRIAL}")):
             trial, _ = read_trial(path.parent)
             self.trials[trial.number] = trial
@@ -114,7 +114,7 @@ class Study(Closeable):
             files.replace(former, tomli_w.dumps(definition.plain).encode())
             study = cls(folder, definition)
         except BaseException:
-            files.close(lock)
+            lock.close()
             raise
         study._lock = lock
         study.write_table()
@@ -123,7 +123,7 @@ class Study(Closeable):
     def close(self) -> None:
         """Allow other processes to write to it."""
         if self._lock is not None:
-            files.close(self._lock)
+            self._lock.close()
             self._lock = None
 
     def folder_of(self, trial: Trial) -> Path:
@@ -208,7 +208,7 @@ class Study(Closeable):
             return False
         lock = files.try_lock(path)
         if lock is not None:
-            files.close(lock)
+            lock.close()
         return lock is None
 
 

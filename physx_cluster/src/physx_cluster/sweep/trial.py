@@ -152,12 +152,10 @@ def run_trial(folder: Path) -> None:
     while lock is None:  # a process of a killed sweep is about to end
         time.sleep(_PATIENCE)
         lock = files.try_lock(folder / LOCK)
-    try:
+    with lock:
         if not (folder / RESULT).exists():
             files.remove(folder / FAILURE)
             _attempt(folder)
-    finally:
-        files.close(lock)
 
 
 def _attempt(folder: Path) -> None:

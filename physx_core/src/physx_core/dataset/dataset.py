@@ -132,7 +132,8 @@ class Dataset(Closeable):
     def close(self) -> None:
         """Store pending samples, seal the last partitions and release the lock.
 
-        Closing a closed dataset does nothing.
+        Closing a closed dataset does nothing, nor does closing it in a process forked from the one
+        that opened it: rows and lock belong to that one.
 
         Raises:
             DatasetError: If pending samples cannot be stored; committed rows stay intact.
@@ -140,7 +141,7 @@ class Dataset(Closeable):
         if self._closed:
             return
         try:
-            if self._appender is not None:
+            if self._appender is not None and self._appender.writer.is_own:
                 try:
                     self._appender.flush()
                 finally:

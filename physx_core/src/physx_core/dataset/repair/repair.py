@@ -79,12 +79,8 @@ def _unlisted_damaged_files(folder: Path) -> Iterator[Path]:
 
 @contextlib.contextmanager
 def _lock(folder: Path) -> Iterator[None]:
-    with files.storing(f"The repaired dataset in {folder}"):
-        lock = locks.lock(folder)
-        try:
-            yield
-        finally:
-            files.close(lock)
+    with files.storing(f"The repaired dataset in {folder}"), locks.lock(folder):
+        yield
 
 
 def _store(folder: Path, manifest: Manifest) -> None:

@@ -19,8 +19,8 @@ _MOMENT = 2.0  # for a process that a killed writer was about to start
 _PAUSE = 0.02
 
 
-def lock(directory: Path, patience: float = _MOMENT) -> int:
-    """Acquire a dataset's lock for a single writer; closing the descriptor releases it.
+def lock(directory: Path, patience: float = _MOMENT) -> files.FileLock:
+    """Acquire a dataset's lock for a single writer.
 
     A writer that was killed while starting a process may have left a forked copy of itself, which
     holds the lock until its exec.
@@ -32,52 +32,50 @@ def lock(directory: Path, patience: float = _MOMENT) -> int:
     Raises:
         DatasetLockedError: If there is another writer.
     """
-    descriptor = files.open_regular(directory / LOCK, os.O_RDWR | os.O_CREAT)
+    lock = files.FileLock(directory / LOCK)
     until = time.monotonic() + patience
     try:
-        while not _try_lock(descriptor):
-            if time.monotonic() > until or _owner_runs(descriptor):
-                raise _locked(directory, descriptor)
+        while not lock.acquire():
+            if time.monotonic() > until or _owner_runs(lock):
+                raise _locked(directory, lock)
             time.sleep(_PAUSE)
-        files.resize(descriptor, 0)
-        files.write_at(descriptor, str(os.getpid()).encode(), 0)
+        files.resize(lock.descriptor, 0)
+        files.write_at(lock.descriptor, str(os.getpid()).encode(), 0)
     except BaseException:
-        files.close(descriptor)
+        lock.close()
         raise
-    return descriptor
+    return lock
 
 
-def lock_shared(directory: Path) -> tuple[int, bool]:
+def lock_shared(directory: Path) -> tuple[files.FileLock, bool]:
     """Acquire a dataset's lock for one of several writers.
 
     Returns:
-        The descriptor (closing it releases the lock), and whether there is no other writer: the
-        lock is then exclusive until `share` admits others.
+        The lock, and whether there is no other writer: it is then exclusive until `share` admits
+        others.
 
     Raises:
         DatasetLockedError: If an exclusive writer has the dataset open.
     """
     with contextlib.suppress(DatasetLockedError):
         return lock(directory, 0.0), True
-    descriptor = files.open_regular(directory / LOCK, os.O_RDWR | os.O_CREAT)
+    lock_of_several = files.FileLock(directory / LOCK)
     try:
-        share(directory, descriptor)
+        share(directory, lock_of_several)
     except BaseException:
-        files.close(descriptor)
+        lock_of_several.close()
         raise
-    return descriptor, False
+    return lock_of_several, False
 
 
-def share(directory: Path, descriptor: int) -> None:
+def share(directory: Path, lock: files.FileLock) -> None:
     """Share the lock with other writers.
 
     Raises:
         DatasetLockedError: If an exclusive writer acquired it first.
     """
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        raise _locked(directory, descriptor) from None
+    if not lock.acquire(shared=True):
+        raise _locked(directory, lock)
 
 
 def take_over(path: Path, place: int) -> int:
@@ -116,29 +114,18 @@ def take_over(path: Path, place: int) -> int:
 @contextlib.contextmanager
 def lock_manifest(directory: Path) -> Iterator[None]:
     """Hold the manifest's lock, which writers of a shared dataset take in turn."""
-    descriptor = files.open_regular(directory / MANIFEST_LOCK, os.O_RDWR | os.O_CREAT)
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX)
+    with files.FileLock(directory / MANIFEST_LOCK) as lock:
+        lock.acquire(wait=True)
         yield
-    finally:
-        files.close(descriptor)
 
 
-def _try_lock(descriptor: int) -> bool:
+def _owner(lock: files.FileLock) -> str:
+    return os.pread(lock.descriptor, 20, 0).decode(errors="replace")
+
+
+def _owner_runs(lock: files.FileLock) -> bool:
     try:
-        fcntl.flock(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return False
-    return True
-
-
-def _owner(descriptor: int) -> str:
-    return os.pread(descriptor, 20, 0).decode(errors="replace")
-
-
-def _owner_runs(descriptor: int) -> bool:
-    try:
-        os.kill(int(_owner(descriptor)), 0)
+        os.kill(int(_owner(lock)), 0)
     except (ProcessLookupError, OverflowError):
         return False
     except (PermissionError, ValueError):  # another user's process, or not written yet
@@ -146,8 +133,8 @@ def _owner_runs(descriptor: int) -> bool:
     return True
 
 
-def _locked(directory: Path, descriptor: int) -> DatasetLockedError:
-    owner = _owner(descriptor) or "unknown"
+def _locked(directory: Path, lock: files.FileLock) -> DatasetLockedError:
+    owner = _owner(lock) or "unknown"
     return DatasetLockedError(
         f"Process {owner} is writing to the dataset in {directory}. Wait until it has closed the "
         "dataset, or open it for reading only. For several writers at the same time, open it "

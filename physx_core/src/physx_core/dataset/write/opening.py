@@ -38,7 +38,7 @@ class WriterOptions:
         if not self.max_file_size > 0:
             raise ConfigError(f"max_file_size is {self.max_file_size} GB but must be positive.")
 
-    def writer(self, folder: Path, manifest: Manifest, lock: int) -> Writer:
+    def writer(self, folder: Path, manifest: Manifest, lock: files.FileLock) -> Writer:
         """Return the writer; without a session name, it continues the last session."""
         session = self.session or next(reversed(manifest.sessions), "run")
         store = ManifestStore(folder, manifest, self.shared)
@@ -63,7 +63,7 @@ def create(folder: Path, options: WriterOptions, info: Mapping[str, Any]) -> Wri
                 if options.shared:
                     locks.share(folder, lock)
             except BaseException:
-                files.close(lock)
+                lock.close()
                 raise
     return options.writer(folder, manifest, lock)
 
@@ -85,6 +85,6 @@ def extend(folder: Path, options: WriterOptions) -> Writer:
                 if options.shared:
                     locks.share(folder, lock)
         except BaseException:
-            files.close(lock)
+            lock.close()
             raise
     return writer

@@ -105,7 +105,12 @@ class Writer:
     """
 
     def __init__(
-        self, store: ManifestStore, session: str, max_file_size: float, durable: bool, lock: int
+        self,
+        store: ManifestStore,
+        session: str,
+        max_file_size: float,
+        durable: bool,
+        lock: files.FileLock,
     ) -> None:
         """Start without an open partition.
 
@@ -115,7 +120,7 @@ class Writer:
             max_file_size: Size in GB at which a partition is full.
             durable: Whether each commit waits for the disk; otherwise files are synced about once
                 a second.
-            lock: Descriptor of the dataset's lock, which `close` releases.
+            lock: The dataset's lock, which `close` releases.
         """
         self.store = store
         self.session = session
@@ -131,6 +136,11 @@ class Writer:
         self._sealed: list[Partition] = []
         self._sealer = ThreadPoolExecutor(1, "physx-seal")
         self._stripes: dict[str, Stripes] = {}
+
+    @property
+    def is_own(self) -> bool:
+        """Whether this process opened it, rather than having been forked from one that did."""
+        return self._lock.is_own
 
     def stripes(self, mode_name: str, count: int) -> Stripes:
         """Let other processes write a mode's rows from now on: see `Dataset.stripes`."""
@@ -245,7 +255,7 @@ class Writer:
                     with files.storing("The last rows"):
                         self._syncer.close()
             finally:
-                files.close(self._lock)
+                self._lock.close()
 
     def _check(self) -> None:
         """Refuse to continue after a failed sync."""
