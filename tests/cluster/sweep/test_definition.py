@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from physx_cluster.sweep import Definition
+from physx_cluster.sweep import Definition, Study
 from physx_cluster.sweep.parameters import Choices, Range, grid_of, read_parameters
 from physx_core.errors import ConfigError
 
@@ -115,7 +115,50 @@ def test_a_range_without_a_number_of_values_has_no_grid(tmp_path):
     )
     definition = Definition.read(Path("sweep.toml"))
     with pytest.raises(ConfigError, match=r"training.network.lr: .* add num = 5"):
-        grid_of("sweep", definition.pipelines["linear"].parameters)
+        Study.open(Path("study"), definition)
+
+
+THOUSAND = "{ low = 1, high = 1000, num = 1000 }"
+BILLION = f"""[parameters]
+training.network.lr = {{ low = 1e-4, high = 0.1, log = true, num = 1000 }}
+training.batch_size = {THOUSAND}
+training.epoch_nb = {THOUSAND}
+"""
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        (BILLION + LINEAR, "has 1000000000 trials .* sampler = .random."),
+        (
+            plus("parameters", "training.network.lr = {low = 0.1, high = 1.0, num = 10000000000}"),
+            "has 10000000000 trials",
+        ),
+        (
+            plus("study", "sampler = 'random'\ntrials = 1000000000"),
+            "has 1000000000 trials .* study.trials",
+        ),
+        (plus("study", f"seeds = {list(range(200_000))}"), "has 200000 trials .* fewer seeds"),
+        (
+            plus("study", "sampler = 'random'\ntrials = 60000", LINEAR)
+            + LINEAR.replace("linear.", "other."),
+            "has 120000 trials",
+        ),
+    ],
+)
+def test_trials_are_counted_before_they_are_built(text, told):
+    Path("sweep.toml").write_text(text)
+    definition = Definition.read(Path("sweep.toml"))
+    with pytest.raises(ConfigError, match=f"sweep {told}"):
+        Study.open(Path("study"), definition)
+    assert not Path("study").exists()
+
+
+def test_integers_that_round_alike_are_counted_once():
+    few = "{ low = 1, high = 3, num = 1000 }"
+    text = f"training.batch_size = {few}\ntraining.epoch_nb = {few}\ntraining.seed = {few}"
+    Path("sweep.toml").write_text(plus("parameters", text))
+    Study.open(Path("study"), Definition.read(Path("sweep.toml"))).close()
 
 
 def test_parameters_of_a_pipeline_add_to_those_of_all():
@@ -131,7 +174,7 @@ def test_parameters_of_a_pipeline_add_to_those_of_all():
     definition = Definition.read(Path("sweep.toml"))
     pipeline = definition.pipelines["linear"]
     assert pipeline.parameters["training.batch_size"] == Choices((10, 20))
-    last = grid_of("", pipeline.parameters)[-1]
+    last = grid_of(pipeline.parameters)[-1]
     tables = pipeline.with_setting(last, seed=3)
     assert tables["training"] == {
         "epoch_nb": 2,
@@ -147,9 +190,9 @@ def test_parameters_of_a_pipeline_add_to_those_of_all():
 
 
 def test_grids_hold_both_ends():
-    assert Range(1, 4, num=4).grid("") == [1, 2, 3, 4]
-    assert Range(1, 2, num=9).grid("") == [1, 2]
-    values = Range(1e-4, 1e-1, log=True, num=4).grid("")
+    assert Range(1, 4, num=4).grid() == [1, 2, 3, 4]
+    assert Range(1, 2, num=9).grid() == [1, 2]
+    values = Range(1e-4, 1e-1, log=True, num=4).grid()
     np.testing.assert_allclose(values, [1e-4, 1e-3, 1e-2, 1e-1], rtol=1e-12)
     assert (values[0], values[-1]) == (1e-4, 1e-1)
 

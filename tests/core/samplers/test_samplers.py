@@ -96,6 +96,13 @@ def test_a_grid_has_all_combinations_bounds_included_and_starts_over():
     assert flat(grid.ask(48)) == flat(grid.ask(0))
 
 
+def test_a_grid_of_any_size_takes_no_memory():
+    grid = begun("grid", points=10**12)
+    assert grid.count == 10**48
+    assert flat(grid.ask(10**48 - 1)) == flat(begun("grid", points=2).ask(15))
+    assert grid.ask(10**12 // 2)["n"] in (2, 3)
+
+
 def test_a_grid_has_as_many_values_of_a_distribution_without_bounds():
     normal = Parameter("a", mean=0.0, deviation=1.0, distribution="normal")
     values = [begun("grid", [normal], points=3).ask(n)["a"] for n in range(3)]

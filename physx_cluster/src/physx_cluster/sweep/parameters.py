@@ -16,6 +16,9 @@ from physx_core.errors import ConfigError
 Setting = dict[str, Any]
 """Name of a parameter to its value."""
 
+MOST = 100_000
+"""Largest number of trials of a study; each is a process and a folder."""
+
 
 @dataclass(frozen=True)
 class Choices:
@@ -27,7 +30,11 @@ class Choices:
 
     values: tuple[Any, ...]
 
-    def grid(self, where: str) -> Sequence[Any]:
+    def count(self, where: str) -> int:
+        """Return the number of values for a grid."""
+        return len(self.values)
+
+    def grid(self) -> Sequence[Any]:
         """Return the values for a grid."""
         return self.values
 
@@ -73,16 +80,24 @@ class Range:
         """Whether the numbers are integers."""
         return isinstance(self.low, int) and isinstance(self.high, int)
 
-    def grid(self, where: str) -> Sequence[Any]:
-        """Return the values for a grid.
+    def count(self, where: str) -> int:
+        """Return the number of values for a grid, without making more than `MOST` of them.
 
         Args:
             where: The parameter, for messages.
+
+        Raises:
+            ConfigError: If the range does not set it.
         """
         if self.num is None:
             raise ConfigError(f"{where}: a grid needs the number of values: add num = 5.")
+        return self.num if self.num > MOST else len(self.grid())
+
+    def grid(self) -> Sequence[Any]:
+        """Return the values for a grid; integers that round alike are one."""
         space = np.geomspace if self.log else np.linspace
-        return list(dict.fromkeys(self._value(x) for x in space(self.low, self.high, self.num)))
+        numbers = space(self.low, self.high, self.num or 0)
+        return list(dict.fromkeys(self._value(number) for number in numbers))
 
     def draw(self, random: np.random.Generator) -> Any:
         """Return a random value."""
@@ -148,8 +163,8 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, (int, float)) and not isinstance(value, bool)
 
 
-def grid_of(where: str, parameters: Mapping[str, Parameter]) -> list[Setting]:
-    """Return all combinations of the parameters' values; the last parameter varies fastest.
+def count_grid(where: str, parameters: Mapping[str, Parameter]) -> int:
+    """Return the number of combinations of the parameters' values, without building them.
 
     Args:
         where: The file, for messages.
@@ -158,5 +173,10 @@ def grid_of(where: str, parameters: Mapping[str, Parameter]) -> list[Setting]:
     Raises:
         ConfigError: If a range does not set its number of values for a grid.
     """
-    values = [parameter.grid(f"{where}: {name}") for name, parameter in parameters.items()]
+    return math.prod(each.count(f"{where}: {name}") for name, each in parameters.items())
+
+
+def grid_of(parameters: Mapping[str, Parameter]) -> list[Setting]:
+    """Return all combinations of the parameters' values; the last parameter varies fastest."""
+    values = [parameter.grid() for parameter in parameters.values()]
     return [dict(zip(parameters, each, strict=True)) for each in itertools.product(*values)]

@@ -10,7 +10,7 @@ import numpy as np
 
 from physx_cluster.sweep.definition import Definition
 from physx_cluster.sweep.optuna import PREFIX, OptunaSearch, known_samplers
-from physx_cluster.sweep.parameters import Parameter, Setting, grid_of
+from physx_cluster.sweep.parameters import MOST, Parameter, Setting, count_grid, grid_of
 from physx_cluster.sweep.results import Result, Trial
 from physx_core.errors import ConfigError, listed, nearest
 
@@ -40,19 +40,18 @@ class Plan:
         """Start before the first batch.
 
         Raises:
-            ConfigError: If the sampler cannot choose settings of these parameters.
+            ConfigError: If there are too many trials, or the sampler cannot choose settings of
+                these parameters.
         """
         study = definition.study
         self._seeds = study.seeds
-        self._searches: dict[str, Search] = {}
-        self._left: dict[str, int] = {}
-        for name, pipeline in definition.pipelines.items():
-            if study.sampler == "grid":
-                grid = Grid(grid_of(definition.name, pipeline.parameters))
-                self._searches[name], self._left[name] = grid, len(grid.settings)
-            else:
-                self._searches[name] = _search(definition, pipeline.parameters)
-                self._left[name] = study.trials or 0
+        self._left = _count_settings(definition)
+        self._searches = {
+            name: Grid(grid_of(pipeline.parameters))
+            if study.sampler == "grid"
+            else _search(definition, pipeline.parameters)
+            for name, pipeline in definition.pipelines.items()
+        }
         waits = study.sampler.startswith(PREFIX) or study.pruner is not None
         self._batch = study.batch if waits else max(self._left.values())
         self.total = sum(self._left.values()) * len(self._seeds)
@@ -87,15 +86,10 @@ class Plan:
 
 
 class Grid:
-    """Chooses all combinations in order.
-
-    Attributes:
-        settings: The combinations.
-    """
+    """Chooses all combinations in order."""
 
     def __init__(self, settings: list[Setting]) -> None:
         """Start with the first combination."""
-        self.settings = settings
         self._next = iter(settings)
 
     def ask(self, count: int) -> list[Setting]:
@@ -124,6 +118,34 @@ class RandomSearch:
         self._number += 1
         random = np.random.default_rng([self._seed, self._number])
         return {name: parameter.draw(random) for name, parameter in self._parameters.items()}
+
+
+def _count_settings(definition: Definition) -> dict[str, int]:
+    """Return the number of settings of each pipeline, before any is built.
+
+    Raises:
+        ConfigError: If there are more than `MOST` trials.
+    """
+    study = definition.study
+    found = {
+        name: count_grid(definition.name, pipeline.parameters)
+        if study.sampler == "grid"
+        else study.trials or 0
+        for name, pipeline in definition.pipelines.items()
+    }
+    settings, seeds = sum(found.values()), len(study.seeds)
+    if settings * seeds > MOST:
+        advice = "Set a smaller number of study.trials"
+        if study.sampler == "grid":
+            advice = (
+                'Draw some combinations with sampler = "random" and trials = 100, or list fewer'
+            )
+        raise ConfigError(
+            f"{definition.name} has {settings * seeds} trials (settings: {settings}, seeds: "
+            f"{seeds}), but a study can have at most {MOST}. {advice}"
+            f"{', or use fewer seeds' if seeds > 1 else ''}."
+        )
+    return found
 
 
 def _search(definition: Definition, parameters: Mapping[str, Parameter]) -> Search:

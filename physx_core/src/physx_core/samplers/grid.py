@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -10,7 +11,6 @@ import numpy as np
 from physx_core.components.parameter import Parameter
 from physx_core.components.sampler import Sampler
 from physx_core.errors import ConfigError, nearest
-from physx_core.typing import Array
 
 
 class Grid(Sampler):
@@ -45,7 +45,7 @@ class Grid(Sampler):
                         f'"physx/grid": points must name exactly the parameters {names}, but '
                         f'"{name}" is {"missing" if name in names else "none of them"}.{known}'
                     )
-        self._levels: list[Array] = []
+        self._levels: list[tuple[int, bool]] = []  # number of values, whether with the bounds
         for parameter in parameters:
             number = points[parameter.name] if isinstance(points, Mapping) else points
             if type(number) is not int or number < 1:
@@ -53,21 +53,19 @@ class Grid(Sampler):
                     f'"physx/grid": the number of points of "{parameter.name}" is {number!r}; it '
                     "must be a whole number, at least 1."
                 )
-            self._levels += [_levels(parameter, number)] * parameter.size
-        self.count = int(np.prod([len(levels) for levels in self._levels], dtype=object))
+            self._levels += [(number, parameter.is_bounded and number > 1)] * parameter.size
+        self.count = math.prod(number for number, _ in self._levels)
 
     def ask(self, number: int) -> dict[str, Any]:
         """Return the values of a set."""
         point, rest = np.empty(self.size), number % self.count
         for element in reversed(range(self.size)):
-            levels = self._levels[element]
-            rest, place = divmod(rest, len(levels))
-            point[element] = levels[place]
+            count, with_bounds = self._levels[element]
+            rest, place = divmod(rest, count)
+            point[element] = _share(place, count) if with_bounds else (place + 0.5) / count
         return self.values(point)
 
 
-def _levels(parameter: Parameter, number: int) -> Array:
-    """Return evenly spaced shares of a distribution."""
-    if parameter.is_bounded and number > 1:
-        return np.linspace(0.0, 1.0, number)
-    return (np.arange(number) + 0.5) / number
+def _share(place: int, count: int) -> float:
+    """Return ``numpy.linspace(0, 1, count)[place]``, without the others."""
+    return 1.0 if place == count - 1 else place * (1.0 / (count - 1))
