@@ -278,6 +278,10 @@ class NetworkConfig:
     constant rate."""
     scheduler_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the scheduler."""
+    scheduler_interval: str | None = field(default=None, metadata={"choices": ("epoch", "step")})
+    """When the scheduler is stepped: "step", with the optimizer; "epoch", after each epoch. None:
+    with the optimizer if the scheduler is known to count its steps, else after each epoch; the
+    first lines of a training say which."""
     network_dir: str | Path | None = None
     """Session or network folder with the initial parameters of the training."""
     network_name: str | None = None

@@ -23,12 +23,15 @@ class Optimization(ABC):
         network: The network to train; set by `set_optimizer`.
         stops_at_nan: Whether a loss or gradient that is not finite ends the training; set by the
             training run.
+        scheduler_interval: When the scheduler is stepped, "epoch" or "step"; None: as suits the
+            scheduler. Set by the training run before `set_scheduler`.
     """
 
     state_file: ClassVar[str] = ""
     extra_fields: Sequence[str] = ()
     network: Network
     stops_at_nan: bool = True
+    scheduler_interval: str | None = None
 
     def set_loss(self, loss: str | type[Any] | None) -> None:
         """Choose the loss function, by class or by its name in the network's library.
@@ -124,6 +127,20 @@ class Optimization(ABC):
     def learning_rate(self) -> float | None:
         """Return the current learning rate; None if there is none."""
         return None
+
+    def begin(self, epoch_nb: int, batch_nb: int) -> Sequence[str]:
+        """Prepare for a training; return lines that the run prints before the first batch.
+
+        Called once, when loss, optimizer and scheduler are chosen, before `load_state` and `join`.
+
+        Args:
+            epoch_nb: Number of epochs, including those before the training was resumed.
+            batch_nb: Number of batches in an epoch.
+
+        Raises:
+            ConfigError: If the options do not suit the training.
+        """
+        return ()
 
     def join(self, group: Group) -> None:
         """Train with the gradients of all processes of a group from now on.

@@ -168,6 +168,7 @@ class Training(NewSessionPipeline):
     _met_nan: bool = field(init=False, repr=False, default=False)
     _told_fields: bool = field(init=False, repr=False, default=False)
     _blocks: int = field(init=False, repr=False, default=0)
+    _told: Sequence[str] = field(init=False, repr=False, default=())
 
     def execute(self) -> None:
         """Train, and write a checkpoint to resume from however the training ends.
@@ -546,6 +547,7 @@ class Training(NewSessionPipeline):
             if last is not None and was_generated:
                 known = last.normalization  # bit-identical
             self.learner.bind(fields, known)
+        self._told = self.learner.begin(self.epoch_nb, data.batches_per_epoch)
         self._load_parameters(last)
         self.learner.join(self.group)
         self.learner.network.set_train()
@@ -575,6 +577,7 @@ class Training(NewSessionPipeline):
         if self.group.size > 1:
             total, each, count = self.batch_size * self.group.size, self.batch_size, self.group.size
             yield f"batches of {total} samples, {each} in each of {count} processes"
+        yield from self._told
 
     def _results(self, error: BaseException | None) -> Iterable[str]:
         yield f"{self.epoch_id} of {self.epoch_nb} epochs in {self._duration:.2f} s"

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
+from torch.optim.lr_scheduler import LRScheduler, OneCycleLR, ReduceLROnPlateau
 
 from physx_core import Network, Optimization
 from physx_core.components import Group
@@ -27,6 +27,7 @@ from physx_torch.choices import choose, find_classes, make
 from physx_torch.networks.network import TorchNetwork
 from physx_torch.parallel import average_gradients, broadcast_parameters
 from physx_torch.storage.state import random_state, read_state, set_random_state, write_state
+from physx_torch.training.schedules import choose_interval, schedule_length
 from physx_torch.training.training_forward import (
     PRECISIONS,
     Forward,
@@ -118,6 +119,7 @@ class TorchOptimization(Optimization):
         self._network: TorchNetwork | None = None
         self._scaler: torch.amp.GradScaler | None = None
         self._is_shared = False
+        self._total: tuple[int, int] | None = None  # epochs of the training, batches in each
         self._known: tuple[torch.Tensor | None, float] = (None, 0.0)  # the loss that was last read
 
     def set_loss(self, loss: str | type[Any] | Loss | None) -> None:
@@ -206,6 +208,10 @@ class TorchOptimization(Optimization):
     def set_scheduler(self, scheduler: str | type[Any], **kwargs: Any) -> None:
         """Choose the learning-rate scheduler.
 
+        It is stepped with the optimizer or after each epoch, as `scheduler_interval` says. By
+        default, OneCycleLR, CyclicLR and schedulers with arguments such as ``total_steps`` or
+        ``num_warmup_steps`` are stepped with the optimizer, others after each epoch.
+
         Args:
             scheduler: Class, or name in `torch.optim.lr_scheduler` such as
                 ``"CosineAnnealingLR"``. ``"ReduceLROnPlateau"`` gets the validation loss, else the
@@ -213,7 +219,8 @@ class TorchOptimization(Optimization):
             kwargs: Arguments of the scheduler.
 
         Raises:
-            ConfigError: If the scheduler does not exist, or rejects the arguments.
+            ConfigError: If the scheduler does not exist, rejects the arguments, or cannot be
+                stepped as `scheduler_interval` says.
             UsageError: If there is no optimizer yet.
         """
         if self.optimizer is None:
@@ -222,7 +229,50 @@ class TorchOptimization(Optimization):
         made = make("scheduler", LRScheduler, chosen, self.optimizer, **kwargs)
         if not isinstance(made, LRScheduler):
             raise ConfigError(f"{scheduler!r} returned {type(made).__name__}, not a scheduler.")
+        self.scheduler_interval = choose_interval(made, kwargs, self.scheduler_interval)
         self.scheduler = made
+        if self.scheduler_interval == "step":  # follows the optimizer, whoever steps it
+            self.optimizer.register_step_post_hook(lambda *_: self._step_scheduler())
+
+    def _step_scheduler(self) -> None:
+        if self.scheduler is None:
+            return
+        try:
+            self.scheduler.step()
+        except ValueError as error:  # a schedule that is over
+            raise ConfigError(f"{type(self.scheduler).__name__} fails: {error}") from error
+
+    def begin(self, epoch_nb: int, batch_nb: int) -> Sequence[str]:
+        """Check the schedule of the learning rate and describe it; see `Optimization.begin`.
+
+        Raises:
+            ConfigError: If the schedule ends before the training.
+        """
+        self._total = epoch_nb, batch_nb
+        if self.scheduler is None:
+            return ()
+        name, every = type(self.scheduler).__name__, "epoch"
+        if self.scheduler_interval == "step":
+            every = "batch" if self._accumulate == 1 else f"{self._accumulate} batches"
+        steps, length = self._check_schedule(), schedule_length(self.scheduler)
+        part = f": {steps} of its {length} steps" if length is not None and steps < length else ""
+        return [f"learning rate: {name}, stepped every {every}{part}"]
+
+    def _check_schedule(self) -> int:
+        """Return the number of the scheduler's steps in the training."""
+        epochs, batches = self._total or (0, 0)
+        by_step = self.scheduler_interval == "step"
+        steps = epochs * batches // self._accumulate if by_step else epochs
+        if isinstance(self.scheduler, OneCycleLR) and steps > self.scheduler.total_steps:
+            raise ConfigError(
+                f"OneCycleLR's schedule has {self.scheduler.total_steps} steps, but the training "
+                f"takes {steps}: {epochs} epochs"
+                + (f" of {batches} batches" if by_step else "")
+                + f". Set total_steps={steps} (--network.scheduler-kwargs total_steps={steps}). A "
+                "resumed training keeps its schedule: start another one from its network "
+                "(NetworkConfig.network_dir)."
+            )
+        return steps
 
     def compute_loss(self, prediction: Tensors, targets: Tensors, data: Tensors) -> torch.Tensor:
         """Return the mean of the prediction fields' losses.
@@ -401,7 +451,7 @@ class TorchOptimization(Optimization):
         return float(self.optimizer.param_groups[0]["lr"])
 
     def epoch_end(self, loss: float) -> None:
-        """Step the scheduler; see `Optimization.epoch_end`.
+        """Step a scheduler that counts epochs; see `Optimization.epoch_end`.
 
         Raises:
             DivergedError: If gradients stayed infinite in float16, regardless of their scaling.
@@ -414,8 +464,8 @@ class TorchOptimization(Optimization):
         if isinstance(self.scheduler, ReduceLROnPlateau):
             if not math.isnan(loss):
                 self.scheduler.step(loss)
-        elif self.scheduler is not None:
-            self.scheduler.step()
+        elif self.scheduler_interval != "step":
+            self._step_scheduler()
 
     def save_state(self, path: Path) -> None:
         """Write the state of the optimizer, scheduler, unfinished step and torch's random numbers.
@@ -433,6 +483,8 @@ class TorchOptimization(Optimization):
         for name, item in (("scheduler", self.scheduler), ("scaler", self._scaler)):
             if item is not None:
                 state[name] = item.state_dict()
+        if self.scheduler is not None:
+            state["interval"] = self.scheduler_interval
         if self._accumulated:
             state["accumulated"] = self._accumulated
             state["gradients"] = network.get_gradients()
@@ -450,6 +502,13 @@ class TorchOptimization(Optimization):
         if state.get("kinds") != self._kinds():
             found, own = (" and ".join(kinds) for kinds in (state.get("kinds", []), self._kinds()))
             raise CheckpointError(f"{path} is the state of {found or 'nothing'}, not of {own}.")
+        former = state.get("interval", "epoch")
+        if self.scheduler is not None and former != self.scheduler_interval:
+            raise CheckpointError(
+                f"The scheduler of {path} was stepped every {former}, not every "
+                f'{self.scheduler_interval}: set NetworkConfig.scheduler_interval="{former}" '
+                f"(--network.scheduler-interval {former}) to continue."
+            )
         try:
             optimizer.load_state_dict(state["optimizer"])
             self._accumulated = state.get("accumulated", 0)
@@ -460,6 +519,7 @@ class TorchOptimization(Optimization):
             if item is not None:
                 item.load_state_dict(state[name])
         set_random_state(state["random"], network.device)
+        self._check_schedule()
 
     def _kinds(self) -> list[str]:
         used = (self.optimizer, self.scheduler, self._scaler)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -118,9 +118,11 @@ class Learner:
         if config.optimizer is not None or config.require_training_stuff:
             optimization.set_optimizer(config.optimizer, self.network, **arguments)
         if config.scheduler is not None:
+            optimization.scheduler_interval = config.scheduler_interval
             optimization.set_scheduler(config.scheduler, **config.scheduler_kwargs)
-        elif config.scheduler_kwargs:
-            raise ConfigError("NetworkConfig.scheduler_kwargs is given without a scheduler.")
+        elif config.scheduler_kwargs or config.scheduler_interval:
+            option = "kwargs" if config.scheduler_kwargs else "interval"
+            raise ConfigError(f"NetworkConfig.scheduler_{option} is given without a scheduler.")
         return optimization
 
     def bind(self, fields: Mapping[str, Field], normalization: Mapping[str, Normalization]) -> None:
@@ -262,6 +264,10 @@ class Learner:
     def learning_rate(self) -> float | None:
         """The current learning rate; None if the optimization has none."""
         return self._trainer().learning_rate()
+
+    def begin(self, epoch_nb: int, batch_nb: int) -> Sequence[str]:
+        """Prepare the optimization for a training; see `Optimization.begin`."""
+        return self._trainer().begin(epoch_nb, batch_nb)
 
     def join(self, group: Group) -> None:
         """Train in a group of processes from now on; fields and parameters must be known.

@@ -70,7 +70,12 @@ class TrainingData:
             made.finish()
             self._current = stored
         self._current.begin_epoch(names, max(0, (self._batch_nb or 0) - done))
-        return self._batch_nb or -(-stored.num_samples // self._batch_size)
+        return self.batches_per_epoch
+
+    @property
+    def batches_per_epoch(self) -> int:
+        """Number of batches in an epoch."""
+        return self._batch_nb or -(-self._stored.num_samples // self._batch_size)
 
     def next_batch(self) -> Batch:
         """Return the next batch in physical units; generated batches are already stored.
