@@ -1,8 +1,9 @@
-"""The plugin ``gym``: every environment registered with Gymnasium, by its id."""
+"""The plugin ``gym``: every environment registered with Gymnasium, and the user's own."""
 
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import gymnasium
 
@@ -12,9 +13,17 @@ from physx_gym.bridge.gym_environment import GymEnvironment
 
 @hookimpl
 def physx_environments() -> Components:
-    """Return all environments registered with Gymnasium."""
-    return {
+    """Return all environments registered with Gymnasium, and what adapts others.
+
+    Those are named by where they are: ``"gym/module:id"``, ``"gym/script.py:function"``.
+    """
+    registered = {
         id: functools.partial(GymEnvironment, id=id)
         for id in gymnasium.registry
         if is_component_name(id)
     }
+    return {**registered, "module": _named}
+
+
+def _named(*, module: str, **kwargs: Any) -> GymEnvironment:
+    return GymEnvironment(id=module, **kwargs)

@@ -300,15 +300,76 @@ def test_references_that_lead_nowhere(reference, error):
         plugins.resolve("environment", reference)
 
 
-def test_a_module_of_the_working_directory_is_named_as_the_script_that_it_is(tmp_path, monkeypatch):
-    """The command `physx` does not look for modules there."""
-    (tmp_path / "rooms").mkdir()
-    (tmp_path / "rooms/tidy.py").write_text("class Room(Environment): pass")
+@pytest.fixture
+def here(tmp_path, monkeypatch):
+    """A working directory that Python does not look for modules in."""
     monkeypatch.chdir(tmp_path)
-    with pytest.raises(ComponentNotFoundError, match='give "rooms/tidy.py:Room"'):
-        plugins.resolve("environment", "rooms.tidy:Room")
-    with pytest.raises(ComponentNotFoundError, match="PYTHONPATH"):
+    monkeypatch.setattr(sys, "path", [each for each in sys.path if each])
+    return tmp_path
+
+
+def test_a_module_is_found_in_the_working_directory_when_it_is_named(here):
+    (here / "rooms").mkdir()
+    (here / "rooms_measures.py").write_text("SIZE = 3\n")
+    (here / "rooms/tidy.py").write_text(
+        "import rooms_measures\nfrom physx_core import Environment\n"
+        "class Room(Environment): size = rooms_measures.SIZE\n"
+    )
+    with pytest.raises(ComponentNotFoundError, match="or run where the module is"):
         plugins.resolve("environment", "halls.tidy:Room")
+    plugins.resolve("environment", "toy/spring")
+    assert str(here) not in sys.path
+    assert plugins.resolve("environment", "rooms.tidy:Room").size == 3
+    assert sys.path[0] == str(here)
+
+
+def test_an_import_that_fails_in_a_module_of_the_working_directory_is_its_own_error(here):
+    (here / "dusty_room.py").write_text("import no_such_broom\n")
+    with pytest.raises(ModuleNotFoundError, match="no_such_broom"):
+        plugins.resolve("environment", "dusty_room:Room")
+
+
+def test_a_folder_where_a_command_runs_has_no_plugins(here):
+    """A package that was downloaded or is being unpacked there is not installed."""
+    add_plugin(here, "unpacked", GOOD)
+    (here / "tqdm.py").write_text("raise SystemExit('not the library')")
+    found = subprocess.run(
+        [sys.executable, "-P", "-m", "physx_core.cli", "plugins"],
+        capture_output=True, text=True, timeout=60, cwd=here, check=True,
+    )  # fmt: skip
+    assert "unpacked" not in found.stdout and "toy" in found.stdout
+
+
+ADAPTING = """
+from physx_core.plugins import hookimpl
+class Adapted:
+    pass
+@hookimpl
+def physx_environments():
+    return {"module": lambda module, **kwargs: (module, kwargs)}
+"""
+
+
+def test_a_plugin_adapts_what_another_library_defines(here, monkeypatch):
+    place = here / "installed"
+    place.mkdir()
+    add_plugin(place, "adapting", ADAPTING)
+    monkeypatch.syspath_prepend(place)
+    for named in ("houses:Hall-v0", "lab/houses.py:Hall", "/lab/houses.py:make"):
+        make = plugins.resolve("environment", f"adapting/{named}")
+        assert make(size=2) == (named, {"size": 2})
+    (here / "houses.py").write_text("class Hall: pass\n")
+    with pytest.raises(ReferenceFormError, match='give "adapting/houses.py:Hall"'):
+        plugins.resolve("environment", "houses.py:Hall")
+    with pytest.raises(ComponentNotFoundError, match='give "adapting/houses:Hall-v0"'):
+        plugins.resolve("environment", "houses:Hall-v0")
+    with pytest.raises(ComponentNotFoundError, match='Plugin "toy" has no environment'):
+        plugins.resolve("environment", "toy/houses:Hall")
+    (here / "adapting").mkdir()
+    (here / "adapting/own.py").write_text(
+        "from physx_core import Environment\nclass Own(Environment): pass\n"
+    )
+    assert plugins.resolve("environment", "adapting/own.py:Own").__name__ == "Own"
 
 
 def test_all_forms_of_a_reference(tmp_path):

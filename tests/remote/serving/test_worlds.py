@@ -54,6 +54,31 @@ class Plain(gymnasium.Env):
         type(self).closed += 1
 
 
+OWN = """
+import gymnasium
+class Own(gymnasium.Env):
+    observation_space = action_space = gymnasium.spaces.Discrete(2)
+def make(**options):
+    return Own()
+gymnasium.register("own/Served-v0", entry_point=Own)
+"""
+
+
+@pytest.mark.parametrize("prefix", ["", "gym/"])
+@pytest.mark.parametrize("place", ["served_module", "served_module.py"])
+@pytest.mark.parametrize("name", ["own/Served-v0", "Own", "make"])
+def test_environments_in_the_working_directory(prefix, place, name, tmp_path, monkeypatch):
+    (tmp_path / "served_module.py").write_text(OWN)
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(sys, "path", [each for each in sys.path if each])
+    monkeypatch.delitem(sys.modules, "served_module", raising=False)
+    with open_worlds(f"{prefix}{place}:{name}", 2) as worlds:
+        assert type(worlds.environments[1].unwrapped).__name__ == "Own"
+    with pytest.raises(ComponentNotFoundError, match="no_served_module"):
+        open_worlds(f"{prefix}no_{place}:{name}")
+    gymnasium.registry.pop("own/Served-v0")
+
+
 def test_ids_of_gymnasium():
     with open_worlds("gym/CartPole-v1", 2) as worlds:
         alone = gymnasium.make("CartPole-v1")
@@ -72,7 +97,7 @@ def test_ids_of_gymnasium():
     [
         ("gym/CartPol-v1", ComponentNotFoundError, 'Did you mean "CartPole-v1"'),
         ("nowhere/Nothing-v0", ComponentNotFoundError, "Gymnasium .*package:id"),
-        ("nowhere:Nothing-v0", ConfigError, "No module named 'nowhere'"),
+        ("nowhere:Nothing-v0", ComponentNotFoundError, "module path has no .*nowhere"),
         ("toy/sprin", ComponentNotFoundError, 'Did you mean "spring"'),
         ("nowhere/spring", PluginNotFoundError, "nowhere"),
         ("physx_core.toy:Linear", ConfigError, "not an environment|not take|not a Gymnasium"),

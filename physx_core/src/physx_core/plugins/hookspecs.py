@@ -6,7 +6,9 @@ imported when the component is first used.
 
 The names of plugins and components consist of letters, digits, "_", "-", and ".", and do not start
 with "-" or ".". A component's name may consist of several such parts separated by "/", like
-Gymnasium ids.
+Gymnasium ids. The component ``module`` adapts what the user has from another library: of the
+reference ``"plugin/package.module:Name"`` it gets ``"package.module:Name"`` as its argument
+``module``.
 """
 
 from __future__ import annotations
@@ -28,6 +30,9 @@ _NAME = r"\w[\w.-]*"
 hookspec = pluggy.HookspecMarker(PLUGINS)
 hookimpl = pluggy.HookimplMarker(PLUGINS)
 """Marks a plugin's function as the implementation of the hook with the same name."""
+
+ADAPTER = "module"
+"""Name of the component that adapts what other libraries define, and of its argument."""
 
 KINDS = {
     "environment": "physx_environments",

@@ -13,10 +13,9 @@ from typing import Any
 from physx_core.components.network import Network
 from physx_core.errors import ConfigError
 from physx_core.plugins.entries import OFFICIAL, PLUGINS
+from physx_core.plugins.hookspecs import ADAPTER
 from physx_core.plugins.references import check_kind, find, resolve
 from physx_core.plugins.registry import available, load
-
-_ADAPTER = "module"
 
 
 def resolve_network(reference: Any, arguments: Mapping[str, Any]) -> tuple[Any, dict[str, Any]]:
@@ -31,14 +30,14 @@ def resolve_network(reference: Any, arguments: Mapping[str, Any]) -> tuple[Any, 
     if library is None:
         check_kind("network", reference, found)
         return found, dict(arguments)
-    if _ADAPTER in arguments:
+    if ADAPTER in arguments:
         raise ConfigError(
             f"{found.__name__} is itself the module, so network_kwargs cannot contain "
-            f'"{_ADAPTER}". If it takes an argument of that name, put all its arguments into '
+            f'"{ADAPTER}". If it takes an argument of that name, put all its arguments into '
             'network_kwargs={"module_kwargs": {...}}.'
         )
     named = reference if isinstance(reference, str) else found
-    return resolve("network", f"{library}/{_ADAPTER}"), {_ADAPTER: named, **arguments}
+    return resolve("network", f"{library}/{ADAPTER}"), {ADAPTER: named, **arguments}
 
 
 def _library_of(found: Any) -> str | None:
@@ -50,6 +49,6 @@ def _library_of(found: Any) -> str | None:
     for package in packages:
         if package not in known and (PLUGINS, package) not in OFFICIAL:
             continue
-        if _ADAPTER in load(package).components.get("network", {}):
+        if ADAPTER in load(package).components.get("network", {}):
             return package
     return None

@@ -29,7 +29,7 @@ from physx_core.errors import (
     UntrustedReferenceError,
     listed,
 )
-from physx_core.plugins.hookspecs import KINDS
+from physx_core.plugins.hookspecs import ADAPTER, KINDS
 from physx_core.plugins.loading import loading
 from physx_core.plugins.registry import available, load, plugin_hint
 
@@ -79,7 +79,8 @@ def resolve(kind: str, reference: Any) -> Any:
         kind: ``environment``, ``network``, ``optimization``, ``transformation``, ``visualizer``,
             ``backend``, ``launcher``, ``buffer``, or ``sampler``.
         reference: ``"plugin/name"``; ``"plugin"`` if it has only one component of the kind;
-            ``"package.module:Class"``; ``"script.py:Class"``; or the class itself.
+            ``"package.module:Class"``; ``"script.py:Class"``; either of them after ``"plugin/"``,
+            for what that plugin adapts; or the class itself.
 
     Returns:
         The class or factory; for ``backend`` an instance of it, ready to build simulations.
@@ -139,7 +140,7 @@ def import_component(kind: str, reference: str) -> Any:
             components.
     """
     place, _, name = reference.rpartition(":")
-    found = _attribute(kind, _module(kind, place), name, place)
+    found = _attribute(kind, import_module(kind, place), name, place)
     if _is_standard(found):
         raise ReferenceFormError(
             f'"{reference}" belongs to Python\'s standard library and is not a physx {kind}.'
@@ -167,9 +168,10 @@ def check_kind(kind: str, reference: Any, found: Any) -> None:
     """
     base = _base_of(kind)
     if isinstance(found, type) and not issubclass(found, base):
+        place = _place_of(reference)
         raise ReferenceFormError(
-            f'"{_place_of(reference)}" is a class that is not derived from {base.__name__}, so it '
-            f"is not a physx {kind}."
+            f'"{place}" is a class that is not derived from {base.__name__}, so it is not a physx '
+            f"{kind}.{adapters_hint(kind, place)}"
         )
     if not callable(found) and not isinstance(found, base):
         raise ReferenceFormError(
@@ -292,13 +294,47 @@ def find(kind: str, reference: Any) -> Any:
             return reference
         raise ReferenceFormError(f"{reference!r} is neither a class nor a reference to one.")
     if ":" in reference:
-        return import_component(kind, reference)
+        adapted = _adapted(kind, reference)
+        return import_component(kind, reference) if adapted is None else adapted
     if reference.endswith(".py"):
         raise ReferenceFormError(
             f'"{reference}" names a script, but not the {kind} in it: '
             f"give {_listed_classes(reference)}."
         )
     return _component_of_plugin(kind, reference)
+
+
+def _adapted(kind: str, reference: str) -> Any:
+    """Return what a plugin makes of ``"plugin/module:Name"``; None for other references.
+
+    A script in a folder with the name of a plugin goes first: the user sees it.
+    """
+    plugin_name, slash, named = reference.partition("/")
+    is_script = Path(reference.rpartition(":")[0]).is_file()
+    if not slash or is_script or plugin_name not in available():
+        return None
+    components = load(plugin_name).components.get(kind, {})
+    if ADAPTER not in components:
+        raise ComponentNotFoundError(kind, named, f'Plugin "{plugin_name}"', components)
+    make = _component_of_plugin(kind, f"{plugin_name}/{ADAPTER}")
+    return functools.partial(make, **{ADAPTER: named})
+
+
+def adapters_hint(kind: str, place: object) -> str:
+    """Return advice for a class or function of another library, if plugins adapt such ones.
+
+    Args:
+        kind: See `resolve`.
+        place: ``"package.module:Name"`` or ``"script.py:Name"``.
+    """
+    having: list[str] = []
+    if not isinstance(place, str) or ":" not in place or place.partition("/")[0] in available():
+        return ""
+    for name in sorted(available()):
+        with contextlib.suppress(PluginError):  # `physx plugins` shows the error
+            if ADAPTER in load(name).components.get(kind, {}):
+                having.append(f'"{name}/{place}"')
+    return f" If it is of a plugin's library, give {' or '.join(having)}." if having else ""
 
 
 def _component_of_plugin(kind: str, reference: str) -> Any:
@@ -350,19 +386,46 @@ def _no_plugin(kind: str, plugin_name: str) -> PluginNotFoundError:
     return PluginNotFoundError(plugin_name, list(available()), hint)
 
 
-def _module(kind: str, place: str) -> ModuleType:
+def import_module(kind: str, place: str) -> ModuleType:
+    """Import a module that the user names, or a script.
+
+    A module that Python does not find is looked for in the working directory, which is then on the
+    module path, as the folder of a script is. It is not put there before: metadata and modules in a
+    folder in which a command happens to run must not become plugins or replace libraries.
+
+    Args:
+        kind: Kind of the component that is wanted from it, for messages.
+        place: ``"package.module"`` or ``"folder/script.py"``.
+
+    Raises:
+        ComponentNotFoundError: If there is no such module or script.
+    """
     if place.endswith(".py"):
         return _script(kind, Path(place))
     try:
         return importlib.import_module(place)
     except ModuleNotFoundError as error:
-        if error.name is not None and (place == error.name or place.startswith(error.name + ".")):
-            hint = "Install the package that has this module, or set PYTHONPATH."
-            script = f"{place.replace('.', '/')}.py"
-            if Path(script).is_file():  # commands do not look for modules in the working directory
-                hint = f"There is a script here: give {_listed_classes(script)}."
+        is_missing = error.name is not None and f"{place}.".startswith(f"{error.name}.")
+        if is_missing and _adds_working_directory(place):
+            return import_module(kind, place)
+        if is_missing:
+            hint = (
+                "Install the package that has this module, set PYTHONPATH, or run where the module "
+                "is."
+            )
             raise ComponentNotFoundError(kind, place, "Python's module path", [], hint) from error
         raise
+
+
+def _adds_working_directory(place: str) -> bool:
+    """Put the working directory on the module path if it has the module and is not there yet."""
+    top, here = place.partition(".")[0], str(Path.cwd())
+    there = Path(f"{top}.py").is_file() or Path(top).is_dir()
+    if not there or here in sys.path:
+        return False
+    sys.path.insert(0, here)
+    importlib.invalidate_caches()
+    return True
 
 
 def _script(kind: str, path: Path) -> ModuleType:
@@ -393,7 +456,10 @@ def _attribute(kind: str, module: ModuleType, name: str, place: str) -> Any:
     found: Any = module
     for part in name.split("."):
         if not hasattr(found, part):
-            raise ComponentNotFoundError(kind, name, place, _classes(kind, module))
+            known, hint = _classes(kind, module), ""
+            if not known or not name.isidentifier():
+                hint = f"It has: {listed(known)}.{adapters_hint(kind, f'{place}:{name}')}"
+            raise ComponentNotFoundError(kind, name, place, known, hint)
         found = getattr(found, part)
     return found
 

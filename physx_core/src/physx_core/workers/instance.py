@@ -29,6 +29,7 @@ from physx_core.errors import (
 )
 from physx_core.fields import Field
 from physx_core.plugins import resolve
+from physx_core.plugins.references import adapters_hint
 from physx_core.rows import RejectedSamples
 from physx_core.typing import Batch, Sample
 
@@ -210,11 +211,17 @@ class Instance(Closeable):
         """Create the environment, and check that its constructor passed on its arguments."""
         make = self._call("import", resolve, "environment", self._reference)
         name = getattr(make, "__name__", repr(make))
-        _check_constructor(name, make, self._arguments)
-        environment = self._call("__init__", make, **self._arguments)
+        try:
+            _check_constructor(name, make, self._arguments)
+            environment = self._call("__init__", make, **self._arguments)
+        except PhysxError as error:
+            if not isinstance(make, type) and "instance_id" in str(error):
+                error.add_note(adapters_hint("environment", self._reference).strip())
+            raise
         if not isinstance(environment, Environment):
             raise UsageError(
                 f"{self._reference!r} returned {environment!r}, which is not an Environment."
+                f"{adapters_hint('environment', self._reference)}"
             )
         if environment._has_seed is None:
             raise UsageError(f"{name}.__init__() must call super().__init__(**kwargs).")

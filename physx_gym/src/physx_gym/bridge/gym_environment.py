@@ -18,7 +18,7 @@ from physx_gym.spaces import SpaceFields
 
 
 class GymEnvironment(Environment):
-    """Stores the transitions of a Gymnasium environment: ``"gym/CartPole-v1"``.
+    """Stores the transitions of a Gymnasium environment, as in ``"gym/CartPole-v1"``.
 
     One sample is one transition: ``observation``, ``action``, ``reward``, ``next_observation``,
     ``terminated`` and ``truncated``. A space of several parts has a field for each, for example
@@ -32,7 +32,7 @@ class GymEnvironment(Environment):
         """Store the arguments of the environment.
 
         Args:
-            id: Its id in Gymnasium, ``"package.module:Class"`` or ``"script.py:Class"``.
+            id: Its id in Gymnasium, or where it is: see `make_env`.
             policy: What chooses the actions: ``"random"`` samples the action space; ``"network"``
                 is the network of the run; ``"package.module:function"`` is called with the
                 observation.

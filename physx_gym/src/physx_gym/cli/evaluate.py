@@ -31,7 +31,7 @@ class Evaluate:
     policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
     """Session or checkpoint of the policy's network."""
     env: str
-    """Id of the environment, or "package.module:Class"."""
+    """Id of the environment, "module:id", "module:Class", or "script.py:function"."""
     backend: str | None = None
     """Engine; by default the environment's own."""
     episodes: int = 20

@@ -36,7 +36,7 @@ class Serve:
     """
 
     environment: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ENVIRONMENT")]
-    """"physx/Cartpole-v0", "gym/CartPole-v1", "dart/arm", "script.py:Class" ..."""
+    """"physx/Cartpole-v0", "gym/CartPole-v1", "dart/arm", "module:id-v0", "script.py:Class" ..."""
     protocol: str = "physx"
     """"physx", "godot-gym", "godot-rl", or "package.module:Class"."""
     address: str = "127.0.0.1"

@@ -11,7 +11,7 @@ import gymnasium
 from physx_core import Closeable, PhysxError
 from physx_core.components import Environment
 from physx_core.errors import ComponentNotFoundError, ConfigError, UsageError
-from physx_core.plugins import available, find, load
+from physx_core.plugins import available, find, import_module, load
 from physx_remote.serving.sample_env import SampleEnv
 
 _PLUGIN = "gym"
@@ -163,10 +163,11 @@ def open_worlds(
 
     Args:
         environment: A Gymnasium id, such as ``"gym/CartPole-v1"`` or, if it has a version,
-            ``"physx/Cartpole-v0"`` or ``"package:id-v0"``, which imports the package first; a
-            reference to a physx environment, such as ``"toy/spring"``, which becomes a `SampleEnv`;
-            ``"package.module:Class"`` or ``"script.py:Class"`` of either kind; a class, or a
-            function that returns an environment; or one Gymnasium environment.
+            ``"physx/Cartpole-v0"`` or ``"module:id-v0"`` and ``"script.py:id-v0"``, which import
+            the module first; a reference to a physx environment, such as ``"toy/spring"``, which
+            becomes a `SampleEnv`; ``"package.module:Class"`` or ``"script.py:function"`` of either
+            kind, also after ``"gym/"``; a class, or a function that returns an environment; or one
+            Gymnasium environment.
         num_worlds: Number of worlds to create.
         env_kwargs: Keyword arguments of each environment, including those of `SampleEnv`.
 
@@ -206,9 +207,10 @@ def _make_world(
     environment: Any, arguments: dict[str, Any], number: int, num_worlds: int
 ) -> gymnasium.Env[Any, Any]:
     if isinstance(environment, str):
-        if is_gymnasium_id(environment):
-            return _make_gymnasium(environment.removeprefix(_PREFIX), arguments)
-        environment = find("environment", environment)
+        name = environment.removeprefix(_PREFIX)
+        if is_gymnasium_id(name) or (name != environment and ":" not in name):
+            return _make_gymnasium(name, arguments)
+        environment = find("environment", name)
     if isinstance(environment, type) and issubclass(environment, Environment):
         return SampleEnv(environment, **arguments, instance_id=number + 1, instance_nb=num_worlds)
     if not callable(environment):
@@ -232,10 +234,13 @@ def call_with(maker: Callable[..., Any], arguments: Mapping[str, Any]) -> Any:
 
 
 def _make_gymnasium(name: str, arguments: dict[str, Any]) -> gymnasium.Env[Any, Any]:
-    if ":" not in name and name not in gymnasium.registry and _PLUGIN in available():
+    place, _, id = name.rpartition(":")
+    if place:
+        import_module("environment", place)
+    elif name not in gymnasium.registry and _PLUGIN in available():
         load(_PLUGIN)
     try:
-        return gymnasium.make(name, disable_env_checker=True, **arguments)
+        return gymnasium.make(id, disable_env_checker=True, **arguments)
     except gymnasium.error.UnregisteredEnv as error:
         place = 'Gymnasium (ids of other packages are written "package:id")'
         raise ComponentNotFoundError("environment", name, place, gymnasium.registry) from error
