@@ -16,6 +16,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar, dataclass_transform
 
+from physx_core import checks
 from physx_core.errors import ConfigError, ConfigFileError, UnknownOptionError, UsageError
 from physx_core.parsing import parse_toml
 
@@ -90,6 +91,7 @@ def _typeguard() -> Any:
 
 
 def _validate(instance: Any, cls: Any) -> None:
+    checks.store_declared(f"{cls.__name__}.", instance)
     typeguard = _typeguard()
     hints = _hints(cls)
     for option in dataclasses.fields(cls):

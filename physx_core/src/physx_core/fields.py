@@ -11,6 +11,7 @@ from typing import Any, Literal, TypeAlias
 import numpy as np
 from numpy.typing import DTypeLike
 
+from physx_core import checks
 from physx_core.errors import ConfigError, FieldShapeError, FieldTypeError, NotFiniteError
 from physx_core.typing import Array
 
@@ -70,10 +71,7 @@ class Field:
             )
         object.__setattr__(self, "dtype", dtype.newbyteorder("<").str)
         if self.shape is not None:
-            shape = (self.shape,) if isinstance(self.shape, int) else tuple(self.shape)
-            if any(not isinstance(n, (int, np.integer)) or n < 0 for n in shape):
-                raise ConfigError(f'Field "{self.name}": {self.shape!r} is not a shape.')
-            object.__setattr__(self, "shape", tuple(int(n) for n in shape))
+            object.__setattr__(self, "shape", _shape(self.name, self.shape))
 
     @cached_property
     def numpy_dtype(self) -> np.dtype[Any]:
@@ -175,6 +173,19 @@ class Field:
             unit=plain.get("unit", ""),
             role=plain.get("role", "training"),
         )
+
+
+def _shape(name: str, given: Any) -> tuple[int, ...]:
+    """Return a shape: a size, or several."""
+    where = f'Field "{name}": shape'
+    try:
+        sizes = tuple(given)
+    except TypeError:
+        sizes = (given,)
+    shape = tuple(checks.integer(where, size) for size in sizes)
+    if min(shape, default=0) < 0:
+        raise ConfigError(f"{where} is {given!r} but must not be negative.")
+    return shape
 
 
 FieldLike: TypeAlias = Field | tuple[str, Any] | str

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import copy
 import pickle
+from decimal import Decimal
+from fractions import Fraction
 
 import numpy as np
 import pytest
@@ -255,3 +257,29 @@ def test_factors_of_masses_are_of_links_and_positive(backend):
         backend.build(World([Robot("ant", fixed_base=False, mass_factors={"torsoo": 2.0})]))
     with pytest.raises(ConfigError, match=r'mass_factors\["torso"\]'):
         Robot("ant", mass_factors={"torso": 0.0})
+
+
+@pytest.mark.parametrize("number", [np.float64, np.float32, np.array, Fraction, Decimal])
+def test_a_world_of_numpy_numbers_moves_exactly_like_one_of_floats(backend, number):
+    def world(of):
+        joints = {"back_left_knee": JointSettings(damping=of(0.5), stiffness=of(0.25))}
+        robot = Robot(
+            "ant",
+            fixed_base=False,
+            position=(of(0.0), of(0.0), of(0.75)),
+            mass_factors={"torso": of(1.25), "front_left_thigh": of(0.5)},
+            friction=of(0.75),
+            joints=joints,
+        )
+        box = Box(name="box", size=(of(0.5), of(0.25), of(0.25)), position=(3, 0, of(0.5)))
+        ground = Ground(friction=of(0.5), height=of(0.0))
+        return World([robot], objects=[box], ground=ground, period=of(2**-10))
+
+    with backend.build(world(float)) as plain, backend.build(world(number)) as other:
+        q = plain.positions()
+        assert plain.mass_matrix(q)[2, 2] > 1.0
+        assert (other.mass_matrix(q) == plain.mass_matrix(q)).all()
+        for simulation in (plain, other):
+            simulation.set_torques(np.full(len(plain.layout.joints), 0.5))
+            simulation.step(300)
+        assert (other.positions() == plain.positions()).all()

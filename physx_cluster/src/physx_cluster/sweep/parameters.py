@@ -59,8 +59,8 @@ class Range:
         num: Number of values in a grid.
     """
 
-    low: float
-    high: float
+    low: int | float
+    high: int | float
     log: bool = False
     num: int | None = at_least(2, None)
 

@@ -12,6 +12,7 @@ from typing import TYPE_CHECKING, Any, Literal, TypeAlias
 
 import numpy as np
 
+from physx_core import checks
 from physx_core.errors import ConfigError
 from physx_core.fields import RESERVED, Field
 from physx_core.typing import Array
@@ -103,10 +104,10 @@ class Parameter:
         if given is None:
             return None
         try:
-            array = np.asarray(given, np.float64)
+            array = checks.array(option, given)
             is_flat = isinstance(given, tuple) and array.shape == (self.size,)
             flat = array if is_flat else np.broadcast_to(array, self.shape).ravel()
-        except (TypeError, ValueError, OverflowError):
+        except (ConfigError, ValueError):
             raise self._error(
                 f'has "{option}" {given!r}, which is neither a number nor of shape {self.shape}'
             ) from None

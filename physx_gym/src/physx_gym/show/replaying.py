@@ -72,7 +72,7 @@ def replay(
         VisualizerError: If the viewer cannot be opened, or cannot draw.
         ConfigError: If an option is invalid.
     """
-    checks.positive("frame_rate", frame_rate)
+    frame_rate = checks.positive("frame_rate", frame_rate)
     chosen = as_logs(logs, compare)
     plotted = plots is not False and record_video_path is None
     groups = _groups(chosen, plots) if plotted else {}

@@ -8,6 +8,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from physx_core import checks
 from physx_core.errors import ConfigError, LogError
 from physx_core.fields import is_finite
 from physx_core.rotations import interpolate_rows
@@ -24,7 +25,7 @@ class Trajectory:
     shorter arc.
 
     Attributes:
-        times: Non-decreasing, shape (rows,), in s.
+        times: Non-decreasing, shape (rows,), in s; like the others kept as a read-only copy.
         positions: Shape (rows, nq), in the convention of `physx_core.simulation.layout`.
         velocities: Shape (rows, nv), likewise.
         beyond: What happens before the first and after the last row: ``"raise"``, an error;
@@ -43,7 +44,8 @@ class Trajectory:
         Raises:
             ConfigError: If they do not.
         """
-        rows = len(self.times)
+        checks.store_declared("Trajectory.", self)
+        rows = len(np.atleast_1d(self.times))
         shapes = [np.shape(a) for a in (self.times, self.positions, self.velocities)]
         if len(shapes[0]) != 1 or not rows or any(len(s) != 2 or s[0] != rows for s in shapes[1:]):
             raise ConfigError(

@@ -35,13 +35,14 @@ class Ground:
     normal: tuple[float, ...] = (0.0, 0.0, 1.0)
 
     def __post_init__(self) -> None:
+        checks.store_declared("Ground.", self)
         checks.options(checks.not_negative, "Ground.", self, "friction", "restitution")
         checks.finite("Ground.height", self.height)
         normal = checks.vector("Ground.normal", self.normal, 3)
         length = float(np.linalg.norm(normal))
         if not length > 0:
             raise ConfigError("Ground.normal must not be 0.")
-        object.__setattr__(self, "normal", tuple(part / length for part in normal))
+        object.__setattr__(self, "normal", checks.scaled(normal, length))
 
 
 @dataclass(frozen=True)
@@ -72,8 +73,9 @@ class Stairs:
     restitution: float = 1.0
 
     def __post_init__(self) -> None:
+        checks.store_declared("Stairs.", self)
         checks.options(checks.not_negative, "Stairs.", self, "friction", "restitution")
-        if not isinstance(self.steps, int) or self.steps < 1:
+        if self.steps < 1:
             raise ConfigError(f"Stairs.steps is {self.steps!r} but must be a positive integer.")
         checks.options(checks.positive, "Stairs.", self, "rise", "run", "width")
         checks.finite("Stairs.begin", self.begin)
@@ -116,18 +118,14 @@ class HeightField:
     restitution: float = 1.0
 
     def __post_init__(self) -> None:
+        checks.store_declared("HeightField.", self)
         checks.options(checks.not_negative, "HeightField.", self, "friction", "restitution")
-        try:
-            heights = np.array(self.heights, np.float64)
-        except (TypeError, ValueError, OverflowError) as error:
-            raise ConfigError(f"HeightField.heights are not numbers: {error}.") from error
+        heights = self.heights
         if heights.ndim != 2 or min(heights.shape) < 2 or not np.isfinite(heights).all():
             raise ConfigError(
                 f"HeightField.heights has the shape {heights.shape} but needs two axes of 2 or "
                 "more finite numbers."
             )
-        heights.flags.writeable = False
-        object.__setattr__(self, "heights", heights)
         spacing = checks.vector("HeightField.spacing", self.spacing, 2)
         for distance in spacing:
             checks.positive("HeightField.spacing", distance)

@@ -39,6 +39,7 @@ class WorldObject:
         kind = type(self).__name__
         checks.name(kind.lower(), self.name)
         where = f'{kind} "{self.name}": '
+        checks.store_declared(where, self)
         checks.options(checks.positive, where, self, "mass", *self.lengths)
         object.__setattr__(self, "position", checks.vector(f"{where}position", self.position, 3))
         orientation = checks.unit_quaternion(f"{where}orientation", self.orientation)

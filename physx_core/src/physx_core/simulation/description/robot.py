@@ -47,6 +47,7 @@ class JointSettings:
     def __post_init__(self) -> None:
         if self.mode not in get_args(Mode):
             raise UnknownOptionError("JointSettings.mode", [str(self.mode)], get_args(Mode))
+        checks.store_declared("JointSettings.", self)
         checks.positive("JointSettings.gain", self.gain)
         checks.finite("JointSettings.rest", self.rest)
         for option in ("damping", "friction", "stiffness", "armature"):
@@ -101,6 +102,7 @@ class Robot:
     def __post_init__(self) -> None:
         checks.name("robot", self.name)
         where = f'Robot "{self.name}": '
+        checks.store_declared(where, self)
         if not isinstance(self.urdf, (str, Path)):
             raise ConfigError(f"{where}urdf is {self.urdf!r} but must be a path.")
         if self.collisions not in get_args(Collisions):

@@ -72,10 +72,9 @@ class World:
             raise ConfigError(
                 f"World.ground is {self.ground!r}, not Ground, Stairs, or HeightField."
             )
+        checks.store_declared("World.", self)
         checks.positive("World.period", self.period)
-        if self.iterations is not None and not (
-            type(self.iterations) is int and self.iterations > 0
-        ):
+        if self.iterations is not None and self.iterations < 1:
             raise ConfigError(f"World.iterations is {self.iterations!r}, not a positive integer.")
         object.__setattr__(self, "gravity", checks.vector("World.gravity", self.gravity, 3))
         for option, known in (

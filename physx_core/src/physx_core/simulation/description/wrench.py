@@ -51,24 +51,27 @@ class Wrench:
             raise ConfigError(f"{where}body must be a name.")
         if self.frame not in ("world", "body"):
             raise UnknownOptionError(f"{where}frame", [str(self.frame)], ("world", "body"))
+        checks.store_declared(where, self)
         object.__setattr__(self, "point", checks.vector(f"{where}point", self.point, 3))
         if self.duration is not None:
             checks.positive(f"{where}duration", self.duration)
         shape: tuple[int, ...] = (3,)
         if self.times is not None:
-            times = _array(f"{where}times", self.times)
-            if times.ndim != 1 or len(times) < 1 or (np.diff(times) <= 0).any():
-                raise ConfigError(f"{where}times must be a vector of increasing numbers.")
-            object.__setattr__(self, "times", times)
+            times = np.asarray(self.times)
+            rises = times.ndim == 1 and len(times) > 0 and (np.diff(times) > 0).all()
+            if not rises or not np.isfinite(times).all():
+                raise ConfigError(f"{where}times must be a vector of increasing, finite numbers.")
             shape = (len(times), 3)
         for option in ("force", "torque"):
-            values = _array(where + option, getattr(self, option))
+            values: Any = getattr(self, option)
             if self.times is not None and values.shape == (3,):
                 values = np.tile(values, (shape[0], 1))
             if values.shape != shape:
                 raise ConfigError(
                     f"{where}{option} has the shape {values.shape} but needs {shape}."
                 )
+            if not np.isfinite(values).all():
+                raise ConfigError(f"{where}{option} must be finite numbers.")
             object.__setattr__(self, option, values)
 
     def at(self, time: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -95,14 +98,3 @@ class Wrench:
         if self.times is not None:
             return int(np.floor(float(self.times[-1]) / period * (1 + 1e-12))) + 1
         return None
-
-
-def _array(option: str, values: Any) -> NDArray[np.float64]:
-    try:
-        array = np.array(values, np.float64)
-    except (TypeError, ValueError, OverflowError) as error:
-        raise ConfigError(f"{option} must be numbers: {error}.") from error
-    if not np.isfinite(array).all():
-        raise ConfigError(f"{option} must be finite numbers.")
-    array.flags.writeable = False
-    return array

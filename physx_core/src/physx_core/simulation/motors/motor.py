@@ -72,6 +72,7 @@ class Motor:
         where = f'Motor of "{self.joint}": '
         if not isinstance(self.joint, str):
             raise ConfigError(f"{where}joint must be a name.")
+        checks.store_declared(where, self)
         checks.options(_positive_or_inf, where, self, "max_torque", "max_velocity", "slope")
         checks.options(checks.not_negative, where, self, "inertia", "damping", "backlash")
         for option in ("viscous", "dry"):

@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import ClassVar
 
 from physx_core import checks
 from physx_core.errors import ConfigError, UnknownOptionError
 
-Amounts = float | Mapping[str, Any]
+Amounts = float | Mapping[str, float | Sequence[float]]
 """A number for all components, or for each quantity one number or a number for each component."""
 
 
@@ -63,6 +63,7 @@ class Sensor:
                 f"The name of a sensor is {self.name!r} but must be a nonempty string."
             )
         where = f'{kind} "{self.name}": '
+        checks.store_declared(where, self)
         if self.period is not None:
             checks.positive(f"{where}period", self.period)
         checks.options(checks.not_negative, where, self, "delay", "jitter")

@@ -10,6 +10,7 @@ from typing import Any
 
 import numpy as np
 
+from physx_core import checks
 from physx_core.errors import ComponentNotFoundError, ConfigError, FeatureNotSupportedError
 from physx_core.simulation import Part, Simulation
 from physx_core.typing import Records, Vector
@@ -27,11 +28,13 @@ class Quantity(ABC):
     """
 
     def __post_init__(self) -> None:
-        """Convert lists to tuples, and check that its parts are quantities.
+        """Store numbers as declared and lists as tuples; check that its parts are quantities.
 
         Raises:
-            ConfigError: If they are not, or a string is given instead of a list.
+            ConfigError: If they are not, a string is given instead of a list, or an option is not
+                of the declared kind of number.
         """
+        checks.store_declared(f"{type(self).__name__}.", self)
         for field in dataclasses.fields(self):  # type: ignore[arg-type]
             value, where = getattr(self, field.name), f"{type(self).__name__}.{field.name}"
             if isinstance(value, list):

@@ -35,10 +35,10 @@ class _Mixture(Reward):
         names = [part for each in weighted for part in each.names]
         if len(set(names)) < len(names):
             raise ConfigError(f'Two parts of "{name}" have the same name: {sorted(names)}.')
-        for each, weight in weighted.items():
-            checks.finite(f'weight of "{each.name}"', weight)
         self.rewards = tuple(weighted)
-        self.weights = tuple(weighted.values())
+        self.weights = tuple(
+            checks.finite(f'weight of "{each.name}"', weight) for each, weight in weighted.items()
+        )
         if normalize:
             wrong = [each.name for each in self.rewards if not each.is_normalized]
             if wrong or min(self.weights) < 0 or sum(self.weights) <= 0:
