@@ -3,10 +3,13 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import hashlib
+import io
 import os
 import random
 import signal
+import tempfile
 import threading
 import time
 from pathlib import Path
@@ -301,11 +304,111 @@ def test_what_would_come_again_is_raised_at_once(clients, caplog, fresh_notes):
     assert fresh_notes() == 2
 
 
+# The size of the journal -------------------------------------------------------------------------
+
+
+@pytest.fixture
+def full_disk(monkeypatch, tmp_path):
+    """Let files for temporary data take 5 kB each, then none."""
+
+    class Small(io.BytesIO):
+        def write(self, data):
+            if self.tell() + len(data) > 5_000:
+                raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
+            return super().write(data)
+
+    monkeypatch.setattr(tempfile, "SpooledTemporaryFile", lambda *_: Small())
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    return tmp_path
+
+
+ASKS = {"num_clients": 2, "env_kwargs": {"asks": True}}
+
+
+def test_a_run_goes_on_at_the_limit_of_a_journal_and_says_so_once(
+    local, clients, batch_services, said
+):
+    expected = digest(run(local(WANDERER, **ASKS), [30, 30], apply=True))
+    source = clients(WANDERER, run_ahead=0, restarts=1, journal_size=2e-6, **ASKS)
+    assert digest(run(source, [30, 30], apply=True)) == expected
+    assert [text.partition(":")[0] for text in said()] == [
+        f"Instance {number} can no longer be restarted" for number in (1, 2)
+    ]
+    assert all("journal_size = 2e-06 GB" in text for text in said())
+
+
+def test_a_client_that_ends_beyond_the_limit_of_its_journal_ends_the_run_with_the_reason(
+    clients, batch_services, process_ids
+):
+    with clients(WANDERER, run_ahead=0, restarts=3, journal_size=2e-6, **ASKS) as source:
+        source.batch(60)
+        os.kill(process_ids()[2], signal.SIGKILL)
+        with pytest.raises(ClientError, match="SIGKILL") as caught:
+            source.batch(60)
+    (note,) = caught.value.__notes__
+    assert "Instance 2 can no longer be restarted" in note
+    assert "journal_size" in note
+
+
+def test_a_client_is_restarted_before_its_journal_reaches_the_limit(
+    local, clients, batch_services, process_ids, said
+):
+    expected = digest(run(local(WANDERER, **ASKS), [10, 90], apply=False))
+    with clients(WANDERER, run_ahead=0, restarts=1, journal_size=4e-6, **ASKS) as source:
+        batches = [{name: rows.copy() for name, rows in source.batch(10).items()}]
+        assert not said()
+        os.kill(process_ids()[1], signal.SIGKILL)
+        batches.append(source.batch(90))
+    assert digest(batches) == expected
+    assert len(said("Restart 1 of 1")) == 1
+    assert len(said("can no longer")) == 2
+
+
+def test_a_full_folder_for_temporary_files_is_named_and_the_run_goes_on(
+    local, clients, batch_services, full_disk, said
+):
+    expected = digest(run(local(WANDERER, **ASKS), [200], apply=True))
+    source = clients(WANDERER, run_ahead=0, restarts=1, **ASKS)
+    assert digest(run(source, [200], apply=True)) == expected
+    assert len(said(f"cannot grow in {full_disk}: No space left")) == 2
+
+
+def test_a_full_folder_is_named_to_whom_a_restarted_client_cannot_be_told(full_disk):
+    journal = Journal(2, 1e9)
+    journal.record(pack(Kind.APPLY, bytes(3_000), 1))
+    with pytest.raises(ClientError, match=rf"Client 2 .* {full_disk}, fails: No space .* TMPDIR"):
+        journal.record(pack(Kind.APPLY, bytes(3_000), 1), is_read=True)
+    assert journal.order(0)
+
+
+def test_redrawn_parameters_begin_a_journal_anew(clients, batch_services, said):
+    journal = Journal(1, 10)
+    journal.record(pack(Kind.APPLY, bytes(100), 1))
+    assert journal.given_up
+    journal.restart()
+    assert not journal.given_up
+    assert journal.record(pack(Kind.CREDIT, number=3))
+    assert journal.credit
+
+
+def test_an_instance_of_an_elastic_run_does_not_move_beyond_the_limit_of_its_journal(
+    clients, batch_services, process_ids
+):
+    options = {"min_clients": 1, "max_clients": 2, "restarts": 2, "journal_size": 2e-6, **ASKS}
+    with clients(WANDERER, run_ahead=0, **options) as source:
+        source.batch(60)
+        os.kill(os.getpgid(process_ids()[2]), signal.SIGKILL)
+        with pytest.raises(ClientError) as caught:
+            for _ in range(20):
+                source.batch(60)
+    assert "journal_size" in caught.value.__notes__[0]
+
+
 # The journal ------------------------------------------------------------------------------------
 
 
 def test_a_journal_tells_again_what_was_told():
-    journal = Journal()
+    journal = Journal(1, 1e9)
     told = [
         pack(Kind.CREDIT, number=2),
         pack(Kind.ANSWER, b"first", 1),
@@ -326,8 +429,25 @@ def test_a_journal_tells_again_what_was_told():
     journal.close()
 
 
+def test_a_journal_at_its_limit_is_given_up_once_its_client_has_been_told_everything(said):
+    journal = Journal(3, 1000)
+    answers = [pack(Kind.ANSWER, b"x" * 400, number) for number in (1, 2, 3, 4)]
+    for answer in answers[:3]:
+        journal.record(answer, is_read=True)
+    assert journal.answer(1) == answers[0]
+    assert not journal.given_up
+    assert not journal.record(answers[3])
+    assert "journal_size" in journal.given_up
+    assert journal.answer(1) is journal.answer(4) is None
+    assert journal.record(pack(Kind.APPLY, b"x", 1))
+    assert journal.order(0) is None
+    (warning,) = said()
+    assert "Instance 3 can no longer be restarted" in warning
+    journal.close()
+
+
 def test_a_journal_of_credit_alone_does_not_grow():
-    journal = Journal()
+    journal = Journal(1, 1e9)
     for number in range(1000):
         journal.record(pack(Kind.CREDIT, number=number))
     assert journal.order(0) is None

@@ -109,6 +109,7 @@ class ClientGroup:
             token,
             sets,
             self._replaces,
+            1e9 * config.journal_size,
             skip,
             self._pool,
             written,
@@ -294,8 +295,14 @@ class ClientGroup:
         if self._pool is None:
             return
         for number in self._pool.check(now, self._began, ending=self._closing):
+            if self._given_up(number) and not self._closing:
+                place = self._place(number)
+                raise self._final(number, ClientError(number, "lost its client.", client=place))
             self._replace(number, self._handles.pop(number, None))
-        while not self._closing and (moved := self._pool.find_move(self._progress)) is not None:
+        while not self._closing:
+            moved = self._pool.find_move(self._progress, lambda n: not self._given_up(n))
+            if moved is None:
+                break
             handle = self._handles.pop(moved)
             handle.kill()
             self._replace(moved, handle)
@@ -342,6 +349,8 @@ class ClientGroup:
 
     def _replaces(self, number: int, error: PhysxError | None) -> bool:
         """Return whether another client replaces one that failed, or left without an error."""
+        if self._given_up(number):  # the next one can only start with other parameters
+            return not isinstance(error, ClientError) and self._redraws_after(number, error)
         if error is None and (self._is_by_hand or self.config.redraw or self._pool is not None):
             return True
         return self._restarts_after(number, error) or self._redraws_after(number, error)
@@ -378,9 +387,9 @@ class ClientGroup:
         absent = self._is_by_hand and self._pool is None and self._find_peer(number) is None
         if absent or not self._replaces(number, None if left else error):
             self._sets.fail(number, self._episode(number), error)
-            raise error
+            raise self._final(number, error)
         text, _, details = str(error).partition("\n")
-        if left or self._restarts_after(number, error):
+        if left or (self._restarts_after(number, error) and not self._given_up(number)):
             self._restarts[number] += not left
             follows = self._describe_next(number, left)
         else:
@@ -396,6 +405,17 @@ class ClientGroup:
         self._exits.pop(number, None)
         if not self._closing:
             self._launch([number])
+
+    def _given_up(self, number: int) -> str:
+        """Return why an instance cannot be restarted although it could before; empty if it can."""
+        peer = self.server.peers.get(number)
+        return "" if peer is None or peer.journal is None else peer.journal.given_up
+
+    def _final(self, number: int, error: PhysxError) -> PhysxError:
+        """Add to an error that ends the run why its instance cannot be restarted, if so."""
+        if reason := self._given_up(number):
+            error.add_note(f"{reason}.")
+        return error
 
     def _episode(self, number: int) -> int:
         peer = self.server.peers.get(number)

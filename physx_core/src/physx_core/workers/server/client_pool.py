@@ -375,7 +375,9 @@ class ClientPool(Launcher):
         self._assign()
         return handles
 
-    def find_move(self, progress: Progress) -> int | None:
+    def find_move(
+        self, progress: Progress, can_move: Callable[[int], bool] = lambda number: True
+    ) -> int | None:
         """Return an instance to move to a client with less to do; None: none.
 
         It generates its rows again there, so it moves only if it then finishes earlier, assuming
@@ -383,6 +385,7 @@ class ClientPool(Launcher):
 
         Args:
             progress: How far an instance is.
+            can_move: Whether an instance can start again elsewhere.
         """
         ready = self._ready
         if self._waiting or len(ready) < 2:
@@ -391,7 +394,9 @@ class ClientPool(Launcher):
         most = max(ready, key=lambda client: client.load)
         if most.load - least.load < 2:
             return None
-        numbers = [worker.instance_id for worker in most.workers.values()]
+        numbers = [w.instance_id for w in most.workers.values() if can_move(w.instance_id)]
+        if not numbers:
+            return None
         number = min(numbers, key=lambda number: progress(number)[0])
         made, left = progress(number)
         left = made if left is None else left

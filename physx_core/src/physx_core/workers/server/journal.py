@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+import contextlib
+import logging
 import tempfile
 from array import array
 
+from physx_core.errors import ClientError
 from physx_core.net.frames import HEADER, Kind
 
 _IN_MEMORY = 1 << 22
+_ORDERS = (Kind.CREDIT, Kind.APPLY, Kind.STORED)
+_LOG = logging.getLogger("physx")
 
 
 class Journal:
@@ -17,19 +22,60 @@ class Journal:
     stored rows. Of successive credits only the last is kept, so the journal of an instance that
     only generates rows does not grow. Other messages are kept unmodified, in a temporary file once
     there are many.
+
+    A journal that reaches its limit, or for which the disk has no space, is given up: it forgets
+    everything, the run goes on, and a warning says that the instance can no longer be restarted.
+
+    Attributes:
+        given_up: Why, as a sentence; empty: it is complete.
     """
 
-    def __init__(self) -> None:
-        """Start empty."""
+    def __init__(self, instance_id: int, limit: float) -> None:
+        """Start empty.
+
+        Args:
+            instance_id: Number of the instance, from 1.
+            limit: Largest size in bytes.
+        """
+        self._instance_id, self._limit = instance_id, limit
+        self.given_up = ""
+        self.restart()
+
+    def restart(self) -> None:
+        """Start again, empty: the next client needs nothing of what was told before."""
+        self.given_up = ""
         self._messages = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115 - see close
         self._size = 0
         self._answers = array("Q")  # request number - 1 to the offset of its answer + 1; 0: none
         self._orders = array("Q")
         self._credit = b""
 
-    def record(self, message: bytes) -> bool:
-        """Keep a message if a successor will need it; return whether it is an order."""
+    def record(self, message: bytes, *, is_read: bool = False) -> bool:
+        """Keep a message if a successor will need it; return whether it is an order.
+
+        Args:
+            message: The message.
+            is_read: Whether the instance's client has yet to be told what is in the journal; until
+                then it grows beyond its limit.
+
+        Raises:
+            ClientError: If that client cannot be told, as the disk has no space for the message.
+        """
         _, kind, _, number = HEADER.unpack_from(message)
+        if self.given_up:
+            return kind in _ORDERS
+        try:
+            self._keep(message, kind, number)
+        except OSError as error:
+            if is_read:
+                raise self._failure(error) from error
+            self._give_up(f"cannot grow in {_folder()}: {error.strerror}")
+        if self._size > self._limit and not is_read:
+            limit = f"{self._limit / 1e9:g} GB"
+            self._give_up(f"has reached its limit, EnvironmentConfig.journal_size = {limit}")
+        return kind in _ORDERS
+
+    def _keep(self, message: bytes, kind: int, number: int) -> None:
         if kind == Kind.CREDIT:
             self._credit = bytes(message)
         elif kind in (Kind.APPLY, Kind.STORED):
@@ -41,7 +87,11 @@ class Journal:
             missing = number - len(self._answers)
             self._answers.frombytes(bytes(max(0, missing) * self._answers.itemsize))
             self._answers[number - 1] = self._write(message) + 1
-        return kind in (Kind.CREDIT, Kind.APPLY, Kind.STORED)
+
+    @property
+    def answers(self) -> int:
+        """Largest number of a request whose answer it holds, counted from 1; 0: none."""
+        return len(self._answers)
 
     def answer(self, number: int) -> bytes | None:
         """Return the answer to a request; None if there is none yet.
@@ -63,16 +113,45 @@ class Journal:
 
     def close(self) -> None:
         """Forget everything; calling it again does nothing."""
-        self._messages.close()
+        with contextlib.suppress(OSError):  # of what is still to be written
+            self._messages.close()
+
+    def _give_up(self, reason: str) -> None:
+        self.close()
+        self._answers, self._orders, self._credit = array("Q"), array("Q"), b""
+        self.given_up = (
+            f"Instance {self._instance_id} can no longer be restarted: the journal of what its "
+            f"client was told {reason}"
+        )
+        _LOG.warning("%s. The run goes on, but would end with that client.", self.given_up)
+
+    def _failure(self, error: OSError) -> ClientError:
+        return ClientError(
+            self._instance_id,
+            "cannot be told what its predecessor was told: the journal of that, in "
+            f"{_folder()}, fails: {error.strerror}. Free some space there, or name "
+            "another folder with the environment variable TMPDIR.",
+        )
 
     def _write(self, message: bytes) -> int:
         place = self._size
         self._messages.seek(place)
         self._messages.write(message)
+        self._messages.flush()  # a full disk is noticed now, not when a client needs the message
         self._size += len(message)
         return place
 
     def _read(self, place: int) -> bytes:
-        self._messages.seek(place)
-        head = self._messages.read(HEADER.size)
-        return head + self._messages.read(HEADER.unpack(head)[0])
+        try:
+            self._messages.seek(place)
+            head = self._messages.read(HEADER.size)
+            return head + self._messages.read(HEADER.unpack(head)[0])
+        except OSError as error:
+            raise self._failure(error) from error
+
+
+def _folder() -> str:
+    try:
+        return tempfile.gettempdir()
+    except OSError:  # no folder can be written to
+        return "any folder for temporary files"

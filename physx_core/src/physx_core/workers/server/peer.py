@@ -144,7 +144,7 @@ class Peer(Connection):
         self.origin = Origin(row, self.rejected.count, self.shown, step, self.episode + 1)
         if self.journal is not None:
             self.journal.close()
-            self.journal = Journal()
+            self.journal.restart()
             self.journal.record(pack(Kind.CREDIT, number=self.granted))
 
     def hear(self, *, whole: bool) -> None:
@@ -162,7 +162,9 @@ class Peer(Connection):
         What a successor will need goes into the journal. A client that has just taken a place gets
         the orders from there, one after another.
         """
-        is_order = self.journal is not None and self.journal.record(message)
+        is_order = self.journal is not None and self.journal.record(
+            message, is_read=self._next_order is not None or self.requests < self.journal.answers
+        )
         if self._next_order is None or not is_order:
             self.send_once(message)
 

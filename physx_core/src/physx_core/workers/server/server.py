@@ -64,7 +64,8 @@ class Server:
         setup: Callable[[Peer], bytes],
         token: str,
         sets: ParameterSets,
-        replaces: Callable[[int, PhysxError | None], bool] = lambda number, error: False,
+        replaces: Callable[[int, PhysxError | None], bool],
+        journal_size: float,
         skip: Skip = NOTHING,
         pool: ClientPool | None = None,
         written: WrittenRows | None = None,
@@ -81,6 +82,7 @@ class Server:
             sets: Chooses the instances' parameters.
             replaces: Returns whether another client takes the place of one that failed with an
                 error, or left without one.
+            journal_size: Largest size in bytes of an instance's journal.
             skip: What an earlier run already got from the instances.
             pool: The clients, if they run workers for several instances; None: each runs one.
             written: Counts the rows that the clients write themselves; None: they send them.
@@ -91,6 +93,7 @@ class Server:
         self._spin_time = _SPIN_TIME if has_core_for_each(instance_nb) else 0.0
         self._requests = ServiceRequests(services, sets)
         self._setup, self._replaces, self._skip = setup, replaces, skip
+        self._journal_size = journal_size
         self._pool = pool
         self._ending = self._has_news = False
         self._listener = Listener[Peer](self._meet, self._give_up, encrypts=True)
@@ -313,7 +316,7 @@ class Server:
             peer.received = self._skip.rows_of(peer.instance_id, self._instance_nb)
             peer.rejected.count = self._skip.rejected_of(peer.instance_id)
         if former is None and self._replaces(peer.instance_id, None):
-            peer.journal = Journal()
+            peer.journal = Journal(peer.instance_id, self._journal_size)
         peer.send(pack(Kind.SETUP, self._setup(peer)))
 
     def _give_up(self, peer: Peer) -> None:
