@@ -15,7 +15,6 @@ import time
 from concurrent.futures import ThreadPoolExecutor
 from importlib.metadata import version
 from pathlib import Path
-from xml.etree import ElementTree
 
 import numpy as np
 
@@ -49,8 +48,7 @@ With meshes as *collisions*, `Robot(collisions="boxes")` or `"capsules"` is many
 def measure(name: str) -> dict[str, object]:
     """Measure a robot on all engines; it floats if its root link has a mass."""
     model = read_robot(Robot(name))
-    mass = ElementTree.fromstring(model.text).find("link/inertial/mass")
-    floats = mass is not None and float(mass.get("value", "0")) > NEGLIGIBLE
+    floats = model.bodies[0].mass > NEGLIGIBLE
     robot = Robot(name, fixed_base=not floats, collisions="none")
     found: dict[str, object] = {"load": [], "steps": []}
     world, accelerations = World([robot]), []

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from physx_core import Box, JointSettings, PhysxError, Robot, World, Wrench
-from physx_core.engines import named_robots, read_robot, rigid_bodies
+from physx_core.engines import named_robots, read_robot
 
 pytest.importorskip("mujoco")
 
@@ -18,7 +18,7 @@ ROBOTS = sorted(named_robots())
 def world_of(name, **options):
     """Return a world with a robot, which floats if its root link has a mass."""
     model = read_robot(Robot(name))
-    floats = rigid_bodies(model)[0].mass > 1e-6
+    floats = model.bodies[0].mass > 1e-6
     return World([Robot(name, fixed_base=not floats, collisions="none", **options)])
 
 

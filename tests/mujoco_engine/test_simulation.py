@@ -22,7 +22,7 @@ from physx_core import (
     World,
     Wrench,
 )
-from physx_core.engines import read_robot, rigid_bodies
+from physx_core.engines import read_robot
 from physx_core.errors import (
     FeatureNotSupportedError,
     ModelError,
@@ -41,7 +41,7 @@ def energy(simulation):
     """Return the energy of the double pendulum."""
     q, v = simulation.positions(), simulation.velocities()
     found = 0.5 * v @ simulation.mass_matrix(q) @ v
-    bodies = rigid_bodies(read_robot(Robot("double_pendulum")))
+    bodies = read_robot(Robot("double_pendulum")).bodies
     for body, pose in zip(bodies, simulation.body_poses(), strict=True):
         found += WEIGHT * body.mass * (pose[2] + (to_matrix(pose[3:]) @ body.center)[2])
     return found

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from physx_core import Mesh, Robot, World
-from physx_core.engines import RobotBackend, named_robots, read_parts, read_robot, rigid_bodies
+from physx_core.engines import RobotBackend, named_robots, read_parts, read_robot
 from physx_core.errors import ModelError
 
 TEXT = """
@@ -33,7 +33,7 @@ def test_links_are_rigid_bodies_in_the_order_of_the_tree(tmp_path):
     path = tmp_path / "crane.urdf"
     path.write_text(TEXT, encoding="utf-8")
     model = read_robot(Robot(path, mass_factors={"hook": 2.0}))
-    base, cart, hook = rigid_bodies(model)
+    base, cart, hook = model.bodies
     assert [body.name for body in (base, cart, hook)] == list(model.links)
     assert [body.parent for body in (base, cart, hook)] == [-1, 0, 1]
     assert (base.mass, base.joint, hook.joint) == (1e-9, None, None)
@@ -52,7 +52,7 @@ def test_links_are_rigid_bodies_in_the_order_of_the_tree(tmp_path):
 @pytest.mark.parametrize("name", [name for name in named_robots() if "/" not in name])
 def test_every_robot_of_physx_is_read(name):
     parts = read_parts(World([Robot(name, fixed_base=False)]))
-    bodies = rigid_bodies(parts.movers[0].model)
+    bodies = parts.movers[0].model.bodies
     joints = [body.joint for body in bodies if body.joint is not None]
     assert tuple(joints) == parts.movers[0].model.joints
     for body in bodies:

@@ -15,12 +15,14 @@ import numpy as np
 from physx_core.engines import (
     CollisionShape,
     Joint,
+    LoadedBody,
+    LoadedRobot,
     Mover,
     Parts,
     RigidBody,
     Static,
+    check_loaded,
     read_vertices,
-    rigid_bodies,
 )
 from physx_core.errors import ModelError
 from physx_core.rotations import to_matrix
@@ -89,6 +91,11 @@ class ModelBuilder:
         )
         model.body_inertia[bodies] = self._moments
         mujoco.mj_setConst(model, mujoco.MjData(model))
+        first = 0
+        for mover in self._parts.movers:
+            last = first + len(mover.model.links)
+            check_loaded("mujoco", mover, _loaded(model, mover, bodies[first:last]))
+            first = last
         return WorldModel(model, bodies, owners)
 
     # Robots and objects ---------------------------------------------------------------------
@@ -96,7 +103,7 @@ class ModelBuilder:
     def _add_mover(self, place: int, mover: Mover) -> None:
         added: list[Any] = []
         first = len(self._moments)
-        for body in rigid_bodies(mover.model):
+        for body in mover.model.bodies:
             if body.parent < 0:
                 turn = to_matrix(mover.orientation)
                 new = self._add_body(self._spec.worldbody, body, np.array(mover.position), turn)
@@ -197,6 +204,34 @@ class ModelBuilder:
         self._owners.append(owner)
         priority = self._priorities[float(friction)]
         return body.add_geom(type=kind, condim=3, priority=priority, **self._hard, **more)
+
+
+def _loaded(model: Any, mover: Mover, bodies: Index) -> LoadedRobot:
+    """Return what MuJoCo holds of a robot or object, for `check_loaded`."""
+    poses = _matrices(model.body_pos[bodies], model.body_quat[bodies])
+    if not mover.fixed_base:
+        poses[0] = np.eye(4)
+    turns = _matrices(model.body_ipos[bodies], model.body_iquat[bodies])[:, :3, :3]
+    inertia = np.einsum("nij,nj,nkj->nik", turns, model.body_inertia[bodies], turns)
+    values = zip(model.body_mass[bodies], model.body_ipos[bodies], inertia, strict=True)
+    moving = [body.joint is not None for body in mover.model.bodies]
+    joints = model.body_jntadr[bodies[moving]]
+    places = model.jnt_dofadr[joints]
+    limits = {"damping": model.dof_damping[places], "friction": model.dof_frictionloss[places]}
+    return LoadedRobot(
+        poses,
+        model.jnt_axis[joints],
+        [LoadedBody((link,), *each) for link, each in enumerate(values)],
+        limits,
+    )
+
+
+def _matrices(positions: Vector, quaternions: Vector) -> Vector:
+    """Return poses, given as positions (n, 3) and quaternions w, x, y, z, as matrices (n, 4, 4)."""
+    found = np.tile(np.eye(4), (len(positions), 1, 1))
+    for pose, position, (w, x, y, z) in zip(found, positions, quaternions, strict=True):
+        pose[:3, :3], pose[:3, 3] = to_matrix((x, y, z, w)), position
+    return found
 
 
 def _quaternion(rotation: Vector) -> Vector:

@@ -5,6 +5,9 @@ from .backend import RobotBackend as RobotBackend
 from .engine import RobotEngine as RobotEngine
 from .engine import base_accelerations as base_accelerations
 from .engine import twist_change as twist_change
+from .models.loaded import LoadedBody as LoadedBody
+from .models.loaded import LoadedRobot as LoadedRobot
+from .models.loaded import check_loaded as check_loaded
 from .models.meshes import bounding_box as bounding_box
 from .models.meshes import bounding_capsule as bounding_capsule
 from .models.meshes import geometry_file as geometry_file
@@ -15,8 +18,8 @@ from .models.parts import Static as Static
 from .models.parts import layout_of as layout_of
 from .models.parts import read_parts as read_parts
 from .models.parts import static_poses as static_poses
+from .models.rigid_bodies import Joint as Joint
 from .models.rigid_bodies import RigidBody as RigidBody
-from .models.rigid_bodies import rigid_bodies as rigid_bodies
 from .models.robot_files import EXAMPLE_DATA as EXAMPLE_DATA
 from .models.robot_files import OWN_ROBOTS as OWN_ROBOTS
 from .models.robot_files import example_data_dir as example_data_dir
@@ -24,7 +27,6 @@ from .models.robot_files import example_robot as example_robot
 from .models.robot_files import find_robot as find_robot
 from .models.robot_files import named_robots as named_robots
 from .models.shapes import CollisionShape as CollisionShape
-from .models.urdf import Joint as Joint
 from .models.urdf import RobotModel as RobotModel
 from .models.urdf import read_robot as read_robot
 from .resistance import Resistance as Resistance

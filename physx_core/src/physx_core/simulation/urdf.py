@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import os
+import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,6 +27,10 @@ _SIZES: dict[str, dict[str, int]] = {
     "capsule": {"radius": 1, "length": 1},
 }
 """Attributes that give the size of each kind of shape, and how many numbers each has."""
+_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
+"""A number as every URDF reader takes it; Python's `float` also takes 1_0, inf and digits that are
+not ASCII."""
+_BLANKS = re.compile(r"[ \t\r\n]+")
 _LARGEST = 2**24
 """Maximum size of a URDF file, in bytes."""
 _MOST = {"link": 400, "visual": 4000, "collision": 4000}
@@ -176,7 +181,7 @@ def origin_of(where: str, element: Element) -> Vector:
 def numbers_of(
     where: str, element: Element, attribute: str, default: str, count: int
 ) -> list[float]:
-    """Return the numbers in an attribute.
+    """Return the numbers in an attribute, separated by blanks or line breaks.
 
     Args:
         where: Start of the error message, as in ``'joint "knee"'``.
@@ -186,15 +191,14 @@ def numbers_of(
         count: Required number of numbers.
 
     Raises:
-        ModelError: If they are not `count` finite numbers.
+        ModelError: If they are not `count` finite decimal numbers in ASCII characters.
     """
     text = element.get(attribute, default)
-    try:
-        numbers = [float(part) for part in text.split()]
-    except ValueError:
-        numbers = [math.nan]
-    if len(numbers) != count or not all(map(math.isfinite, numbers)):
-        raise ModelError(f'{where} has {attribute}="{text}"')
+    parts = _BLANKS.split(text.strip(" \t\r\n"))
+    numbers = [float(part) for part in parts if _NUMBER.fullmatch(part)]
+    if not len(numbers) == len(parts) == count or not all(map(math.isfinite, numbers)):
+        wanted = "a finite number" if count == 1 else f"{count} finite numbers"
+        raise ModelError(f'{where} has {attribute}="{text}", which is not {wanted} such as -2.5e-3')
     return numbers
 
 

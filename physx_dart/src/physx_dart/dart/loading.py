@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 import sys
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -13,7 +13,16 @@ from typing import Any
 import numpy as np
 from dartpy import dynamics, utils
 
-from physx_core.engines import CollisionShape, Mover, Static, geometry_file
+from physx_core.engines import (
+    CollisionShape,
+    Joint,
+    LoadedBody,
+    LoadedRobot,
+    Mover,
+    Static,
+    check_loaded,
+    geometry_file,
+)
 from physx_core.errors import ModelError
 from physx_core.rotations import to_matrix
 from physx_core.simulation import Ground, HeightField, Stairs
@@ -26,14 +35,38 @@ GROUND_SIZE = (1000.0, 1000.0, 10.0)
 """Size of the box that represents an infinite plane, in m. For a box on a plane, DART finds a
 single contact point; for a box on a box, all corners."""
 
+_ACTUATORS = {
+    "force": dynamics.ActuatorType.FORCE,
+    "servo": dynamics.ActuatorType.SERVO,
+    "velocity": dynamics.ActuatorType.VELOCITY,
+    "position": dynamics.ActuatorType.SERVO,
+}
+_LIMITS: Mapping[str, Callable[[Any], float]] = {
+    "lower": lambda joint: joint.getPositionLowerLimit(0),
+    "upper": lambda joint: joint.getPositionUpperLimit(0),
+    "max_velocity": lambda joint: joint.getVelocityUpperLimit(0),
+    "max_torque": lambda joint: joint.getForceUpperLimit(0),
+    "damping": lambda joint: joint.getDampingCoefficient(0),
+    "friction": lambda joint: joint.getCoulombFriction(0),
+}
+"""How to read an attribute of `Joint` from DART's joint."""
+
 _MESH = (
     '<robot name="mesh"><link name="mesh"><collision><geometry><mesh filename="{}"/>'
     "</geometry></collision></link></robot>"
 )
 
 
-def load_skeleton(mover: Mover) -> dynamics.Skeleton:
-    """Return the skeleton of a robot or object, without shapes."""
+def load_skeleton(mover: Mover, *, free: bool = False) -> dynamics.Skeleton:
+    """Return the skeleton of a robot or object, without shapes.
+
+    Args:
+        mover: The robot or object.
+        free: Whether its joints have neither limits nor resistance, and take torques.
+
+    Raises:
+        ModelError: If DART cannot load it, or holds something else than physx read.
+    """
     model, text = mover.model, mover.model.text
     if model.links[0] == WORLD:
         text = text.replace(f'link="{WORLD}"', f'link="{ROOT}"')
@@ -43,7 +76,49 @@ def load_skeleton(mover: Mover) -> dynamics.Skeleton:
         place = _transform(mover.position, to_matrix(mover.orientation))
         skeleton.getRootJoint().setTransformFromParentBodyNode(place)
     skeleton.setName(mover.name)
+    joints = [skeleton.getJoint(joint.name) for joint in model.joints]
+    limits: dict[str, Vector] = {}
+    if not free:
+        for joint, native in zip(model.joints, joints, strict=True):
+            _configure(joint, native)
+        for name, read in _LIMITS.items():
+            limits[name] = np.array([read(native) for native in joints], np.float64)
+    check_loaded("dart", mover, _loaded(skeleton, mover, limits))
     return skeleton
+
+
+def _loaded(skeleton: dynamics.Skeleton, mover: Mover, limits: Mapping[str, Vector]) -> LoadedRobot:
+    """Return what DART holds of a robot or object."""
+    bodies, poses = [], []
+    for place, link in enumerate(mover.model.links):
+        body = skeleton.getBodyNode(link_name(link))
+        if body is None:
+            raise ModelError(f'DART finds no link "{link}" in {mover.model.path}.')
+        joint, inertia = body.getParentJoint(), body.getInertia()
+        child = joint.getTransformFromChildBodyNode().inverse()
+        poses.append(joint.getTransformFromParentBodyNode().multiply(child).matrix())
+        found = inertia.getLocalCOM(), inertia.getMoment()
+        bodies.append(LoadedBody((place,), inertia.getMass(), *found))
+    joints = [skeleton.getJoint(joint.name) for joint in mover.model.joints]
+    axes = np.array([joint.getAxis() for joint in joints]).reshape(-1, 3)
+    return LoadedRobot(np.array(poses), axes, bodies, limits)
+
+
+def _configure(joint: Joint, native: Any) -> None:
+    """Set the limits, resistance, and actuator of a joint in DART."""
+    settings = joint.settings
+    native.setPositionLowerLimit(0, joint.lower)
+    native.setPositionUpperLimit(0, joint.upper)
+    native.setVelocityLowerLimit(0, -joint.max_velocity)
+    native.setVelocityUpperLimit(0, joint.max_velocity)
+    native.setForceLowerLimit(0, -joint.max_torque)
+    native.setForceUpperLimit(0, joint.max_torque)
+    native.setLimitEnforcement(True)
+    native.setDampingCoefficient(0, joint.damping)
+    native.setCoulombFriction(0, joint.friction)
+    native.setSpringStiffness(0, settings.stiffness)
+    native.setRestPosition(0, settings.rest)
+    native.setActuatorType(_ACTUATORS[settings.mode])
 
 
 def link_name(link: str) -> str:

@@ -7,9 +7,8 @@ import math
 from typing import Any
 
 import numpy as np
-from dartpy import dynamics
 
-from physx_core.engines import Joint, Mover, RobotEngine, base_accelerations, rk4_step
+from physx_core.engines import Mover, RobotEngine, base_accelerations, rk4_step
 from physx_core.rotations import (
     from_rotation_vector,
     multiply,
@@ -19,13 +18,6 @@ from physx_core.rotations import (
 )
 from physx_core.typing import Vector
 from physx_dart.dart.loading import link_name, load_skeleton
-
-_ACTUATORS = {
-    "force": dynamics.ActuatorType.FORCE,
-    "servo": dynamics.ActuatorType.SERVO,
-    "velocity": dynamics.ActuatorType.VELOCITY,
-    "position": dynamics.ActuatorType.SERVO,
-}
 
 
 class DartRobot(RobotEngine):
@@ -46,8 +38,6 @@ class DartRobot(RobotEngine):
         self._native = np.array([*range(self.base), *places], dtype=np.intp)
         self._sorted = bool((self._native == np.arange(self.nv)).all())
         self.bodies = [self.skeleton.getBodyNode(link_name(link)) for link in self.model.links]
-        for joint, native in zip(self.model.joints, joints, strict=True):
-            _configure(joint, native)
         self._held, self._commands = np.zeros(self.nv), np.zeros(self.nv - self.base)
         self._pushes: list[tuple[int, Vector, Vector, Vector, bool]] = []
         self._change: Vector | None = None
@@ -194,7 +184,7 @@ class DartRobot(RobotEngine):
     @property
     def _shadow(self) -> Any:
         if self._made_shadow is None:
-            self._made_shadow = load_skeleton(self.mover)
+            self._made_shadow = load_skeleton(self.mover, free=True)
             self._made_shadow.setGravity(list(self._gravity))
         return self._made_shadow
 
@@ -268,20 +258,3 @@ def _push(body: Any, force: Vector, torque: Vector, point: Vector, local: bool) 
     """Apply a wrench to a body in DART."""
     body.addExtForce(force, point, local, True)
     body.addExtTorque(torque, local)
-
-
-def _configure(joint: Joint, native: Any) -> None:
-    """Set the limits, resistance, and actuator of a joint in DART."""
-    settings = joint.settings
-    native.setPositionLowerLimit(0, joint.lower)
-    native.setPositionUpperLimit(0, joint.upper)
-    native.setVelocityLowerLimit(0, -joint.max_velocity)
-    native.setVelocityUpperLimit(0, joint.max_velocity)
-    native.setForceLowerLimit(0, -joint.max_torque)
-    native.setForceUpperLimit(0, joint.max_torque)
-    native.setLimitEnforcement(True)
-    native.setDampingCoefficient(0, joint.damping)
-    native.setCoulombFriction(0, joint.friction)
-    native.setSpringStiffness(0, settings.stiffness)
-    native.setRestPosition(0, settings.rest)
-    native.setActuatorType(_ACTUATORS[settings.mode])

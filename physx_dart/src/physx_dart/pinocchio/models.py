@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pinocchio
 
-from physx_core.engines import Mover
+from physx_core.engines import LoadedBody, LoadedRobot, Mover, check_loaded
 from physx_core.errors import ModelError
 from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
@@ -91,4 +91,30 @@ def _finish(
     if moving != [joint.name for joint in mover.model.joints]:
         path = mover.model.path
         raise ModelError(f"Pinocchio reads the joints of {path} in a different order: {moving}.")
+    check_loaded("pinocchio", mover, _loaded(model, mover))
     return model
+
+
+def _loaded(model: Any, mover: Mover) -> LoadedRobot:
+    """Return what Pinocchio holds of a robot or object, whose limits it does not use."""
+    bodies = mover.model.bodies
+    frames = [model.frames[frame] for frame in frames_of(model, mover)]
+    poses, axes = [], []
+    for frame, body in zip(frames, bodies, strict=True):
+        joint, place = frame.parentJoint, frame.placement
+        if body.joint is not None:
+            place = model.jointPlacements[joint] * place
+            twist = model.joints[joint].createData().S
+            axes.append(twist[:3] if body.joint.unit == "m" else twist[3:])
+        if body.parent >= 0:
+            place = frames[body.parent].placement.actInv(place)
+        poses.append(place.homogeneous)
+    carried: dict[int, list[int]] = {}
+    for link, frame in enumerate(frames):
+        carried.setdefault(frame.parentJoint, []).append(link)
+    carried.pop(0, None)  # welded to the world
+    found = []
+    for joint, links in carried.items():
+        inertia = frames[links[0]].placement.actInv(model.inertias[joint])
+        found.append(LoadedBody(links, inertia.mass, inertia.lever, inertia.inertia))
+    return LoadedRobot(np.array(poses), np.array(axes).reshape(-1, 3), found)

@@ -52,7 +52,8 @@ class PinocchioRobot(RobotEngine):
         self.model_in_motion = load_stepping_model(mover, world.gravity, armature=implicit)
         self.data = self.model_in_motion.createData()
         # Constraints act on the robot without its implicit damping, as in DART.
-        self._model = load_stepping_model(mover, world.gravity, armature=resists.armature)
+        self._model = self.model_in_motion.copy()
+        self._model.armature = np.asarray(resists.armature, np.float64)
         self._data = self._model.createData()
         self.frames = frames_of(self.model_in_motion, mover)
         self._pushes = pinocchio.StdVec_Force()

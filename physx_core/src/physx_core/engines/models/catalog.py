@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from xml.etree import ElementTree
 from xml.etree.ElementTree import Element
 
 from physx_core.engines.models.robot_files import mesh_path, named_robots
@@ -32,14 +31,13 @@ def describe(name: str, path: Path) -> RobotInfo:
         root = parse_urdf(path)
     except PhysxError as error:
         return RobotInfo(name, path, error=str(error))
-    masses = ElementTree.fromstring(model.text).iter("mass")
     shapes = [shape for each in root.iter("collision") for shape in each.iterfind("geometry/*")]
     meshes = [shape for shape in shapes if shape.tag == "mesh"]
     return RobotInfo(
         name,
         path,
         len(model.joints),
-        sum(float(mass.get("value", "0")) for mass in masses),
+        sum(body.mass for body in model.bodies),
         _kind(len(shapes) - len(meshes), len(meshes)),
         _warning(path, meshes),
     )

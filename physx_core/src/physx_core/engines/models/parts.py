@@ -8,15 +8,11 @@ from pathlib import Path
 
 import numpy as np
 
+from physx_core.engines.models.rigid_bodies import Inertial, Joint
 from physx_core.engines.models.shapes import CollisionShape, moments, shape_of_object
-from physx_core.engines.models.urdf import Joint, RobotModel, read_robot
+from physx_core.engines.models.urdf import RobotModel, model_of_body, read_robot
 from physx_core.errors import ModelError
 from physx_core.simulation import Ground, HeightField, Layout, Part, Stairs, World, WorldObject
-
-_OBJECT = (
-    '<robot name="robot"><link name="body"><inertial><mass value="{mass!r}"/><inertia '
-    'ixx="{0!r}" iyy="{1!r}" izz="{2!r}" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>'
-)
 
 
 @dataclass(frozen=True)
@@ -112,9 +108,9 @@ def _touches(world: World, itself: bool) -> bool:
 
 def _object(thing: WorldObject) -> Mover:
     shape = shape_of_object(thing)
-    values = (float(moment) for moment in moments(shape, thing.mass))
-    text = _OBJECT.format(*values, mass=float(thing.mass))
-    model = RobotModel(Path(thing.name), text, ("body",), (), (shape,))
+    xx, yy, zz = moments(shape, thing.mass).tolist()
+    inertial = Inertial(float(thing.mass), (xx, yy, zz, 0.0, 0.0, 0.0))
+    model = model_of_body("body", Path(thing.name), inertial, shape)
     return Mover(thing.name, model, False, thing.position, thing.orientation, is_object=True)
 
 

@@ -1,19 +1,43 @@
-"""Rigid bodies: the links of a robot as numbers, for engines that do not read URDF."""
+"""Rigid bodies: the links and joints of a robot as numbers."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
-from xml.etree import ElementTree
-from xml.etree.ElementTree import Element
+from typing import NamedTuple
 
 import numpy as np
 
-from physx_core.engines.models.urdf import Joint, RobotModel
-from physx_core.simulation import UrdfTree, link_of, numbers_of, origin_of
+from physx_core.rotations import from_roll_pitch_yaw, to_matrix
+from physx_core.simulation import JointSettings
 from physx_core.typing import Vector
 
-_INERTIAL = ("inertial", "inertial/mass", "inertial/inertia")
-_MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
+
+@dataclass(frozen=True)
+class Joint:
+    """A joint with one degree of freedom.
+
+    Attributes:
+        name: Name in the file.
+        lower: Lower position limit, in rad or m; -inf: none.
+        upper: Upper position limit, in rad or m; inf: none.
+        max_velocity: Limit of the velocity, in rad/s or m/s.
+        max_torque: Limit of the torque, in N m or N.
+        damping: Viscous damping, in N m s/rad or N s/m.
+        friction: Coulomb friction, in N m or N.
+        settings: The world's settings for it.
+        unit: Unit of its position, rad or m.
+    """
+
+    name: str
+    lower: float
+    upper: float
+    max_velocity: float
+    max_torque: float
+    damping: float
+    friction: float
+    settings: JointSettings
+    unit: str
 
 
 @dataclass(frozen=True, eq=False)
@@ -44,32 +68,39 @@ class RigidBody:
     inertia: Vector
 
 
-def rigid_bodies(model: RobotModel) -> tuple[RigidBody, ...]:
-    """Return the links of a robot or object as rigid bodies, parents before children."""
-    tree = UrdfTree(ElementTree.fromstring(model.text))
-    joints = {joint.name: joint for joint in model.joints}
-    places = {name: place for place, name in enumerate(tree.links)}
-    found = []
-    for name in tree.links:
-        above = tree.parents.get(name)
-        parent, pose, joint, axis = -1, np.eye(4), None, np.zeros(3)
-        if above is not None:
-            where = f'joint "{above.get("name")}"'
-            parent, pose = places[link_of(above, "parent")], origin_of(where, above)
-            joint, given = joints.get(above.get("name", "")), above.find("axis")
-            if joint is not None and given is not None:
-                axis = np.array(numbers_of(where, given, "xyz", "", 3))
-        inertial = _inertial(f'link "{name}"', tree.elements[name])
-        found.append(RigidBody(name, parent, pose, joint, axis, *inertial))
-    return tuple(found)
+class Origin(NamedTuple):
+    """A pose as in a URDF file: translation in m; roll, pitch and yaw in rad."""
+
+    xyz: Sequence[float] = (0.0, 0.0, 0.0)
+    rpy: Sequence[float] = (0.0, 0.0, 0.0)
+
+    def matrix(self) -> Vector:
+        """Return it as a homogeneous matrix, shape (4, 4)."""
+        pose = np.eye(4)
+        pose[:3, 3] = self.xyz
+        if any(self.rpy):
+            pose[:3, :3] = to_matrix(from_roll_pitch_yaw(*self.rpy))
+        return pose
 
 
-def _inertial(where: str, link: Element) -> tuple[float, Vector, Vector]:
-    """Return the mass, center of mass, and moments of inertia of a link in the engines' text."""
-    (inertial,), (mass,), (given,) = (link.findall(path) for path in _INERTIAL)
-    (number,) = numbers_of(where, mass, "value", "", 1)
-    xx, yy, zz, xy, xz, yz = (numbers_of(where, given, name, "", 1)[0] for name in _MOMENTS)
-    place = origin_of(where, inertial)
-    turn = place[:3, :3]
-    inertia = turn @ np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]]) @ turn.T
-    return number, place[:3, 3], inertia
+class Inertial(NamedTuple):
+    """The inertia of a link as in a URDF file.
+
+    Attributes:
+        mass: In kg.
+        moments: Moments of inertia xx, yy, zz, xy, xz, yz about the axes of `origin`, in kg m².
+        origin: The center of mass, and the axes of the moments.
+    """
+
+    mass: float
+    moments: Sequence[float]
+    origin: Origin = Origin()
+
+    def in_link(self) -> tuple[float, Vector, Vector]:
+        """Return mass, center of mass (3,) and moments (3, 3) about it in the link's frame."""
+        xx, yy, zz, xy, xz, yz = self.moments
+        inertia = np.array([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
+        if any(self.origin.rpy):
+            turn = self.origin.matrix()[:3, :3]
+            inertia = turn @ inertia @ turn.T
+        return self.mass, np.array(self.origin.xyz, np.float64), inertia

@@ -1,11 +1,12 @@
 """Robot models from URDF files: names, joints, collision shapes, and URDF text for the engines.
 
-All engines load the same text, rebuilt from the file: links with their inertia, joints with their
-origin and axis. Everything else is read here, so it means the same in every engine:
+All engines load the same text, written from the numbers read here, since readers disagree about
+what counts as a number: links with their inertia, joints with their origin and axis. Everything
+else is read here, so it means the same in every engine:
 
 - Shapes are omitted; `physx_core.engines.models.shapes` reads those for collisions. All meshes must
   exist.
-- A link without inertia, or with mass 0, gets 1e-9 kg and 1e-12 kg m².
+- A link without mass gets 1e-9 kg and, unless it has moments of inertia, 1e-12 kg m².
 - Mimic joints are treated as ordinary joints.
 - A position limit whose ends are equal or absent, or a velocity or effort limit that is 0 or
   absent, counts as no limit: many files contain zeros for unknown limits.
@@ -18,8 +19,12 @@ import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import NamedTuple
 from xml.etree.ElementTree import Element
 
+import numpy as np
+
+from physx_core.engines.models.rigid_bodies import Inertial, Joint, Origin, RigidBody
 from physx_core.engines.models.robot_files import check_meshes, find_robot
 from physx_core.engines.models.shapes import CollisionShape, shapes_of_robot
 from physx_core.errors import ModelError, listed, nearest
@@ -37,37 +42,7 @@ _UNLIMITED = '<limit lower="-1e9" upper="1e9" effort="1e9" velocity="1e9"/>'
 _PLAIN = JointSettings()
 _SPECIAL = re.compile('[&<>"\t\n\r]')
 _MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-_NEGLIGIBLE = (
-    '<inertial><mass value="1e-9"/><inertia ixx="1e-12" iyy="1e-12" izz="1e-12" '
-    'ixy="0" ixz="0" iyz="0"/></inertial>'
-)
-
-
-@dataclass(frozen=True)
-class Joint:
-    """A joint with one degree of freedom.
-
-    Attributes:
-        name: Name in the file.
-        lower: Lower position limit, in rad or m; -inf: none.
-        upper: Upper position limit, in rad or m; inf: none.
-        max_velocity: Limit of the velocity, in rad/s or m/s.
-        max_torque: Limit of the torque, in N m or N.
-        damping: Viscous damping, in N m s/rad or N s/m.
-        friction: Coulomb friction, in N m or N.
-        settings: The world's settings for it.
-        unit: Unit of its position, rad or m.
-    """
-
-    name: str
-    lower: float
-    upper: float
-    max_velocity: float
-    max_torque: float
-    damping: float
-    friction: float
-    settings: JointSettings
-    unit: str
+_NEGLIGIBLE = Inertial(1e-9, (1e-12, 1e-12, 1e-12, 0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -79,6 +54,7 @@ class RobotModel:
         text: URDF text for the engines.
         links: Names of all links, parents before children, in tree order.
         joints: The joints with one degree of freedom, in tree order.
+        bodies: The links as numbers, those of `text`, in the order of `links`.
         shapes: Collision shapes; empty if there is nothing to touch.
     """
 
@@ -86,7 +62,19 @@ class RobotModel:
     text: str
     links: tuple[str, ...]
     joints: tuple[Joint, ...]
+    bodies: tuple[RigidBody, ...]
     shapes: tuple[CollisionShape, ...] = ()
+
+
+class _Link(NamedTuple):
+    """A link and the joint that leads to it, which only the root link lacks."""
+
+    name: str
+    parent: str = ""
+    joint_name: str = ""
+    origin: Origin = Origin()
+    joint: Joint | None = None
+    axis: Sequence[float] = (0.0, 0.0, 0.0)
 
 
 def read_robot(robot: Robot, *, touching: bool = False) -> RobotModel:
@@ -117,11 +105,31 @@ def read_robot(robot: Robot, *, touching: bool = False) -> RobotModel:
         joints = tuple(_joint(joint, robot.joints) for joint in moving)
         _check_settings(robot, joints)
         _check_masses(robot, list(tree.links))
-        text = _engine_text(tree, robot.mass_factors)
+        inertials = [
+            _inertial(name, tree.elements[name], float(robot.mass_factors.get(name, 1.0)))
+            for name in tree.links
+        ]
+        links = _links(tree, joints)
+        text = _engine_text(links, inertials)
         shapes = shapes_of_robot(robot, path, tree) if touching else ()
     except (ModelError, ValueError) as error:
         raise ModelError(f'Robot "{robot.name}", {path}: {error}.') from error
-    return RobotModel(path, text, tuple(tree.links), joints, shapes)
+    bodies = _bodies(links, inertials)
+    return RobotModel(path, text, tuple(tree.links), joints, bodies, shapes)
+
+
+def model_of_body(name: str, path: Path, inertial: Inertial, shape: CollisionShape) -> RobotModel:
+    """Return the model of an object: a robot with one link.
+
+    Args:
+        name: Name of the link.
+        path: Name of the object, as a path.
+        inertial: The link's inertia.
+        shape: Its collision shape.
+    """
+    links = [_Link(name)]
+    text, bodies = _engine_text(links, [inertial]), _bodies(links, [inertial])
+    return RobotModel(path, text, (name,), (), bodies, (shape,))
 
 
 def _check_settings(robot: Robot, joints: tuple[Joint, ...]) -> None:
@@ -165,34 +173,51 @@ def _joint(joint: Element, all_settings: Mapping[str, JointSettings]) -> Joint:
 
 
 def _number(joint: Element, tag: str, attribute: str) -> float:
-    """Return a finite number; 0 if it is absent."""
+    """Return a finite number, not negative except in position limits; 0 if it is absent."""
     element = joint.find(tag)
-    text = "0" if element is None else element.get(attribute, "0")
-    signed = attribute in ("lower", "upper")
-    try:
-        number = float(text)
-    except ValueError:
-        number = math.nan
-    if not math.isfinite(number) or (number < 0 and not signed):
-        raise ModelError(f'joint "{joint.get("name")}" has {attribute}="{text}"')
+    if element is None:
+        return 0.0
+    where = f'joint "{joint.get("name")}"'
+    (number,) = numbers_of(where, element, attribute, "0", 1)
+    if number < 0 and attribute not in ("lower", "upper"):
+        raise ModelError(f'{where} has {attribute}="{element.get(attribute)}", which is negative')
     return number
 
 
-def _engine_text(tree: UrdfTree, mass_factors: Mapping[str, float]) -> str:
-    parts = ['<robot name="robot">']
+def _links(tree: UrdfTree, joints: Sequence[Joint]) -> list[_Link]:
+    moving, found = {joint.name: joint for joint in joints}, []
     for name in tree.links:
-        link = _inertial(name, tree.elements[name], mass_factors.get(name, 1.0))
-        parts.append(f"<link name={_quote(name)}>{link}</link>")
-    for joint in tree.joints:
-        moving = joint.get("type") in _MOVING
-        kind = "prismatic" if joint.get("type") == "prismatic" else "revolute"
-        name = joint.get("name", "")
-        parts.append(f'<joint name={_quote(name)} type="{kind if moving else "fixed"}">')
-        parts.append(_origin(f'joint "{name}"', joint))
-        for tag in ("parent", "child"):
-            parts.append(f"<{tag} link={_quote(link_of(joint, tag))}/>")
-        if moving:
-            parts.append(f'<axis xyz="{_axis(joint)}"/>{_UNLIMITED}')
+        above = tree.parents.get(name)
+        if above is None:
+            found.append(_Link(name))
+            continue
+        joint = moving.get(above.get("name", ""))
+        axis = (0.0, 0.0, 0.0) if joint is None else _axis(above)
+        origin = _origin(f'joint "{above.get("name")}"', above)
+        found.append(
+            _Link(name, link_of(above, "parent"), above.get("name", ""), origin, joint, axis)
+        )
+    return found
+
+
+def _engine_text(links: Sequence[_Link], inertials: Sequence[Inertial]) -> str:
+    parts = ['<robot name="robot">']
+    for link, inertial in zip(links, inertials, strict=True):
+        moments = (f'{k}="{_text(x)}"' for k, x in zip(_MOMENTS, inertial.moments, strict=True))
+        parts.append(
+            f"<link name={_quote(link.name)}><inertial>{_origin_text(inertial.origin)}"
+            f'<mass value="{_text(inertial.mass)}"/><inertia {" ".join(moments)}/>'
+            "</inertial></link>"
+        )
+    for link in links[1:]:
+        joint, kind = link.joint, "fixed"
+        if joint is not None:
+            kind = "prismatic" if joint.unit == "m" else "revolute"
+        parts.append(f'<joint name={_quote(link.joint_name)} type="{kind}">')
+        parts.append(_origin_text(link.origin))
+        parts.append(f"<parent link={_quote(link.parent)}/><child link={_quote(link.name)}/>")
+        if joint is not None:
+            parts.append(f'<axis xyz="{_text(*link.axis)}"/>{_UNLIMITED}')
         parts.append("</joint>")
     return "".join([*parts, "</robot>"])
 
@@ -205,47 +230,62 @@ def _quote(name: str) -> str:
     return quoteattr(name)
 
 
-def _inertial(name: str, link: Element, factor: float) -> str:
-    """Return the text of a link's inertia scaled by a factor, with each number validated."""
+def _origin_text(origin: Origin) -> str:
+    return f'<origin xyz="{_text(*origin.xyz)}" rpy="{_text(*origin.rpy)}"/>'
+
+
+def _text(*numbers: float) -> str:
+    """Return numbers in the shortest form that every reader reads exactly."""
+    return " ".join(repr(float(number)) for number in numbers)
+
+
+def _bodies(links: Sequence[_Link], inertials: Sequence[Inertial]) -> tuple[RigidBody, ...]:
+    places = {link.name: place for place, link in enumerate(links)}
+    return tuple(
+        RigidBody(
+            link.name,
+            places.get(link.parent, -1),
+            link.origin.matrix(),
+            link.joint,
+            np.array(link.axis),
+            *inertial.in_link(),
+        )
+        for link, inertial in zip(links, inertials, strict=True)
+    )
+
+
+def _inertial(name: str, link: Element, factor: float) -> Inertial:
+    """Return a link's inertia scaled by a factor."""
     given, where = link.find("inertial"), f'link "{name}"'
-    mass = None if given is None else given.find("mass")
-    if given is None or mass is None or _checked_text(where, mass, "value", "0", 1) == "0":
+    element = None if given is None else given.find("mass")
+    if given is None or element is None:
         return _NEGLIGIBLE
-    if float(mass.get("value", "0")) < 0:
-        raise ModelError(f'{where} has the mass "{mass.get("value")}"')
+    (mass,) = numbers_of(where, element, "value", "0", 1)
+    if mass < 0:
+        raise ModelError(f'{where} has the mass "{element.get("value")}"')
     inertia = given.find("inertia")
     found = Element("none") if inertia is None else inertia
-    values = {key: _checked_text(where, found, key, "0", 1) for key in _MOMENTS}
-    value = mass.get("value", "")
-    if factor != 1.0:
-        values = {key: repr(factor * float(text)) for key, text in values.items()}
-        value = repr(factor * float(value))
-    moments = " ".join(f'{key}="{text}"' for key, text in values.items())
-    origin = _origin(where, given)
-    return f'<inertial>{origin}<mass value="{value}"/><inertia {moments}/></inertial>'
+    moments = [factor * numbers_of(where, found, key, "0", 1)[0] for key in _MOMENTS]
+    if not all(map(math.isfinite, [factor * mass, *moments])):
+        raise ModelError(f"{where} is too heavy for numbers with its mass factor {factor}")
+    if mass == 0 and not any(moments):
+        return _NEGLIGIBLE
+    return Inertial(factor * mass or _NEGLIGIBLE.mass, moments, _origin(where, given))
 
 
-def _origin(where: str, given: Element) -> str:
+def _origin(where: str, given: Element) -> Origin:
     origin = given.find("origin")
     if origin is None:
-        return ""
-    xyz, rpy = (_checked_text(where, origin, key, "0 0 0", 3) for key in ("xyz", "rpy"))
-    return f'<origin xyz="{xyz}" rpy="{rpy}"/>'
+        return Origin()
+    return Origin(*(numbers_of(where, origin, key, "0 0 0", 3) for key in ("xyz", "rpy")))
 
 
-def _checked_text(where: str, element: Element, attribute: str, default: str, count: int) -> str:
-    """Return the text of an attribute that must be finite numbers; "0" for a number equal to 0."""
-    numbers = numbers_of(where, element, attribute, default, count)
-    return element.get(attribute, default) if any(numbers) or count > 1 else "0"
-
-
-def _axis(joint: Element) -> str:
-    element = joint.find("axis")
-    text = "1 0 0" if element is None else element.get("xyz", "1 0 0")
-    axis = [float(part) for part in text.split()]
+def _axis(joint: Element) -> list[float]:
+    """Return a joint's axis as a unit vector."""
+    where, element = f'joint "{joint.get("name")}"', joint.find("axis")
+    axis = [1.0, 0.0, 0.0] if element is None else numbers_of(where, element, "xyz", "1 0 0", 3)
     length = math.hypot(*axis)
-    if len(axis) != 3 or not 0 < length < math.inf:
-        raise ModelError(f'joint "{joint.get("name")}" has the axis "{text}"')
-    if length == 1.0:
-        return text
-    return " ".join(repr(part / length) for part in axis)
+    if not 0 < length < math.inf:
+        text = "" if element is None else element.get("xyz")
+        raise ModelError(f'{where} has the axis "{text}", which has no direction')
+    return [part / length for part in axis]
