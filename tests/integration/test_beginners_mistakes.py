@@ -578,9 +578,9 @@ class OwnNetwork(Network):
 class OwnOptimization(Optimization):
     """Gradient descent on the mean square, in NumPy."""
 
-    def compute_loss(self, prediction, targets, data):
-        self.difference = prediction["prediction"] - targets["next_state"]
-        self.inputs = data["state"]
+    def compute_loss(self, batch):
+        self.difference = batch.prediction["prediction"] - batch.targets["next_state"]
+        self.inputs = batch.data["state"]
         return float(np.mean(self.difference**2))
 
     def optimize(self, loss):
@@ -629,11 +629,6 @@ def gives_fields_as_a_text():
     own(net_fields="state")
 
 
-@mistake(e.ConfigError, "predicts prediction but is compared with next_state, state")
-def compares_one_prediction_with_two_fields():
-    own(opt_fields=["next_state", "state"])
-
-
 @mistake(e.CheckpointError, "Changed.save_parameters() does not write", "It writes: weights.npz")
 def writes_the_parameters_to_another_file():
     def save_parameters(self, path):
@@ -669,7 +664,7 @@ def gives_a_transformation_too_few_arguments():
 @mistake(e.UsageError, 'transform_loss() must return a dictionary with "loss", not float')
 def returns_a_number_from_transform_loss():
     class Own(LeastSquares):
-        def transform_loss(self, loss, data):
+        def transform_loss(self, loss, batch):
             return loss
 
     train(of("toy/linear", optimization=Own))
@@ -678,7 +673,7 @@ def returns_a_number_from_transform_loss():
 @mistake(e.UsageError, 'transform_loss() returned "each", which is not a number')
 def returns_an_array_from_transform_loss():
     class Own(LeastSquares):
-        def transform_loss(self, loss, data):
+        def transform_loss(self, loss, batch):
             return {"loss": loss, "each": np.zeros(3)}
 
     train(of("toy/linear", optimization=Own))

@@ -15,6 +15,7 @@ import numpy as np
 from physx_core.components.environment import Environment
 from physx_core.components.network import Network
 from physx_core.components.optimization import Optimization
+from physx_core.components.predicted_batch import PredictedBatch
 from physx_core.components.transformation import Transformation
 from physx_core.errors import CheckpointError, ConfigError, FieldsMismatchError
 from physx_core.fields import Field
@@ -209,17 +210,22 @@ class LeastSquares(Optimization):
         self._normal: Array | None = None
         self._right: Array | None = None
 
-    def compute_loss(self, prediction: Tensors, targets: Tensors, data: Tensors) -> Any:
+    def compute_loss(self, batch: PredictedBatch) -> Any:
         """Return the mean squared difference and keep the batch for `optimize`."""
-        self._rows = self._network.rows(data)
-        target = targets[self._network.opt_fields[0]]
+        self._rows = self._network.rows(batch.data)
+        target = batch.targets[self._network.opt_fields[0]]
         self._targets = target.reshape(len(target), -1)
-        return float(np.mean((prediction[self._network.pred_fields[0]] - target) ** 2))
+        return float(np.mean(self._errors(batch) ** 2))
 
-    def compute_row_losses(self, prediction: Tensors, targets: Tensors, data: Tensors) -> Any:
+    def compute_row_losses(self, batch: PredictedBatch) -> Any:
         """Return the mean squared difference of each row."""
-        error = prediction[self._network.pred_fields[0]] - targets[self._network.opt_fields[0]]
+        error = self._errors(batch)
         return np.mean((error**2).reshape(len(error), -1), axis=1)
+
+    def _errors(self, batch: PredictedBatch) -> Array:
+        predicted, target = self._network.pred_fields[0], self._network.opt_fields[0]
+        errors: Array = batch.prediction[predicted] - batch.targets[target]
+        return errors
 
     def optimize(self, loss: Any) -> None:
         """Add the batch to the normal equations and solve them."""

@@ -4,14 +4,16 @@ from __future__ import annotations
 
 import contextlib
 import io
+import itertools
 import logging
 import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 import torch
+from torch.fx.experimental.proxy_tensor import make_fx
 
 from physx_core import Field
 from physx_core.errors import ConfigError, MissingLibraryError
@@ -76,6 +78,9 @@ def export_network(
     samples = {name: _samples(fields[name], network) for name in network.net_fields}
     try:
         with _evaluating(network), _quiet():
+            predict(samples)  # finds out whether the network differentiates
+            if network.differentiates:
+                predict = _record_derivatives(predict, samples, network, form)
             FORMS[form](_PhysicalUnits(network, predict).eval(), samples, path)
     except MissingLibraryError:
         raise
@@ -106,6 +111,33 @@ def _evaluating(network: TorchNetwork) -> Iterator[None]:
         for parameter in trained:
             parameter.requires_grad_(True)
         network.train(was_training)
+
+
+def _record_derivatives(
+    predict: Predict, samples: Tensors, network: TorchNetwork, form: str
+) -> Predict:
+    """Return the plain operations of a prediction that differentiates.
+
+    Exporters record operations, but not that torch differentiates them.
+    """
+    if form == "torchscript":
+        raise ConfigError("TorchScript does not record derivatives; onnx and pt2 do.")
+    tensors = (*samples.values(), *network.parameters(), *network.buffers())
+    taken = {size for tensor in tensors for size in tensor.shape}
+    # Axes of equal sizes would be taken for one: the sample axis gets a size of its own.
+    rows = next(count for count in itertools.count(3) if count not in taken)
+    record = make_fx(  # which does not take methods
+        lambda data: predict(data), tracing_mode="symbolic", _allow_non_fake_inputs=True
+    )
+    recorded: Any = record(
+        {name: values[:1].expand(rows, *values.shape[1:]) for name, values in samples.items()}
+    )
+    found = recorded(samples)
+    for name, wanted in predict(samples).items():
+        if torch.allclose(found[name], wanted, equal_nan=True):
+            continue
+        raise ConfigError("its derivatives depend on the number of samples.")
+    return cast("Predict", recorded)
 
 
 def _samples(field: Field, network: TorchNetwork) -> torch.Tensor:

@@ -22,9 +22,10 @@ class Descent(Optimization):
         if self.rate == 0.123:
             raise ConfigError("This rate is of no use: give another lr.")
 
-    def compute_loss(self, prediction, targets, data):
+    def compute_loss(self, batch):
         name = self.network.opt_fields[0]
-        self.error, self.rows = prediction[name] - targets[name], self.network.rows(data)
+        self.rows = self.network.rows(batch.data)
+        self.error = batch.prediction[name] - batch.targets[name]
         return float(np.mean(self.error**2))
 
     def optimize(self, loss):

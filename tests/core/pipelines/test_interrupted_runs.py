@@ -361,8 +361,8 @@ class Diverging(LeastSquares):
 
     steps, spoils = 0, "loss"
 
-    def compute_loss(self, prediction, targets, data):
-        loss = super().compute_loss(prediction, targets, data)
+    def compute_loss(self, batch):
+        loss = super().compute_loss(batch)
         self.steps += 1
         return float("nan") if self.steps == 6 and self.spoils == "loss" else loss
 
@@ -436,8 +436,8 @@ def test_the_command_line_reports_a_divergence(capsys, tmp_path):
     (tmp_path / "own.py").write_text(
         "import numpy as np\nfrom physx_core.toy import LeastSquares\n"
         "class Nan(LeastSquares):\n"
-        "    def compute_loss(self, *args):\n"
-        "        super().compute_loss(*args)\n"
+        "    def compute_loss(self, batch):\n"
+        "        super().compute_loss(batch)\n"
         "        return float('nan')\n"
     )
     words = ["train", "sessions/run", "--network.network", "toy/linear", "--epoch-nb", "1"]

@@ -234,14 +234,14 @@ def test_an_error_ends_a_run_whose_clients_wait_for_losses(tmp_path, delay, noth
 class Silent(LeastSquares):
     """Does not tell the losses of rows."""
 
-    def compute_row_losses(self, prediction, targets, data):
-        return super(LeastSquares, self).compute_row_losses(prediction, targets, data)
+    def compute_row_losses(self, batch):
+        return super(LeastSquares, self).compute_row_losses(batch)
 
 
 class Short(LeastSquares):
     """Tells the loss of one row only."""
 
-    def compute_row_losses(self, prediction, targets, data):
+    def compute_row_losses(self, batch):
         return np.zeros(1)
 
 

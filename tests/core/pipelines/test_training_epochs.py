@@ -33,9 +33,9 @@ class Scripted(LeastSquares):
         self.losses, self.epoch, self.judged = losses, 0, []
         self.validation = validation or losses
 
-    def transform_loss(self, loss, data):
-        now = self.losses if len(data["state"]) == 5 else self.validation
-        return {"loss": now[self.epoch], "rows": len(data["state"])}
+    def transform_loss(self, loss, batch):
+        now = self.losses if len(batch.data["state"]) == 5 else self.validation
+        return {"loss": now[self.epoch], "rows": len(batch.data["state"])}
 
     def learning_rate(self):
         return 0.5**self.epoch
@@ -107,7 +107,7 @@ def test_the_variance_is_that_of_the_last_fifty_batches_and_epochs(data):
     rng = np.random.default_rng(1)
 
     class Random(Scripted):
-        def transform_loss(self, loss, data):
+        def transform_loss(self, loss, batch):
             return {"loss": float(rng.random())}
 
     config = NetworkConfig(Linear, optimization=Random, optimization_kwargs={"losses": []})

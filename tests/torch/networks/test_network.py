@@ -72,7 +72,6 @@ def test_pred_fields_can_be_named():
         {"net_fields": ["a", "a"]},
         {"net_fields": []},
         {"net_fields": [1]},
-        {"opt_fields": ["a", "b"], "pred_fields": "c"},
     ],
 )
 def test_names_that_do_not_fit(fields):

@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import torch
 
-from physx_core import Dataset, DatasetConfig, NetworkConfig, Training
+from physx_core import Dataset, DatasetConfig, NetworkConfig, Training, Transformation
+from physx_core.components import PredictedBatch
 from physx_core.errors import DivergedError
 from physx_torch import FC, TorchNetwork, TorchOptimization
 
@@ -28,9 +29,10 @@ def samples(network, scale=1.0):
 
 
 def learn(network, optimization, data):
-    loss = optimization.compute_loss(network.predict(data), data, data)
+    batch = PredictedBatch.of(network, Transformation(), data)
+    loss = optimization.compute_loss(batch)
     optimization.optimize(loss)
-    return optimization.transform_loss(loss, data)["loss"]
+    return optimization.transform_loss(loss, batch)["loss"]
 
 
 def content(network):
@@ -125,7 +127,7 @@ def test_masks_may_hold_infinity_and_buffers_no_nan():
 class Told(TorchOptimization):
     """Records tensors that belong to a graph."""
 
-    def transform_loss(self, loss, data):
+    def transform_loss(self, loss, batch):
         return {"loss": loss, "twice": 2 * loss}
 
 
@@ -159,12 +161,12 @@ def test_a_training_says_where_the_gradient_became_nan(data):
 
         seen = 0
 
-        def compute_loss(self, prediction, targets, data):
+        def compute_loss(self, batch):
             self.seen += 1
-            loss = super().compute_loss(prediction, targets, data)
+            loss = super().compute_loss(batch)
             if self.seen != 6:
                 return loss
-            return loss + root_of_zero(*prediction.values(), *targets.values())
+            return loss + root_of_zero(*batch.prediction.values(), *batch.targets.values())
 
     network = config(loss="MSELoss", optimization=Late)
     place = "sessions/training/network/network_0"

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 import torch
 
-from physx_core import Field, Normalization
+from physx_core import Field, Normalization, Transformation
+from physx_core.components import PredictedBatch
 from physx_core.errors import CheckpointError, ConfigError, UsageError
 from physx_torch import FC, TorchNetwork, TorchOptimization, TorchTransformation
 
@@ -35,9 +36,10 @@ def regression(number=128):
 def learn(network, optimization, tensors, steps):
     losses = []
     for _ in range(steps):
-        loss = optimization.compute_loss(network.predict(tensors), tensors, tensors)
+        batch = PredictedBatch.of(network, Transformation(), tensors)
+        loss = optimization.compute_loss(batch)
         optimization.optimize(loss)
-        losses.append(optimization.transform_loss(loss, tensors)["loss"])
+        losses.append(optimization.transform_loss(loss, batch)["loss"])
     return losses
 
 
@@ -60,11 +62,10 @@ def test_normalized_regression_is_learned():
     data = network.numpy_to_tensor(batch)
     losses = []
     for _ in range(300):
-        prediction = network.predict(transformation.transform_before_prediction(data))
-        prediction, targets = transformation.transform_before_loss(prediction, data)
-        loss = optimization.compute_loss(prediction, targets, data)
+        predicted = PredictedBatch.of(network, transformation, data)
+        loss = optimization.compute_loss(predicted)
         optimization.optimize(loss)
-        losses.append(optimization.transform_loss(loss, data))
+        losses.append(optimization.transform_loss(loss, predicted))
     assert losses[0]["loss"] > 0.5
     assert losses[-1]["loss"] < 1e-3
     assert all(isinstance(item["loss"], float) for item in losses)
@@ -88,8 +89,8 @@ def test_one_step_of_gradient_descent_by_hand():
 class Doubled(TorchOptimization):
     """Has a loss of its own."""
 
-    def compute_loss(self, prediction, targets, data):
-        return 2 * super().compute_loss(prediction, targets, data)
+    def compute_loss(self, batch):
+        return 2 * super().compute_loss(batch)
 
 
 @pytest.mark.parametrize(
@@ -107,15 +108,15 @@ def test_the_losses_of_rows_are_those_of_batches_of_one_row(kind, loss):
     optimization.set_loss(loss)
     optimization.set_optimizer("SGD", network, lr=0.1)
     tensors = network.numpy_to_tensor(regression(7))
-    prediction = network.predict(tensors)
-    losses = optimization.compute_row_losses(prediction, tensors, tensors)
+    batch = PredictedBatch.of(network, Transformation(), tensors)
+    losses = optimization.compute_row_losses(batch)
     assert losses.shape == (7,)
     assert not losses.requires_grad
     for row in range(7):
         one = {name: value[row : row + 1] for name, value in tensors.items()}
-        alone = optimization.compute_loss(network.predict(one), one, one)
+        alone = optimization.compute_loss(PredictedBatch.of(network, Transformation(), one))
         assert losses[row].item() == pytest.approx(alone.item(), rel=1e-5)
-    whole = optimization.compute_loss(prediction, tensors, tensors)
+    whole = optimization.compute_loss(batch)
     assert losses.mean().item() == pytest.approx(whole.item(), rel=1e-5)
 
 
@@ -203,7 +204,7 @@ def test_frozen_parameters_stay():
 def test_calls_out_of_order(tmp_path):
     optimization = TorchOptimization()
     with pytest.raises(UsageError, match="set_loss"):
-        optimization.compute_loss({}, {}, {})
+        optimization.compute_loss(None)
     with pytest.raises(UsageError, match="set_optimizer"):
         optimization.optimize(torch.tensor(1.0))
     with pytest.raises(UsageError, match="set_optimizer"):

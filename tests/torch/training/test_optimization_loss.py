@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from physx_core import Transformation
+from physx_core.components import PredictedBatch
 from physx_core.errors import ConfigError, FieldsMismatchError
 from physx_torch import FC, TorchOptimization
 
@@ -17,6 +19,14 @@ def optimization_of(network, loss="MSELoss", **options):
     return optimization
 
 
+def batch_of(prediction, targets):
+    """Return a batch as an optimization gets it; nothing is normalized."""
+    return PredictedBatch(
+        None, Transformation(), data=targets, inputs={}, output=prediction,
+        prediction=prediction, targets=targets,
+    )  # fmt: skip
+
+
 # Values -----------------------------------------------------------------------------------------
 
 
@@ -25,14 +35,14 @@ def test_several_fields_have_the_mean_of_their_losses():
     optimization = optimization_of(network, "L1Loss")
     prediction = {"pb": torch.zeros(5, 3), "pa": torch.zeros(5, 1)}
     targets = {"a": torch.full((5, 1), 4.0), "b": torch.full((5, 3), 2.0)}
-    assert optimization.compute_loss(prediction, targets, {}).item() == 3.0
+    assert optimization.compute_loss(batch_of(prediction, targets)).item() == 3.0
 
 
 def test_shapes_that_would_be_broadcast_are_an_error():
     optimization = optimization_of(FC([2, 1]))
     with pytest.raises(FieldsMismatchError, match=r"\(4, 1\).*\(4,\)") as caught:
         optimization.compute_loss(
-            {"prediction": torch.zeros(4, 1)}, {"ground_truth": torch.zeros(4)}, {}
+            batch_of({"prediction": torch.zeros(4, 1)}, {"ground_truth": torch.zeros(4)})
         )
     assert set(caught.value.differences) == {"prediction"}
 
@@ -42,7 +52,7 @@ def test_class_indices_as_targets():
     optimization = optimization_of(FC([2, 3]), "CrossEntropyLoss", **options)
     target = torch.tensor([0, 2])
     loss = optimization.compute_loss(
-        {"prediction": torch.zeros(2, 3)}, {"ground_truth": target}, {}
+        batch_of({"prediction": torch.zeros(2, 3)}, {"ground_truth": target})
     )
     assert loss.item() == pytest.approx(np.log(3))
 
@@ -71,7 +81,9 @@ def test_loss_in_every_form(loss):
     optimization = optimization_of(FC([2, 1]))
     optimization.set_loss(loss)
     prediction, target = torch.rand(4, 1), torch.rand(4, 1)
-    value = optimization.compute_loss({"prediction": prediction}, {"ground_truth": target}, {})
+    value = optimization.compute_loss(
+        batch_of({"prediction": prediction}, {"ground_truth": target})
+    )
     torch.testing.assert_close(value, squares(prediction, target))
 
 
@@ -94,7 +106,7 @@ def test_wrong_loss(loss, told):
 def test_arguments_of_the_loss():
     optimization = optimization_of(FC([2, 1]), loss_kwargs={"reduction": "sum"})
     value = optimization.compute_loss(
-        {"prediction": torch.ones(4, 1)}, {"ground_truth": torch.zeros(4, 1)}, {}
+        batch_of({"prediction": torch.ones(4, 1)}, {"ground_truth": torch.zeros(4, 1)})
     )
     assert value.item() == 4
     with pytest.raises(ConfigError, match="reduction"):

@@ -37,8 +37,8 @@ class Net(FC):
         self.unused = torch.nn.Linear(2, 2)
 
 class Extra(TorchOptimization):
-    def transform_loss(self, loss, data):
-        return {"loss": loss.item(), "size": float(data["x"].abs().mean())}
+    def transform_loss(self, loss, batch):
+        return {"loss": loss.item(), "size": float(batch.data["x"].abs().mean())}
 
 class Halves(Environment):
     """Makes of each stored sample one with half the target."""

@@ -58,13 +58,13 @@ class Weighted(TorchOptimization):
 
     extra_fields = ("weight",)
 
-    def compute_loss(self, prediction, targets, data):
-        self.error = (prediction["y"] - targets["y"])[:, 0] ** 2
-        return (data["weight"] * self.error).mean()
+    def compute_loss(self, batch):
+        self.error = (batch.prediction["y"] - batch.targets["y"])[:, 0] ** 2
+        return (batch.data["weight"] * self.error).mean()
 
-    def transform_loss(self, loss, data):
-        worst = self.error.detach().max()
-        return {"loss": loss.item(), "worst": worst.item(), "weight": data["weight"].mean().item()}
+    def transform_loss(self, loss, batch):
+        worst, weight = self.error.detach().max(), batch.data["weight"].mean()
+        return {"loss": loss.item(), "worst": worst.item(), "weight": weight.item()}
 
 
 def test_extra_entries_of_the_loss_are_recorded(data):

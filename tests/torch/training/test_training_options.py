@@ -6,6 +6,8 @@ import numpy as np
 import pytest
 import torch
 
+from physx_core import Transformation
+from physx_core.components import PredictedBatch
 from physx_core.errors import ConfigError
 from physx_torch import FC, TorchOptimization
 
@@ -34,9 +36,10 @@ def samples(network, number=12):
 
 
 def learn(network, optimization, data):
-    loss = optimization.compute_loss(network.predict(data), data, data)
+    batch = PredictedBatch.of(network, Transformation(), data)
+    loss = optimization.compute_loss(batch)
     optimization.optimize(loss)
-    return optimization.transform_loss(loss, data)["loss"]
+    return optimization.transform_loss(loss, batch)["loss"]
 
 
 def vector(network):

@@ -11,6 +11,7 @@ from .launcher import Launcher as Launcher
 from .network import Network as Network
 from .optimization import Optimization as Optimization
 from .parameter import Parameter as Parameter
+from .predicted_batch import PredictedBatch as PredictedBatch
 from .sampler import LearningSampler as LearningSampler
 from .sampler import Sampler as Sampler
 from .scene.colors import map_values as map_values

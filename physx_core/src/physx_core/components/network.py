@@ -44,7 +44,8 @@ class Network(ABC):
         net_fields: Input fields of the network.
         opt_fields: Target fields that the loss compares the prediction with.
         pred_fields: Fields that the network predicts; the i-th has the shape, unit and
-            normalization of the i-th of `opt_fields`.
+            normalization of the i-th of `opt_fields`. There may be more or fewer than targets if
+            the optimization has a loss for that; further predictions are not converted.
         parameters_file: Name of the file that `save_parameters` writes into a checkpoint.
         default_optimization: Reference of the optimization used if none is configured; empty: one
             must be configured for training.

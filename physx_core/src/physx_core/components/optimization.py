@@ -9,8 +9,8 @@ from typing import Any, ClassVar
 
 from physx_core.components.group import Group
 from physx_core.components.network import Network
+from physx_core.components.predicted_batch import PredictedBatch
 from physx_core.errors import ConfigError
-from physx_core.typing import Tensors
 
 
 class Optimization(ABC):
@@ -80,19 +80,17 @@ class Optimization(ABC):
         raise ConfigError(f"{type(self).__name__} has no schedulers: leave out scheduler.")
 
     @abstractmethod
-    def compute_loss(self, prediction: Tensors, targets: Tensors, data: Tensors) -> Any:
-        """Return the loss of a prediction.
+    def compute_loss(self, batch: PredictedBatch) -> Any:
+        """Return the loss of a batch, in training and in validation.
 
         Args:
-            prediction: The network's `pred_fields`.
-            targets: The network's `opt_fields`.
-            data: The whole batch, for losses that need more.
+            batch: Prediction, targets and all other fields, normalized and in physical units.
         """
 
-    def compute_row_losses(self, prediction: Tensors, targets: Tensors, data: Tensors) -> Any:
+    def compute_row_losses(self, batch: PredictedBatch) -> Any:
         """Return the loss of each row of a batch, shape (rows,), for samplers that learn from them.
 
-        Called after `compute_loss`, with the same arguments, before `optimize`; must not change
+        Called after `compute_loss`, with the same batch, before `optimize`; must not change
         anything.
 
         Raises:
@@ -103,14 +101,14 @@ class Optimization(ABC):
             "sampler learns: implement compute_row_losses(), or choose another sampler."
         )
 
-    def transform_loss(self, loss: Any, data: Tensors) -> dict[str, Any]:
+    def transform_loss(self, loss: Any, batch: PredictedBatch) -> dict[str, Any]:
         """Return the statistics of this step; entries other than ``loss`` are recorded too.
 
         Called after `optimize`. All entries are numbers or can be converted with ``float``.
 
         Args:
             loss: The result of `compute_loss`.
-            data: The whole batch.
+            batch: The same batch, with the prediction from before the step.
         """
         return {"loss": loss}
 

@@ -102,7 +102,7 @@ def _invert(case: Case, *, normalized: bool) -> None:
     raw = network.predict(transformation.transform_before_prediction(inputs))
     kept = network.numpy_to_tensor(_arrays(learner, raw))
     physical = _arrays(learner, transformation.transform_before_apply(kept))
-    pairs = list(zip(network.pred_fields, network.opt_fields, strict=True))
+    pairs = list(zip(network.pred_fields, network.opt_fields, strict=False))
     targets = network.numpy_to_tensor({opt: physical[pred] for pred, opt in pairs})
     compared = transformation.transform_before_loss(raw, targets)
     predicted, wanted = (_arrays(learner, one) for one in compared)

@@ -26,6 +26,8 @@ from physx_torch.storage.parameters import check_match, read_shapes, read_tensor
 
 DATA_TYPES = {"float32": torch.float32, "float64": torch.float64}
 """Floating-point types that a network can compute in, by name."""
+_LACKS_GRADIENTS = "does not require grad"
+"""In what torch raises if a forward function differentiates while no gradients are recorded."""
 
 
 class TorchNetwork(torch.nn.Module, Network):
@@ -35,12 +37,19 @@ class TorchNetwork(torch.nn.Module, Network):
     tensors of `net_fields` in order, of shape (samples, *field shape), and returns those of
     `pred_fields`: one tensor, several in order, or a dictionary by name.
 
+    In evaluation mode no gradients are recorded, unless an input requires gradients, or ``forward``
+    itself differentiates, for example ``torch.autograd.grad(energy.sum(), position,
+    create_graph=True)``: that works in training, validation and prediction alike. The first
+    evaluation finds out, and the graph ends with each call. ``create_graph=self.training`` saves
+    time.
+
     The names of the fields are class attributes of the subclass or arguments of the constructor.
     With `opt_fields` but no `pred_fields`, predictions have the names of their targets.
 
     Attributes:
         device: Device of the parameters.
         data_type: Floating-point type of parameters and tensors.
+        differentiates: Whether ``forward`` differentiates; known after the first prediction.
     """
 
     parameters_file: ClassVar[str] = "parameters.safetensors"
@@ -67,7 +76,7 @@ class TorchNetwork(torch.nn.Module, Network):
 
         Raises:
             UnknownOptionError: If no class of the network accepts an option.
-            ConfigError: If names are missing or duplicate, or their numbers do not match.
+            ConfigError: If names are missing or duplicate.
         """
         if kwargs:
             raise UnknownOptionError(type(self).__name__, kwargs, options_of(type(self)))
@@ -78,14 +87,10 @@ class TorchNetwork(torch.nn.Module, Network):
         if pred_fields is None and self.pred_fields == Network.pred_fields and own_names:
             pred_fields = self.opt_fields
         self.pred_fields = _names("pred_fields", pred_fields, self.pred_fields)
-        if len(self.pred_fields) != len(self.opt_fields):
-            raise ConfigError(
-                f"{type(self).__name__} predicts {listed(self.pred_fields)} but is compared with "
-                f"{listed(self.opt_fields)}: each pred_field needs one opt_field."
-            )
         self.device = torch.device("cpu")
         self.data_type = torch.float32
         self._training_forward: Callable[..., Any] | None = None
+        self.differentiates = False
 
     @classmethod
     def set_seed(cls, seed: int) -> None:
@@ -133,8 +138,25 @@ class TorchNetwork(torch.nn.Module, Network):
             ) from None
         if self.training:
             return self._by_field(self(*inputs))
-        with torch.no_grad():
-            return self._by_field(self(*inputs))
+        return self._evaluate(inputs)
+
+    def _evaluate(self, inputs: Sequence[torch.Tensor]) -> Tensors:
+        """Predict in evaluation mode, recording gradients only if something asks for them."""
+        for tensor in inputs:
+            if tensor.requires_grad:
+                return self._by_field(self(*inputs))
+        if not self.differentiates:
+            try:
+                with torch.no_grad():
+                    return self._by_field(self(*inputs))
+            except RuntimeError as error:
+                if _LACKS_GRADIENTS not in str(error):
+                    raise
+            self.differentiates = True
+        with torch.enable_grad():
+            prediction = self._by_field(self(*inputs))
+        # Detached, so that nothing of the graph outlives this call.
+        return {name: tensor.detach() for name, tensor in prediction.items()}
 
     def forward(self, *inputs: torch.Tensor) -> Any:
         """Return the tensors of `pred_fields`; implemented by subclasses.

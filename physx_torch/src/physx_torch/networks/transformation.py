@@ -59,7 +59,7 @@ class TorchTransformation(Transformation):
         scales = {name: _scale(item, network) for name, item in normalization.items()}
         self._inputs = {n: scales[n] for n in network.net_fields if n in scales}
         self._targets = {n: scales[n] for n in network.opt_fields if n in scales}
-        pairs = zip(network.pred_fields, network.opt_fields, strict=True)
+        pairs = zip(network.pred_fields, network.opt_fields, strict=False)
         self._predictions = {pred: scales[opt] for pred, opt in pairs if opt in scales}
 
     def transform_before_prediction(self, data: Tensors) -> Tensors:

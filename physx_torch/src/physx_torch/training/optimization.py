@@ -5,7 +5,7 @@ from __future__ import annotations
 import copy
 import inspect
 import math
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -13,7 +13,7 @@ import torch
 from torch.optim.lr_scheduler import LRScheduler, OneCycleLR, ReduceLROnPlateau
 
 from physx_core import Network, Optimization
-from physx_core.components import Group
+from physx_core.components import Group, PredictedBatch
 from physx_core.errors import (
     CheckpointError,
     ConfigError,
@@ -22,7 +22,6 @@ from physx_core.errors import (
     UsageError,
     listed,
 )
-from physx_core.typing import Tensors
 from physx_torch.choices import choose, find_classes, make
 from physx_torch.networks.network import TorchNetwork
 from physx_torch.parallel import average_gradients, broadcast_parameters
@@ -58,6 +57,18 @@ def _without_reduction(loss: Loss) -> Loss | None:
     single: Any = copy.copy(loss)
     single.reduction = "none"
     return single
+
+
+def _pairs(network: TorchNetwork) -> Iterable[tuple[str, str]]:
+    """Return the names of each prediction and of the target that it is compared with."""
+    predicted, targets = network.pred_fields, network.opt_fields
+    if len(predicted) != len(targets):
+        raise ConfigError(
+            f"{type(network).__name__} predicts {listed(predicted)} but is compared with "
+            f"{listed(targets)}: each of pred_fields needs one of opt_fields. For a loss of all of "
+            "them together, derive from TorchOptimization and implement compute_loss(batch)."
+        )
+    return zip(predicted, targets, strict=True)
 
 
 class TorchOptimization(Optimization):
@@ -185,6 +196,8 @@ class TorchOptimization(Optimization):
                 f"{type(made).__name__} evaluates the loss several times in a step, which physx "
                 "does not support. Choose another optimizer."
             )
+        if type(self).compute_loss is TorchOptimization.compute_loss:
+            _pairs(network)
         self.optimizer = made
         self._network = network
         self._place_loss()
@@ -274,24 +287,19 @@ class TorchOptimization(Optimization):
             )
         return steps
 
-    def compute_loss(self, prediction: Tensors, targets: Tensors, data: Tensors) -> torch.Tensor:
-        """Return the mean of the prediction fields' losses.
-
-        Args:
-            prediction: The network's `pred_fields`.
-            targets: The network's `opt_fields`.
-            data: The whole batch; not used.
+    def compute_loss(self, batch: PredictedBatch) -> torch.Tensor:
+        """Return the mean of the prediction fields' losses, of normalized values if configured.
 
         Raises:
             UsageError: If the loss or optimizer has not been chosen yet.
+            ConfigError: If there are more predictions than targets, or fewer.
             FieldsMismatchError: If the shapes of a prediction and its target differ.
         """
         if self.loss is None or self._network is None:
             raise UsageError("compute_loss() must be called after set_loss() and set_optimizer().")
         losses = []
-        names = zip(self._network.pred_fields, self._network.opt_fields, strict=True)
-        for pred_name, opt_name in names:
-            pred, target = prediction[pred_name], targets[opt_name]
+        for pred_name, opt_name in _pairs(self._network):
+            pred, target = batch.prediction[pred_name], batch.targets[opt_name]
             # Targets that are class indices, which are integers, have other shapes.
             if pred.shape != target.shape and target.is_floating_point():
                 text = f'shape {tuple(pred.shape)}, but "{opt_name}" has {tuple(target.shape)}'
@@ -299,10 +307,7 @@ class TorchOptimization(Optimization):
             losses.append(self.loss(pred, target))
         return losses[0] if len(losses) == 1 else torch.stack(losses).mean()
 
-    @torch.no_grad()
-    def compute_row_losses(
-        self, prediction: Tensors, targets: Tensors, data: Tensors
-    ) -> torch.Tensor:
+    def compute_row_losses(self, batch: PredictedBatch) -> torch.Tensor:
         """Return the loss of each row.
 
         Losses of PyTorch with a ``reduction`` are computed for all rows at once, others row by row.
@@ -314,18 +319,18 @@ class TorchOptimization(Optimization):
             raise UsageError("compute_row_losses() needs set_loss() and set_optimizer() first.")
         by_row = _without_reduction(self.loss)
         if by_row is None or type(self).compute_loss is not TorchOptimization.compute_loss:
-            rows = range(len(next(iter(prediction.values()))))
-            parts = (
-                [{name: value[row : row + 1] for name, value in one.items()} for row in rows]
-                for one in (prediction, targets, data)
-            )
-            return torch.stack([self.compute_loss(*row) for row in zip(*parts, strict=True)])
-        names = zip(self._network.pred_fields, self._network.opt_fields, strict=True)
-        losses = [by_row(prediction[pred_name], targets[name]) for pred_name, name in names]
-        flat = [loss.reshape(len(loss), -1).mean(1) for loss in losses]
-        return torch.stack(flat).mean(0)
+            rows = range(len(next(iter(batch.prediction.values()))))
+            # With gradients, which the loss of a subclass may need.
+            return torch.stack([self.compute_loss(batch[row : row + 1]).detach() for row in rows])
+        with torch.no_grad():
+            losses = [
+                by_row(batch.prediction[pred_name], batch.targets[opt_name])
+                for pred_name, opt_name in _pairs(self._network)
+            ]
+            flat = [loss.reshape(len(loss), -1).mean(1) for loss in losses]
+            return torch.stack(flat).mean(0)
 
-    def transform_loss(self, loss: torch.Tensor, data: Tensors) -> dict[str, Any]:
+    def transform_loss(self, loss: torch.Tensor, batch: PredictedBatch) -> dict[str, Any]:
         """Return ``{"loss": <number>}``."""
         if loss is self._known[0]:  # already read: on a GPU, reading it again waits for the step
             number = self._known[1]

@@ -128,13 +128,14 @@ class Descends(Optimization):
         super().set_optimizer(optimizer, network, **kwargs)
         self.momentum = np.zeros(())
 
-    def compute_loss(self, prediction, targets, data):
-        error = (prediction["y"] - targets["y"]).reshape(len(prediction["y"]), -1)
-        self.gradient = 2 * self.network.hidden(data).T @ error / error.size
+    def compute_loss(self, batch):
+        error = batch.prediction["y"] - batch.targets["y"]
+        error = error.reshape(len(error), -1)
+        self.gradient = 2 * self.network.hidden(batch.data).T @ error / error.size
         return float(np.mean(error**2))
 
-    def compute_row_losses(self, prediction, targets, data):
-        error = prediction["y"] - targets["y"]
+    def compute_row_losses(self, batch):
+        error = batch.prediction["y"] - batch.targets["y"]
         return np.mean(error.reshape(len(error), -1) ** 2, axis=1)
 
     def optimize(self, loss):
@@ -154,8 +155,8 @@ class Climbs(Descends):
 
 
 class StepsInLoss(Descends):
-    def compute_loss(self, prediction, targets, data):
-        loss = super().compute_loss(prediction, targets, data)
+    def compute_loss(self, batch):
+        loss = super().compute_loss(batch)
         self.network.last -= 0.01 * self.gradient
         return loss
 
@@ -165,9 +166,9 @@ class ForgetsMomentum(Descends):
 
 
 class RowLossesStep(Descends):
-    def compute_row_losses(self, prediction, targets, data):
+    def compute_row_losses(self, batch):
         self.gradient = 2 * self.gradient
-        return super().compute_row_losses(prediction, targets, data)
+        return super().compute_row_losses(batch)
 
 
 class Noisy(Descends):
@@ -177,8 +178,8 @@ class Noisy(Descends):
 
 
 class HidesNaN(Descends):
-    def compute_loss(self, prediction, targets, data):
-        loss = super().compute_loss(prediction, targets, data)
+    def compute_loss(self, batch):
+        loss = super().compute_loss(batch)
         self.gradient = np.nan_to_num(self.gradient)
         return float(np.nan_to_num(loss))
 

@@ -100,8 +100,3 @@ def _check_fields(network: Network) -> None:
             raise ConfigError(
                 f"{type(network).__name__}.{option} is {names!r} but must be a list of names."
             )
-    if len(network.pred_fields) != len(network.opt_fields):
-        raise ConfigError(
-            f"{type(network).__name__} predicts {listed(network.pred_fields)} but is compared with "
-            f"{listed(network.opt_fields)}: each of pred_fields needs one of opt_fields."
-        )

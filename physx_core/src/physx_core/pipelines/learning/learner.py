@@ -6,7 +6,7 @@ import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +14,7 @@ from physx_core import checkpoint
 from physx_core.components.group import Group
 from physx_core.components.network import Network
 from physx_core.components.optimization import Optimization
+from physx_core.components.predicted_batch import PredictedBatch, predict
 from physx_core.components.transformation import Transformation
 from physx_core.config import NetworkConfig
 from physx_core.errors import (
@@ -35,15 +36,6 @@ from physx_core.plugins.references import check_recorded, is_of_plugin, is_recor
 from physx_core.rows import concatenate
 from physx_core.statistics import Normalization
 from physx_core.typing import Array, Batch, Index, Tensors
-
-
-class _Step(NamedTuple):
-    """The intermediate results of a batch, as tensors."""
-
-    data: Tensors
-    prediction: Tensors
-    loss: Any
-    compared: tuple[Tensors, Tensors]
 
 
 class Learner:
@@ -148,16 +140,10 @@ class Learner:
         names = (*self.network.net_fields, *self.network.opt_fields, *extra)
         return list(dict.fromkeys(names))
 
-    def _compute_loss(self, optimization: Optimization, batch: Batch) -> _Step:
-        """Return the loss of a batch in physical units, with the intermediate results."""
-        network, transformation = self.network, self.transformation
-        data = network.numpy_to_tensor(batch)
-        inputs = {name: data[name] for name in network.net_fields}
-        targets = {name: data[name] for name in network.opt_fields}
-        predicted = network.predict(transformation.transform_before_prediction(inputs))
-        prediction, targets = transformation.transform_before_loss(predicted, targets)
-        loss = optimization.compute_loss(prediction, targets, data)
-        return _Step(data, predicted, loss, (prediction, targets))
+    def _predict_batch(self, batch: Batch) -> PredictedBatch:
+        """Predict a batch in physical units that contains `batch_fields`."""
+        data = self.network.numpy_to_tensor(batch)
+        return PredictedBatch.of(self.network, self.transformation, data)
 
     def _trainer(self) -> Optimization:
         if self.optimization is None:
@@ -189,8 +175,8 @@ class Learner:
         share = batch
         if weight is None:
             share, weight = (batch, 1.0) if group.size == 1 else group.share_of(batch)
-        step = self._compute_loss(optimization, share)
-        loss, stops = step.loss, optimization.stops_at_nan
+        step = self._predict_batch(share)
+        loss, stops = optimization.compute_loss(step), optimization.stops_at_nan
         if stops and isinstance(loss, (float, np.floating)) and not math.isfinite(loss):
             raise DivergedError(self._explain(f"the loss is {loss}", step))
         if by_row:
@@ -199,7 +185,7 @@ class Learner:
             optimization.optimize(loss if group.size == 1 else loss * (weight * group.size))
         except DivergedError as error:
             raise DivergedError(self._explain(str(error), step)) from None
-        losses = _numbers(optimization, loss, step.data)
+        losses = _numbers(optimization, loss, step)
         if group.size > 1:
             totals = group.total([value * weight for value in losses.values()])
             losses = dict(zip(losses, totals, strict=True))
@@ -207,8 +193,8 @@ class Learner:
             raise DivergedError(self._explain(f"the loss is {losses['loss']}", step))
         return losses
 
-    def _compute_row_losses(self, optimization: Optimization, step: _Step) -> Array:
-        found = optimization.compute_row_losses(*step.compared, step.data)
+    def _compute_row_losses(self, optimization: Optimization, step: PredictedBatch) -> Array:
+        found = optimization.compute_row_losses(step)
         losses: Array = self.network.tensor_to_numpy({"loss": found})["loss"].astype(np.float64)
         rows = len(next(iter(step.data.values())))
         if losses.shape != (rows,):
@@ -218,11 +204,11 @@ class Learner:
             )
         return losses
 
-    def _explain(self, found: str, step: _Step) -> str:
+    def _explain(self, found: str, step: PredictedBatch) -> str:
         """Return what is not finite, and the first value leading to it that is not finite."""
         for what, tensors in (
             ("the field", step.data),
-            ("the network's prediction", step.prediction),
+            ("the network's prediction", step.output),
         ):
             for name, array in self.network.tensor_to_numpy(tensors).items():
                 if not is_finite(array):
@@ -243,8 +229,9 @@ class Learner:
             if self.group.size > 1:
                 share, weight = self.group.share_of(batch)
                 size *= weight
-            step = self._compute_loss(optimization, share)
-            for name, value in _numbers(optimization, step.loss, step.data).items():
+            step = self._predict_batch(share)
+            loss = optimization.compute_loss(step)
+            for name, value in _numbers(optimization, loss, step).items():
                 sums[name] = sums.get(name, 0.0) + value * size
             count += size
         self.network.set_train()
@@ -374,8 +361,7 @@ class Learner:
 
     def _predict_tensors(self, inputs: Tensors) -> Tensors:
         """Return the prediction for the network's inputs, both in physical units."""
-        prediction = self.network.predict(self.transformation.transform_before_prediction(inputs))
-        return self.transformation.transform_before_apply(prediction)
+        return predict(self.network, self.transformation, inputs)
 
     def save(
         self,
@@ -546,9 +532,9 @@ def _check(
     check_recorded(kind, file, reference, arguments, advice, trust=trust)
 
 
-def _numbers(optimization: Optimization, loss: Any, data: Tensors) -> dict[str, float]:
+def _numbers(optimization: Optimization, loss: Any, step: PredictedBatch) -> dict[str, float]:
     """Return the result of `Optimization.transform_loss` as plain numbers."""
-    losses = optimization.transform_loss(loss, data)
+    losses = optimization.transform_loss(loss, step)
     method = f"{type(optimization).__name__}.transform_loss()"
     if not isinstance(losses, Mapping) or "loss" not in losses:
         given = listed(map(str, losses)) if isinstance(losses, Mapping) else type(losses).__name__
