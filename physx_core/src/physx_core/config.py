@@ -11,7 +11,7 @@ import functools
 import os
 import sys
 import typing
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Literal, TypeVar, dataclass_transform
@@ -30,9 +30,11 @@ __all__ = [
     "at_least",
     "configuration",
     "from_plain",
+    "merge_arguments",
     "options",
     "read_toml",
     "reference_of",
+    "set_option",
     "to_plain",
     "write_toml",
 ]
@@ -386,6 +388,37 @@ def from_plain(make: Callable[..., T], plain: Mapping[str, Any]) -> T:
         is_table = nested is not None and isinstance(value, Mapping)
         values[name] = from_plain(nested, value) if nested and is_table else value
     return make(**values)
+
+
+def set_option(where: str, tables: dict[str, Any], path: Sequence[str], value: Any) -> None:
+    """Set one option or argument in nested tables; all others stay.
+
+    Args:
+        where: The option as the user wrote it, for errors.
+        tables: The tables, which are changed; missing ones are created.
+        path: The tables' names from the outside in, then the option's.
+        value: Its value.
+
+    Raises:
+        ConfigError: If the path leads through something that is not a table.
+    """
+    *places, name = path
+    table = tables
+    for place in places:
+        table = table.setdefault(place, {})
+        if not isinstance(table, dict):
+            raise ConfigError(f"{where} names an option in {place}, which is not a table.")
+    table[name] = value
+
+
+def merge_arguments(former: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return arguments in which those given replace the former ones, in nested tables too."""
+    merged = dict(former)
+    for name, value in given.items():
+        old = merged.get(name)
+        nested = isinstance(value, Mapping) and isinstance(old, Mapping)
+        merged[name] = merge_arguments(old, value) if nested and old else value
+    return merged
 
 
 def _configuration_in(hint: Any) -> type[Any] | None:

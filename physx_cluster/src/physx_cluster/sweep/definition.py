@@ -11,7 +11,7 @@ from typing import Any, TypeVar
 
 from physx_cluster.sweep.parameters import Parameter, Setting, read_parameters
 from physx_core import DataGeneration, Training, plugins
-from physx_core.config import at_least, configuration, from_plain, read_toml
+from physx_core.config import at_least, configuration, from_plain, read_toml, set_option
 from physx_core.errors import ConfigError, ConfigFileError, PhysxError, UnknownOptionError, listed
 
 T = TypeVar("T")
@@ -307,14 +307,7 @@ def _check_setting(where: str, pipeline: PipelineTable, setting: Setting, seed: 
 
 def _put(tables: dict[str, Any], path: str, value: Any) -> None:
     """Set the option of a path such as ``training.network.lr``."""
-    *places, name = path.split(".")
-    table = tables
-    if not places or places[0] not in tables:
-        raise UnknownOptionError(f"The parameter {path}", [places[0] if places else name], tables)
-    for place in places:
-        table = table.setdefault(place, {})
-        if not isinstance(table, dict):
-            raise ConfigError(
-                f"The parameter {path} names an option in {place}, which is not a table."
-            )
-    table[name] = value
+    places = path.split(".")
+    if len(places) == 1 or places[0] not in tables:
+        raise UnknownOptionError(f"The parameter {path}", [places[0]], tables)
+    set_option(f"The parameter {path}", tables, places, value)

@@ -1,4 +1,8 @@
-"""Parses command-line arguments of the form ``NAME=VALUE``, and references to components."""
+"""Parses the arguments of components: ``NAME=VALUE`` and ``--OPTION.NAME VALUE``.
+
+``--network.network-kwargs width=64 depth=2`` gives all arguments; those that a file or session has
+no longer apply. ``--network.network-kwargs.width 64`` changes one, and the others stay.
+"""
 
 from __future__ import annotations
 
@@ -6,9 +10,17 @@ import contextlib
 import json
 import re
 import tomllib
+from collections.abc import Callable, Sequence
 from typing import Any
 
 from tyro.constructors import ConstructorRegistry, PrimitiveConstructorSpec, PrimitiveTypeInfo
+
+from physx_core.errors import UsageError
+
+METAVAR = "NAME=VALUE ..."
+"""Stands for the arguments in the help."""
+Change = tuple[str, tuple[str, ...], Any]
+"""The option ``--OPTION.NAME`` as written, the path of the argument, and its value."""
 
 _WORDS = re.compile(r"\[[^][{},\s\"'=]+(\s*,\s*[^][{},\s\"'=]+)*\]")
 """A list of words without brackets, spaces, or quotes."""
@@ -24,7 +36,7 @@ def argument_registry() -> ConstructorRegistry:
             return None
         return PrimitiveConstructorSpec(
             nargs="*",
-            metavar="NAME=VALUE ...",
+            metavar=METAVAR,
             instance_from_str=lambda words: dict(_argument(word) for word in words),
             is_instance=lambda value: isinstance(value, dict),
             str_from_instance=lambda value: [f"{name}={item}" for name, item in value.items()],
@@ -43,6 +55,41 @@ def argument_registry() -> ConstructorRegistry:
         )
 
     return registry
+
+
+def take_changes(
+    words: Sequence[str], find: Callable[[str], tuple[str, ...] | None]
+) -> tuple[list[Change], list[str]]:
+    """Return the changes of single arguments, ``--OPTION.NAME VALUE``, and the other words.
+
+    Args:
+        words: The words of a command.
+        find: Returns the path of the argument that an option names; None: it is no argument.
+
+    Raises:
+        UsageError: If a value is missing, or there are several.
+    """
+    changes: list[Change] = []
+    rest: list[str] = []
+    left = list(words)
+    while left:
+        word = left.pop(0)
+        option, equals, text = word.partition("=")
+        path = find(option) if option.startswith("--") else None
+        if path is None:
+            rest.append(word)
+            continue
+        if not equals:
+            if not left or left[0].startswith("--"):
+                raise UsageError(f"{option} needs a value: {option} VALUE.")
+            text = left.pop(0)
+        if left and not left[0].startswith("-"):
+            raise UsageError(
+                f'{option} takes one value, but "{left[0]}" follows. Write a list in brackets, and '
+                f"quote it if it has spaces: {option} '[3, 32, 2]'."
+            )
+        changes.append((option, path, _value(text)))
+    return changes, rest
 
 
 def _argument(word: str) -> tuple[str, Any]:

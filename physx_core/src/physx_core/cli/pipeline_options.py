@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ast
+import copy
 import dataclasses
+import functools
 import inspect
 import itertools
 import sys
@@ -16,12 +18,16 @@ from typing import Annotated, Any, TypeVar
 
 import tyro
 
-from physx_core.cli.arguments import argument_registry
-from physx_core.config import from_plain, read_toml
+from physx_core.cli.arguments import argument_registry, take_changes
+from physx_core.config import from_plain, read_toml, set_option
 from physx_core.errors import ConfigFileError, UnknownOptionError, UsageError, listed
 from physx_core.pipelines.pipeline import Pipeline
 
 P = TypeVar("P", bound=Pipeline)
+
+_ONE_ARGUMENT = """\
+NAME=VALUE ... gives all arguments of a component. `--{option}.NAME VALUE`
+changes one, and the others stay. Values are written as in TOML; words need no quotes."""
 
 
 def pipeline_from(
@@ -42,7 +48,8 @@ def pipeline_from(
         places: Options that take the leading words without a dash, for example
             ``environment.environment``.
         words: The words after the command. ``--config FILE`` names a TOML file, or a session that
-            has one. The table of the pipeline's kind contains options; words override them.
+            has one. The table of the pipeline's kind contains options; words override them, and
+            ``--network.network-kwargs.NAME VALUE`` overrides one argument.
         given: Table of options that apply unless the file contains them.
         arguments: Names of the leading words without a dash, for the help.
         examples: Typical command lines without the command, for the help.
@@ -52,6 +59,7 @@ def pipeline_from(
     rest = _name_positionals(verb, places, rest)
     defaults = _nested_defaults(make, table, rest)
     options = _options_of(make, defaults, rest)
+    changes, rest = take_changes(rest, functools.partial(_argument_path, make))
     known = {name for name, _, _ in options} | defaults.keys()
     unknown = table.keys() - known
     if unknown:
@@ -59,13 +67,51 @@ def pipeline_from(
     form = dataclasses.make_dataclass(verb, options, kw_only=True)
     about = textwrap.dedent(make.__doc__ or "").split("\n\n")[0]
     lines = "\n".join(f"  physx {verb} {example}" for example in examples)
-    about += f"\n\nexamples:\n{lines}"
+    kwargs = "network.network-kwargs" if "network" in known else "environment.env-kwargs"
+    about += f"\n\nexamples:\n{lines}\n\n{_ONE_ARGUMENT.format(option=kwargs)}"
     asks = not {"-h", "--help"}.isdisjoint(rest)
     with argument_registry():
         prog = f"physx {verb} {arguments}" if asks else f"physx {verb}"
         chosen: Any = tyro.cli(form, args=rest, prog=prog, description=about)
-    values = {_python_name(make, name): getattr(chosen, name) for name in (o[0] for o in options)}
-    return make(**values)
+    values = {name: getattr(chosen, name) for name, _, _ in options}
+    for option, path, value in changes:
+        _change(values, option, path, value)
+    return make(**{_python_name(make, name): value for name, value in values.items()})
+
+
+def _argument_path(make: type[Any], option: str) -> tuple[str, ...] | None:
+    """Return the path of the argument that ``--OPTION.NAME`` names; None: it names none.
+
+    The path consists of the pipeline's option, that of its configuration if it is one, and the
+    argument, followed by names in its table, if any.
+    """
+    first, *others = option.removeprefix("--").split(".")
+    place, path = first.replace("-", "_"), others
+    hints = {_option_name(name): hint for name, hint in typing.get_type_hints(make).items()}
+    found = [place]
+    configuration = _configuration_of(hints.get(place))
+    if configuration is not None and path:
+        found.append(path.pop(0).replace("-", "_"))
+        hints = typing.get_type_hints(configuration)
+    if hints.get(found[-1]) != dict[str, Any] or not path:
+        return None
+    if not all(path):
+        raise UsageError(f"{option} names no argument: write {option.rstrip('.')}.NAME VALUE.")
+    return (*found, path[0].replace("-", "_"), *path[1:])
+
+
+def _change(values: dict[str, Any], option: str, path: Sequence[str], value: Any) -> None:
+    """Set one argument in the options' values, keeping the others."""
+    place, *inner = path
+    config = values[place]
+    if not dataclasses.is_dataclass(config):
+        values[place] = table = copy.deepcopy(config)
+        set_option(option, table, inner, value)
+        return
+    name, *names = inner
+    table = copy.deepcopy(getattr(config, name))
+    set_option(option, table, names, value)
+    values[place] = dataclasses.replace(config, **{name: table})  # type: ignore[type-var]
 
 
 def take_session(words: Sequence[str]) -> tuple[Path | None, list[str]]:
@@ -178,7 +224,12 @@ def _python_name(make: type[Pipeline], name: str) -> str:
 
 def _configuration(make: type[Pipeline], python_name: str) -> Any:
     hint = typing.get_type_hints(make)[python_name]
-    return next((c for c in typing.get_args(hint) if dataclasses.is_dataclass(c)), hint)
+    return _configuration_of(hint) or hint
+
+
+def _configuration_of(hint: Any) -> Any:
+    """Return the configuration in an annotation; None if there is none."""
+    return next((c for c in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(c)), None)
 
 
 def _set_help(cls: type[Any]) -> None:

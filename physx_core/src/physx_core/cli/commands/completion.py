@@ -9,6 +9,7 @@ import re
 from collections.abc import Iterator, Sequence
 
 from physx_core import plugins
+from physx_core.cli.arguments import METAVAR
 from physx_core.cli.command import main
 from physx_core.errors import PhysxError, UsageError
 from physx_core.plugins import KINDS
@@ -83,9 +84,13 @@ def _after(words: Sequence[str]) -> Iterator[str]:
         return
     text = _help(words[0])
     options = dict(_options(text))
+    arguments = [f"{name}." for name, (metavar, _) in options.items() if metavar == METAVAR]
+    options |= {f"{name}NAME": ("VALUE", "") for name in arguments}
     option, place = "", 0
     for word in words[1:]:
         if word.startswith("-"):
+            parent = next((each for each in arguments if word.startswith(each)), "")
+            word = f"{parent}NAME" if parent else word
             option = word if options.get(word, ("", ""))[0] else ""
         elif option and word != "=":
             option = option if "..." in options[option][0] else ""

@@ -16,7 +16,7 @@ from physx_core.components.network import Network
 from physx_core.components.optimization import Optimization
 from physx_core.components.predicted_batch import PredictedBatch, predict
 from physx_core.components.transformation import Transformation
-from physx_core.config import NetworkConfig
+from physx_core.config import NetworkConfig, merge_arguments
 from physx_core.errors import (
     CheckpointError,
     ConfigError,
@@ -455,8 +455,9 @@ def load_learner(
     """Return a session's trained network, ready to predict.
 
     A checkpoint may only name components of installed plugins. Name any other network, such as your
-    own class, in `config`; if it is the checkpoint's network and no arguments are given, it gets
-    the checkpoint's arguments.
+    own class, in `config`. If it is the checkpoint's network, it gets the checkpoint's arguments,
+    except those given in `config`, which may be some of those in a nested table. The same applies
+    to the transformation.
 
     Args:
         folder: The folder of the session, of its checkpoints, or of one checkpoint.
@@ -481,7 +482,7 @@ def load_learner(
         raise CheckpointError(
             f"{found.path / checkpoint.DESCRIPTION} is invalid: {error}"
         ) from error
-    network = None if config.network else _create_recorded(merged, found)
+    network = None if config.network else _create_recorded(merged, found, config.network_kwargs)
     learner = Learner(merged, trains=False, network=network)
     used, recorded = learner.config.transformation, found.network.get("transformation")
     if config.transformation is None and recorded and not is_recorded_as(used, recorded):
@@ -492,15 +493,17 @@ def load_learner(
     return learner
 
 
-def _create_recorded(config: NetworkConfig, found: checkpoint.Checkpoint) -> Network:
-    """Create the network that a checkpoint names, with its arguments."""
+def _create_recorded(
+    config: NetworkConfig, found: checkpoint.Checkpoint, given: Mapping[str, Any]
+) -> Network:
+    """Create the network that a checkpoint names, with its arguments and those given."""
     try:
         make, arguments = resolve_network(config.network, config.network_kwargs)
         if isinstance(make, type) and issubclass(make, Network):
             make.check_arguments(arguments, found.path / make.parameters_file)
         return create_network(config)
     except Exception as error:  # a component may raise anything for arguments of a damaged file
-        if isinstance(error, PhysxError) and not isinstance(error, ConfigError):
+        if isinstance(error, PhysxError) and (given or not isinstance(error, ConfigError)):
             raise
         raise CheckpointError(
             f'{found.path / checkpoint.DESCRIPTION} describes a "{config.network}" that cannot be '
@@ -511,17 +514,30 @@ def _create_recorded(config: NetworkConfig, found: checkpoint.Checkpoint) -> Net
 def _choose(
     kind: str, found: checkpoint.Checkpoint, config: NetworkConfig, trust: bool
 ) -> dict[str, Any]:
-    """Return a component's reference and arguments: the user's, by default the checkpoint's."""
+    """Return a component's reference and arguments: the user's, else the checkpoint's."""
     given, own = getattr(config, kind), getattr(config, f"{kind}_kwargs")
     reference = found.network.get(kind)
     arguments = found.network.get(f"{kind}_kwargs", {})
-    if given is not None and (own or not is_recorded_as(given, reference)):
+    if given is not None and not is_recorded_as(given, reference):
         return {kind: given, f"{kind}_kwargs": own}
+    arguments = _without(arguments, own)
     is_code = ":" in str(reference) and not is_of_plugin(kind, reference)
     if kind == "transformation" and is_code and not trust:
         reference = None  # it may be the network's default
     _check(kind, found, reference if given is None else None, arguments, trust)
-    return {kind: given or reference, f"{kind}_kwargs": arguments}
+    return {kind: given or reference, f"{kind}_kwargs": merge_arguments(arguments, own)}
+
+
+def _without(arguments: Mapping[str, Any], given: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the arguments of a checkpoint that the user does not replace."""
+    kept = {}
+    for name, value in arguments.items():
+        own = given.get(name)
+        if isinstance(own, Mapping) and isinstance(value, Mapping):
+            kept[name] = _without(value, own)
+        elif name not in given:
+            kept[name] = value
+    return kept
 
 
 def _check(
