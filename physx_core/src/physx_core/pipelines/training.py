@@ -184,6 +184,7 @@ class Training(NewSessionPipeline):
         """
         with self._running(), deferred_interrupt() as interrupt:
             self.train_begin()
+            self._restore()
             try:
                 while self.epoch_condition():
                     self.epoch_begin()
@@ -211,7 +212,11 @@ class Training(NewSessionPipeline):
             self.train_end()
 
     def train_begin(self) -> None:
-        """Called before the first epoch, or before the epoch at which training resumes."""
+        """Called before the first epoch, or before the epoch at which training resumes.
+
+        When a training resumes, its checkpoint is restored once more afterwards: what this method
+        changes in the network, the optimization, or its loss has an effect only at the beginning.
+        """
         self.epoch_id = self._resumed.epoch
 
     def epoch_condition(self) -> bool:
@@ -509,6 +514,7 @@ class Training(NewSessionPipeline):
         former, last = start.generation, start.checkpoint
         seed = self.group.tell(choose_seed(self.seed) if former is None else former.seed)
         self._resumed = last.progress if last else Progress(0, 0, 0, seed)
+        self._resumed_from = last
         self._saved = (self._resumed.epoch, self._resumed.batch)
         self._blocks = self._resumed.blocks
         self.checkpoint_path = last.path if last else None
@@ -551,6 +557,16 @@ class Training(NewSessionPipeline):
         self._load_parameters(last)
         self.learner.join(self.group)
         self.learner.network.set_train()
+
+    def _restore(self) -> None:
+        """Undo what an overridden `train_begin` has changed in a training that resumes.
+
+        Else a resumed training would differ from an uninterrupted one, in which it ran only once.
+        """
+        last, is_own = self._resumed_from, type(self).train_begin is not Training.train_begin
+        if last is not None and is_own:
+            self.learner.resume(last)
+            self.learner.network.set_train()
 
     def _load_parameters(self, last: checkpoint.Checkpoint | None) -> None:
         config = self.network_config

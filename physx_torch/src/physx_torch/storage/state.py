@@ -7,6 +7,7 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from physx_core.errors import CheckpointError
@@ -50,8 +51,12 @@ def set_random_state(state: Mapping[str, torch.Tensor], device: torch.device) ->
 
 def _split(value: Any, where: str, tensors: dict[str, torch.Tensor]) -> dict[str, Any]:
     if isinstance(value, torch.Tensor):
+        while where in tensors:  # keys may contain slashes
+            where += "+"
         tensors[where] = value
         return {"tensor": where}
+    if isinstance(value, np.generic):
+        value = value.item()
     if isinstance(value, Mapping):
         items = [[key, _split(item, f"{where}/{key}", tensors)] for key, item in value.items()]
         return {"items": items}

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import copy
+import functools
 import inspect
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -10,7 +11,7 @@ from pathlib import Path
 from typing import Any, ClassVar
 
 import torch
-from torch.optim.lr_scheduler import LRScheduler, OneCycleLR, ReduceLROnPlateau
+from torch.optim.lr_scheduler import LRScheduler, ReduceLROnPlateau
 
 from physx_core import Network, Optimization
 from physx_core.components import Group, PredictedBatch
@@ -25,8 +26,9 @@ from physx_core.errors import (
 from physx_torch.choices import choose, find_classes, make
 from physx_torch.networks.network import TorchNetwork
 from physx_torch.parallel import average_gradients, broadcast_parameters
+from physx_torch.storage.attributes import Attributes
 from physx_torch.storage.state import random_state, read_state, set_random_state, write_state
-from physx_torch.training.schedules import choose_interval, schedule_length
+from physx_torch.training.schedules import TrainingLength, choose_interval
 from physx_torch.training.training_forward import (
     PRECISIONS,
     Forward,
@@ -35,6 +37,9 @@ from physx_torch.training.training_forward import (
 )
 
 _LEAST_SCALE = 1e-9
+_ANOTHER = (
+    "Start another training from its network: NetworkConfig.network_dir (--network.network-dir)."
+)
 Loss = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
 
 
@@ -78,13 +83,30 @@ class TorchOptimization(Optimization):
     of `pred_fields` is compared with the i-th of `opt_fields`. If a subclass returns more than
     ``loss`` from `transform_loss`, that is recorded too.
 
+    Parameters of the loss are trained with the network's, by the same optimizer.
+
+    A subclass may have further state: `save_state` finds it in the attributes of the optimization
+    and of a loss that is a module. It saves optimizers, schedulers, modules such as averaged
+    models, and other objects with ``state_dict``, if they are created before the training, for
+    example in `set_optimizer`; tensors, arrays and generators of random numbers; lists and
+    dictionaries of these; and plain data that have changed since the training began. Anything else
+    that is state is an error before or after the first batch.
+
+    Validation, the checkpoint "best", predictions and exports use the parameters of the network.
+    Averaged ones must be copied into the network to be used, for example in
+    `Training.train_end`, before the last checkpoint.
+
     Attributes:
+        network: The network to train; set by `set_optimizer`.
         loss: The loss function; None before `set_loss`.
         optimizer: The optimizer; None before `set_optimizer`.
         scheduler: Learning-rate scheduler; None if the rate is constant.
+        unsaved: Names of attributes that are not state, such as ``"history"`` or
+            ``"loss.history"``: they are not saved in checkpoints.
     """
 
     state_file: ClassVar[str] = "optimization.safetensors"
+    unsaved: ClassVar[Sequence[str]] = ()
 
     def __init__(
         self,
@@ -129,8 +151,11 @@ class TorchOptimization(Optimization):
         self._loss_kwargs = dict(loss_kwargs or {})
         self._network: TorchNetwork | None = None
         self._scaler: torch.amp.GradScaler | None = None
-        self._is_shared = False
-        self._total: tuple[int, int] | None = None  # epochs of the training, batches in each
+        self._learned_by_loss: dict[str, torch.nn.Parameter] = {}
+        self._shared: torch.nn.Module | None = None  # what all processes have in common
+        self._total = (0, 0)  # epochs of the training, batches in each
+        self._attributes: Attributes | None = None
+        self._has_saved = False
         self._known: tuple[torch.Tensor | None, float] = (None, 0.0)  # the loss that was last read
 
     def set_loss(self, loss: str | type[Any] | Loss | None) -> None:
@@ -157,11 +182,21 @@ class TorchOptimization(Optimization):
             raise ConfigError(f"The loss {loss!r} cannot be called with prediction and target.")
         self.loss = chosen
         self._place_loss()
+        if self.optimizer is not None and self._learned_by_loss:
+            self.optimizer.add_param_group({"params": list(self._learned_by_loss.values())})
 
     def _place_loss(self) -> None:
-        # Losses may have their own tensors, for example class weights.
-        if isinstance(self.loss, torch.nn.Module) and self._network is not None:
-            self.loss.to(self._network.device, self._network.data_type)
+        # Losses may have their own tensors, for example class weights, and learn some of them.
+        loss, network = self.loss, self._network
+        self._learned_by_loss = {}
+        if isinstance(loss, torch.nn.Module) and network is not None:
+            loss.to(network.device, network.data_type)
+            others = {id(parameter) for parameter in network.parameters()}
+            self._learned_by_loss = {
+                name: parameter
+                for name, parameter in loss.named_parameters()
+                if parameter.requires_grad and id(parameter) not in others
+            }
 
     def set_optimizer(
         self, optimizer: str | type[Any] | None, network: Network, **kwargs: Any
@@ -186,7 +221,10 @@ class TorchOptimization(Optimization):
         if not isinstance(network, TorchNetwork):
             raise ConfigError(f"{type(network).__name__} is not a TorchNetwork.")
         chosen = choose("optimizer", optimizer, find_classes(torch.optim, torch.optim.Optimizer))
+        self._network = self.network = network
+        self._place_loss()
         trained = [p for p in network.parameters() if p.requires_grad]
+        trained += self._learned_by_loss.values()
         made = make("optimizer", torch.optim.Optimizer, chosen, trained, **kwargs)
         if not isinstance(made, torch.optim.Optimizer):
             raise ConfigError(f"{optimizer!r} returned {type(made).__name__}, not an optimizer.")
@@ -199,8 +237,6 @@ class TorchOptimization(Optimization):
         if type(self).compute_loss is TorchOptimization.compute_loss:
             _pairs(network)
         self.optimizer = made
-        self._network = network
-        self._place_loss()
         self._set_forward(network)
 
     def _set_forward(self, network: TorchNetwork) -> None:
@@ -256,36 +292,33 @@ class TorchOptimization(Optimization):
             raise ConfigError(f"{type(self.scheduler).__name__} fails: {error}") from error
 
     def begin(self, epoch_nb: int, batch_nb: int) -> Sequence[str]:
-        """Check the schedule of the learning rate and describe it; see `Optimization.begin`.
+        """Check and describe the schedule, and find the state; see `Optimization.begin`.
 
         Raises:
             ConfigError: If the schedule ends before the training.
+            CheckpointError: If an attribute is state that cannot be saved.
         """
         self._total = epoch_nb, batch_nb
-        if self.scheduler is None:
-            return ()
-        name, every = type(self.scheduler).__name__, "epoch"
-        if self.scheduler_interval == "step":
-            every = "batch" if self._accumulate == 1 else f"{self._accumulate} batches"
-        steps, length = self._check_schedule(), schedule_length(self.scheduler)
-        part = f": {steps} of its {length} steps" if length is not None and steps < length else ""
-        return [f"learning rate: {name}, stepped every {every}{part}"]
+        self._attributes = self._find_attributes()
+        self._attributes.begin()
+        self._check_saved(self._attributes)
+        lines = []
+        if self._learned_by_loss:
+            count = sum(parameter.numel() for parameter in self._learned_by_loss.values())
+            lines.append(f"loss: {count:,} parameters, trained with the network's")
+        if self.scheduler is not None:
+            self._check_schedule()
+            lines.append(self._length.describe(self.scheduler))
+        return lines
 
-    def _check_schedule(self) -> int:
-        """Return the number of the scheduler's steps in the training."""
-        epochs, batches = self._total or (0, 0)
+    def _check_schedule(self) -> None:
+        if self.scheduler is not None:
+            self._length.check(self.scheduler)
+
+    @property
+    def _length(self) -> TrainingLength:
         by_step = self.scheduler_interval == "step"
-        steps = epochs * batches // self._accumulate if by_step else epochs
-        if isinstance(self.scheduler, OneCycleLR) and steps > self.scheduler.total_steps:
-            raise ConfigError(
-                f"OneCycleLR's schedule has {self.scheduler.total_steps} steps, but the training "
-                f"takes {steps}: {epochs} epochs"
-                + (f" of {batches} batches" if by_step else "")
-                + f". Set total_steps={steps} (--network.scheduler-kwargs total_steps={steps}). A "
-                "resumed training keeps its schedule: start another one from its network "
-                "(NetworkConfig.network_dir)."
-            )
-        return steps
+        return TrainingLength(*self._total, self._accumulate if by_step else None)
 
     def compute_loss(self, batch: PredictedBatch) -> torch.Tensor:
         """Return the mean of the prediction fields' losses, of normalized values if configured.
@@ -362,8 +395,8 @@ class TorchOptimization(Optimization):
         if self._scaler is not None:
             scaled = self._scaler.scale(scaled)
         scaled.backward()
-        if self._is_shared:
-            average_gradients(network)
+        if self._shared is not None:
+            average_gradients(self._shared)
         self._accumulated += 1
         is_due = self._accumulated >= self._accumulate
         norms: Sequence[torch.Tensor] = ()
@@ -382,7 +415,8 @@ class TorchOptimization(Optimization):
         if self._gradient_clip is not None:
             if self._scaler is not None:
                 self._scaler.unscale_(optimizer)
-            norm = torch.nn.utils.clip_grad_norm_(network.parameters(), self._gradient_clip)
+            learned = [*network.parameters(), *self._learned_by_loss.values()]
+            norm = torch.nn.utils.clip_grad_norm_(learned, self._gradient_clip)
             return [norm] if self._scaler is None else ()
         if self._scaler is not None or not self.stops_at_nan:
             return ()
@@ -401,18 +435,20 @@ class TorchOptimization(Optimization):
 
         In a group of processes, only the gradients are checked, which all processes have in common.
         """
-        values = [*norms] if self._is_shared else [loss.detach(), *norms]
+        is_alone = self._shared is None
+        values = [loss.detach(), *norms] if is_alone else [*norms]
         if loss.is_cuda and values:  # waits for the GPU once
             alike = [value.to(loss.device, torch.float32) for value in values]
             numbers = torch.stack(alike).tolist()
         else:
             numbers = [value.item() for value in values]
-        if not self._is_shared:
+        if is_alone:
             self._known = loss, numbers[0]
         if all(map(math.isfinite, numbers)):
             return
-        what = "" if self._is_shared or math.isfinite(numbers[0]) else f"the loss is {numbers[0]}"
-        for name, gradient in network.get_gradients().items():
+        is_loss = is_alone and not math.isfinite(numbers[0])
+        what = f"the loss is {numbers[0]}" if is_loss else ""
+        for name, gradient in {**network.get_gradients(), **self._gradients_of_loss()}.items():
             if what:
                 break
             if not torch.isfinite(gradient).all():
@@ -441,9 +477,12 @@ class TorchOptimization(Optimization):
             UsageError: If there is no optimizer yet.
         """
         _, network = self._prepared("join")
-        self._is_shared = group.size > 1
-        if self._is_shared:
-            broadcast_parameters(network)
+        loss, self._shared = self.loss, None
+        if group.size > 1:
+            self._shared = network
+            if isinstance(loss, torch.nn.Module) and loss.state_dict():
+                self._shared = torch.nn.ModuleList([network, loss])
+            broadcast_parameters(self._shared)
 
     def __str__(self) -> str:
         scheduler = type(self.scheduler).__name__ if self.scheduler is not None else "no scheduler"
@@ -475,16 +514,25 @@ class TorchOptimization(Optimization):
     def save_state(self, path: Path) -> None:
         """Write the state of the optimizer, scheduler, unfinished step and torch's random numbers.
 
+        Further state is found in the attributes of the optimization and of its loss, as described
+        for the class.
+
         Raises:
             UsageError: If there is no optimizer yet.
-            CheckpointError: If a part of the state is neither plain data nor a tensor.
+            CheckpointError: If a part of the state cannot be saved.
         """
         optimizer, network = self._prepared("save_state")
+        attributes = self._attributes or self._find_attributes()
         state: dict[str, Any] = {
             "kinds": self._kinds(),
             "optimizer": optimizer.state_dict(),
             "random": random_state(network.device),
+            "attributes": attributes.save(),
         }
+        if not self._has_saved:
+            self._check_saved(attributes)
+        elif lost := self._unsavable(attributes):
+            state["lost"] = lost  # the parameters are worth saving nevertheless
         for name, item in (("scheduler", self.scheduler), ("scaler", self._scaler)):
             if item is not None:
                 state[name] = item.state_dict()
@@ -493,17 +541,42 @@ class TorchOptimization(Optimization):
         if self._accumulated:
             state["accumulated"] = self._accumulated
             state["gradients"] = network.get_gradients()
+            state["gradients of the loss"] = self._gradients_of_loss()
         write_state(path, state)
+        self._has_saved = True
 
     def load_state(self, path: Path) -> None:
         """Restore the state written by `save_state`, including torch's random numbers.
 
         Raises:
             UsageError: If there is no optimizer yet.
-            CheckpointError: If the file is missing, damaged, or for another optimizer or scheduler.
+            CheckpointError: If the file is missing, damaged, or for another optimizer or scheduler,
+                or lacks some of the state.
         """
         optimizer, network = self._prepared("load_state")
         state = read_state(path)
+        self._check_fits(path, state)
+        try:
+            optimizer.load_state_dict(state["optimizer"])
+            self._accumulated = state.get("accumulated", 0)
+            network.set_gradients(state.get("gradients", {}))
+        except (KeyError, ValueError) as error:
+            raise CheckpointError(f"{path} is from another network: {error}.") from error
+        for name, parameter in self._learned_by_loss.items():
+            gradient = state.get("gradients of the loss", {}).get(name)
+            parameter.grad = None if gradient is None else gradient.to(parameter)
+        for name, item in (("scheduler", self.scheduler), ("scaler", self._scaler)):
+            if item is not None:
+                item.load_state_dict(state[name])
+        try:
+            attributes = self._attributes or self._find_attributes()
+            attributes.load(state.get("attributes", {}), network.device)
+        except CheckpointError as error:
+            raise CheckpointError(f"{path} does not fit: {error}. {_ANOTHER}") from error
+        set_random_state(state["random"], network.device)
+        self._check_schedule()
+
+    def _check_fits(self, path: Path, state: Mapping[str, Any]) -> None:
         if state.get("kinds") != self._kinds():
             found, own = (" and ".join(kinds) for kinds in (state.get("kinds", []), self._kinds()))
             raise CheckpointError(f"{path} is the state of {found or 'nothing'}, not of {own}.")
@@ -514,18 +587,56 @@ class TorchOptimization(Optimization):
                 f'{self.scheduler_interval}: set NetworkConfig.scheduler_interval="{former}" '
                 f"(--network.scheduler-interval {former}) to continue."
             )
-        try:
-            optimizer.load_state_dict(state["optimizer"])
-            self._accumulated = state.get("accumulated", 0)
-            network.set_gradients(state.get("gradients", {}))
-        except (KeyError, ValueError) as error:
-            raise CheckpointError(f"{path} is from another network: {error}.") from error
-        for name, item in (("scheduler", self.scheduler), ("scaler", self._scaler)):
-            if item is not None:
-                item.load_state_dict(state[name])
-        set_random_state(state["random"], network.device)
-        self._check_schedule()
+        if lost := state.get("lost"):
+            raise CheckpointError(
+                f"{path} lacks a part of the state: {_reasons(lost)}. A resumed training would "
+                f"differ. {_ANOTHER}"
+            )
+
+    def _find_attributes(self) -> Attributes:
+        network = self._network
+        modules = () if network is None else network.modules()
+        tensors = () if network is None else (*network.parameters(), *network.buffers())
+        used = (self.optimizer, self.scheduler, self._scaler)
+        return Attributes(
+            self,
+            skipped=_own_attributes(),
+            extra=("loss",),
+            unsaved=self.unsaved,
+            known=[*modules, *tensors, *(item for item in used if item is not None)],
+        )
+
+    def _unsavable(self, attributes: Attributes) -> dict[str, str]:
+        """Return what cannot be saved, and why, unless a subclass saves the state itself."""
+        own = type(self).save_state is not TorchOptimization.save_state
+        return {} if own else attributes.unsavable
+
+    def _check_saved(self, attributes: Attributes) -> None:
+        if not (lost := self._unsavable(attributes)):
+            return
+        kind, first = type(self).__name__, next(iter(lost))
+        raise CheckpointError(
+            f"The state of {kind} cannot be saved, so that a resumed training would differ: "
+            f"{_reasons(lost)}. Make it an attribute of its own that is a tensor, a "
+            "torch.nn.Module, an object with state_dict() and load_state_dict(), or a list or "
+            "dictionary of these; or override save_state() and load_state(); or, if it is no "
+            f'state, name it in the class: unsaved = ("{first}",).'
+        )
+
+    def _gradients_of_loss(self) -> dict[str, torch.Tensor]:
+        named = self._learned_by_loss.items()
+        return {name: p.grad for name, p in named if p.grad is not None}
 
     def _kinds(self) -> list[str]:
         used = (self.optimizer, self.scheduler, self._scaler)
         return [type(item).__name__ for item in used if item is not None]
+
+
+def _reasons(lost: Mapping[str, str]) -> str:
+    return "; ".join(f'"{path}" {reason}' for path, reason in lost.items())
+
+
+@functools.cache
+def _own_attributes() -> frozenset[str]:
+    """Return the attributes of TorchOptimization, which it saves itself."""
+    return frozenset(vars(TorchOptimization())) | set(inspect.get_annotations(Optimization))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 from torch.optim.lr_scheduler import CyclicLR, LRScheduler, OneCycleLR, ReduceLROnPlateau
 
@@ -43,7 +43,51 @@ def choose_interval(
     return asked or ("step" if counts or any(map(_STEPS.search, arguments)) else "epoch")
 
 
-def schedule_length(scheduler: LRScheduler) -> int | None:
+class TrainingLength(NamedTuple):
+    """Length of a training, and how often its scheduler is stepped in it.
+
+    Attributes:
+        epochs: Number of epochs.
+        batches: Number of batches in an epoch.
+        every: Number of batches between the scheduler's steps; None: it is stepped every epoch.
+    """
+
+    epochs: int
+    batches: int
+    every: int | None
+
+    @property
+    def steps(self) -> int:
+        """Number of the scheduler's steps."""
+        return self.epochs if self.every is None else self.epochs * self.batches // self.every
+
+    def describe(self, scheduler: LRScheduler) -> str:
+        """Return when the scheduler is stepped, and if its schedule is longer than the training."""
+        every = "epoch" if self.every is None else "batch"
+        if self.every is not None and self.every > 1:
+            every = f"{self.every} batches"
+        length = _schedule_length(scheduler)
+        part = f": {self.steps} of its {length} steps" if self.steps < (length or 0) else ""
+        return f"learning rate: {type(scheduler).__name__}, stepped every {every}{part}"
+
+    def check(self, scheduler: LRScheduler) -> None:
+        """Check that the schedule does not end before the training.
+
+        Raises:
+            ConfigError: If it does.
+        """
+        if not isinstance(scheduler, OneCycleLR) or self.steps <= scheduler.total_steps:
+            return
+        each = "" if self.every is None else f" of {self.batches} batches"
+        raise ConfigError(
+            f"OneCycleLR's schedule has {scheduler.total_steps} steps, but the training takes "
+            f"{self.steps}: {self.epochs} epochs{each}. Set total_steps={self.steps} "
+            f"(--network.scheduler-kwargs total_steps={self.steps}). A resumed training keeps its "
+            "schedule: start another one from its network (NetworkConfig.network_dir)."
+        )
+
+
+def _schedule_length(scheduler: LRScheduler) -> int | None:
     """Return the number of steps of a schedule; None if it has none, or it is unknown."""
     sequence, first = [scheduler], 0
     while milestones := getattr(sequence[-1], "_milestones", None):
