@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-from functools import partial
-from typing import Any
-
 import gymnasium
 
 _ENTRY_POINTS = {
@@ -33,28 +30,6 @@ def register() -> None:
         gymnasium.register(
             id,
             entry_point=f"physx_gym.environments.{place}",
-            vector_entry_point=partial(make_vector, id),
+            vector_entry_point=f"physx_gym.vectors:{id}",
             reward_threshold=_REWARD_THRESHOLDS.get(name),
         )
-
-
-_VECTOR_OPTIONS = (
-    *("num_processes", "batch_size", "autoreset_mode", "copy", "timeout"),
-    *("launcher", "launcher_kwargs", "ip_address", "restarts"),
-)
-
-
-def make_vector(id: str, num_envs: int, **options: Any) -> Any:
-    """Return a vector environment whose environments run in separate processes.
-
-    Args:
-        id: Id of the environment.
-        num_envs: Number of environments.
-        options: ``num_processes``, ``batch_size``, ``autoreset_mode``, ``copy``, ``timeout``,
-            ``launcher``, ``launcher_kwargs``, ``ip_address`` and ``restarts`` of
-            `ParallelVectorEnv`; all others go to each environment.
-    """
-    from physx_gym.vector.vector_env import ParallelVectorEnv
-
-    own = {name: options.pop(name) for name in _VECTOR_OPTIONS if name in options}
-    return ParallelVectorEnv(id, num_envs, env_kwargs=options, **own)

@@ -114,7 +114,7 @@ def test_each_link_uses_the_nearest_of_several_imus():
         Imu(name="calf", body="FL_calf", rotation=TILTED),
     ]
     env = walker(sensors=[*encoders(), *imus], filtered={"kp": 0.0, "ki": 0.0})
-    assert env.outermost.layers[2].observer.bodies == ("base", "FL_calf")
+    assert env.derived.layers[2].observer.bodies == ("base", "FL_calf")
     simulation = env.simulator.simulation
     for observed in swaying(env, 20, 1.0):
         truth = simulation.body_poses(["base", "FL_calf"])[:, 3:]

@@ -253,10 +253,10 @@ class Doubling(Layer):
 
 def test_layers_forward_what_they_do_not_override():
     base = Falling()
-    assert base.outermost is base and base.unwrapped is base and base.layers == (base,)
+    assert base.derived is base and base.unwrapped is base and base.layers == (base,)
     layer = Doubling(base)
     assert isinstance(layer, PipelineEnv) and isinstance(layer, gymnasium.Env)
-    assert layer.unwrapped is base and base.outermost is layer and layer.outermost is layer
+    assert layer.unwrapped is base and base.derived is layer and layer.derived is layer
     assert layer.layers == (base, layer)
     for name in ("simulator", "robot_state", "num_steps", "step_dt", "training", "measurements"):
         assert getattr(layer, name) is getattr(base, name)
@@ -265,7 +265,7 @@ def test_layers_forward_what_they_do_not_override():
     with pytest.raises(EpisodeError, match="Doubling"):
         base.step([0.0])
     base.reset()
-    assert base.outermost is base and base.step([0.0])[1] == 1.0
+    assert base.derived is base and base.step([0.0])[1] == 1.0
     with pytest.raises(AttributeError, match="nothing_like_it"):
         _ = layer.nothing_like_it
 
@@ -281,7 +281,7 @@ def test_options_reach_every_layer():
 def test_a_layer_that_is_gone_leaves_the_base():
     base = Falling()
     Doubling(base)
-    assert base.outermost is base
+    assert base.derived is base
 
 
 def test_wrapper_attributes():

@@ -104,7 +104,7 @@ def test_copies_of_a_running_environment(backend, way):
     actions = [env.action_space.sample() for _ in range(2)]
     env.step(actions[0])
     other = way(env)
-    assert type(other) is Counting and other.outermost is other and other.unwrapped is other.env
+    assert type(other) is Counting and other.derived is other and other.unwrapped is other.env
     assert other.is_simulation_running and other.num_steps == 1 and other.training
     assert np.shares_memory(other.robot_state.q, other.simulator.values)
     assert np.shares_memory(other.base_q, other.robot_state.q)

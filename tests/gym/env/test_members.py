@@ -18,7 +18,7 @@ from physx_gym.tasks.quantities import BodyPositions, Delta, JointPositions
 
 MEMBERS = (
     "simulator", "render_mode", "stepper_state", "is_simulation_running", "robot", "robot_state",
-    "outermost", "log_fieldnames", "np_random", "np_random_seed", "num_steps", "quantities",
+    "derived", "log_fieldnames", "np_random", "np_random_seed", "num_steps", "quantities",
     "observation", "action", "measurements", "register_variable", "set_wrapper_attr",
     "get_wrapper_attr", "has_wrapper_attr", "viewer_kwargs", "step_dt", "control_dt", "observe_dt",
     "simulation_duration_max", "debug", "unwrapped", "training", "train", "eval", "reset", "close",
@@ -117,9 +117,9 @@ def test_samples_repeat_when_spaces_are_recreated():
 def test_the_pipeline_changes_at_the_base():
     env = cart()
     layer = Layer(env)
-    assert env.outermost is layer
+    assert env.derived is layer
     env._update_pipeline(None)
-    assert env.outermost is env is layer.outermost
+    assert env.derived is env is layer.derived
     env._update_pipeline(layer)
     layer.reset()
     env._update_pipeline(None)

@@ -123,7 +123,7 @@ def test_rewards_and_terminations_are_described_by_tables():
     assert reward > 0
     assert not terminated
     assert not truncated
-    assert info["reward"]
+    assert info["reward_total"]
 
 
 class Rewarded(ControlledEnv):

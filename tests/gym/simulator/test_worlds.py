@@ -284,7 +284,7 @@ def test_lists_of_a_file_are_weights_and_names():
     env = build_pipeline({"cls": "physx/Cartpole-v0"}, [wrapper])()
     env.reset(seed=0)
     _, reward, *_, info = env.step(1)
-    assert reward == pytest.approx(1.0 + 1.0 + 3 * info["reward"]["place"])
+    assert reward == pytest.approx(1.0 + 1.0 + 3 * info["reward_place"])
 
 
 def test_the_environments_own_action_is_clipped_and_checked_too():

@@ -69,7 +69,7 @@ def test_rewards_follow_their_formulas():
     rng = np.random.default_rng(0)
     for _ in range(5):
         *_, info = results = top.step(rng.uniform(-5, 5, 8))
-        parts = info["reward"]
+        parts = {name.removeprefix("reward_"): value for name, value in info.items()}
 
         def kernel(error, cutoff):
             return math.exp(math.log(0.01) * float(np.sum(np.square(error))) / cutoff**2)
@@ -99,8 +99,8 @@ def test_normalized_sums_stay_within_0_and_1_and_rewards_add_up_over_layers():
     outer = ComposedEnv(inner, reward=Survival("again"))
     outer.reset(seed=0)
     _, total, _, _, info = outer.step(np.zeros(8))
-    assert info["reward"]["total"] == pytest.approx(0.5 + 0.5 * info["reward"]["RollPitch"])
-    assert total == pytest.approx(info["reward"]["total"] + 1.0)
+    assert info["reward_total"] == pytest.approx(0.5 + 0.5 * info["reward_RollPitch"])
+    assert total == pytest.approx(info["reward_total"] + 1.0)
 
 
 def test_terminations_end_episodes():

@@ -140,7 +140,7 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
 
     @property
     @abstractmethod
-    def outermost(self) -> PipelineEnv:
+    def derived(self) -> PipelineEnv:
         """The outermost environment of this environment's pipeline."""
 
     @property
@@ -203,6 +203,7 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
             EpisodeError: If no episode is running, it is over, or another layer started it.
             ActionError: If the action does not have the form of the action space, or is not finite.
             SimulationError: If the simulation, an observation or a reward is no longer finite.
+            ConfigError: If the information has a name of trainers: see `OF_TRAINERS`.
         """
 
     @abstractmethod

@@ -9,6 +9,7 @@ from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from physx_core import checks
 from physx_core.components import Factory
@@ -58,6 +59,7 @@ class RobotEnv(PipelineEnv):
     """``eye`` and ``target`` of the camera that `render` uses, in m; by default it shows all
     objects."""
 
+    _spec: EnvSpec | None = None
     _left_out: ClassVar[frozenset[str]] = frozenset({"_outermost", "_own_renderer"})
 
     def __init__(
@@ -304,7 +306,18 @@ class RobotEnv(PipelineEnv):
         return self
 
     @property
-    def outermost(self) -> PipelineEnv:
+    def spec(self) -> EnvSpec | None:
+        """How `gymnasium.make` created it, and after how many steps it truncates an episode."""
+        if self._spec is not None:
+            self._spec.max_episode_steps = self._control_loop.timing.most_steps
+        return self._spec
+
+    @spec.setter
+    def spec(self, spec: EnvSpec | None) -> None:
+        self._spec = spec
+
+    @property
+    def derived(self) -> PipelineEnv:
         """The outermost layer on this environment; the environment itself if there is none."""
         found = None if self._outermost is None else self._outermost()
         return self if found is None else found
@@ -419,7 +432,7 @@ class RobotEnv(PipelineEnv):
             gymnasium.Env.reset(self, seed=seed)
         self._control_loop.episode = 0
         self.simulator.seed(np.random.SeedSequence(self.np_random_seed, spawn_key=(1,)))
-        self._seed_spaces(self.outermost.layers)
+        self._seed_spaces(self.derived.layers)
 
     def _seed_spaces(self, layers: tuple[PipelineEnv, ...]) -> None:
         """Seed the samples of the layers' spaces, unless the seed of the environment is unknown."""
@@ -449,6 +462,7 @@ class RobotEnv(PipelineEnv):
         ends = subclass_checks.check_pair(
             outermost, "has_terminated", outermost.has_terminated(info)
         )
+        subclass_checks.check_info(outermost, info)
         if any(ends):
             word = "terminated" if ends[0] else "truncated"
             raise EpisodeError(
@@ -500,7 +514,7 @@ class RobotEnv(PipelineEnv):
             SimulationError: If the simulation, an observation or a reward is no longer finite.
         """
         loop = self._control_loop
-        if not loop.is_ready or outermost is not self.outermost:
+        if not loop.is_ready or outermost is not self.derived:
             raise self._step_error(outermost)
         loop.actions.write(action)
         try:
@@ -516,6 +530,7 @@ class RobotEnv(PipelineEnv):
             reward = outermost.compute_reward(terminated, info)
             if type(reward) is not float:
                 reward = subclass_checks.check_number(outermost, reward)
+            subclass_checks.check_info(outermost, info)
             if reward != reward:
                 raise SimulationError(f"The reward of {type(outermost).__name__} is not a number.")
             if loop.is_recorded:
@@ -558,7 +573,7 @@ class RobotEnv(PipelineEnv):
         if not self._control_loop.is_ready:
             return EpisodeError(self._control_loop.reason)
         return EpisodeError(
-            f"The episode belongs to {type(self.outermost).__name__}, the outermost of the "
+            f"The episode belongs to {type(self.derived).__name__}, the outermost of the "
             f"pipeline, but step was called on {type(outermost).__name__}: call step there, or "
             "reset here."
         )
@@ -619,7 +634,7 @@ class RobotEnv(PipelineEnv):
         foreseen = [layer._foresee(each) for layer, each in zip(layers, memories, strict=True)]
         if any(foreseen):
             self.stop()
-        if not runs or self.outermost is not outermost or not self.is_simulation_running:
+        if not runs or self.derived is not outermost or not self.is_simulation_running:
             self.run_reset(outermost, None, state["own"][0]["options"])
         for layer, own in zip(layers, state["own"], strict=True):
             layer._restore_own(own)

@@ -100,6 +100,33 @@ def check_spaces(env: Any) -> None:
             )
 
 
+OF_TRAINERS = frozenset(
+    {
+        *("observation", "action", "reward", "done", "terminated", "truncated", "next"),  # TorchRL
+        *("episode", "final_obs", "final_info"),  # Gymnasium
+        *("terminal_observation", "TimeLimit.truncated"),  # stable-baselines3
+    }
+)
+"""Names in information that trainers and wrappers write themselves, or beside it in one table."""
+
+
+def check_info(outermost: Any, info: Mapping[str, Any]) -> None:
+    """Check that no name in information is one of trainers.
+
+    Args:
+        outermost: The pipeline that wrote it.
+        info: The information.
+    """
+    if OF_TRAINERS.isdisjoint(info):
+        return
+    name = min(OF_TRAINERS & info.keys())
+    kinds = " or ".join(dict.fromkeys(type(each).__name__ for each in outermost.layers[::-1]))
+    raise ConfigError(
+        f'{kinds} wrote info["{name}"], but trainers keep what is theirs under that name, and '
+        f'would replace one by the other: choose another, such as "my_{name}".'
+    )
+
+
 def not_written(env: Any, method: str, where: str) -> ConfigError:
     """Return the error for a method that returned what it should have written."""
     return ConfigError(

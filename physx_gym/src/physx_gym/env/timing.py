@@ -24,6 +24,7 @@ class StepTiming:
         observe_dt: Time between two observations, in s.
         tick: Greatest number of physics steps that divides all three.
         last: Physics steps after which an episode is truncated.
+        most_steps: Steps of the environment after which an episode is truncated.
         longest: Time by which every episode is over, in s.
     """
 
@@ -59,7 +60,8 @@ class StepTiming:
         self.tick = math.gcd(self.step, self.control, self.observe)
         duration = checks.positive("simulation_duration_max", duration)
         self.last = math.ceil(duration / period * (1 - 1e-12))
-        self.longest = math.ceil(self.last / self.step) * self.step * period
+        self.most_steps = math.ceil(self.last / self.step)
+        self.longest = self.most_steps * self.step * period
 
     def schedule(self, is_held: bool, every_physics_step: bool) -> list[Tick]:
         """Return the ticks of a step; at its start the observation is up to date.

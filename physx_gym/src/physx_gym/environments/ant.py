@@ -27,10 +27,10 @@ class AntEnv(RobotEnv):
     height of the torso in m; its orientation, a quaternion x, y, z, w; the joints' positions in
     rad; velocity of the torso in its own frame, in m/s and rad/s; the joints' velocities. Reward:
     mean velocity along x in the step, in m/s, plus 0.5 while the ant is healthy, minus 0.005 times
-    the sum of the squared actions; ``info["reward"]`` has the parts. The ant is healthy while its
-    torso is between 0.1 and 1 m high, and not upside down; the torso's radius is 0.2 m, so it may
-    lie on the ground. An episode terminates when the ant is no longer healthy, and is truncated
-    after 1000 steps of 50 ms.
+    the sum of the squared actions; the information has the parts, as ``"reward_forward"`` and so
+    on. The ant is healthy while its torso is between 0.1 and 1 m high, and not upside down; the
+    torso's radius is 0.2 m, so it may lie on the ground. An episode terminates when the ant is no
+    longer healthy, and is truncated after 1000 steps of 50 ms.
 
     The task is that of J. Schulman et al., "High-dimensional continuous control using generalized
     advantage estimation", 2015, with another robot. Options have the same names as in Gymnasium's
@@ -139,11 +139,11 @@ class AntEnv(RobotEnv):
         (x, y), (x_before, y_before) = self._place, self._before
         velocity = (x - x_before) / self.step_dt
         parts = {
-            "forward": self._forward_weight * velocity,
-            "survival": self._healthy_reward if self.is_healthy else 0.0,
-            "effort": -self._effort_weight * float(self.action @ self.action),
+            "reward_forward": self._forward_weight * velocity,
+            "reward_survival": self._healthy_reward if self.is_healthy else 0.0,
+            "reward_effort": -self._effort_weight * float(self.action @ self.action),
         }
-        info["reward"] = parts
+        info |= parts
         info["x_position"], info["y_position"] = x, y
         info["x_velocity"], info["y_velocity"] = velocity, (y - y_before) / self.step_dt
         return float(sum(parts.values()))

@@ -35,10 +35,10 @@ class QuadrupedEnv(RobotEnv):
     joints' positions relative to the standing pose, in rad, and velocities; the last action; cosine
     and sine of the heading, the angle from the x axis to the trunk's. Reward: up to 2 for a forward
     velocity of `speed`, up to 0.5 for going straight, up to 0.5 for a heading of 0, 0.25 for
-    staying up, minus costs of torques and abrupt actions; ``info["reward"]`` has the parts,
-    ``info["x_velocity"]`` the mean velocity along the x axis in the step, in m/s. An episode
-    terminates if the trunk is below 0.12 m or leans by more than 1 rad, and is truncated after 1000
-    steps of 20 ms.
+    staying up, minus costs of torques and abrupt actions; the information has the parts, as
+    ``"reward_forward"`` and so on, ``info["x_velocity"]`` the mean velocity along the x axis in the
+    step, in m/s. An episode terminates if the trunk is below 0.12 m or leans by more than 1 rad,
+    and is truncated after 1000 steps of 20 ms.
     """
 
     def __init__(self, *, backend: Any = BACKEND, speed: float = 0.6, **options: Any) -> None:
@@ -130,13 +130,13 @@ class QuadrupedEnv(RobotEnv):
         heading = math.atan2(self.observation[46], self.observation[45])
         torques = self.robot_state.command
         parts = {
-            "forward": 2.0 * math.exp(-4.0 * (forward - self.speed) ** 2),
-            "straight": 0.5 * math.exp(-4.0 * (left**2 + 0.25 * turn**2)),
-            "heading": 0.5 * math.exp(-4.0 * heading**2),
-            "survival": 0.0 if terminated else 0.25,
-            "torques": -1e-4 * float(torques @ torques),
-            "haste": -0.01 * self._haste,
+            "reward_forward": 2.0 * math.exp(-4.0 * (forward - self.speed) ** 2),
+            "reward_straight": 0.5 * math.exp(-4.0 * (left**2 + 0.25 * turn**2)),
+            "reward_heading": 0.5 * math.exp(-4.0 * heading**2),
+            "reward_survival": 0.0 if terminated else 0.25,
+            "reward_torques": -1e-4 * float(torques @ torques),
+            "reward_haste": -0.01 * self._haste,
         }
-        info["reward"] = parts
+        info |= parts
         info["x_velocity"] = (self._place - self._before) / self.step_dt
         return sum(parts.values())

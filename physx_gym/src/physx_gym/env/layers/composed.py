@@ -16,8 +16,8 @@ from physx_gym.tasks.trajectory import Trajectory
 class ComposedEnv(Layer):
     """Adds a reward and terminations to an environment.
 
-    The reward is added to that of the layers below; ``info["reward"]`` contains its parts by name.
-    An episode ends when the layers below or one of the terminations end it;
+    The reward is added to that of the layers below; the information has each of its parts, as
+    ``"reward_<name>"``. An episode ends when the layers below or one of the terminations end it;
     ``info["terminations"]`` names the terminations that did.
 
     Attributes:
@@ -87,9 +87,11 @@ class ComposedEnv(Layer):
         """Return the reward of the layers below plus that of this layer."""
         total = self.env.compute_reward(terminated, info)
         if self.reward is not None:
-            parts = info.setdefault("reward", {})
+            parts: dict[str, float] = {}
             own = self.reward.compute(self.env.quantities, terminated, parts)
             parts[self.reward.name] = own
+            for name, value in parts.items():  # numbers, not a dictionary: TorchRL reads them
+                info[f"reward_{name}"] = value
             total += own
         return total
 

@@ -100,9 +100,9 @@ class Layer(PipelineEnv):
         return self._base
 
     @property
-    def outermost(self) -> PipelineEnv:
+    def derived(self) -> PipelineEnv:
         """The outermost environment of the pipeline."""
-        return self._base.outermost
+        return self._base.derived
 
     @property
     def layers(self) -> tuple[PipelineEnv, ...]:
@@ -143,7 +143,7 @@ class Layer(PipelineEnv):
 
     def __getstate__(self) -> dict[str, Any]:
         """Return the attributes, and whether this is the outermost layer."""
-        return super().__getstate__() | {"_is_outermost": self.outermost is self}
+        return super().__getstate__() | {"_is_outermost": self.derived is self}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
         """Restore the attributes, and the outermost layer of the pipeline."""
