@@ -8,8 +8,10 @@ import pytest
 
 from physx_core import DataGeneration, DatasetConfig, EnvironmentConfig, NetworkConfig, Training
 from physx_core.errors import ConfigError, PhysxError
-from physx_gym import Policy
+from physx_gym import ComposedEnv, Policy, RobotEnv, plain
 from physx_gym.cli import evaluate
+from physx_gym.tasks.quantities import JointPositions
+from physx_gym.tasks.terminations import OutOfBounds
 
 
 class Walk(gymnasium.Env):
@@ -91,3 +93,162 @@ def test_what_cannot_be_evaluated_says_why(session, tmp_path):
         evaluate.run([*words, "--replay", str(tmp_path / "walk.rrd")])
     with pytest.raises(ConfigError, match="Pendulum-v1"):
         evaluate.run([session, "--env", "Pendulum-v9"])
+
+
+# Recordings of episodes that wrappers change ----------------------------------------------------
+
+WRAPPERS = gymnasium.wrappers
+
+
+class Repeat(gymnasium.Wrapper):
+    """Repeats each action for three steps, as trainers' frame skipping does."""
+
+    def step(self, action):
+        total = 0.0
+        for _ in range(3):
+            observation, reward, terminated, truncated, info = self.env.step(action)
+            total += reward
+            if terminated or truncated:
+                break
+        return observation, total, terminated, truncated, info
+
+
+class Noops(gymnasium.Wrapper):
+    """Starts episodes anew after a few steps, as trainers' random starts do."""
+
+    def reset(self, **options):
+        self.env.reset(**options)
+        for _ in range(4):
+            self.env.step(np.zeros(2))
+        return self.env.reset(**options)
+
+
+class Cart(RobotEnv):
+    """The reward is the torque of the first motor, so that a recording shows who acted."""
+
+    def __init__(self):
+        super().__init__("cartpole", 0.04, simulation_duration_max=1.0)
+
+    def _sample_state(self):
+        return self.np_random.uniform(-0.1, 0.1, 2), np.zeros(2)
+
+    def compute_reward(self, terminated, info):
+        return float(self.action[0])
+
+
+def rescaled(env):
+    return WRAPPERS.RescaleAction(env, np.float64(-0.1), np.float64(0.1))
+
+
+WRAPPED = {
+    "none": lambda env: env,
+    "plain": plain,
+    "flattened": WRAPPERS.FlattenObservation,
+    "limited": lambda env: WRAPPERS.TimeLimit(env, 7),
+    "rescaled": rescaled,
+    "limited and rescaled": lambda env: WRAPPERS.TimeLimit(rescaled(env), 7),
+    "stacked": lambda env: WRAPPERS.FrameStackObservation(WRAPPERS.FlattenObservation(env), 3),
+    "delayed": lambda env: WRAPPERS.DelayObservation(WRAPPERS.FlattenObservation(env), 2),
+    "sticky": lambda env: WRAPPERS.StickyAction(env, 0.5),
+    "counted": WRAPPERS.RecordEpisodeStatistics,
+    "repeated": Repeat,
+    "repeated and limited": lambda env: WRAPPERS.TimeLimit(Repeat(env), 4),
+    "started anew": Noops,
+    "terminating": lambda env: ComposedEnv(
+        env, terminations=OutOfBounds(JointPositions(), -0.11, 0.11, "fell")
+    ),
+    "terminating in training": lambda env: ComposedEnv(
+        env,
+        terminations=OutOfBounds(JointPositions(), -0.11, 0.11, "fell", training_only=True),
+    ),
+}
+
+
+class Steering:
+    """A policy that depends on all that it sees; it keeps what it did."""
+
+    def __init__(self, env):
+        self.space = env.action_space
+
+    def act(self, observation):
+        seen = np.concatenate([np.ravel(x) for x in _leaves(observation)])
+        share = np.full(self.space.shape, 0.5 + 0.5 * np.sin(100 * seen.sum()))
+        return self.space.low + share * (self.space.high - self.space.low)
+
+
+def _leaves(tree):
+    return (
+        [leaf for x in tree.values() for leaf in _leaves(x)] if isinstance(tree, dict) else [tree]
+    )
+
+
+@pytest.mark.parametrize("name", WRAPPED)
+def test_the_recorded_episode_is_the_evaluated_one(name):
+    base = Cart()
+    env = WRAPPED[name](base)
+    act = Steering(env).act
+    commands = []
+    compute = base.compute_command
+
+    def listen(action, command):
+        compute(action, command)
+        commands.append(command.copy())
+
+    figures, recording = evaluate.evaluate_recorded(env, act, 3)
+    base.eval()
+    base.compute_command = listen
+    assert evaluate.evaluate(env, act, [3]) == [figures]
+    steps = int(base.num_steps)
+    columns = recording["variables"]
+    rewards = columns["reward.step"][1:]
+    assert len(rewards) == steps
+    assert rewards.sum() == pytest.approx(figures["reward"])
+    told = np.transpose([columns["action.slider"], columns["action.hinge"]])
+    np.testing.assert_array_equal(told[:-1], np.array(commands)[-steps:])
+    repeats = 3 if "repeated" in name else 1
+    assert figures["length"] == -(-steps // repeats)
+    assert (figures["length"] == 7) == ("limited" in name and repeats == 1)
+    env.close()
+
+
+def test_an_environment_without_a_robot_is_not_recorded():
+    with pytest.raises(ConfigError, match="is not a RobotEnv"):
+        evaluate.evaluate_recorded(Walk(), lambda seen: seen[:1], 0)
+
+
+SWING = """
+import gymnasium, numpy as np
+from physx_gym import RobotEnv
+
+class Swing(RobotEnv):
+    def __init__(self, **options):
+        super().__init__("cartpole", 0.04, simulation_duration_max=1.0, **options)
+    def compute_reward(self, terminated, info):
+        return float(self.training)
+
+def make(**options):
+    return gymnasium.wrappers.TimeLimit(gymnasium.wrappers.FlattenObservation(Swing(**options)), 7)
+"""
+
+
+def test_the_command_records_through_wrappers(tmp_path, capsys, monkeypatch):
+    pytest.importorskip("physx_rerun")
+    (tmp_path / "swing.py").write_text(SWING)
+    monkeypatch.chdir(tmp_path)
+    options = {"session_dir": str(tmp_path), "quiet": True}
+    environment = EnvironmentConfig("gym/swing.py:make", seed=0, as_tcp_ip_client=False)
+    DataGeneration(environment, session_name="data", batch_nb=1, batch_size=20, **options).execute()
+    kwargs = {"net_fields": "observation", "opt_fields": "action"}
+    network = NetworkConfig("toy/linear", network_kwargs=kwargs)
+    Training(
+        network, DatasetConfig("data"), session_name="run", epoch_nb=1, batch_size=20, **options
+    ).execute()
+    words = ["run", "--env", "swing.py:make", "--episodes", "2", "--json"]
+    evaluate.run(words)
+    alone = capsys.readouterr().out
+    evaluate.run([*words, "--replay", "swing.rrd"])
+    recorded = capsys.readouterr().out
+    assert recorded.startswith(alone) and "recording: swing.rrd" in recorded
+    assert (tmp_path / "swing.rrd").stat().st_size > 1000
+    figures = [(each["length"], each["reward"]) for each in json.loads(alone)["episodes"]]
+    assert figures == [(7, 0.0), (7, 0.0)]  # in evaluation mode, recorded or not

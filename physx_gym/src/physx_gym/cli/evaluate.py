@@ -15,8 +15,10 @@ import tyro
 from physx_core.cli import argument_registry, show, show_table
 from physx_core.errors import ConfigError
 from physx_gym.bridge.make_env import make_env
+from physx_gym.bridge.plain import PlainEnv
 from physx_gym.bridge.policy import Policy
 from physx_gym.env.robot_env import RobotEnv
+from physx_gym.show.replaying import replay
 
 SPEED = "x_velocity"
 """Name, in information, of the velocity in the direction of walking, in m/s."""
@@ -61,7 +63,7 @@ def run(words: Sequence[str]) -> None:
     try:
         act = Policy(options.policy, env, trust=options.trust).act
         seeds = range(options.seed, options.seed + options.episodes)
-        found = evaluate(env, act, seeds)
+        found, recording = _evaluate_all(env, act, seeds, options)
         if options.json:
             given = {"env": options.env, "backend": options.backend, "policy": options.policy}
             show(json.dumps(given | {"summary": summary(found), "episodes": found}))
@@ -69,8 +71,10 @@ def run(words: Sequence[str]) -> None:
             where = "" if options.backend is None else f" on {options.backend}"
             show(f"{options.env}{where}: {len(found)} episodes, seeds {seeds[0]} to {seeds[-1]}\n")
             print_table(summary(found))
-        if options.replay is not None or options.film is not None:
-            _show_episode(env, act, options)
+        if options.replay is not None:
+            show(f"recording: {replay(recording, path=options.replay)}")
+        if options.film is not None:
+            show(f"film: {replay(recording, record_video_path=options.film)}")
     finally:
         env.close()
 
@@ -134,13 +138,52 @@ def print_table(figures: dict[str, dict[str, float]]) -> None:
     show_table(["", *numbers, "unit"], lines, numbers=numbers)
 
 
-def _show_episode(env: gymnasium.Env[Any, Any], act: Any, options: Evaluate) -> None:
-    """Write a recording and a film of the first episode."""
+def robot_of(env: gymnasium.Env[Any, Any]) -> RobotEnv | None:
+    """Return the robot's environment below all wrappers, or None if there is none."""
     base = env.unwrapped
-    if not isinstance(base, RobotEnv):
-        raise ConfigError(f"{options.env} is not a RobotEnv, so its episodes are not recorded.")
-    base.evaluate(act, seed=options.seed, enable_stats=False, enable_replay=False)
-    if options.replay is not None:
-        show(f"recording: {base.replay(path=options.replay)}")
-    if options.film is not None:
-        show(f"film: {base.replay(record_video_path=options.film)}")
+    while isinstance(base, PlainEnv):
+        base = base.env.unwrapped
+    return base if isinstance(base, RobotEnv) else None
+
+
+def evaluate_recorded(
+    env: gymnasium.Env[Any, Any], act: Callable[[Any], Any], seed: int
+) -> tuple[dict[str, float], dict[str, Any]]:
+    """Run an episode, and return its figures and the recording of it, as `RobotEnv.log_data`.
+
+    The wrappers act on the policy's actions, and may act more or less often than it, or end the
+    episode; what is recorded is what the robot below them did.
+
+    Args:
+        env: The environment, with a `RobotEnv` below its wrappers.
+        act: Returns the action for an observation.
+        seed: Seed of the episode.
+
+    Raises:
+        ConfigError: If there is no robot.
+    """
+    robot = robot_of(env)
+    if robot is None:
+        raise ConfigError(f"{env} is not a RobotEnv, so its episodes are not recorded.")
+    robot.stop()
+    was_training = robot.training
+    robot.eval()
+    try:
+        (figures,) = evaluate(env, act, [seed])
+    finally:
+        robot.stop()
+        robot.train(was_training)
+    return figures, robot.log_data
+
+
+def _evaluate_all(
+    env: gymnasium.Env[Any, Any], act: Callable[[Any], Any], seeds: range, options: Evaluate
+) -> tuple[list[dict[str, float]], dict[str, Any]]:
+    """Run episodes in evaluation mode; return their figures, and a recording to be shown."""
+    robot = robot_of(env)
+    if robot is not None:
+        robot.eval()
+    if options.replay is None and options.film is None:
+        return evaluate(env, act, seeds), {}
+    first, recording = evaluate_recorded(env, act, seeds[0])
+    return [first, *evaluate(env, act, seeds[1:])], recording
