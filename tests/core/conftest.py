@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.numpy import load_file
 
 from physx_core import Dataset, EnvironmentConfig, Field
 from physx_core.sources import ClientSource, LocalSource
@@ -82,7 +83,7 @@ class Thousand:
             self._make(folder, self.rows if rows is None else rows, session, **options)
 
     def check(self, folder, rows, *, counted=True):
-        """Check rows, statistics and files; the manifest holds the statistics if `counted`."""
+        """Check rows, statistics and files; the statistics are stored if `counted`."""
         with Dataset.open(folder) as dataset:
             assert dataset.num_samples("training") == len(rows["n"])
             for name, values in rows.items():
@@ -91,10 +92,13 @@ class Thousand:
             np.testing.assert_allclose(found.mean, rows["x"].mean(axis=0), atol=1e-12)
             np.testing.assert_allclose(found.std, rows["x"].std(axis=0), rtol=1e-9)
             assert dataset.verify() == []
-        plain = json.loads((folder / "dataset.json").read_text())["modes"]["training"]
-        count = plain["normalization"].get("x", {"count": 0})["count"]
-        assert count == (len(rows["n"]) if counted else count)
-        for session in {partition["session"] for partition in plain["partitions"]}:
+        plain = json.loads((folder / "dataset.json").read_text())
+        partitions = plain["modes"]["training"]["partitions"]
+        if counted:
+            assert all(partition["counted"] for partition in partitions)
+            stored = load_file(folder / plain["statistics"]["file"])
+            assert stored["training/x/count"] == len(rows["n"])
+        for session in {partition["session"] for partition in partitions}:
             assert (folder / f"{session}.h5").exists()
 
     def part(self, start, stop):

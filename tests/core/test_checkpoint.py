@@ -4,10 +4,13 @@ import contextlib
 import os
 import shutil
 import tomllib
+import zlib
 from pathlib import Path
 
 import numpy as np
 import pytest
+import tomli_w
+from safetensors.numpy import load_file, save
 
 from physx_core import (
     Dataset,
@@ -15,6 +18,7 @@ from physx_core import (
     EnvironmentConfig,
     Field,
     NetworkConfig,
+    Normalization,
     Prediction,
     Training,
     checkpoint,
@@ -86,7 +90,7 @@ def names(folder):
 def test_a_checkpoint_describes_each_of_its_files(tmp_path):
     path = saved(tmp_path / "run", 1)[0]
     plain = tomllib.loads((path / DESCRIPTION).read_text())
-    assert plain["format_version"] == 2
+    assert plain["format_version"] == 3
     sizes = {name: item["nbytes"] for name, item in plain["files"].items()}
     assert sizes == {name: (path / name).stat().st_size for name in (PARAMETERS, STATE)}
     assert list(plain)[-1] == "checksum"
@@ -142,28 +146,22 @@ def test_a_description_that_was_edited_by_hand_says_how_to_go_on(tmp_path):
         read(path)
 
 
-def as_version_1(path):
-    """Rewrite the description as it was before there were checksums."""
-    file = path / DESCRIPTION
-    text = file.read_text().replace("format_version = 2", "format_version = 1")
-    file.write_text(text[: text.index("[files")])
-
-
-def test_checkpoints_without_checksums_are_still_read(tmp_path):
-    for path in saved(tmp_path / "run"):
-        as_version_1(path)
-    assert weight(tmp_path / "run") == 2 and weight(tmp_path / "run", 1) == 1
-
-
 @pytest.mark.parametrize("end", ["", '[checksum]\ncrc32 = "edited"\n'])
 def test_a_later_format_is_not_called_damaged(tmp_path, end):
     path = saved(tmp_path / "run", 1)[0]
     file = path / DESCRIPTION
-    text = file.read_text().replace("format_version = 2", "format_version = 3")
+    text = file.read_text().replace("format_version = 3", "format_version = 4")
     file.write_text(text[: text.index("[checksum]")] + end)
-    with pytest.raises(
-        CheckpointError, match="version 3.*reads versions up to 2.*pip install --upgrade"
-    ):
+    with pytest.raises(CheckpointError, match="version 4.*reads version 3.*pip install --upgrade"):
+        read(path)
+
+
+def test_an_earlier_format_is_refused_because_its_normalization_was_text(tmp_path):
+    path = saved(tmp_path / "run", 1)[0]
+    file = path / DESCRIPTION
+    text = file.read_text().replace("format_version = 3", "format_version = 2")
+    file.write_text(text[: text.index("[checksum]")] + '[checksum]\ncrc32 = "edited"\n')
+    with pytest.raises(CheckpointError, match=r"version 2.*reads version 3.*Train .* again"):
         read(path)
 
 
@@ -171,11 +169,11 @@ def test_a_later_format_is_not_called_damaged(tmp_path, end):
     "text",
     [
         "",
-        "format_version = 1",
+        "format_version = 3",
         "format_version = 'two'",
-        "format_version = 1\nfields = 3\nprogress = 4",
-        "format_version = 1\nfields = [" * 5000,
-        'format_version = 2\nfiles = {"../x" = {}}\n[checksum]\ncrc32 = "edited"\n',
+        "format_version = 3\nfields = 3\nprogress = 4",
+        "format_version = 3\nfields = [" * 5000,
+        'format_version = 3\nfiles = {"../x" = {}}\n[checksum]\ncrc32 = "edited"\n',
         "\xff",
     ],
 )
@@ -183,6 +181,82 @@ def test_any_text_in_place_of_a_description_is_a_checkpoint_error(tmp_path, text
     path = saved(tmp_path / "run", 1)[0]
     (path / DESCRIPTION).write_text(text, encoding="latin-1")
     with pytest.raises(CheckpointError, match=DESCRIPTION):
+        read(path)
+
+
+# Normalization ----------------------------------------------------------------------------------
+
+
+def normalized(session, shape):
+    """Save a checkpoint with a normalization of two fields of a shape; return both."""
+    session.mkdir()
+    rng = np.random.default_rng(0)
+    config = NetworkConfig(Linear, {"net_fields": "x", "opt_fields": "y"}, optimization=Stateful)
+    made = Learner(config, trains=True)
+    given = {name: Normalization(*rng.random((4, *shape))) for name in ("x", "y", "z")}
+    made.bind({name: Field(name, shape) for name in given}, given)
+    return made.save(session / "network", progress(0)), given
+
+
+def test_a_normalization_is_kept_bit_for_bit_in_a_file_of_arrays(tmp_path):
+    path, given = normalized(tmp_path / "run", (2, 3))
+    found = read(path).normalization
+    assert found.keys() == {"x", "y"}
+    for name, one in found.items():
+        for part in ("mean", "std", "minimum", "maximum"):
+            np.testing.assert_array_equal(getattr(one, part), getattr(given[name], part))
+    stored = load_file(path / "normalization.safetensors")
+    np.testing.assert_array_equal(stored["x/mean"], given["x"].mean)
+    assert "normalization.safetensors" in tomllib.loads((path / DESCRIPTION).read_text())["files"]
+
+
+def test_a_description_has_the_same_size_for_a_field_of_any_width(tmp_path):
+    sizes = [
+        (normalized(tmp_path / f"{width}", (width, width))[0] / DESCRIPTION).stat().st_size
+        for width in (2, 30)
+    ]
+    assert max(sizes) - min(sizes) < 200
+    assert not (saved(tmp_path / "plain", 1)[0] / "normalization.safetensors").exists()
+
+
+@pytest.mark.parametrize("how", ["flipped", "cut", "gone", "longer"])
+def test_a_damaged_normalization_is_noticed(tmp_path, how):
+    path, _ = normalized(tmp_path / "run", (4,))
+    file = path / "normalization.safetensors"
+    content = bytearray(file.read_bytes())
+    content[-3] ^= 4
+    if how == "gone":
+        file.unlink()
+    else:
+        sound = file.read_bytes()
+        file.write_bytes({"flipped": content, "cut": sound[:-8], "longer": sound + b"0"}[how])
+    with pytest.raises(CheckpointError, match=r"normalization\.safetensors"):
+        read(path)
+
+
+@pytest.mark.parametrize(
+    "arrays",
+    [
+        {"x/mean": np.zeros(4), "x/std": np.ones(3)},
+        {"x/mean": np.array([0.0, 1, np.nan, 3]), "x/std": np.ones(4)},
+        {"x/mean": np.zeros(4)},
+        {"other/mean": np.zeros(4), "other/std": np.ones(4)},
+        {"mean": np.zeros(4)},
+        {"x/mean": np.zeros(4, "int32"), "x/std": np.ones(4)},
+        None,
+    ],
+)
+def test_arrays_that_are_no_normalization_are_a_checkpoint_error(tmp_path, arrays):
+    path, _ = normalized(tmp_path / "run", (4,))
+    content = b"text" * 99 if arrays is None else save(arrays)
+    (path / "normalization.safetensors").write_bytes(content)
+    file = path / DESCRIPTION
+    plain = tomllib.loads(file.read_text())
+    plain["files"]["normalization.safetensors"] = {
+        "nbytes": len(content), "crc32": f"{zlib.crc32(content):08x}"
+    }  # fmt: skip
+    file.write_text(tomli_w.dumps({**plain, "checksum": {"crc32": "edited"}}))
+    with pytest.raises(CheckpointError, match="network_0"):
         read(path)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Self
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,6 +15,8 @@ from physx_core.typing import Array
 Doubles = NDArray[np.float64]
 _WIDTH = 512
 _QUIET = np.errstate(over="ignore", invalid="ignore")
+_NORMALIZATION = ("mean", "std", "minimum", "maximum")
+_MERGEABLE = {"count", "mean", "squares", "minimum", "maximum"}
 
 
 @dataclass(frozen=True)
@@ -26,7 +28,7 @@ class Normalization:
         std: Standard deviation, of the field's shape, float64, in the field's unit; 1 for a
             constant component, so that normalization only shifts it to 0.
         minimum: Smallest value, of the field's shape, float64, in the field's unit; None if
-            unknown, as in checkpoints of the first version.
+            unknown.
         maximum: Largest value, like `minimum`.
     """
 
@@ -35,17 +37,25 @@ class Normalization:
     minimum: Array | None = None
     maximum: Array | None = None
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain data for JSON or TOML."""
-        known = ((name, getattr(self, name)) for name in ("mean", "std", "minimum", "maximum"))
-        return {name: values.tolist() for name, values in known if values is not None}
+    def arrays(self) -> dict[str, Array]:
+        """Return the known statistics by name, for a file or another process."""
+        known = ((name, getattr(self, name)) for name in _NORMALIZATION)
+        return {name: values for name, values in known if values is not None}
 
     @classmethod
-    def from_dict(cls, plain: Mapping[str, Any]) -> Normalization:
-        """Return the normalization that `to_dict` described."""
-        names = ("mean", "std", "minimum", "maximum")
-        known = {name: np.asarray(plain[name], np.float64) for name in names if name in plain}
-        return cls(**known)
+    def from_arrays(cls, arrays: Mapping[str, Array], shape: tuple[int, ...]) -> Normalization:
+        """Return the normalization that `arrays` described.
+
+        Args:
+            arrays: The statistics by name, possibly from an untrusted source.
+            shape: Shape of the field.
+
+        Raises:
+            ValueError: If they are not the finite statistics of such a field.
+        """
+        if not {"mean", "std"} <= arrays.keys() <= set(_NORMALIZATION):
+            raise ValueError(f"the statistics {sorted(arrays)} are not those of a normalization")
+        return cls(**{name: _checked(name, array, shape) for name, array in arrays.items()})
 
 
 class RunningStatistics:
@@ -66,7 +76,6 @@ class RunningStatistics:
         self._origin: Doubles = np.zeros(())
         self._mean: Doubles = np.zeros(())  # relative to the origin
         self._squares: Doubles = np.zeros(())  # sum of squared deviations from the mean
-        self._std: Doubles | None = None  # as read, because its square would lose precision
         self._minimum: Doubles = np.zeros(())
         self._maximum: Doubles = np.zeros(())
 
@@ -79,8 +88,6 @@ class RunningStatistics:
     @property
     def std(self) -> Doubles:
         """Population standard deviation of each component, in the field's unit."""
-        if self._std is not None:
-            return self._std
         std = np.sqrt(self._squares / max(self.count, 1))
         return np.where(np.isfinite(std), std, self._maximum / 2 - self._minimum / 2)
 
@@ -115,15 +122,19 @@ class RunningStatistics:
 
     @_QUIET
     def merge(self, other: RunningStatistics) -> None:
-        """Add the rows that `other` has seen."""
+        """Add the rows that `other` has seen.
+
+        The result is the same whether either has been through `arrays` before.
+        """
         if not other.count:
             return
+        mean = other.mean
         if not self.count:
-            self._start_at(other._origin)
+            self._start_at(mean)
             self._minimum, self._maximum = other._minimum, other._maximum
+        self._origin, self._mean = self.mean, np.zeros(mean.shape)  # as after `arrays`
         self._widen(other._minimum, other._maximum)
-        mean = (other._origin - self._origin) + other._mean
-        self._combine(other.count, np.asarray(mean), other._squares)
+        self._combine(other.count, np.asarray(mean - self._origin), other._squares)
 
     def normalization(self) -> Normalization:
         """Return the normalization; the deviation is 1 where values differ only by rounding."""
@@ -132,33 +143,46 @@ class RunningStatistics:
         std = np.where(std > resolution, std, 1.0)
         return Normalization(mean, std, self._minimum, self._maximum)
 
-    def to_dict(self) -> dict[str, Any]:
-        """Return plain data for JSON."""
-        values = {
+    def arrays(self) -> dict[str, Array]:
+        """Return all that is needed to merge them, by name, for a file or another process.
+
+        Returns:
+            ``count``, int64, of shape (); ``mean``, ``squares`` (the sum of squared deviations from
+            the mean), ``minimum`` and ``maximum``, float64, of the field's shape. Squares that
+            overflow are infinite.
+        """
+        squares = np.where(np.isnan(self._squares), np.inf, self._squares)
+        return {
+            "count": np.array(self.count, np.int64),
             "mean": self.mean,
-            "std": self.std,
+            "squares": squares,
             "minimum": self._minimum,
             "maximum": self._maximum,
         }
-        return {"count": self.count} | {name: array.tolist() for name, array in values.items()}
 
     @classmethod
-    @_QUIET
-    def from_dict(cls, plain: Mapping[str, Any]) -> Self:
-        """Return the statistics that `to_dict` described.
+    def from_arrays(cls, arrays: Mapping[str, Array], shape: tuple[int, ...]) -> Self:
+        """Return the statistics that `arrays` described.
 
-        They are empty if minimum and maximum are missing, as in early versions: the rows are then
-        read again when statistics are needed.
+        Args:
+            arrays: The arrays by name, possibly from an untrusted source.
+            shape: Shape of the field.
+
+        Raises:
+            ValueError: If they are not statistics of such a field.
         """
+        if arrays.keys() != _MERGEABLE:
+            raise ValueError(f"{sorted(arrays)} are not statistics that can be merged")
+        count, squares = arrays["count"], arrays["squares"]
+        if count.dtype != np.int64 or count.shape != () or not 0 < count < 2**62:
+            raise ValueError("the count is invalid")
+        if squares.dtype != np.float64 or squares.shape != shape or not (squares >= 0).all():
+            raise ValueError("the squares are invalid")
         statistics = cls()
-        if "minimum" not in plain or "maximum" not in plain:
-            return statistics
-        statistics._start_at(np.asarray(plain["mean"], np.float64))
-        statistics._minimum = np.asarray(plain["minimum"], np.float64)
-        statistics._maximum = np.asarray(plain["maximum"], np.float64)
-        statistics.count = int(plain["count"])
-        statistics._std = np.asarray(plain["std"], np.float64)
-        statistics._squares = statistics._std**2 * statistics.count
+        statistics._start_at(_checked("mean", arrays["mean"], shape))
+        statistics._minimum = _checked("minimum", arrays["minimum"], shape)
+        statistics._maximum = _checked("maximum", arrays["maximum"], shape)
+        statistics._squares, statistics.count = squares.copy(), int(count)
         return statistics
 
     def _start_at(self, origin: Doubles) -> None:
@@ -171,11 +195,18 @@ class RunningStatistics:
         self._maximum = np.maximum(self._maximum, maximum, dtype=np.float64)
 
     def _combine(self, count: int, mean: Doubles, squares: Doubles) -> None:
-        self._std, total = None, self.count + count
+        total = self.count + count
         difference = mean - self._mean
         self._squares = self._squares + squares + difference**2 * (self.count * count / total)
         self._mean = self._mean + difference * (count / total)
         self.count = total
+
+
+def _checked(name: str, array: Array, shape: tuple[int, ...]) -> Doubles:
+    """Return a copy of a statistic after checking its type, shape and values."""
+    if array.dtype != np.float64 or array.shape != shape or not np.isfinite(array).all():
+        raise ValueError(f"the {name} is invalid")
+    return array.copy()
 
 
 def _over_rows(function: np.ufunc, rows: Array) -> Array:

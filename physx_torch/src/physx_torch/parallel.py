@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import atexit
 import datetime
-import json
 import os
 from collections.abc import Iterable, Sequence
 from typing import Any
@@ -19,6 +18,7 @@ from torch import distributed
 
 from physx_core.components import Group
 from physx_core.errors import ConfigError
+from physx_core.net import decode, encode
 from physx_core.typing import Batch
 from physx_torch.devices import find_device
 
@@ -54,12 +54,12 @@ class TorchGroup(Group):
 
     def tell(self, value: Any) -> Any:
         """Return the leading process's value in all processes."""
-        text = json.dumps(value).encode() if self.leads else b""
-        length = self._broadcast(torch.tensor([len(text)]))
+        content = encode(value) if self.leads else b""
+        length = self._broadcast(torch.tensor([len(content)]))
         told = torch.zeros(int(length.item()), dtype=torch.uint8)
         if self.leads:
-            told = torch.frombuffer(bytearray(text), dtype=torch.uint8)
-        return json.loads(self._broadcast(told).cpu().numpy().tobytes())
+            told = torch.frombuffer(bytearray(content), dtype=torch.uint8)
+        return decode(self._broadcast(told).cpu().numpy().tobytes())
 
     def _broadcast(self, tensor: torch.Tensor) -> torch.Tensor:
         tensor = tensor.to(self._device)

@@ -7,7 +7,8 @@ import sys
 import h5py
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
+from safetensors.numpy import load_file
 from xxhash import xxh3_64_intdigest
 
 from physx_core import Dataset, Field
@@ -91,7 +92,9 @@ def test_h5py_reads_the_partitions_and_the_index(folder):
     plain = json.loads((folder / "dataset.json").read_text())
     assert plain["format_version"] == 1 and plain["info"] == {"seed": 1}
     assert [p["rows"] for p in plain["modes"]["training"]["partitions"]] == [340, 340, 320]
-    assert plain["modes"]["training"]["normalization"]["x"]["count"] == N
+    stored = load_file(folder / plain["statistics"]["file"])
+    assert stored["training/x/count"] == N
+    assert_allclose(stored["training/x/mean"], ROWS["x"].mean(axis=0), atol=1e-12)
 
 
 def test_partitions_respect_their_size(folder):
@@ -157,7 +160,8 @@ def test_a_session_continues_where_the_last_one_ended(folder):
     after = content(folder)
     check(folder)
     for name, was in before.items():
-        assert name in ("dataset.json", "dataset.lock", "one.h5") or after[name] == was
+        changed = name in ("dataset.json", "dataset.lock", "one.h5") or "statistics" in name
+        assert changed or after[name] == was
     for session in ("one", "two"):
         with h5py.File(folder / f"{session}.h5") as index:
             assert_array_equal(index["training/n"][:], ROWS["n"])

@@ -54,7 +54,7 @@ def change(plain, path, value):
 MODE = ("modes", "training")
 FIRST = (*MODE, "partitions", 0)
 X = (*MODE, "fields", 0)
-MEAN = (*MODE, "normalization", "x")
+STATISTICS = ("statistics",)
 
 IMPOSSIBLE = [
     ((*FIRST, "rows"), -1),
@@ -118,22 +118,22 @@ IMPOSSIBLE = [
     ((*X, "unit"), 5),
     ((*X, "role"), "root"),
     ((*X, "role"), ["training"]),
-    ((*MEAN, "mean"), [float("nan")] * 5),
-    ((*MEAN, "mean"), [float("inf")] * 5),
-    ((*MEAN, "mean"), [0.0] * 4),
-    ((*MEAN, "mean"), "0"),
-    ((*MEAN, "mean"), None),
-    ((*MEAN, "std"), [[0.0]] * 5),
-    ((*MEAN, "count"), -1),
-    ((*MEAN, "count"), 1e300),
-    ((*MEAN, "count"), ...),
-    ((*MODE, "normalization"), []),
-    ((*MODE, "normalization"), {"y": {"count": 1}}),
+    (STATISTICS, []),
+    (STATISTICS, None),
+    ((*STATISTICS, "file"), "../statistics_00000000.safetensors"),
+    ((*STATISTICS, "file"), "/dev/zero"),
+    ((*STATISTICS, "file"), 5),
+    ((*STATISTICS, "file"), ...),
+    ((*STATISTICS, "crc32"), 5),
+    ((*STATISTICS, "crc32"), "00000000"),
+    ((*STATISTICS, "crc32"), "-1"),
+    ((*STATISTICS, "crc32"), "f" * 10**4),
+    ((*STATISTICS, "crc32"), ...),
     (MODE, []),
     (MODE, {}),
     (("modes",), []),
     (("modes",), None),
-    (("modes",), {"../x": {"fields": [], "partitions": [], "normalization": {}}}),
+    (("modes",), {"../x": {"fields": [], "partitions": []}}),
     (("info",), []),
     (("info",), "text"),
     (("versions",), {"python": 3}),

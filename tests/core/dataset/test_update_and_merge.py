@@ -2,10 +2,12 @@
 
 import json
 import shutil
+import zlib
 
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from safetensors.numpy import load_file, save
 
 from physx_core import Dataset
 from physx_core.errors import (
@@ -212,7 +214,12 @@ def test_statistics_are_merged_and_not_recomputed(folder, tmp_path, thousand):
     thousand.write(tmp_path / "other")
     place = tmp_path / "other" / "dataset.json"
     plain = json.loads(place.read_text())
-    plain["modes"]["training"]["normalization"]["x"]["mean"] = [4.0] * 5
+    arrays = load_file(place.parent / plain["statistics"]["file"])
+    arrays["training/x/mean"][:] = 4
+    content = save(arrays)
+    crc32 = f"{zlib.crc32(content):08x}"
+    plain["statistics"] = {"file": f"statistics_{crc32}.safetensors", "crc32": crc32}
+    (place.parent / plain["statistics"]["file"]).write_bytes(content)
     write_manifest(place, plain)
     with Dataset.open(folder, writable=True) as dataset:
         dataset.merge(tmp_path / "other")
@@ -225,8 +232,6 @@ def test_statistics_are_merged_and_not_recomputed(folder, tmp_path, thousand):
 
 def write_manifest(path, plain):
     """Write a manifest with a valid checksum."""
-    import zlib
-
     plain = {name: value for name, value in plain.items() if name != "crc32"}
     body = json.dumps(plain, indent=1).encode()[:-2]
     path.write_bytes(body + b',\n "crc32": "%08x"\n}' % zlib.crc32(body))
@@ -302,7 +307,8 @@ def test_an_interrupted_removal_is_completed(folder, thousand):
     plain = json.loads((folder / "dataset.json").read_text())
     mode = plain["modes"]["training"]
     mode["dropped"] = [mode["partitions"].pop(1)]
-    mode["normalization"] = {}
+    for partition in mode["partitions"]:
+        partition["counted"] = False
     write_manifest(folder / "dataset.json", plain)
     (folder / "run_training_n_1.h5").unlink()
     rows = thousand.stacked((0, 340), (680, 1000))

@@ -75,12 +75,12 @@ class Rogue(Steps):
     def __init__(self, *, kind: str, number: int, value=None, **kwargs):
         super().__init__(**kwargs)
         if value == "plausible":
-            names = ("mean", "std", "minimum", "maximum")
+            names = ("mean", "squares", "minimum", "maximum")
             value = {
                 "rows": 3,
                 "checksums": dict.fromkeys(("x", "n", "f", "env_id", "episode", "step"), 0),
                 "statistics": {
-                    name: {"count": 3, **{each: np.zeros(shape) for each in names}}
+                    name: {"count": np.array(3), **{each: np.zeros(shape) for each in names}}
                     for name, shape in (("x", 30), ("f", ()))
                 },
             }

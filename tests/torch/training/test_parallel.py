@@ -183,6 +183,10 @@ def together():
         made.execute()
         mine = [float(p.detach().abs().sum()) for p in made.learner.network.parameters()]
         assert mine == made.group.tell(mine), "without a seed they do not begin alike"
+        wide = np.arange(5e5) / 3 if made.group.leads else None
+        told = made.group.tell({"x": [wide, (1, "two")]})
+        assert told["x"][0].tobytes() == (np.arange(5e5) / 3).tobytes(), "bits were lost"
+        assert told["x"][1] == (1, "two") and told["x"][0].shape == (500_000,)
     training(5, "dies", kind=Dies).execute()
 
 if __name__ == "__main__":

@@ -13,8 +13,8 @@ from physx_core import files
 from physx_core.fields import Field
 from physx_core.statistics import Normalization
 
-FORMAT_VERSION = 2
-"""Version of the description; version 1 has no checksums."""
+FORMAT_VERSION = 3
+"""Version of the description; earlier ones have the normalization as text, and are refused."""
 NAME = "network"
 """Name of the checkpoints unless another one is given."""
 BEST = "best"
@@ -22,6 +22,8 @@ DESCRIPTION = "checkpoint.toml"
 BUFFER = "buffer.bin"
 """File with the state of the buffer that draws the batches: 8-byte integers."""
 WHOLE = np.dtype("<i8")
+NORMALIZATION = "normalization.safetensors"
+"""File with the normalization, if any: arrays named ``<field>/<statistic>``."""
 SAMPLER = "sampler.bin"
 """File with the state of the sampler that learns from the training: 8-byte floats."""
 REAL = np.dtype("<f8")

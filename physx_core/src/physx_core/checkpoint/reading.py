@@ -14,6 +14,7 @@ import numpy as np
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
+from physx_core.array_file import unpack
 from physx_core.checkpoint.description import (
     ADVICE,
     BEST,
@@ -24,6 +25,7 @@ from physx_core.checkpoint.description import (
     KEPT,
     LARGEST,
     NAME,
+    NORMALIZATION,
     NUMBER,
     REAL,
     SAMPLER,
@@ -151,7 +153,8 @@ def read(path: Path, *, content: bool = True) -> Checkpoint:
 
     Args:
         path: The checkpoint's folder.
-        content: Whether to check every byte of its files, not only their sizes.
+        content: Whether to read its files: to check every byte, not only their sizes, and to
+            return the normalization.
 
     Raises:
         CheckpointError: If one of its files is missing or damaged, or its format is too new.
@@ -220,19 +223,17 @@ def _read(path: Path, *, content: bool = True) -> Checkpoint:
         raise _unopened(DESCRIPTION, error) from error
     try:
         plain = _parse(text)
-        listed_files = plain["files"] if plain["format_version"] > 1 else {}
-        fields = [Field.from_dict(item) for item in plain["fields"]]
-        normalization = plain.get("normalization", {})
+        for name, written in plain["files"].items():
+            _check_file(path, name, written, content)
+        fields = {item["name"]: Field.from_dict(item) for item in plain["fields"]}
         found = Checkpoint(
             path=path,
             network={key: plain[key] for key in KEPT if key in plain},
-            fields={item.name: item for item in fields},
-            normalization={n: Normalization.from_dict(c) for n, c in normalization.items()},
+            fields=fields,
+            normalization=_read_normalization(path, plain["files"], fields) if content else {},
             progress=Progress(**plain["progress"]),
             crc=crc32(text),
         )
-        for name, written in listed_files.items():
-            _check_file(path, name, written, content)
     except _INVALID as error:
         reason = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
         size = f" ({len(text)} bytes)"
@@ -249,26 +250,46 @@ def _parse(content: bytes) -> dict[str, Any]:
     if type(version) is not int:
         raise ValueError(f"'format_version' is {version!r}")
     if version > FORMAT_VERSION and checksum is None:
-        raise _later(version)
-    if version > 1 or checksum is not None:
-        end = _END_PATTERN.fullmatch(content, max(0, len(content) - len(END.format(0))))
-        is_whole = end is not None and int(end[1], 16) == crc32(content[: end.start()])
-        if not is_whole and checksum != {"crc32": _EDITED}:
-            raise UnreadableError(
-                f"{DESCRIPTION} was damaged, cut, or edited by hand: its checksum does not match",
-                f'{ADVICE} If it was edited on purpose, put crc32 = "{_EDITED}" under '
-                "[checksum] at its end.",
-            )
-    if version > FORMAT_VERSION:
-        raise _later(version)
+        raise _unsupported(version)
+    end = _END_PATTERN.fullmatch(content, max(0, len(content) - len(END.format(0))))
+    is_whole = end is not None and int(end[1], 16) == crc32(content[: end.start()])
+    if not is_whole and checksum != {"crc32": _EDITED}:
+        raise UnreadableError(
+            f"{DESCRIPTION} was damaged, cut, or edited by hand: its checksum does not match",
+            f'{ADVICE} If it was edited on purpose, put crc32 = "{_EDITED}" under '
+            "[checksum] at its end.",
+        )
+    if version != FORMAT_VERSION:
+        raise _unsupported(version)
     return plain
 
 
-def _later(version: int) -> UnreadableError:
+def _unsupported(version: int) -> UnreadableError:
+    later = version > FORMAT_VERSION
     return UnreadableError(
-        f"it has format version {version}, but this physx reads versions up to {FORMAT_VERSION}",
-        install_hint("physx-core", update=True),
+        f"it has format version {version}, but this physx reads version {FORMAT_VERSION}",
+        install_hint("physx-core", update=True) if later else "Train the network again.",
     )
+
+
+def _read_normalization(
+    path: Path, listed_files: Mapping[str, Any], fields: Mapping[str, Field]
+) -> dict[str, Normalization]:
+    """Return the normalization in a checkpoint's file, if one is listed."""
+    written = listed_files.get(NORMALIZATION)
+    if written is None:
+        return {}
+    try:
+        content = files.read_content(path / NORMALIZATION, written["nbytes"])
+    except OSError as error:
+        raise _unopened(NORMALIZATION, error) from error
+    if f"{crc32(content):08x}" != written["crc32"]:
+        raise UnreadableError(f"{NORMALIZATION} is damaged: its checksum does not match")
+    arrays: dict[str, dict[str, Array]] = {}
+    for place, array in unpack(content).items():
+        name, part = place.split("/")
+        arrays.setdefault(name, {})[part] = array
+    return {n: Normalization.from_arrays(own, fields[n].shape or ()) for n, own in arrays.items()}
 
 
 def _check_file(path: Path, name: str, written: Mapping[str, Any], content: bool) -> None:

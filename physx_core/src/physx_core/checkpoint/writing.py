@@ -15,6 +15,7 @@ import numpy as np
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
+from physx_core.array_file import pack
 from physx_core.checkpoint.description import (
     BEST,
     BUFFER,
@@ -23,6 +24,7 @@ from physx_core.checkpoint.description import (
     FORMAT_VERSION,
     KEPT,
     NAME,
+    NORMALIZATION,
     NUMBER,
     REAL,
     SAMPLER,
@@ -82,7 +84,8 @@ def save(
     numbers = list_numbers(network_dir, name)
     path = network_dir / f"{name}_{BEST if best else max(numbers, default=-1) + 1}"
     partial = partial_path(path)
-    description = _describe(config, network, fields, normalization, progress)
+    description = _describe(config, network, fields, progress)
+    coefficients = _pack(normalization, {one["name"] for one in description["fields"]})
     try:
         check_session(network_dir)
         if not network_dir.is_dir():
@@ -91,9 +94,9 @@ def save(
             files.sync_folder(network_dir.parent)
         _clear(network_dir, name)
         if best:
-            _write(partial, description, network)
+            _write(partial, description, network, coefficients)
         else:
-            _write(partial, description, network, optimization, buffer, sampler)
+            _write(partial, description, network, coefficients, optimization, buffer, sampler)
         _publish(partial, path)
     except BaseException as error:
         cause = error if isinstance(error, OSError) else error.__cause__
@@ -117,11 +120,7 @@ def _not_stored(path: Path, cause: OSError, others: Sequence[str]) -> PhysxError
 
 
 def _describe(
-    config: NetworkConfig,
-    network: Network,
-    fields: Mapping[str, Field],
-    normalization: Mapping[str, Normalization],
-    progress: Progress,
+    config: NetworkConfig, network: Network, fields: Mapping[str, Field], progress: Progress
 ) -> dict[str, Any]:
     plain = to_plain(config)
     used = [name for name in (*network.net_fields, *network.opt_fields) if name in fields]
@@ -130,16 +129,25 @@ def _describe(
         "progress": dataclasses.asdict(progress),
         **{key: plain[key] for key in KEPT if key in plain},
         "fields": [fields[name].to_dict() for name in dict.fromkeys(used)],
-        "normalization": {
-            name: normalization[name].to_dict() for name in used if name in normalization
-        },
     }
+
+
+def _pack(normalization: Mapping[str, Normalization], names: Container[str]) -> bytes | None:
+    """Return the content of the file with the normalization of some fields; None if it is empty."""
+    arrays = {
+        f"{name}/{part}": array
+        for name, one in normalization.items()
+        if name in names
+        for part, array in one.arrays().items()
+    }
+    return pack(arrays) if arrays else None
 
 
 def _write(
     partial: Path,
     description: Mapping[str, Any],
     network: Network,
+    normalization: bytes | None,
     optimization: Optimization | None = None,
     buffer: Index | None = None,
     sampler: Array | None = None,
@@ -147,6 +155,8 @@ def _write(
     """Write a checkpoint's files to a new folder, and wait until they are on the disk."""
     files.create_folder(partial, sync=False)
     network.save_parameters(partial / network.parameters_file)
+    if normalization is not None:
+        _write_new(partial / NORMALIZATION, normalization)
     described = _describe_files(partial)
     if optimization is not None and optimization.state_file:
         optimization.save_state(partial / optimization.state_file)

@@ -33,7 +33,8 @@ class Group:
         """Return the leading process's value in all processes.
 
         Args:
-            value: JSON-compatible data; ignored in the other processes.
+            value: Numbers, strings, arrays, and lists, tuples and dictionaries of those; ignored in
+                the other processes.
         """
         return value
 

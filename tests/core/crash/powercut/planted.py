@@ -14,7 +14,7 @@ from unittest import mock
 from physx_core import files
 from physx_core.checkpoint import writing
 from physx_core.dataset.repair import recovery
-from physx_core.dataset.store import syncing
+from physx_core.dataset.store import statistics_file, syncing
 from physx_core.dataset.store.partition import format as partition_format
 from physx_core.dataset.store.partition.file import PartitionFile
 from physx_core.dataset.write import updating
@@ -113,7 +113,22 @@ def _settle_unsynced(self: Any) -> None:
         _settle(self)
 
 
-_mark, _settle = PartitionFile.mark, PartitionFile.settle
+def _write_unsynced(directory: Path, manifest: Any) -> Any:
+    def replace(path: Path, content: bytes) -> None:
+        _replace(path, content, wait=False)
+
+    with mock.patch.object(files, "replace", replace):
+        return _write_statistics(directory, manifest)
+
+
+def _write_clearing_first(directory: Path, manifest: Any) -> Any:
+    written = _write_statistics(directory, manifest)
+    statistics_file.clear(directory, written)
+    return written
+
+
+_mark, _settle, _replace = PartitionFile.mark, PartitionFile.settle, files.replace
+_write_statistics = statistics_file.write
 
 
 def _newest_record(_: int, __: int, ___: int, commits: Any) -> Any:
@@ -145,6 +160,14 @@ BUGS = (
     ),
     Bug("the manifest is renamed before it is synced", _skip("sync", "replace")),
     Bug("the manifest's new name is not synced", _skip("sync_folder", "replace")),
+    Bug(
+        "the manifest refers to statistics that are not on the disk",
+        _instead(statistics_file, "write", _write_unsynced),
+    ),
+    Bug(
+        "old statistics are removed while the manifest refers to them",
+        _instead(statistics_file, "write", _write_clearing_first),
+    ),
     Bug(
         "a durable append does not sync",
         _instead(OpenPartition, "append", _unsynced(OpenPartition.append)),

@@ -4,9 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from pathlib import Path
 
 from physx_core.dataset.read.reader import Reader
-from physx_core.dataset.store.manifest import Mode, Partition
+from physx_core.dataset.store import statistics_file
+from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.statistics import RunningStatistics
 
 Statistics = dict[str, RunningStatistics]
@@ -15,29 +17,38 @@ Statistics = dict[str, RunningStatistics]
 def compute_statistics(reader: Reader, mode_name: str) -> Statistics:
     """Return the statistics of a mode's floating-point fields over all its committed rows."""
     mode = reader.mode(mode_name)
+    statistics_file.load(reader.directory, reader.manifest)
     for partition in mode.partitions:
         if not partition.counted:
             _update_running(reader, mode, partition)
-    count_sealed(mode)
-    found = mode.statistics
+    count_sealed(reader.directory, reader.manifest, mode)
+    found = mode.statistics or {}
     for partition in mode.partitions:
         if not partition.counted:
             found = merge_statistics(found, partition.running)
     return found
 
 
-def count_sealed(mode: Mode) -> None:
+def count_sealed(directory: Path, manifest: Manifest, mode: Mode) -> None:
     """Merge the complete statistics of sealed partitions into those of the mode.
 
+    They are merged in the order of the rows, and stored with the next change of the manifest.
     Partitions with rows that were updated in place are left out until they have checksums again,
     as the rows may not have reached the disk yet.
     """
+    statistics_file.load(directory, manifest)
     for place, partition in enumerate(mode.partitions):
         have = (partition.running.get(name) for name in mode.counted_fields)
         complete = all(s is not None and s.count == partition.rows for s in have)
         if partition.checksums and not partition.counted and complete:
-            mode.statistics = merge_statistics(mode.statistics, partition.running)
+            add_counted(manifest, mode, partition.running)
             mode.partitions[place] = replace(partition, counted=True, running={})
+
+
+def add_counted(manifest: Manifest, mode: Mode, further: Mapping[str, RunningStatistics]) -> None:
+    """Merge statistics of further rows into those of a mode, which have been loaded."""
+    mode.statistics = merge_statistics(mode.statistics or {}, further)
+    manifest.statistics_checksum = None
 
 
 def merge_statistics(

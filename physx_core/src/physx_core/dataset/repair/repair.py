@@ -11,8 +11,12 @@ from physx_core.dataset.read.mode_statistics import compute_statistics
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.repair import recovery
 from physx_core.dataset.repair.aside import set_aside, unused
-from physx_core.dataset.repair.report import find_problem, find_problems
-from physx_core.dataset.store import locks, manifest_file
+from physx_core.dataset.repair.report import (
+    find_partition_problems,
+    find_problem,
+    find_statistics_problem,
+)
+from physx_core.dataset.store import locks, manifest_file, statistics_file
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition.file import copy
 from physx_core.dataset.store.virtual_index import write_index
@@ -30,6 +34,11 @@ def repair(folder: Path) -> list[str]:
         manifest.problems.clear()
         recovery.count_rows(folder, manifest)  # a damaged partition may have hidden later ones
         done += recovery.recover(folder, manifest)
+        problem = find_statistics_problem(folder)
+        if problem is not None:
+            statistics_file.load(folder, manifest)
+            manifest.statistics_checksum = None
+            done.append(f"{problem} They have been stored again.")
         if done:
             _store(folder, manifest)
         else:
@@ -103,7 +112,7 @@ def _load_sound_manifest(folder: Path) -> tuple[Manifest, list[str]]:
             what = str(error)
         with contextlib.suppress(DatasetError):
             manifest = recovery.load(folder, edited=True)
-            if not manifest.problems and not find_problems(folder, manifest):
+            if not manifest.problems and not find_partition_problems(folder, manifest):
                 for mode in manifest.modes.values():
                     mode.forget_statistics()
                 return manifest, [f"{path} was edited by hand; it matches the files and is kept."]

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.dataset.store import manifest_file
+from physx_core.dataset.store import manifest_file, statistics_file
 from physx_core.dataset.store.manifest import Manifest, Partition
 from physx_core.dataset.store.partition.format import Inspection
 from physx_core.errors import DatasetError
@@ -34,11 +34,18 @@ def summarize(manifest: Manifest) -> list[dict[str, Any]]:
 
 
 def find_problems(directory: Path, manifest: Manifest, content: bool = True) -> list[str]:
-    """Check every partition file against the manifest and, with `content`, its checksum.
+    """Check all files against the manifest; partitions with `content` against their checksums.
 
     Returns:
         One message per problem; empty for a sound dataset.
     """
+    found = find_partition_problems(directory, manifest, content)
+    problem = find_statistics_problem(directory)
+    return found if problem is None else [*found, problem]
+
+
+def find_partition_problems(directory: Path, manifest: Manifest, content: bool = True) -> list[str]:
+    """Check every partition file: see `find_problems`."""
     found = (
         find_problem(directory, partition, field, content)
         for mode in manifest.modes.values()
@@ -46,6 +53,39 @@ def find_problems(directory: Path, manifest: Manifest, content: bool = True) -> 
         for field in mode.fields.values()
     )
     return [problem for problem in found if problem is not None]
+
+
+def find_statistics_problem(directory: Path) -> str | None:
+    """Return what is wrong with the file of statistics that the manifest refers to, or None."""
+    manifest = _stored_manifest(directory)
+    if manifest is None or manifest.statistics_checksum is None:
+        return None
+    checksum = manifest.statistics_checksum
+    try:
+        statistics_file.read(directory, manifest)
+    except FileNotFoundError:
+        problem = "is missing."
+    except OSError as error:
+        problem = f"cannot be read: {error.strerror}."
+    except ValueError:
+        problem = "was changed: its checksum does not match."
+    else:
+        return None
+    now = _stored_manifest(directory)
+    if now is None or now.statistics_checksum != checksum:
+        return None  # a writer has just replaced it
+    return (
+        f"{directory / statistics_file.file_name(checksum)} {problem} No row is lost: the "
+        "statistics are computed from the rows, each time until `physx verify --repair` or "
+        "Dataset.repair(directory) stores them again."
+    )
+
+
+def _stored_manifest(directory: Path) -> Manifest | None:
+    try:
+        return manifest_file.load(directory, edited=True)
+    except (DatasetError, FileNotFoundError):
+        return None
 
 
 def find_problem(

@@ -1,6 +1,7 @@
-"""The manifest: a dataset's modes, fields, partitions, statistics, and origin.
+"""The manifest: a dataset's modes, fields, partitions, and origin.
 
-`physx_core.dataset.store.manifest_file` stores it as ``dataset.json``.
+`physx_core.dataset.store.manifest_file` stores it as ``dataset.json``,
+`physx_core.dataset.store.statistics_file` the statistics of its rows beside it.
 """
 
 from __future__ import annotations
@@ -180,7 +181,8 @@ class Mode:
     Attributes:
         fields: The fields by name; a shape is None until the first rows determine it.
         partitions: The partitions in the order of their rows.
-        statistics: Statistics of floating-point fields over the rows of all counted partitions.
+        statistics: Statistics of floating-point fields over the rows of all counted partitions;
+            None while they are only in their file: `statistics_file.load` reads them.
         dropped: Partitions that do not belong to the mode although their files may exist: they are
             being removed, or copied from another dataset.
         removed: Largest number of a removed partition, by session. It is never reused, so that a
@@ -189,7 +191,7 @@ class Mode:
 
     fields: dict[str, Field]
     partitions: list[Partition] = field(default_factory=list)
-    statistics: dict[str, RunningStatistics] = field(default_factory=dict)
+    statistics: dict[str, RunningStatistics] | None = field(default_factory=dict)
     dropped: list[Partition] = field(default_factory=list)
     removed: dict[str, int] = field(default_factory=dict)
 
@@ -261,7 +263,7 @@ class Mode:
         return Mode(
             dict(self.fields),
             list(self.partitions),
-            dict(self.statistics),
+            None if self.statistics is None else dict(self.statistics),
             list(self.dropped),
             dict(self.removed),
         )
@@ -271,7 +273,6 @@ class Mode:
         plain: dict[str, Any] = {
             "fields": [of.to_dict() for of in self.fields.values()],
             "partitions": [partition.to_dict() for partition in self.partitions],
-            "normalization": {name: s.to_dict() for name, s in self.statistics.items() if s.count},
         }
         if self.removed:
             plain["removed"] = self.removed
@@ -301,6 +302,8 @@ class Manifest:
         modes: The modes by name.
         info: Where the data come from: environment, its keyword arguments, seed, etc.
         versions: Versions of Python and of the packages that created the dataset.
+        statistics_checksum: CRC-32 of the file with the statistics of the counted partitions;
+            None if they are not stored yet.
         problems: Modes whose rows cannot be counted, and why; not stored.
         generation: Increases whenever known rows have been changed or renumbered, which makes
             rows kept in memory stale; not stored.
@@ -309,6 +312,7 @@ class Manifest:
     modes: dict[str, Mode] = field(default_factory=dict)
     info: dict[str, Any] = field(default_factory=dict)
     versions: dict[str, str] = field(default_factory=versions)
+    statistics_checksum: int | None = None
     problems: dict[str, DatasetError] = field(default_factory=dict)
     generation: int = 0
 
@@ -317,6 +321,13 @@ class Manifest:
         """Names of the sessions that wrote rows, in the order of their rows."""
         found = [p.session for mode in self.modes.values() for p in mode.partitions]
         return list(dict.fromkeys(found))
+
+    @property
+    def has_new_statistics(self) -> bool:
+        """Whether there are statistics that are not stored yet."""
+        return self.statistics_checksum is None and any(
+            mode.statistics for mode in self.modes.values()
+        )
 
     @property
     def is_striped(self) -> bool:
@@ -337,7 +348,13 @@ class Manifest:
     def copy(self) -> Manifest:
         """Return a copy to change while this one stays; the partitions are shared."""
         modes = {name: mode.copy() for name, mode in self.modes.items()}
-        return Manifest(modes, dict(self.info), dict(self.versions), dict(self.problems))
+        return Manifest(
+            modes,
+            dict(self.info),
+            dict(self.versions),
+            self.statistics_checksum,
+            dict(self.problems),
+        )
 
     def take(self, other: Manifest) -> None:
         """Take over the contents of `other`."""
@@ -347,6 +364,7 @@ class Manifest:
             if name not in self.problems
         )
         self.modes, self.info = other.modes, other.info
+        self.statistics_checksum = other.statistics_checksum
         self.versions, self.problems = other.versions, other.problems
 
 

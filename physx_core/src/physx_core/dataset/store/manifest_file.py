@@ -1,6 +1,7 @@
 """Writes and reads the file ``dataset.json``.
 
-Its last entry is a CRC-32 of everything before it, so that truncation or manual edits are noticed
+Its size does not depend on the fields' shapes: statistics, which do, have a file of their own. Its
+last entry is a CRC-32 of everything before it, so that truncation or manual edits are noticed
 before a wrong offset yields wrong numbers. Every value is validated: a dataset may come from an
 untrusted source.
 """
@@ -15,6 +16,7 @@ from typing import Any
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
+from physx_core.dataset.store import statistics_file
 from physx_core.dataset.store.manifest import Manifest, Partition
 from physx_core.dataset.store.manifest_parsing import parse_manifest
 from physx_core.dataset.store.validation import whole
@@ -39,7 +41,10 @@ _INVALID = (
 
 
 def save(directory: Path, manifest: Manifest) -> None:
-    """Write the manifest atomically."""
+    """Write the manifest atomically, after the statistics if they are not stored yet."""
+    before, after = manifest.statistics_checksum, manifest.statistics_checksum
+    if before is None:
+        after = statistics_file.write(directory, manifest)
     plain = {
         "format": FORMAT,
         "format_version": STRIPED_VERSION if manifest.is_striped else VERSION,
@@ -47,9 +52,15 @@ def save(directory: Path, manifest: Manifest) -> None:
         "info": manifest.info,
         "modes": {name: mode.to_dict() for name, mode in manifest.modes.items()},
     }
+    if after is not None:
+        name = statistics_file.file_name(after)
+        plain["statistics"] = {"file": name, "crc32": f"{after:08x}"}
     body = _format(plain).encode()[:-2]
     end = f',\n "crc32": "{crc32(body):08x}"\n}}'.encode()
     files.replace(directory / FILE, body + end)
+    manifest.statistics_checksum = after
+    if before is None and after is not None:
+        statistics_file.clear(directory, after)
 
 
 def read(directory: Path) -> bytes:

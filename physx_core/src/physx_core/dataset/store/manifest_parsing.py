@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-import numpy as np
-
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition.format import Stripe, parse_stripe
+from physx_core.dataset.store.statistics_file import file_name
 from physx_core.dataset.store.validation import (
     SESSION,
     checked,
@@ -17,7 +16,6 @@ from physx_core.dataset.store.validation import (
     whole,
 )
 from physx_core.fields import Field
-from physx_core.statistics import RunningStatistics
 
 
 def parse_manifest(plain: Mapping[str, Any]) -> Manifest:
@@ -29,7 +27,19 @@ def parse_manifest(plain: Mapping[str, Any]) -> Manifest:
     versions = checked(dict, plain["versions"], "'versions'")
     for version in versions.values():
         checked(str, version, "a version")
-    return Manifest(modes, checked(dict, plain["info"], "'info'"), versions)
+    info = checked(dict, plain["info"], "'info'")
+    if "statistics" in plain:
+        return Manifest(modes, info, versions, _statistics_checksum(plain["statistics"]))
+    for mode in modes.values():  # as in early versions, whose rows are read again
+        mode.forget_statistics()
+    return Manifest(modes, info, versions)
+
+
+def _statistics_checksum(plain: Any) -> int:
+    checksum = int(checked(str, plain["crc32"], "the checksum of the statistics"), 16)
+    if plain["file"] != file_name(checksum):
+        raise ValueError(f"the file of the statistics cannot be {plain['file']!r:.60}")
+    return checksum
 
 
 def _mode(mode_name: str, plain: Any) -> Mode:
@@ -44,6 +54,7 @@ def _mode(mode_name: str, plain: Any) -> Mode:
     mode = Mode(
         fields,
         [_partition(mode_name, entry, fields) for entry in plain["partitions"]],
+        statistics=None,
         dropped=[_partition(mode_name, entry, fields) for entry in plain.get("dropped", ())],
     )
     for session, index in checked(dict, plain.get("removed", {}), "'removed'").items():
@@ -54,7 +65,6 @@ def _mode(mode_name: str, plain: Any) -> Mode:
     for group in mode.groups:
         _check_stripes(group)
     whole(mode.rows, "the number of rows")
-    _add_statistics(mode, checked(dict, plain["normalization"], "'normalization'"))
     return mode
 
 
@@ -104,24 +114,3 @@ def _check_stripes(group: list[Partition]) -> None:
     rows = [partition.rows for partition in group]
     if rows != sorted(rows, reverse=True) or rows[0] > rows[-1] + 1:
         raise ValueError("stripes of the same rows have inconsistent numbers of rows")
-
-
-def _add_statistics(mode: Mode, plain: Mapping[str, Any]) -> None:
-    """Give a mode its statistics if they cover the partitions that are marked as counted."""
-    counted = sum(partition.rows for partition in mode.partitions if partition.counted)
-    for name, values in plain.items():
-        if name not in mode.fields:
-            raise ValueError(f"there is no field {name!r:.60}")
-        whole(values["count"], f"the count of {name!r}")
-        shape, components = mode.fields[name].shape, {}
-        for key in values.keys() - {"count"}:
-            array = np.asarray(values[key], np.float64)
-            if shape is not None and not array.size and 0 in shape:
-                array = array.reshape(shape)  # JSON loses the shape of empty arrays
-            if array.shape != shape or not np.isfinite(array).all():
-                raise ValueError(f"the normalization of {name!r} has an invalid {key}")
-            components[key] = array
-        mode.statistics[name] = RunningStatistics.from_dict({**values, **components})
-    have = (mode.statistics.get(name) for name in mode.counted_fields)
-    if any((statistics.count if statistics else 0) != counted for statistics in have):
-        mode.forget_statistics()

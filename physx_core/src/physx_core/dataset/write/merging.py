@@ -11,7 +11,8 @@ from collections.abc import Mapping
 from pathlib import Path
 
 from physx_core import files
-from physx_core.dataset.read.mode_statistics import merge_statistics
+from physx_core.dataset.read.mode_statistics import add_counted
+from physx_core.dataset.store import statistics_file
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition.file import copy
 from physx_core.dataset.store.sealing import remove_files
@@ -31,6 +32,7 @@ def add_partitions(writer: Writer, source: Path, given: Manifest) -> None:
         source: Folder of the other dataset.
         given: Manifest of the other dataset.
     """
+    statistics_file.load(source, given)
     pairs = _reserve(writer, given)
     try:
         for name, partitions in pairs.items():
@@ -38,8 +40,9 @@ def add_partitions(writer: Writer, source: Path, given: Manifest) -> None:
                 _copy_files(writer.store.directory, source, given.modes[name].fields, old, new)
         files.sync_folder(writer.store.directory)
         with writer.store.change() as manifest:
+            statistics_file.load(writer.store.directory, manifest)
             for name, partitions in pairs.items():
-                _accept(manifest.modes[name], given.modes[name], partitions)
+                _accept(manifest, manifest.modes[name], given.modes[name], partitions)
     except BaseException:
         with contextlib.suppress(OSError):  # the next writer removes what is left
             _forget(writer, {name: [new for _, new in found] for name, found in pairs.items()})
@@ -109,7 +112,7 @@ def _copy_files(
             )
 
 
-def _accept(mode: Mode, other: Mode, pairs: Pairs) -> None:
+def _accept(manifest: Manifest, mode: Mode, other: Mode, pairs: Pairs) -> None:
     """Make copied partitions part of the mode, with the other's statistics if complete."""
     arrived = {new.key: new for _, new in pairs}
     mode.dropped = [partition for partition in mode.dropped if partition.key not in arrived]
@@ -118,7 +121,7 @@ def _accept(mode: Mode, other: Mode, pairs: Pairs) -> None:
         new.sealed, new.counted = True, known
         mode.partitions.append(new)
     if known:
-        mode.statistics = merge_statistics(mode.statistics, other.statistics)
+        add_counted(manifest, mode, other.statistics or {})
 
 
 def _forget(writer: Writer, partitions: Mapping[str, list[Partition]]) -> None:

@@ -10,7 +10,7 @@ from typing import Any
 
 from physx_core import files
 from physx_core.dataset.repair import recovery
-from physx_core.dataset.store import locks, manifest_file
+from physx_core.dataset.store import locks, manifest_file, statistics_file
 from physx_core.dataset.store.manifest import Manifest, to_plain_info
 from physx_core.dataset.store.manifest_store import ManifestStore
 from physx_core.dataset.store.validation import SESSION
@@ -82,6 +82,7 @@ def extend(folder: Path, options: WriterOptions) -> Writer:
                 if recovery.recover(folder, manifest):
                     write_index(folder, writer.session, manifest)
                 manifest_file.save(folder, manifest)
+                statistics_file.clear(folder, manifest.statistics_checksum)
                 if options.shared:
                     locks.share(folder, lock)
         except BaseException:

@@ -271,7 +271,7 @@ class Stripes:
                 mode.swap(partition)
             for partition in empty:
                 del mode.partitions[mode.place(partition)]
-            count_sealed(mode)
+            count_sealed(self.directory, manifest, mode)
             write_index(self.directory, self.session, manifest)
         keys = {partition.key for partition in sealed}
         self._groups = {

@@ -296,7 +296,7 @@ class Writer:
                 mode = manifest.modes[entry.mode]
                 if entry.rows:
                     mode.swap(entry)
-                    count_sealed(mode)
+                    count_sealed(self._directory, manifest, mode)
                 else:
                     del mode.partitions[mode.place(entry)]
             write_index(self._directory, self.session, manifest)
@@ -368,7 +368,7 @@ class Writer:
                 changed = True
                 with contextlib.suppress(DatasetError):  # a partition is damaged: skip for now
                     compute_statistics(self._reader, name)
-        if changed:
+        if changed or manifest.has_new_statistics:
             manifest_file.save(self._directory, manifest)
         write_index(self._directory, self.session, manifest, wait=True)
 

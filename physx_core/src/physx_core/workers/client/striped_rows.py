@@ -7,8 +7,6 @@ from collections import deque
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from physx_core import files
 from physx_core.dataset.store import locks
 from physx_core.dataset.store.manifest import Partition, has_statistics
@@ -18,7 +16,6 @@ from physx_core.errors import DatasetError
 from physx_core.fields import Field
 from physx_core.net.frames import Frame, Kind, pack
 from physx_core.net.values import decode, encode
-from physx_core.statistics import RunningStatistics
 from physx_core.typing import Batch
 from physx_core.workers.client.link import RunEnded, WorkerLink
 
@@ -153,14 +150,9 @@ class StripedRows:
                 "rows": partition.rows,
                 "checksums": partition.checksums,
                 "statistics": {
-                    field.name: _plain_statistics(partition.running[field.name])
+                    field.name: partition.running[field.name].arrays()
                     for field in writer.fields
                     if has_statistics(field)
                 },
             }
             self._link.send(pack(Kind.SEALED, encode(plain, "a sealed partition"), number))
-
-
-def _plain_statistics(of: RunningStatistics) -> dict[str, Any]:
-    names = ("mean", "std", "minimum", "maximum")
-    return {"count": of.count, **{name: np.asarray(getattr(of, name)) for name in names}}

@@ -7,8 +7,6 @@ import socket
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any
 
-import numpy as np
-
 from physx_core.dataset.store.manifest import Partition, has_statistics, rows_of_stripe
 from physx_core.dataset.write.stripes import PROOF, Stripes
 from physx_core.errors import ConnectionRefusedByPeerError
@@ -105,7 +103,7 @@ class WrittenRows:
     def _take_sealed(self, peer: Peer, frame: Frame) -> None:
         try:
             rows, checksums, running = self._parse_sealed(decode(frame.payload))
-        except (KeyError, TypeError, ValueError) as error:
+        except (AttributeError, KeyError, TypeError, ValueError) as error:
             raise ConnectionRefusedByPeerError(
                 f"It sealed a partition with impossible numbers: {error}."
             ) from error
@@ -127,13 +125,10 @@ class WrittenRows:
         counted = {name for name, field in fields.items() if has_statistics(field)}
         if running.keys() != counted:
             raise ValueError("its statistics")
-        for name, values in running.items():
-            arrays = [np.asarray(values[key]) for key in ("mean", "std", "minimum", "maximum")]
-            shapes = {array.shape for array in arrays}
-            kinds = {array.dtype for array in arrays}
-            if shapes != {fields[name].shape} or kinds != {np.dtype(np.float64)}:
-                raise ValueError(f"the statistics of {name!r}")
-            if values["count"] != rows or not all(np.isfinite(array).all() for array in arrays):
-                raise ValueError(f"the statistics of {name!r}")
-        found = {name: RunningStatistics.from_dict(values) for name, values in running.items()}
+        found = {
+            name: RunningStatistics.from_arrays(arrays, fields[name].shape or ())
+            for name, arrays in running.items()
+        }
+        if any(statistics.count != rows for statistics in found.values()):
+            raise ValueError("the counts of its statistics")
         return rows, checksums, found

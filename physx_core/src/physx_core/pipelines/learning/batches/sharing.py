@@ -75,15 +75,14 @@ class SharedBatches:
 def _to_plain(block: Block) -> dict[str, Any]:
     return {
         "fields": [field.to_dict() for field in block.fields.values()],
-        "normalization": {name: one.to_dict() for name, one in block.normalization.items()},
+        "normalization": {name: one.arrays() for name, one in block.normalization.items()},
     }
 
 
 def _to_block(plain: dict[str, Any]) -> Block:
-    fields = [Field.from_dict(one) for one in plain["fields"]]
-    normalization = plain["normalization"].items()
-    return Block(
-        {},
-        {field.name: field for field in fields},
-        {name: Normalization.from_dict(one) for name, one in normalization},
-    )
+    fields = {one["name"]: Field.from_dict(one) for one in plain["fields"]}
+    normalization = {
+        name: Normalization.from_arrays(arrays, fields[name].shape or ())
+        for name, arrays in plain["normalization"].items()
+    }
+    return Block({}, fields, normalization)
