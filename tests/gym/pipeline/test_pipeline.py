@@ -123,7 +123,7 @@ def test_rewards_and_terminations_are_described_by_tables():
     assert reward > 0
     assert not terminated
     assert not truncated
-    assert info["reward_total"]
+    assert any(name.startswith("reward_") for name in info)
 
 
 class Rewarded(ControlledEnv):
