@@ -15,7 +15,7 @@ import pinocchio
 from physx_core.engines import Algorithms, Mover, Parts, Resistance, read_parts, static_poses
 from physx_core.simulation import World
 from physx_core.typing import Vector
-from physx_dart.pinocchio.models import frames_of, load_model
+from physx_dart.pinocchio.models import frames_of, load_model, twists_of
 
 _WORLD_AXES = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
 _velocity, _acceleration = pinocchio.getFrameVelocity, pinocchio.getFrameClassicalAcceleration
@@ -107,7 +107,7 @@ class MoverAlgorithms:
         pinocchio.framesForwardKinematics(model, data, q)
         x, y, z = data.oMf[frame].rotation @ point
         arm = np.array([[0.0, -z, y], [z, 0.0, -x], [-y, x, 0.0]])
-        found = np.array(found, order="C").reshape(6, -1)  # a single column is returned as a vector
+        found = np.array(twists_of(found), order="C")
         found[:3] -= arm @ found[3:]
         return found
 

@@ -18,6 +18,7 @@ from physx_core.engines import CollisionShape, Mover, Static
 from physx_core.errors import FeatureNotSupportedError
 from physx_core.simulation import CONTACT
 from physx_core.typing import Records, Vector
+from physx_dart.pinocchio.models import twists_of
 from physx_dart.pinocchio.surfaces import Plane, surface_of
 
 MARGIN = 1e-4
@@ -187,7 +188,7 @@ class ContactFinder:
             v: Velocities that the robot would have without contacts, shape (nv,).
             period: Length of the step, in s.
         """
-        motions = pinocchio.computeJointJacobians(self._model, self._data, q)
+        motions = twists_of(pinocchio.computeJointJacobians(self._model, self._data, q))
         points = self._weights.dot(self._poses.reshape(-1, 3))
         if self._first_rim < len(points):
             points = np.concatenate([points[: self._first_rim], self._rims(points)])

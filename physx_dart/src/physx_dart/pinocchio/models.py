@@ -57,6 +57,11 @@ def frames_of(model: Any, mover: Mover) -> list[int]:
     return [model.getFrameId(link, pinocchio.FrameType.BODY) for link in mover.model.links]
 
 
+def twists_of(found: Vector) -> Vector:
+    """Return a Jacobian of Pinocchio, which returns a single column as a vector, shape (6, nv)."""
+    return found.reshape(6, -1)
+
+
 def _parse(mover: Mover, *root: Any) -> Any:
     try:
         model = pinocchio.buildModelFromXML(mover.model.text, *root)

@@ -23,7 +23,7 @@ from physx_core.typing import Records, Vector
 from physx_dart.pinocchio.constraints import Constraints, Warmth, constrained, limited
 from physx_dart.pinocchio.contacts import ContactFinder
 from physx_dart.pinocchio.limits import JointConstraints
-from physx_dart.pinocchio.models import frames_of, load_stepping_model
+from physx_dart.pinocchio.models import frames_of, load_stepping_model, twists_of
 from physx_dart.pinocchio.solver import ImpulseSolver
 
 _UNSEEN = 10
@@ -211,7 +211,8 @@ class PinocchioRobot(RobotEngine):
 
     def place_joints(self) -> Vector:
         """Place the joints in `data`; return the twists for unit velocities, shape (6, nv)."""
-        return pinocchio.computeJointJacobians(self.model_in_motion, self.data, self._positions)
+        q = self._positions
+        return twists_of(pinocchio.computeJointJacobians(self.model_in_motion, self.data, q))
 
     def _step_rk4(self) -> None:
         """Simulate one step with the classic fourth-order Runge-Kutta method."""
