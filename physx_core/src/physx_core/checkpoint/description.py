@@ -52,6 +52,8 @@ class Progress:
         blocks: Number of batches whose rows environments generated.
         best: State of `BestEpoch`.
         record: State of `TrainingRecord`.
+        order: The `ReadingOrder` of the stored samples; empty before the first is read, or if they
+            are not shuffled.
     """
 
     epoch: int
@@ -61,6 +63,7 @@ class Progress:
     blocks: int = 0
     best: dict[str, Any] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
+    order: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, Self, Unpack
 
 import numpy as np
+from numpy.typing import DTypeLike
 
 from physx_core import files
 from physx_core.closeable import Closeable
@@ -16,7 +17,8 @@ from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.sampling import BatchOptions, BatchReader
 from physx_core.dataset.read.splits import Subset, split
 from physx_core.dataset.read.strategies.cache import ColumnCache
-from physx_core.dataset.read.strategies.strategy import Strategy
+from physx_core.dataset.read.strategies.strategy import ReadingOrder, Strategy
+from physx_core.dataset.read.strategies.windows import block_rows
 from physx_core.dataset.read.views import ModeView, row_numbers
 from physx_core.dataset.repair import recovery, repair
 from physx_core.dataset.repair.report import find_problems, summarize
@@ -233,6 +235,8 @@ class Dataset(Closeable):
                 the normalization to use. False by default.
                 strategy (str): How samples are read, see `physx_core.dataset.read.strategies`;
                 ``"auto"``, the default: chosen by the fields' sizes and the free memory.
+                block (int | None): Number of rows in a block of ``disk windowed``; None, the
+                default: by the fields' sizes. See `reading_order`.
 
         Returns:
             An iterator over batches: field name to array of shape (samples, *field shape).
@@ -259,6 +263,27 @@ class Dataset(Closeable):
         self._prepare_reading()
         names = list(self._reader.mode(mode).fields if fields is None else fields)
         return self._columns.choose_strategy(mode, names)
+
+    def reading_order(
+        self, mode: str, fields: Sequence[str], dtype: DTypeLike | None = None
+    ) -> ReadingOrder:
+        """Return what the order of shuffled rows depends on now, besides the seed.
+
+        `batches` with this ``strategy`` and ``block`` gives the same order whatever memory is free.
+
+        Args:
+            mode: Name of the mode.
+            fields: Names of the fields to read together.
+            dtype: Type to convert floating-point fields to; None: no conversion.
+
+        Raises:
+            DatasetError: If there is no such mode or field.
+        """
+        self._prepare_reading()
+        kind = None if dtype is None else np.dtype(dtype)
+        row_nbytes = sum(self._reader.field(mode, name).nbytes for name in fields)
+        chosen = self._columns.choose_strategy(mode, fields, kind)
+        return ReadingOrder(chosen, block_rows(row_nbytes))
 
     def episodes(self, mode: str) -> list[Episode]:
         """Return the trajectories of a mode, each with the numbers of its rows in temporal order.

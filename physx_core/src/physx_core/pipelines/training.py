@@ -168,6 +168,7 @@ class Training(NewSessionPipeline):
     _met_nan: bool = field(init=False, repr=False, default=False)
     _told_fields: bool = field(init=False, repr=False, default=False)
     _blocks: int = field(init=False, repr=False, default=0)
+    _told_order: bool = field(init=False, repr=False, default=False)
     _told: Sequence[str] = field(init=False, repr=False, default=())
 
     def execute(self) -> None:
@@ -229,6 +230,10 @@ class Training(NewSessionPipeline):
         self.batch_id = self._resumed.batch if begins else 0
         names = self.learner.batch_fields
         self._epoch_batches = self.data.begin_epoch(self.epoch_id, names, self.batch_id)
+        if self.data.notice and not self._told_order and self._leads:
+            self.observers.note(self.data.notice)
+            self.session.note(self.data.notice)
+            self._told_order = True
         if self.data.has_changed:
             self.learner.normalize(self.data.normalization())
         if begins:
@@ -385,6 +390,7 @@ class Training(NewSessionPipeline):
             self._blocks,
             self.best.state,
             self._record.state,
+            self.data.order,
         )
         generated = self.data.generated
         states = generated.states(self._blocks) if generated is not None else ()

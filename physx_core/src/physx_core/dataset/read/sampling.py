@@ -32,6 +32,7 @@ class BatchOptions(TypedDict, total=False):
     reuse: bool
     normalize: bool | Mapping[str, Normalization]
     strategy: Choice
+    block: int | None
 
 
 class BatchReader:
@@ -52,6 +53,7 @@ class BatchReader:
         reuse: bool = False,
         normalize: bool | Mapping[str, Normalization] = False,
         strategy: Choice = "auto",
+        block: int | None = None,
     ) -> None:
         """Check the options, which are those of `Dataset.batches`; `subset` must be ascending.
 
@@ -72,7 +74,7 @@ class BatchReader:
         self._size, self._epochs = batch_size, epochs
         self._random = np.random.default_rng(seed) if shuffle else None
         self._dtype = None if dtype is None else np.dtype(dtype)
-        self._strategy = check_strategy(strategy)
+        self._strategy, self._block = check_strategy(strategy), block
         self._kinds = {
             field.name: (field.shape or (), converted_dtype(field, self._dtype)) for field in known
         }
@@ -115,7 +117,7 @@ class BatchReader:
         if strategy == "disk exact" and random is not None:
             return ExactEpoch(self._columns, mode, names, dtype, random, self._subset)
         disk = [DiskColumn(self._columns.reader, mode, name, dtype) for name in names]
-        return WindowedEpoch(disk, random, self._subset)
+        return WindowedEpoch(disk, random, self._subset, self._block)
 
     def _new_batch(self, size: int) -> Batch:
         if self._buffers is None:

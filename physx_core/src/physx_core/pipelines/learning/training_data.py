@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
+from typing import Any
 
 from physx_core.dataset import Dataset
 from physx_core.fields import Field
@@ -130,6 +131,16 @@ class TrainingData:
     def batches_read(self) -> int:
         """Number of batches read from the dataset."""
         return self._stored.count
+
+    @property
+    def order(self) -> dict[str, Any]:
+        """The reading order of the stored samples, as plain data; empty before it is chosen."""
+        return self._stored.order
+
+    @property
+    def notice(self) -> str:
+        """Why reading differs from that before the training was resumed; empty: it does not."""
+        return self._stored.notice
 
     @property
     def produces(self) -> bool:

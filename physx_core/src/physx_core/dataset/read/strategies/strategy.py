@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Literal, TypeAlias, cast, get_args
+from typing import Literal, NamedTuple, TypeAlias, cast, get_args
 
 from physx_core.dataset.read.strategies import memory
 from physx_core.errors import ConfigError, listed
@@ -19,6 +19,19 @@ Strategy: TypeAlias = Literal["memory", "disk exact", "disk windowed"]
   are shuffled. Every row occurs once per epoch, but rows of the same block stay close together.
 """
 Choice: TypeAlias = Strategy | Literal["auto"]
+
+
+class ReadingOrder(NamedTuple):
+    """What the order of shuffled rows depends on, besides the seed.
+
+    Attributes:
+        strategy: How the rows are read; ``memory`` and ``disk exact`` give the same order.
+        block: Number of rows in a block of ``disk windowed``.
+    """
+
+    strategy: Strategy
+    block: int
+
 
 LARGE_ROW = 4096
 """Bytes from which reading a single row pays off: a disk never reads less at a time."""

@@ -12,6 +12,11 @@ _BLOCK = 2**19
 _WINDOW_BLOCKS = 64
 
 
+def block_rows(row_nbytes: int) -> int:
+    """Return the number of rows in a block, for the bytes of a row of all fields together."""
+    return max(1, _BLOCK // max(1, row_nbytes))
+
+
 class WindowedEpoch:
     """A pass over rows on disk, block by block.
 
@@ -29,6 +34,7 @@ class WindowedEpoch:
         columns: list[DiskColumn],
         random: np.random.Generator | None,
         subset: Index | None = None,
+        block: int | None = None,
     ) -> None:
         """Draw the order of the blocks and announce the first ones.
 
@@ -36,12 +42,13 @@ class WindowedEpoch:
             columns: The fields.
             random: Draws the order; None: the order of writing.
             subset: Numbers of the rows to read, ascending; None: all.
+            block: Number of rows in a block; None: half a megabyte of them.
         """
         self._total = columns[0].shape[0]
         self.rows = self._total if subset is None else len(subset)
         self._columns, self._random, self._subset = columns, random, subset
         row_nbytes = sum(column.row_nbytes for column in columns)
-        self._block = max(1, _BLOCK // max(1, row_nbytes))
+        self._block = block or block_rows(row_nbytes)
         number = -(-self._total // self._block)
         self._blocks = np.arange(number) if random is None else random.permutation(number)
         if random is None:  # nothing is shuffled: a window of a few megabytes suffices
