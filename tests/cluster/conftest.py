@@ -20,11 +20,11 @@ class RayCluster:
         variables: The environment variables by which a run finds it.
     """
 
-    def __init__(self):
+    def __init__(self, **settings):
         from ray.cluster_utils import Cluster
 
         soon = {"health_check_initial_delay_ms": 0, "health_check_period_ms": 500}
-        settings = {**soon, "health_check_failure_threshold": 4}
+        settings = {**soon, "health_check_failure_threshold": 4, **settings}
         self._cluster = Cluster(
             initialize_head=True,
             head_node_args={
@@ -41,6 +41,11 @@ class RayCluster:
 
     def raylet_of(self, node):
         return node.all_processes["raylet"][0].process.pid
+
+    def kill_head(self):
+        """Kill the process that holds the cluster together."""
+        for each in self._cluster.head_node.all_processes["gcs_server"]:
+            os.kill(each.process.pid, signal.SIGKILL)
 
     def kill(self, node):
         """Kill all processes of a node, as if its machine lost its power."""
@@ -68,17 +73,31 @@ def descendants(pid):
     return found
 
 
-@pytest.fixture(scope="session")
-def ray_cluster():
-    """Ray with two nodes of one processor each."""
+@contextlib.contextmanager
+def started_ray(**settings):
+    """Start Ray with two nodes of one processor each."""
     pytest.importorskip("ray")
     folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")  # the names of sockets must be short
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("RAY_TMPDIR", folder)
-        cluster = RayCluster()
+        cluster = RayCluster(**settings)
         yield cluster
         cluster.close()
     shutil.rmtree(folder, ignore_errors=True)
+
+
+@pytest.fixture(scope="session")
+def ray_cluster():
+    """Ray with two nodes of one processor each."""
+    with started_ray() as cluster:
+        yield cluster
+
+
+@pytest.fixture
+def mortal_ray():
+    """Another cluster, whose processes end 4 s after its head, not 60 s."""
+    with started_ray(gcs_rpc_server_reconnect_timeout_s=4) as cluster:
+        yield cluster
 
 
 @pytest.fixture(scope="session")

@@ -2,43 +2,38 @@
 
 from __future__ import annotations
 
-import asyncio
+import importlib.util
+import itertools
+import logging
+import queue
 import signal
+import socket
+import subprocess
+import sys
 import threading
-from collections.abc import Coroutine, Sequence
-from concurrent.futures import Future
+from collections.abc import Mapping, Sequence
 from typing import Any
 
-from physx_cluster.placement.bundles import Bundle, describe, find_misfit, share_of_processors
+from physx_cluster.launchers.messages import Messages
+from physx_core import Closeable
 from physx_core.components import ClientHandle, Launcher
 from physx_core.errors import ClientError, ConfigError
 from physx_core.origin import install_hint
+from physx_core.processes import ChildProcess, OutputTail, describe_exit
+from physx_core.workers import ClientProcess
 
-try:
-    import ray
-    from ray.exceptions import RayActorError, RayError
-    from ray.util.placement_group import (
-        placement_group,
-        placement_group_table,
-        remove_placement_group,
-    )
-    from ray.util.scheduling_strategies import PlacementGroupSchedulingStrategy
-except ImportError as error:
+if importlib.util.find_spec("ray") is None:
     raise ConfigError(
-        f"The launcher cluster/ray needs Ray: {error}. {install_hint('physx-cluster', 'ray')}"
-    ) from error
+        "The launcher cluster/ray needs Ray, which is not installed. "
+        f"{install_hint('physx-cluster', 'ray')}"
+    )
 
-from physx_cluster.launchers.ray_agent import Agent
-from physx_cluster.launchers.ray_connection import RayConnection
-
-_CALLS = 100_000  # concurrent calls of one agent: two for each client
-# A Ray process kills its children when it is told to exit: the clients, whose own children would
-# survive, and the watchdog, which would have ended all of them.
-_LEAVE_CHILDREN = {"RAY_kill_child_processes_on_worker_exit": "false"}
-_ANSWER_TIME = 1.0  # s, for an agent that is asked to kill a client
-_LOOK_TIME = 2.0  # s, for Ray to find nodes
-_PAUSE = 0.25
+_DRIVER = "physx_cluster.launchers.ray_driver"
+_OPEN_TIME = 150.0  # s, to start Ray on this machine
+_LAUNCH_TIME = 30.0  # s, for an answer that takes Ray 2 s
+_LEAVE_TIME = 10.0  # s, to disconnect from a cluster, or to end one
 _STRATEGIES = ("SPREAD", "PACK", "STRICT_SPREAD", "STRICT_PACK")
+_LOG = logging.getLogger("physx")
 
 
 class RayLauncher(Launcher):
@@ -49,6 +44,9 @@ class RayLauncher(Launcher):
     the run does that itself. If a node is lost, Ray moves its part of the group to another node,
     where the run restarts the clients (`EnvironmentConfig.restarts`); the rows are the same. In an
     elastic run, each client has its own group and waits for a place independently.
+
+    Ray is connected to by another process, the driver. If the cluster is lost, the run goes on with
+    the clients that are connected, but starts no more.
     """
 
     elsewhere = True
@@ -68,8 +66,9 @@ class RayLauncher(Launcher):
 
         Args:
             address: ``HOST:PORT`` of Ray's head node, "auto" for the cluster on this machine,
-                "local" to start one; None: the environment variable ``RAY_ADDRESS``, else the
-                cluster on this machine, else a new one that ends with the run.
+                "local" to start one; None: the cluster to which this process is connected, else the
+                environment variable ``RAY_ADDRESS``, else the cluster on this machine, else a new
+                one that ends with the run.
             num_cpus: CPUs of each client; None: one, or an equal share if the cluster has fewer
                 CPUs than clients.
             num_gpus: GPUs of each client.
@@ -92,247 +91,256 @@ class RayLauncher(Launcher):
                 f"A client needs {needs}: amounts must not be negative, and at least one "
                 "resource must be positive, such as num_cpus=0.1."
             )
-        self._address, self._strategy, self._needs = address, strategy, needs
-        self._runtime_env = runtime_env
-        self._connection: RayConnection | None = None
-        self._nodes: _Nodes | None = None
+        self._options = {
+            "address": address,
+            "strategy": strategy,
+            "needs": needs,
+            "runtime_env": runtime_env,
+        }
+        self._driver: _DriverProcess | None = None
 
     def open(self) -> str | None:
         """Connect to Ray: see `Launcher.open`."""
-        self._connection = RayConnection(self._address)
-        self._nodes = _Nodes(self._runtime_env)
-        return self._connection.host
+        address = self._options["address"] or _connected_address()
+        options = {**self._options, "address": address, "elastic": self.elastic}
+        self._driver = _DriverProcess(options)
+        return self._driver.host
 
     def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
         """Start the clients: see `Launcher.launch`."""
-        assert self._nodes is not None and self._connection is not None
-        without = [number for number in instances if number not in self._nodes.places]
-        groups = [[number] for number in without] if self.elastic else [without]
-        for group in groups if without else ():
-            self._reserve(group, len(without))
-        return [self._nodes.start(number, address, token) for number in instances]
+        assert self._driver is not None
+        handles = self._driver.launch(instances, address, token)
+        if self._driver.end and not self.elastic:  # an elastic run goes on with the others
+            raise ClientError(instances[0], f"cannot be started: {self._driver.end}.")
+        return [*handles]
 
     def close(self) -> None:
         """End the agents, and Ray if it was started here: see `Launcher.close`."""
-        nodes, self._nodes = self._nodes, None
-        connection, self._connection = self._connection, None
-        if nodes is not None:
-            nodes.close()
-        if connection is not None:
-            connection.close()
-
-    def _reserve(self, instances: Sequence[int], total: int) -> None:
-        """Reserve the resources of some of all clients; Ray decides where."""
-        assert self._nodes is not None and self._connection is not None
-        found = self._connection.nodes()
-        needs = dict(self._needs)
-        if needs["CPU"] is None:
-            needs["CPU"] = share_of_processors(found, total)
-        bundle: Bundle = {name: float(need) for name, need in needs.items() if need}
-        group = placement_group([bundle] * len(instances), strategy=self._strategy)
-        self._nodes.add(group, instances, bundle)
-        if self.elastic:
-            misfit = find_misfit(found, bundle)
-        else:
-            misfit = "" if group.wait(_LOOK_TIME) else self._find_reason(group, bundle)
-        if misfit:
-            raise ClientError(
-                instances[0],
-                f"has no place on Ray: {misfit}. Ask for less with "
-                'launcher_kwargs={"num_cpus": ...}, run fewer clients, or add nodes with "ray '
-                'start --address ...".',
-            )
-
-    def _find_reason(self, group: Any, bundle: Bundle) -> str:
-        """Return why Ray can never place a group on the current nodes; empty if it may."""
-        assert self._connection is not None
-        found = self._connection.nodes()
-        if misfit := find_misfit(found, bundle):
-            return misfit
-        table = placement_group_table(group)
-        if table["stats"]["scheduling_state"] != "INFEASIBLE":
-            return ""
-        count = len(table["bundles"])
-        return (
-            f"{count} clients, each with {describe(bundle)}, do not fit the {len(found)} nodes "
-            f"with the strategy {self._strategy}"
-        )
+        driver, self._driver = self._driver, None
+        if driver is not None:
+            driver.close()
 
 
 class RayHandle(ClientHandle):
-    """A client on one of the cluster's nodes.
+    """A client on one of the cluster's nodes."""
 
-    Attributes:
-        agent: The agent of its node; None until there is one.
-    """
-
-    def __init__(self, instance_id: int, nodes: _Nodes) -> None:
+    def __init__(self, instance_id: int, key: int, driver: _DriverProcess) -> None:
         """Store the arguments.
 
         Args:
             instance_id: Number of the instance, from 1.
-            nodes: Runs its coroutines.
+            key: What the driver calls it.
+            driver: Sends it signals.
         """
-        self.instance_id = instance_id
-        self.agent: Any = None
-        self.waits_for = "waiting for Ray"
-        self.end: Future[tuple[int, str]] = Future()
-        self._nodes = nodes
-        self._killed = False
+        self.instance_id, self._key, self._driver = instance_id, key, driver
+        self._state = "waiting for Ray"
+        self._end: tuple[int, str] | None = None
+        self._process: ClientProcess | None = None  # on the run's own node
+        self._lock = threading.Lock()
+        self._is_killed = False
 
     def exit_status(self) -> int | None:
         """Return the exit status: see `ClientHandle.exit_status`."""
-        return self.end.result()[0] if self.end.done() else None
+        if self._process is not None:
+            return self._process.exit_status()
+        return self._end[0] if self._end is not None else None
 
     def stderr(self) -> str:
         """Return the last lines of its standard error: see `ClientHandle.stderr`."""
-        return self.end.result()[1] if self.end.done() else ""
+        if self._process is not None:
+            return self._process.stderr()
+        return self._end[1] if self._end is not None else ""
 
     def state(self) -> str:
         """Return what it waits for: see `ClientHandle.state`."""
-        return self.waits_for
+        return self._state
 
     def terminate(self) -> None:
         """Ask the client to end: see `ClientHandle.terminate`."""
-        self._nodes.do(self._signal(signal.SIGTERM))
+        self._signal(signal.SIGTERM)
 
     def kill(self) -> None:
         """Kill the client: see `ClientHandle.kill`."""
-        if not self._killed:
-            self._killed = True
-            self._nodes.do(self._signal(signal.SIGKILL))
+        if not self._is_killed:
+            self._is_killed = True
+            self._signal(signal.SIGKILL)
+
+    def take(self, message: Mapping[str, Any], address: str, token: str) -> None:
+        """Take what the driver says about it."""
+        match message["say"]:
+            case "state":
+                self._state = message["state"]
+            case "end":
+                self.finish(message["status"], message["stderr"])
+            case "here":
+                self._start(address, token)
 
     def finish(self, status: int, stderr: str = "") -> None:
-        """Record the end of the client, unless it is already known."""
-        if not self.end.done():
-            self.end.set_result((status, stderr))
+        """Record its end, unless it is already known."""
+        if self._end is None:
+            self._end = status, stderr
 
-    async def _signal(self, number: signal.Signals) -> None:
-        """Send a signal; a client whose agent does not answer is lost with its node or cut off.
+    def lose_driver(self, why: str) -> None:
+        """Note that Ray is lost: a client that has begun goes on, the others will never begin."""
+        if self._process is None and not self._state.startswith("running"):
+            self.finish(1, why)
 
-        A client that is cut off exits when it notices that the server has closed the connection.
-        """
-        if self.agent is None:
-            self.finish(-number)
-            return
-        try:
-            call = _ask(self.agent, "signal", self.instance_id, int(number))
-            await asyncio.wait_for(call, _ANSWER_TIME)
-        except (RayError, TimeoutError):
-            if number == signal.SIGKILL:
+    def _start(self, address: str, token: str) -> None:
+        """Start the client on this machine."""
+        process = ClientProcess(self.instance_id, address, token)
+        with self._lock:
+            if self._end is not None:
+                return
+            try:
+                process.start()
+            except ClientError as error:
+                self.finish(1, str(error))
+                return
+            self._process, self._state = process, "running on this machine"
+
+    def _signal(self, number: signal.Signals) -> None:
+        with self._lock:
+            if self._process is not None:
+                is_kill = number == signal.SIGKILL
+                self._process.kill() if is_kill else self._process.terminate()
+            elif self._driver.end:
+                # It exits by itself once the server has closed the connection.
                 self.finish(-number)
+            else:
+                self._driver.signal(self._key, number)
 
 
-class _Nodes:
-    """A run's agents, and the thread that monitors them.
+class _DriverProcess(Closeable):
+    """The process that is connected to Ray, and the thread that listens to it.
 
     Attributes:
-        places: Instance to its placement group, its index in the group, and its resources.
+        host: Address at which all nodes reach this machine; None: all nodes are on this machine.
+        end: How it ended; empty while it runs.
     """
 
-    def __init__(self, runtime_env: dict[str, Any] | None) -> None:
-        self.places: dict[int, tuple[Any, int, Bundle]] = {}
-        environment = dict(runtime_env or {})
-        environment["env_vars"] = {**environment.get("env_vars", {}), **_LEAVE_CHILDREN}
-        options: dict[str, Any] = {"num_cpus": 0, "max_concurrency": _CALLS}
-        options["runtime_env"] = environment
-        self._actor: Any = ray.remote(**options)(Agent)
-        self._agents: dict[Any, Any] = {}
-        self._here = Agent()  # this process's own node needs no other process
-        self._own_node = ray.get_runtime_context().get_node_id()
-        self._is_plain = runtime_env is None
-        self._groups: list[Any] = []
-        self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+    def __init__(self, options: Mapping[str, Any]) -> None:
+        """Start it, and wait until it is connected.
+
+        Args:
+            options: What it is told first.
+
+        Raises:
+            ConfigError: If the options are not plain data, or there is no such cluster.
+        """
+        self.end = ""
+        self._keys = itertools.count()
+        self._handles: dict[int, tuple[RayHandle, str, str]] = {}
+        self._answers: queue.Queue[dict[str, Any]] = queue.Queue()
+        self._is_in_use = False
+        ours, theirs = socket.socketpair()
+        with theirs:
+            words = [sys.executable, "-P", "-m", _DRIVER, str(theirs.fileno())]
+            self._process = ChildProcess(
+                words,
+                stdout=subprocess.DEVNULL,
+                stderr=subprocess.PIPE,
+                pass_fds=[theirs.fileno()],
+            )
+        assert self._process.stderr is not None
+        self._tail = OutputTail(self._process.stderr)
+        self._messages = Messages(ours)
+        self._thread = threading.Thread(target=self._listen, daemon=True)
         self._thread.start()
+        try:
+            self._messages.send(**options)
+            self.host = self._wait_until_connected()
+            self._is_in_use = True
+        except BaseException as error:
+            self.close()
+            if isinstance(error, TypeError):
+                raise ConfigError(f"launcher_kwargs of cluster/ray: {error}.") from error
+            raise
 
-    def add(self, group: Any, instances: Sequence[int], bundle: Bundle) -> None:
-        """Add a placement group with one bundle for each of the instances."""
-        self._groups.append(group)
-        self.places |= {number: (group, k, bundle) for k, number in enumerate(instances)}
+    def launch(self, instances: Sequence[int], address: str, token: str) -> list[RayHandle]:
+        """Have clients started: see `Launcher.launch`; if Ray is lost, all of them have ended.
 
-    def start(self, number: int, address: str, token: str) -> RayHandle:
-        """Arrange for a client to start as soon as its node is known; return immediately."""
-        handle = RayHandle(number, self)
-        self.do(self._live(handle, address, token))
-        return handle
+        Raises:
+            ClientError: If they have no place.
+        """
+        handles = {next(self._keys): number for number in instances}
+        made = {key: RayHandle(number, key, self) for key, number in handles.items()}
+        self._handles |= {key: (handle, address, token) for key, handle in made.items()}
+        keys = [(number, key) for key, number in handles.items()]
+        self._messages.send(keys=keys, address=address, token=token)
+        answer = self._answer(_LAUNCH_TIME)
+        for handle in made.values() if self.end else ():
+            handle.lose_driver(self.end)
+        if reason := answer.get("misfit"):
+            raise ClientError(
+                instances[0],
+                f"has no place on Ray: {reason}. Ask for less with "
+                'launcher_kwargs={"num_cpus": ...}, run fewer clients, or add nodes with "ray '
+                'start --address ...".',
+            )
+        return [*made.values()]
 
-    def do(self, work: Coroutine[Any, Any, None]) -> None:
-        """Run a coroutine in the thread."""
-        asyncio.run_coroutine_threadsafe(work, self._loop)
+    def signal(self, key: int, number: int) -> None:
+        """Send a signal to a client."""
+        self._messages.send(key=key, signal=int(number))
 
     def close(self) -> None:
-        """End the agents with everything that they started, and release the reserved resources."""
-        self._loop.call_soon_threadsafe(self._loop.stop)
+        """Disconnect from Ray, and end it if it was started for the run."""
+        self._is_in_use = False
+        for handle, _, _ in self._handles.values():
+            if handle.exit_status() is None:
+                handle.kill()
+        self._messages.finish()
+        self._process.wait(_LEAVE_TIME)
+        self._process.close(0.0)
         self._thread.join()
-        for task in asyncio.all_tasks(self._loop):
-            task.cancel()
-        self._loop.run_until_complete(asyncio.sleep(0))
-        self._loop.close()
-        if not ray.is_initialized():
-            return
-        for agent in self._agents.values():
-            ray.kill(agent)
-        for group in self._groups:
-            remove_placement_group(group)
+        self._messages.close()
 
-    async def _live(self, handle: RayHandle, address: str, token: str) -> None:
-        """Start a client, on another node if its node is lost meanwhile, and wait for its end."""
-        number = handle.instance_id
+    def _wait_until_connected(self) -> str | None:
+        answer = self._answer(_OPEN_TIME)
+        if "host" not in answer:
+            raise ConfigError(answer.get("refusal") or f"{self.end}: {self._last_lines()}")
+        host: str | None = answer["host"]
+        return host
+
+    def _answer(self, patience: float) -> dict[str, Any]:
+        """Wait for the driver's answer; one that does not answer, or has ended, is lost."""
+        if self.end:
+            return {}
         try:
-            while not handle.end.done():
-                key, agent = await self._find_agent(handle)
-                try:
-                    await _ask(agent, "answer")
-                    if handle.end.done():
-                        return
-                    handle.agent = agent
-                    await _ask(agent, "start", number, address, token)
-                    break
-                except RayActorError as error:
-                    handle.waits_for = f"its node was lost: {_first_line(error)}"
-                    handle.agent = None
-                    self._agents.pop(key, None)
-                    await asyncio.sleep(_PAUSE)
-            handle.waits_for = f"running on {self._describe(number)}"
-            handle.finish(*await _ask(handle.agent, "follow", number))
-        except RayActorError as error:
-            handle.finish(1, f"Ray: {_first_line(error)}")
-        except Exception as error:  # whatever it is, the run must learn of it
-            handle.finish(1, f"Ray: {error}")
+            return self._answers.get(timeout=patience)
+        except queue.Empty:
+            self._process.close(0.0)
+            return self._answers.get()
 
-    async def _find_agent(self, handle: RayHandle) -> tuple[Any, Any]:
-        """Wait until Ray has placed a client; return the agent there, preceded by its key."""
-        group, index, bundle = self.places[handle.instance_id]
-        while True:
-            table = placement_group_table(group)
-            node = table["bundles_to_node_id"][index]
-            if table["state"] == "CREATED" and node:
-                break
-            free = {name: ray.available_resources().get(name, 0.0) for name in bundle}
-            handle.waits_for = f"waiting for {describe(bundle)} (Ray has {describe(free)} free)"
-            await asyncio.sleep(_PAUSE)
-        handle.waits_for = "waiting for a Ray process to start"
-        if node == self._own_node and self._is_plain and not bundle.get("GPU"):
-            return node, self._here
-        # Ray assigns GPUs to actors, so an agent with GPUs has exactly one client.
-        key = (group.id, index if bundle.get("GPU") else node)
-        if key not in self._agents:
-            place = PlacementGroupSchedulingStrategy(group, placement_group_bundle_index=index)
-            options = {"scheduling_strategy": place, "num_gpus": bundle.get("GPU", 0)}
-            self._agents[key] = self._actor.options(**options).remote()
-        return key, self._agents[key]
+    def _listen(self) -> None:
+        """Take what the driver says, until it ends."""
+        while (message := self._messages.receive()) is not None:
+            if "key" in message:
+                handle, address, token = self._handles[message["key"]]
+                handle.take(message, address, token)
+            else:
+                self._answers.put(message)
+        status = self._process.wait(_LEAVE_TIME)
+        how = describe_exit(status) if status is not None else "closed the connection"
+        self.end = f"Ray is lost: the process that was connected to it {how}"
+        if self._is_in_use:
+            _LOG.warning(
+                "%s. The run goes on with the clients that are connected, and starts no more.\n%s",
+                self.end,
+                self._last_lines(),
+            )
+            for handle, _, _ in [*self._handles.values()]:
+                handle.lose_driver(self.end)
+        self._answers.put({})
 
-    def _describe(self, number: int) -> str:
-        group, index, _ = self.places[number]
-        return f"node {placement_group_table(group)['bundles_to_node_id'][index][:8]}"
+    def _last_lines(self) -> str:
+        return "\n".join(self._tail.text(1.0).strip().splitlines()[-5:])
 
 
-async def _ask(agent: Any, method: str, *arguments: Any) -> Any:
-    """Call an agent's method and return the result; the agent may be in this process."""
-    call = getattr(agent, method)
-    return await (call(*arguments) if isinstance(agent, Agent) else call.remote(*arguments))
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).strip().splitlines()), type(error).__name__)
+def _connected_address() -> str | None:
+    """Return the address of the cluster to which this process is connected, if it uses Ray."""
+    ray: Any = sys.modules.get("ray")
+    if ray is None or not ray.is_initialized():
+        return None
+    address: str = ray.get_runtime_context().gcs_address
+    return address

@@ -9,12 +9,14 @@ import signal
 
 from physx_core.workers import ClientProcess
 
+_TRIM_EVERY = 60.0  # s
+
 
 class Agent:
-    """Runs clients as child processes, which end with the agent's process, even if it is killed.
+    """Runs clients as child processes, which outlive the agent, and end with their connection.
 
-    It is a Ray actor or a plain object. All methods are coroutines, so Ray runs any number of calls
-    concurrently in one thread.
+    It is a Ray actor, which Ray ends if the cluster's head is lost; the run then goes on with the
+    clients. All methods are coroutines, so Ray runs any number of calls concurrently in one thread.
     """
 
     def __init__(self) -> None:
@@ -32,7 +34,7 @@ class Agent:
             address: ``HOST:PORT`` of the run's server.
             token: The run's secret; the client gets it in its environment.
         """
-        client = ClientProcess(instance, address, token)
+        client = ClientProcess(instance, address, token, lives_on=True)
         client.start()
         self._clients[instance] = client
 
@@ -44,7 +46,8 @@ class Agent:
         """
         client = self._clients[instance]
         with contextlib.suppress(ProcessLookupError):
-            await _ends(client)
+            while not await _ends(client, _TRIM_EVERY):
+                client.trim_stderr()
         while (status := client.exit_status()) is None:  # not yet reaped
             await asyncio.sleep(0.01)
         return status, client.stderr()
@@ -55,14 +58,17 @@ class Agent:
         client.kill() if number == signal.SIGKILL else client.terminate()
 
 
-async def _ends(client: ClientProcess) -> None:
-    """Wait until a process ends, without polling."""
+async def _ends(client: ClientProcess, seconds: float) -> bool:
+    """Return whether a process ends within some seconds, without polling."""
     loop = asyncio.get_running_loop()
     over = asyncio.Event()
     descriptor = os.pidfd_open(client.pid or 0)
     loop.add_reader(descriptor, over.set)
     try:
-        await over.wait()
+        await asyncio.wait_for(over.wait(), seconds)
+    except TimeoutError:
+        return False
     finally:
         loop.remove_reader(descriptor)
         os.close(descriptor)
+    return True

@@ -10,6 +10,7 @@ from .interrupt import Terminated as Terminated
 from .interrupt import deferred_interrupt as deferred_interrupt
 from .interrupt import raised_at_sigterm as raised_at_sigterm
 from .memory import anonymous_file as anonymous_file
+from .tail import OutputFile as OutputFile
 from .tail import OutputTail as OutputTail
 from .worker import CLIENT_VARIABLE as CLIENT_VARIABLE
 from .worker import describe_exit as describe_exit

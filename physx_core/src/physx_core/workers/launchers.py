@@ -14,7 +14,7 @@ from collections.abc import Iterable, Sequence
 from physx_core.components.launcher import ClientHandle, Launcher
 from physx_core.errors import ClientError, ConfigError
 from physx_core.net.handshake import TOKEN_VARIABLE
-from physx_core.processes import ChildProcess, OutputTail, worker_variables
+from physx_core.processes import ChildProcess, OutputFile, OutputTail, worker_variables
 
 _TERMINATE_TIME = 0.5
 
@@ -36,6 +36,7 @@ class ClientProcess(ClientHandle):
         token: str,
         core: int | None = None,
         ticket: int | None = None,
+        lives_on: bool = False,
     ) -> None:
         """Store the arguments of the process.
 
@@ -45,6 +46,7 @@ class ClientProcess(ClientHandle):
             token: Token of the run.
             core: The only processor core that it may use; None: all that this process may use.
             ticket: Ticket that it presents to run the instance, in an elastic run.
+            lives_on: Whether it outlives this process; it ends with its connection to the server.
         """
         self.instance_id = instance_id
         self._core = core
@@ -56,6 +58,8 @@ class ClientProcess(ClientHandle):
         self._variables = {TOKEN_VARIABLE: token, **worker_variables()}
         self._process: ChildProcess | None = None
         self._tail: OutputTail | None = None
+        self._file: OutputFile | None = None
+        self._lives_on = lives_on
 
     def start(self) -> None:
         """Start the process.
@@ -64,16 +68,21 @@ class ClientProcess(ClientHandle):
             ClientError: If it cannot be started.
         """
         try:
+            # If this process ended, a pipe would make each line that the client writes an error.
+            self._file = OutputFile() if self._lives_on else None
             self._process = ChildProcess(
-                self._command, variables=self._variables, stderr=subprocess.PIPE
+                self._command,
+                variables=self._variables,
+                stderr=subprocess.PIPE if self._file is None else self._file.descriptor,
+                lives_on=self._lives_on,
             )
         except OSError as error:
             raise ClientError(self.instance_id, f"could not be started: {error}.") from error
         if self._core is not None:
             with contextlib.suppress(ProcessLookupError):  # it has already ended
                 os.sched_setaffinity(self._process.pid, {self._core})
-        assert self._process.stderr is not None
-        self._tail = OutputTail(self._process.stderr)
+        if self._process.stderr is not None:
+            self._tail = OutputTail(self._process.stderr)
 
     @property
     def pid(self) -> int | None:
@@ -86,9 +95,16 @@ class ClientProcess(ClientHandle):
 
     def stderr(self) -> str:
         """Return the last lines that the process wrote to its standard error."""
+        if self._file is not None:
+            return self._file.text()
         if self._tail is None:
             return ""
         return self._tail.text(0.0 if self.exit_status() is None else 0.2)
+
+    def trim_stderr(self) -> None:
+        """Forget all but the last lines of its standard error, if they are in a file."""
+        if self._file is not None:
+            self._file.trim()
 
     def terminate(self) -> None:
         """Ask the process and the processes it started to exit."""
