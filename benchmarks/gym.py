@@ -2,6 +2,7 @@
 
     python benchmarks/gym.py
     python benchmarks/gym.py --jiminy PYTHON    # an interpreter that has gym_jiminy
+    python benchmarks/gym.py --busy 8           # vector environments beside 8 busy processes
 
 Without `--jiminy`, gym_jiminy is taken from the virtual environment .venv/jiminy, if there is one.
 It needs an older NumPy than physx:
@@ -48,6 +49,7 @@ HERE = Path(__file__).parent
 JIMINY = HERE.parent / ".venv" / "jiminy" / "bin" / "python"
 PIPELINE = HERE.parent / "examples" / "environments" / "quadruped.toml"
 ROUNDS, REPEATS = 5, 12
+BUSY_ROUNDS = 9
 SLICE = 0.4
 
 
@@ -435,6 +437,80 @@ def vectors() -> list[bool]:
     return met
 
 
+def busy_vectors(load: int) -> list[bool]:
+    """Compare cartpoles with Gymnasium's vector environments while other processes want the cores.
+
+    Each candidate is a process, as in a training, and all run alternately; the load of the machine
+    by others counts as well.
+
+    Args:
+        load: Number of processes that only use the processor, besides those of others.
+    """
+    others = [subprocess.Popen([sys.executable, "-c", "while True: pass"]) for _ in range(load)]
+    met = []
+    try:
+        for count in (1, 8, 64):
+            kinds = ("physx", "async", "sync")
+            served = {kind: _Served(kind, count) for kind in kinds}
+            measured = {kind: np.empty(BUSY_ROUNDS) for kind in kinds}
+            for number in range(BUSY_ROUNDS):
+                for kind in kinds:
+                    measured[kind][number] = served[kind].rate()
+            for each in served.values():
+                each.close()
+            print(
+                f"{count} cartpoles, {load} busy processes, load {os.getloadavg()[0]:.1f}, steps/s:"
+            )
+            for kind, found in measured.items():
+                print(f"  {kind}: {np.median(found):,.0f}")
+            ratio = np.median(measured["physx"] / np.maximum(measured["async"], measured["sync"]))
+            met.append(claim("physx against the better of Gymnasium's", ratio, at_least=1.0))
+    finally:
+        for each in others:
+            each.kill()
+            each.wait()
+    return met
+
+
+_SERVED = """
+import sys
+import gym as benchmark
+import gymnasium
+kind, count = sys.argv[1], int(sys.argv[2])
+options = {"num_processes": 2} if kind == "physx" else {"vectorization_mode": kind}
+env = gymnasium.make_vec("physx/Cartpole-v0", count, **options)
+actions = benchmark.draw(env)
+env.reset(seed=0)
+for _ in iter(sys.stdin.readline, ""):
+    begin = benchmark.clock()
+    done = benchmark.turn(env, actions)
+    print(done / (benchmark.clock() - begin), flush=True)
+env.close()
+"""
+
+
+class _Served:
+    """A vector environment in a process of its own."""
+
+    def __init__(self, kind: str, count: int) -> None:
+        self._process = subprocess.Popen(
+            [sys.executable, "-W", "ignore", "-c", _SERVED, kind, str(count)],
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+            cwd=HERE,
+        )
+        self.rate()
+
+    def rate(self) -> float:
+        """Return the steps per second of one slice."""
+        print(file=self._process.stdin, flush=True)
+        return float(self._process.stdout.readline())
+
+    def close(self) -> None:
+        self._process.communicate()
+
+
 def compare(candidates: dict[str, Any]) -> dict[str, np.ndarray]:
     """Return steps per second of vector environments in each round, and close them."""
     turns = {name: functools.partial(turn, env, draw(env)) for name, env in candidates.items()}
@@ -478,8 +554,12 @@ def main() -> None:
     parser.add_argument("--check", action="store_true", help="exit with 1 if a target is missed")
     found = str(JIMINY) if JIMINY.exists() else None
     parser.add_argument("--jiminy", metavar="PYTHON", default=found, help="has gym_jiminy")
+    parser.add_argument("--busy", metavar="N", type=int, help="only vectors, beside N processes")
     chosen = parser.parse_args()
     gc.disable()
+    if chosen.busy is not None:
+        finish(busy_vectors(chosen.busy))
+        return
     met = overheads()
     if chosen.jiminy:
         met += against_jiminy(chosen.jiminy)

@@ -22,8 +22,6 @@ END = -1
 """Value of `SharedBatch.asked` that tells a worker to exit."""
 NEVER = 1 << 62
 """A number of entries that is never reached."""
-SPIN_TIME = 1e-3
-"""How long a process polls for what it waits for before it sleeps, in s."""
 
 
 @dataclass

@@ -26,11 +26,13 @@ from physx_gym.spaces import SpaceFields
 from physx_gym.vector.batch import SharedBatch
 from physx_gym.vector.client_workers import ClientWorkers
 from physx_gym.vector.infos import InfoKind, InfoLayout, unpack
+from physx_gym.vector.local_worker import LocalWorker
 from physx_gym.vector.workers import Workers
 
 FORBIDDEN = ("reset", "step", "close")
 """Methods that `call` rejects."""
 
+_HERE = "127.0.0.1"
 _LOG = logging.getLogger("physx")
 
 
@@ -67,7 +69,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         timeout: float = 60.0,
         launcher: str | type[Any] | None = None,
         launcher_kwargs: Mapping[str, Any] | None = None,
-        ip_address: str = "127.0.0.1",
+        ip_address: str = _HERE,
         restarts: int = 0,
     ) -> None:
         """Start the processes.
@@ -79,13 +81,15 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
             env_kwargs: Keyword arguments of each environment.
             num_processes: Number of processes that share the environments; None: one for each
                 processor core, or, with a launcher, for each environment. There are never more than
-                environments.
+                environments, and none for a single one, which is stepped in this process, unless it
+                has a launcher.
             batch_size: Number of environments whose results `recv` returns; None: all.
             autoreset_mode: What happens after the end of an episode.
             copy: Whether the results of `reset` and `step` are copies; otherwise observations are
                 views of the shared memory, valid until the next call.
             timeout: Longest duration of a step of an environment, in s. To create and to close its
-                environments, a process has the same time, but at least a minute.
+                environments, a process has the same time, but at least a minute. The step of an
+                environment in this process is not limited.
             launcher: Launcher that starts the processes, such as ``"cluster/ray"``; None: they are
                 started here, and share memory with this process. Started by a launcher, they are
                 clients, on any machine, and `recv` waits for all pending results.
@@ -95,7 +99,8 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
                 actions, so its environments must be deterministic; the actions are kept for this.
 
         Raises:
-            ConfigError: If a value is out of range, or values of a space do not have a fixed shape.
+            ConfigError: If a value is out of range, or is only for a launcher, which is not given,
+                or values of a space do not have a fixed shape.
             UnknownOptionError: If the autoreset mode is unknown.
             UsageError: If a worker runs a script without ``if __name__ == "__main__":``.
             PhysxError: If an environment or a process fails.
@@ -104,6 +109,8 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         workers = min(processes if num_processes is None else num_processes, num_envs)
         batch_size = num_envs if batch_size is None else batch_size
         _check(num_envs, workers, batch_size, env_kwargs, autoreset_mode)
+        if launcher is None:
+            _check_without_launcher(launcher_kwargs, ip_address, restarts)
         name, options = reference_of(env), dict(env_kwargs or {})
         self.num_envs, self.batch_size = num_envs, batch_size
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -113,6 +120,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         self._starts, shares = starts, [stop - start for start, stop in pairwise(starts)]
         self._worker_of = np.repeat(np.arange(workers), shares).tolist()
         self._all = np.arange(num_envs)
+        self._shares = [np.arange(share) for share in shares]
         # The environments with pending results, by worker, in the order in which it delivers them.
         self._owed: list[deque[int]] = [deque() for _ in range(workers)]
         self._owes = np.zeros(num_envs, np.bool_)
@@ -130,8 +138,10 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         has_finals = self.autoreset_mode is AutoresetMode.SAME_STEP
         with anonymous_file("physx_vector") as file:
             self._batch = SharedBatch(file.fileno(), shares, *fields, has_finals=has_finals)
-            self._workers: Workers | ClientWorkers
-            if launcher is None:
+            self._workers: Workers | ClientWorkers | LocalWorker
+            if launcher is None and num_envs == 1:
+                self._workers = LocalWorker(self._batch, setup)
+            elif launcher is None:
                 self._workers = Workers(self._batch, file.fileno(), setup, timeout)
             else:
                 config = {
@@ -250,8 +260,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         """
         self._open()
         ids = self._all if env_ids is None else self._chosen(env_ids)
-        owing = ids[self._owes[ids]]
-        if len(owing):
+        if self._owes.any() and len(owing := ids[self._owes[ids]]):
             raise UsageError(
                 f"The result of environment {owing[0]} is still pending: call recv() before "
                 "sending it another action, or start over with reset()."
@@ -279,7 +288,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         if not len(ids):
             raise UsageError("No result is pending: call send() or async_reset() first.")
         observations, *results, infos = self._results(ids)
-        return observations, *results, {**infos, "env_id": ids}
+        return observations, *results, {**infos, "env_id": ids.copy()}
 
     @property
     def owing(self) -> int:
@@ -288,8 +297,14 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
 
     def _ask(self, ids: Array) -> None:
         """Have environments step."""
-        self._owes[ids] = True
         workers = self._open()
+        if ids is self._all:
+            self._owes[:] = True
+            for number, mine in enumerate(self._shares):
+                self._owed[number].extend(range(*self._starts[number : number + 2]))
+                workers.ask(number, mine)
+            return
+        self._owes[ids] = True
         ends = ids.searchsorted(self._starts).tolist()  # where each worker's environments end
         for number, (first, last) in enumerate(pairwise(ends)):
             if first < last:
@@ -300,10 +315,11 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
     def _take(self, count: int) -> Array:
         """Wait for `count` results, or all pending ones; return their environments, in order."""
         workers, owed = self._open(), [len(each) for each in self._owed]
-        count = min(count, sum(owed))
-        done = workers.wait(sum(workers.asked) - sum(owed) + count)
-        if count == sum(owed):  # no need to know which come first
-            taken = np.flatnonzero(self._owes)
+        total = sum(owed)
+        count = min(count, total)
+        done = workers.wait(sum(workers.asked) - total + count)
+        if count == total:  # no need to know which come first
+            taken = self._all if count == self.num_envs else np.flatnonzero(self._owes)
             for each in self._owed:
                 each.clear()
         else:
@@ -447,10 +463,25 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         if workers is not None:
             workers.close(orderly=True)
 
-    def _open(self) -> Workers | ClientWorkers:
+    def _open(self) -> Workers | ClientWorkers | LocalWorker:
         if not self._workers.is_open:
             raise UsageError("This vector environment is closed, or ended with an error.")
         return self._workers
+
+
+def _check_without_launcher(
+    launcher_kwargs: Mapping[str, Any] | None, ip_address: str, restarts: int
+) -> None:
+    given = {
+        "launcher_kwargs": bool(launcher_kwargs),
+        "ip_address": ip_address != _HERE,
+        "restarts": restarts != 0,
+    }
+    if unused := [name for name, is_given in given.items() if is_given]:
+        raise ConfigError(
+            f"{' and '.join(unused)} would have no effect without a launcher, whose processes are "
+            'clients. Add launcher="physx/subprocess" to start them on this machine.'
+        )
 
 
 def _check(

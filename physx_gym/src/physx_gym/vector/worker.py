@@ -27,11 +27,11 @@ from physx_core.net import (
     has_core_for_each,
     order,
     pack,
-    spin_until,
 )
 from physx_core.processes import kill_descendants, prepare_worker
-from physx_gym.vector.batch import COMMAND, END, SPIN_TIME, SharedBatch
+from physx_gym.vector.batch import COMMAND, END, SharedBatch
 from physx_gym.vector.share import Share
+from physx_gym.vector.spinning import Spinner
 
 _BELL = pack(Kind.READY)
 _LOOK_EVERY = 1000  # ms
@@ -58,7 +58,7 @@ class Worker:
         self._number = setup["number"]
         self._queue = memoryview(self._batch.queues[self._number])
         self._done = 0
-        self._spins = has_core_for_each(len(setup["shares"]))
+        self._spinner = Spinner(spins=has_core_for_each(len(setup["shares"])))
         sys.path[:] = setup["path"]
         self._share = Share(setup, self._batch, self._send)
 
@@ -94,7 +94,7 @@ class Worker:
         def has_more() -> bool:
             return bool(asked[number] != done)
 
-        if not (self._spins and spin_until(has_more, SPIN_TIME)):
+        if not self._spinner.find(has_more):
             self._batch.idle[number] = 1
             fence()
             while not has_more():

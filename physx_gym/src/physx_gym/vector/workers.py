@@ -26,11 +26,11 @@ from physx_core.net import (
     has_core_for_each,
     order,
     pack,
-    spin_until,
 )
 from physx_core.processes import ChildProcess, OutputTail, describe_exit, worker_variables
 from physx_core.typing import Array
-from physx_gym.vector.batch import COMMAND, END, NEVER, SPIN_TIME, SharedBatch
+from physx_gym.vector.batch import COMMAND, END, NEVER, SharedBatch
+from physx_gym.vector.spinning import Spinner
 
 _BELL = pack(Kind.ACTIONS)
 _TICK = 0.1
@@ -67,7 +67,8 @@ class Workers:
         self._links: list[_Link] = []
         self._by_file: dict[int, int] = {}
         self._poll = select.poll()
-        self._spins = has_core_for_each(len(self._shares) + 1)  # including this process
+        spins = has_core_for_each(len(self._shares) + 1)  # including this process
+        self._spinner = Spinner(spins=spins)
         self._errors: dict[int, PhysxError] = {}
         self._received = [0] * len(self._shares)
         self.is_open = True
@@ -152,7 +153,7 @@ class Workers:
         def is_done() -> bool:
             return sum(batch.done) >= entries
 
-        if not (is_done() or (self._spins and spin_until(is_done, SPIN_TIME))):
+        if not (is_done() or self._spinner.find(is_done)):
             batch.awaited[0] = entries
             fence()
             try:
