@@ -158,7 +158,6 @@ class Watched(Training):
 
     def batch_end(self) -> None:
         """Wait until the clients are ahead, and record the memory, in MiB."""
-        super().batch_end()
         dataset, deadline = self.data.dataset, time.monotonic() + 10
         rows = min(self.batch_id + RUN_AHEAD, self.batch_nb or 0) * BATCH
         while dataset.num_samples("training") < rows and time.monotonic() < deadline:
@@ -254,7 +253,6 @@ class Examined(Training):
 
     def batch_end(self) -> None:
         """Record the mean squared error, ten times in all."""
-        super().batch_end()
         self.batches -= 1
         every = max(1, self.total // 100)
         if self.batches < 10 * every and self.batches % every == 0:

@@ -24,12 +24,10 @@ class Timed(DataGeneration):
     """Measures the time from the first batch to the last; starting the clients is not timed."""
 
     def data_generation_begin(self) -> None:
-        super().data_generation_begin()
         self.begin = time.perf_counter()
 
     def data_generation_end(self) -> None:
         self.rate = self.batch_nb * self.batch_size / (time.perf_counter() - self.begin)
-        super().data_generation_end()
 
 
 def draw(path, clouds, spreads) -> None:

@@ -40,7 +40,6 @@ class Timed(Prediction):
     found = ()
 
     def sample_end(self):
-        super().sample_end()
         begin = time.thread_time()
         self.learner.predict(self.batch)
         seconds = *self.batch["seconds"][0], time.thread_time() - begin

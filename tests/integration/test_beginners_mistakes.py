@@ -684,28 +684,23 @@ def train_without(method):
     own(LINEAR, KEPT, epoch_nb=1, batch_size=4, session_name="new").execute()
 
 
-@mistake(e.UsageError, "Own.epoch_begin() must call super().epoch_begin()")
-def overrides_epoch_begin_without_super():
-    train_without("epoch_begin")
-
-
-@mistake(e.UsageError, "Own.batch_produce() must call super().batch_produce()")
-def overrides_batch_produce_without_super():
+@mistake(e.UsageError, "Own.batch_produce() set no batch: call super().batch_produce(), or set")
+def replaces_batch_produce_without_a_batch():
     train_without("batch_produce")
 
 
-@mistake(e.UsageError, "Own.optimize() must call super().optimize()")
-def overrides_optimize_without_super():
+@mistake(e.UsageError, "Own.optimize() set no losses: call super().optimize(), or set self.losses")
+def replaces_optimize_without_losses():
     train_without("optimize")
 
 
-@mistake(e.UsageError, "Own.batch_count() must call super().batch_count()")
-def overrides_batch_count_without_super():
+@mistake(e.UsageError, "Own.batch_count() did not advance batch_id: call super().batch_count()")
+def replaces_batch_count_without_counting():
     train_without("batch_count")
 
 
-@mistake(e.UsageError, "Own.epoch_count() must call super().epoch_count()", "new/network/network_0")
-def overrides_epoch_count_without_super():
+@mistake(e.UsageError, "Own.epoch_count() did not advance epoch_id", "new/network/network_0")
+def replaces_epoch_count_without_counting():
     train_without("epoch_count")
 
 

@@ -260,11 +260,9 @@ class Numbered(Training):
     """Notes which rows it learns from, and which it validates with."""
 
     def train_begin(self):
-        super().train_begin()
         self.learned, self.held = [], []
 
     def epoch_begin(self):
-        super().epoch_begin()
         self.expected = self._epoch_batches
 
     def batch_end(self):

@@ -165,7 +165,6 @@ class Prints(Prediction):
     """Does something with predictions itself."""
 
     def sample_end(self):
-        super().sample_end()
         assert self.prediction
 
 
@@ -190,7 +189,6 @@ def test_a_prediction_without_an_end_says_how_it_ends(said):
 
     class Interrupted(Prediction):
         def sample_end(self):
-            super().sample_end()
             signal.raise_signal(signal.SIGINT)
 
     Interrupted(NetworkConfig(), SPRING).execute()

@@ -49,7 +49,6 @@ class Recorded(Training):
     """Notes all that batches hold and what they are normalized with."""
 
     def train_begin(self):
-        super().train_begin()
         self.seen = []
         Recording.calls.clear()
 

@@ -149,7 +149,6 @@ def test_events_are_called_in_order():
 
     class Mine(DataGeneration):
         def data_generation_begin(self):
-            super().data_generation_begin()
             calls.append("begin")
 
         def batch_begin(self):
@@ -159,7 +158,6 @@ def test_events_are_called_in_order():
             calls.append(len(self.batch["state"]))
 
         def data_generation_end(self):
-            super().data_generation_end()
             calls.append("end")
 
     Mine(SPRING, batch_nb=2, batch_size=3).execute()
@@ -277,7 +275,6 @@ def test_prediction_gives_the_networks_answer_to_the_environment():
 
     class Watch(Prediction):
         def sample_end(self):
-            super().sample_end()
             seen.append((self.batch["next_state"][0], self.prediction["next_state"][0]))
 
     Watch(NetworkConfig(), SPRING, session_name="run", step_nb=20, record=True).execute()

@@ -255,7 +255,6 @@ def test_replay_sends_each_sample_once_through_the_environment_that_made_it():
 
     class Mine(Replay):
         def sample_end(self):
-            super().sample_end()
             seen.extend(self.batch["seen"][:, 2].tolist())
 
     data = DatasetConfig(existing_dir="sessions/run")
@@ -299,7 +298,6 @@ def test_rejected_samples_are_replayed_once_each(over_tcp, nothing_stays_behind)
 
     class Mine(Replay):
         def sample_end(self):
-            super().sample_end()
             seen.extend(zip(self.batch["seen"][:, 0], self.batch["seen"][:, 2], strict=True))
 
     again = environment("Refusing", num_clients=2, as_tcp_ip_client=over_tcp)

@@ -158,7 +158,6 @@ def test_samples_come_in_the_order_of_the_epoch(source_dir):
             orders[-1].extend(zip(*self.batch["seen"].T.tolist(), strict=True))
 
         def epoch_begin(self):
-            super().epoch_begin()
             orders.append([])
 
     for shuffle in (True, False):
@@ -219,7 +218,6 @@ def test_normalization_is_that_of_the_rows_that_are_stored(source_dir):
 
     class Watch(Training):
         def epoch_begin(self):
-            super().epoch_begin()
             found.append(self.learner.transformation.normalization["y"].mean.item())
 
     for session, once in (("once", True), ("always", False)):

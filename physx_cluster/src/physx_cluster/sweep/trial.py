@@ -98,7 +98,6 @@ class TrialTraining(Training):
 
     def train_begin(self) -> None:
         """Check that the numbers of all earlier epochs exist; a power cut may have lost some."""
-        super().train_begin()
         if self.epoch_id:
             known = read_scalars(self.session.path).get(("epoch", _EVERY_EPOCH), {})
             if not all(epoch in known for epoch in range(1, self.epoch_id + 1)):

@@ -71,18 +71,22 @@ class DataGeneration(NewSessionPipeline):
                 samples are kept.
         """
         with self._running():
+            self.observers.begin("generation", self.batch_nb * self.batch_size, "samples")
             self.data_generation_begin()
-            while self.batch_condition():
+            own = self._is_own(DataGeneration.batch_produce)
+            while more := self.batch_condition():
                 self.batch_begin()
-                self.batch_produce()
+                if own:
+                    self.batch_produce()
+                else:
+                    self._check_batch_produce()
                 self._count("batch_id", "batch_count")
                 self.batch_end()
+            self._check_condition(more, "batch_condition")
             self.data_generation_end()
 
     def data_generation_begin(self) -> None:
         """Called before the first batch."""
-        self.batch_id = 0
-        self.observers.begin("generation", self.batch_nb * self.batch_size, "samples")
 
     def batch_condition(self) -> bool:
         """Return whether there are batches left to generate."""
@@ -97,17 +101,29 @@ class DataGeneration(NewSessionPipeline):
         With ``record_wrong_samples``, the samples that `check_sample` rejected are stored too, in
         the mode "wrong".
         """
-        if self.batch_id == 0:
-            end_generation(self.dataset)
         with record_beside_rows(self.source, self.dataset, self._mode):
             self.batch = self.source.batch(self.batch_size)
             store_sets(self.source, self.dataset, self._mode)
             if self.batch_id == 0:
                 self.dataset.define_fields(self._mode, self.source.fields)
-                described = describe_environment(self.environment_config, self._seed)
-                self.dataset.update_info(**described)
+                self._describe()
             if self.batch:
                 self.dataset.append(self._mode, self.batch, checked=True)
+
+    def _check_batch_produce(self) -> None:
+        """Call a replacement of `batch_produce`, which must store samples."""
+        before = self.dataset.num_samples(self._mode)
+        self.batch_produce()
+        if self.dataset.num_samples(self._mode) == before:
+            store = f"store them with self.dataset.append({self._mode!r}, ...)"
+            raise self._lacks("batch_produce", "stored no samples", store)
+        if self.batch_id == 0:
+            self._describe()
+
+    def _describe(self) -> None:
+        """Store with the samples which environment generated them."""
+        described = describe_environment(self.environment_config, self._seed)
+        self.dataset.update_info(**described)
 
     def batch_count(self) -> None:
         """Count the batch."""
@@ -119,11 +135,14 @@ class DataGeneration(NewSessionPipeline):
 
     def data_generation_end(self) -> None:
         """Called after the last batch."""
-        self.observers.end()
 
     @property
     def _mode(self) -> str:
         return self.mode or (self.dataset_config or DatasetConfig).mode
+
+    def _begin(self) -> None:
+        self.batch_id = 0
+        end_generation(self.dataset)
 
     def _open(self, resources: contextlib.ExitStack) -> None:
         dataset_config = self.dataset_config or DatasetConfig()

@@ -7,7 +7,7 @@ import os
 import sys
 import time
 from abc import ABC, abstractmethod
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import TracebackType
@@ -37,8 +37,13 @@ class Pipeline(ABC):
 
     A pipeline is a context manager: entering it opens its session, dataset, environments, and
     network, and leaving it always closes them. `execute` does both if the pipeline is not open.
-    Subclasses may override any event method; an override must call the base class's method, which
-    does the work described in its docstring.
+
+    Subclasses may override two kinds of methods. The *events*, ``*_begin`` and ``*_end``, are empty
+    and do not need `super`: a ``*_begin`` is called once the pipeline has prepared what begins, an
+    ``*_end`` before it closes what ends. The *steps*, ``*_condition``, ``*_count`` and those named
+    after what they do, do the work described in their docstrings; a replacement that leaves out
+    what the run needs is an error. A loop of one's own over the steps of an open pipeline stores
+    what `execute` does.
 
     When it starts, a run prints to stderr where it writes; when it ends, what it stored and the
     next commands. A run that fails before it has stored anything removes the session created for
@@ -80,6 +85,10 @@ class Pipeline(ABC):
     @abstractmethod
     def _open(self, resources: contextlib.ExitStack) -> None:
         """Open everything, and push what must be closed onto the stack."""
+
+    @abstractmethod
+    def _begin(self) -> None:
+        """Return to the first step: when the pipeline opens, and when `execute` begins."""
 
     def _plan(self) -> Iterable[str]:
         """Return lines on what the run, now open, is about to do."""
@@ -123,6 +132,7 @@ class Pipeline(ABC):
                 self._began = time.monotonic()
                 resources.enter_context(raised_at_sigterm())
                 self._open(resources)
+                self._begin()
                 self._describe_components()
                 self._resources = resources.pop_all()
         except BaseException:
@@ -190,23 +200,37 @@ class Pipeline(ABC):
                 self.session.note(f"{how} after {self._duration:.1f} s")
 
     def _count(self, counter: str, method: str) -> None:
-        """Call the counting method; an override without `super` would make the run endless."""
+        """Call the counting method; a replacement that does not count makes the run endless."""
         before = getattr(self, counter)
         getattr(self, method)()
         if getattr(self, counter) == before:
-            raise self._lacks_super(method)
+            raise self._lacks(method, f"did not advance {counter}", f"increase self.{counter}")
 
-    def _lacks_super(self, method: str) -> UsageError:
-        return UsageError(f"{type(self).__name__}.{method}() must call super().{method}().")
+    def _is_own(self, step: Callable[..., None]) -> bool:
+        """Return whether a step is physx's own method, which needs no checks, or is replaced."""
+        return getattr(getattr(self, step.__name__), "__func__", None) is step
+
+    def _check_condition(self, answer: bool | None, method: str) -> None:
+        """Check the answer with which a condition ended a loop: one without ``return`` is None."""
+        if answer is None:
+            raise self._lacks(method, "returned None", "return whether the run goes on")
+
+    def _lacks(self, method: str, what: str, remedy: str) -> UsageError:
+        """Return the error of a replaced step that leaves out what the run needs."""
+        return UsageError(
+            f"{type(self).__name__}.{method}() {what}: call super().{method}(), or {remedy}."
+        )
 
     @contextlib.contextmanager
     def _running(self) -> Iterator[None]:
         """Open the pipeline for the duration of a run, unless the user has opened it."""
-        if self._resources is not None:
+        with contextlib.ExitStack() as opened:
+            if self._resources is None:
+                opened.enter_context(self)
+            else:
+                self._begin()
             yield
-        else:
-            with self:
-                yield
+            self.observers.end()
 
     def _observe(
         self,

@@ -98,11 +98,18 @@ class Prediction(Pipeline):
             SystemExit: After SIGTERM, with status 143.
         """
         with self._running(), deferred_interrupt() as interrupt:
+            total = None if self.step_nb < 0 else self.step_nb
+            self.observers.begin("prediction", total, "steps")
             self.prediction_begin()
-            while self.prediction_condition() and not interrupt:
+            own = self._is_own(Prediction.predict)
+            while (more := self.prediction_condition()) and not interrupt:
                 self.sample_begin()
-                self.predict()
-                self._count("step_id", "sample_end")
+                if own:
+                    self.predict()
+                else:
+                    self._check_predict()
+                self.sample_end()
+            self._check_condition(more, "prediction_condition")
             self.prediction_end()
             unfinished = self.step_nb >= 0 and self.prediction_condition()
             if interrupt.number == signal.SIGTERM or (interrupt and unfinished):
@@ -110,8 +117,6 @@ class Prediction(Pipeline):
 
     def prediction_begin(self) -> None:
         """Called before the first step."""
-        self.step_id = 0
-        self.observers.begin("prediction", None if self.step_nb < 0 else self.step_nb, "steps")
 
     def prediction_condition(self) -> bool:
         """Return whether there are steps left."""
@@ -121,7 +126,7 @@ class Prediction(Pipeline):
         """Called before each step."""
 
     def predict(self) -> None:
-        """Step the environments, predict, and apply the predictions to the environments."""
+        """Step the environments, predict, and apply the predictions; then count the step."""
         count = self.source.instance_nb
         with record_beside_rows(self.source, self.dataset, "prediction"):
             stored = None if self._stored is None else self._stored.take_cyclic(count)
@@ -131,6 +136,25 @@ class Prediction(Pipeline):
             self.source.apply(self.prediction)
             if self.dataset is not None:
                 self._store(self.dataset)
+        self._count_step()
+
+    def _count_step(self) -> None:
+        self.step_id += 1
+        self.observers.advance(1)
+
+    def _check_predict(self) -> None:
+        """Call a replacement of `predict`, which need not count the step."""
+        begins, earlier = self.step_id, self.batch
+        stored = self.dataset.num_samples("prediction") if self.dataset and not begins else -1
+        self.predict()
+        if self.batch is earlier or not self.prediction:
+            how = "set self.batch = self.source.batch(...) and self.prediction"
+            raise self._lacks("predict", "set no batch and prediction", how)
+        if self.dataset and self.dataset.num_samples("prediction") == stored:
+            how = 'store them with self.dataset.append("prediction", ...)'
+            raise self._lacks("predict", "recorded no samples", how)
+        if self.step_id == begins:
+            self._count_step()
 
     def _check(self, prediction: Batch) -> None:
         """Check that the prediction is finite."""
@@ -141,13 +165,10 @@ class Prediction(Pipeline):
                 raise not_finite_prediction(name).at(instance_id, step)
 
     def sample_end(self) -> None:
-        """Count the step."""
-        self.step_id += 1
-        self.observers.advance(1)
+        """Called after each step."""
 
     def prediction_end(self) -> None:
         """Called after the last step."""
-        self.observers.end()
 
     def _store(self, dataset: Dataset) -> None:
         """Store samples and predictions; predicted fields get a prefix if their name is taken."""
@@ -166,6 +187,9 @@ class Prediction(Pipeline):
             dataset.append_sample("prediction", sample)
 
     # Opening --------------------------------------------------------------------------------
+
+    def _begin(self) -> None:
+        self.step_id, self.batch, self.prediction = 0, {}, {}
 
     def _open(self, resources: contextlib.ExitStack) -> None:
         network, environment = self.network_config, self.environment_config

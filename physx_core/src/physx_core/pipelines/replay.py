@@ -75,20 +75,24 @@ class Replay(NewSessionPipeline):
             SystemExit: After SIGTERM, with status 143; a second signal ends the run immediately.
         """
         with self._running(), deferred_interrupt() as interrupt:
+            steps = self._steps
+            self.observers.begin("replay", None if steps < 0 else steps, "steps")
             self.replay_begin()
-            while self.replay_condition() and not interrupt:
+            own = self._is_own(Replay.replay)
+            while (more := self.replay_condition()) and not interrupt:
                 self.sample_begin()
-                self.replay()
-                self._count("step_id", "sample_end")
+                if own:
+                    self.replay()
+                else:
+                    self._check_replay()
+                self.sample_end()
+            self._check_condition(more, "replay_condition")
             self.replay_end()
             if interrupt.number == signal.SIGTERM:
                 interrupt.end()
 
     def replay_begin(self) -> None:
         """Called before the first step."""
-        self.step_id = 0
-        steps = self._steps
-        self.observers.begin("replay", None if steps < 0 else steps, "steps")
 
     def replay_condition(self) -> bool:
         """Return whether there are steps left."""
@@ -98,24 +102,38 @@ class Replay(NewSessionPipeline):
         """Called before each step."""
 
     def replay(self) -> None:
-        """Give each instance the next stored sample, and step it."""
+        """Give each instance the next stored sample, and step it; then count the step."""
         count = self.source.instance_nb
         self.batch = self.source.batch(count, self._stored.take_cyclic(count))
+        self._count_step()
 
-    def sample_end(self) -> None:
-        """Count the step."""
+    def _count_step(self) -> None:
         self.step_id += 1
         self.observers.advance(1)
 
+    def _check_replay(self) -> None:
+        """Call a replacement of `replay`, which need not count the step."""
+        begins, earlier = self.step_id, self.batch
+        self.replay()
+        if self.batch is earlier:
+            raise self._lacks("replay", "set no batch", "set self.batch = self.source.batch(...)")
+        if self.step_id == begins:
+            self._count_step()
+
+    def sample_end(self) -> None:
+        """Called after each step."""
+
     def replay_end(self) -> None:
         """Called after the last step."""
-        self.observers.end()
 
     @property
     def _steps(self) -> int:
         if self.step_nb is None:
             return -(-self._stored.count // self.source.instance_nb)
         return self.step_nb
+
+    def _begin(self) -> None:
+        self.step_id, self.batch = 0, {}
 
     def _open(self, resources: contextlib.ExitStack) -> None:
         config = self.dataset_config

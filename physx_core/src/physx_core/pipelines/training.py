@@ -170,6 +170,7 @@ class Training(NewSessionPipeline):
     _blocks: int = field(init=False, repr=False, default=0)
     _told_order: bool = field(init=False, repr=False, default=False)
     _told: Sequence[str] = field(init=False, repr=False, default=())
+    _recorded: dict[str, float] | None = field(init=False, repr=False, default=None)
 
     def execute(self) -> None:
         """Train, and write a checkpoint to resume from however the training ends.
@@ -186,31 +187,32 @@ class Training(NewSessionPipeline):
         with self._running(), deferred_interrupt() as interrupt:
             self.train_begin()
             self._restore()
-            try:
-                while self.epoch_condition():
-                    self.epoch_begin()
-                    if self._epoch_batches is None:
-                        raise self._lacks_super("epoch_begin")
-                    while self.batch_condition():
-                        self.batch_begin()
-                        self.batch_produce()
-                        if not hasattr(self, "batch"):
-                            raise self._lacks_super("batch_produce")
-                        self.optimize()
-                        if not self.losses:
-                            raise self._lacks_super("optimize")
-                        self._count("batch_id", "batch_count")
-                        self.batch_end()
-                        self._leave_batch(interrupt)
-                    self._count("epoch_id", "epoch_count")
-                    self.epoch_end()
-                    if self.group.any(bool(interrupt)):
-                        self._end_early(interrupt)
-            except (Exception, SystemExit) as error:
-                if not isinstance(error, Terminated):
-                    self._save_after(error)
-                raise
+            while more := self.epoch_condition():
+                self._begin_epoch()
+                self.epoch_begin()
+                while left := self.batch_condition():
+                    self.batch_begin()
+                    self.batch_produce()
+                    if not self.batch:
+                        raise self._lacks("batch_produce", "set no batch", "set self.batch")
+                    self.losses = {}
+                    self.optimize()
+                    if not self.losses:
+                        how = 'set self.losses = {"loss": ...}'
+                        raise self._lacks("optimize", "set no losses", how)
+                    self._count("batch_id", "batch_count")
+                    if self._recorded is not self.losses:
+                        self._record_batch()
+                    self.batch_end()
+                    self._leave_batch(interrupt)
+                self._check_condition(left, "batch_condition")
+                self._count("epoch_id", "epoch_count")
+                self._finish_epoch()
+                self.epoch_end()
+                self._leave_epoch(interrupt)
+            self._check_condition(more, "epoch_condition")
             self.train_end()
+            self._finish()
 
     def train_begin(self) -> None:
         """Called before the first epoch, or before the epoch at which training resumes.
@@ -218,16 +220,15 @@ class Training(NewSessionPipeline):
         When a training resumes, its checkpoint is restored once more afterwards: what this method
         changes in the network, the optimization, or its loss has an effect only at the beginning.
         """
-        self.epoch_id = self._resumed.epoch
 
     def epoch_condition(self) -> bool:
         """Return whether there are epochs left and the training has not stopped early."""
         return self.epoch_id < self.epoch_nb and not self.stopped
 
-    def epoch_begin(self) -> None:
-        """Called before each epoch; determines its number of batches."""
-        begins = self.epoch_id == self._resumed.epoch
-        self.batch_id = self._resumed.batch if begins else 0
+    def _begin_epoch(self) -> None:
+        """Prepare the epoch and determine its number of batches, unless that is done."""
+        if self._epoch_batches is not None:
+            return
         names = self.learner.batch_fields
         self._epoch_batches = self.data.begin_epoch(self.epoch_id, names, self.batch_id)
         if self.data.notice and not self._told_order and self._leads:
@@ -236,13 +237,18 @@ class Training(NewSessionPipeline):
             self._told_order = True
         if self.data.has_changed:
             self.learner.normalize(self.data.normalization())
-        if begins:
+        if self.epoch_id == self._resumed.epoch:
             self.data.skip(self._resumed.batches_read)
             left = (self.epoch_nb - self.epoch_id) * self._epoch_batches - self.batch_id
             self.observers.begin("training", max(0, left), "batches")
 
+    def epoch_begin(self) -> None:
+        """Called before each epoch, when its batches are prepared."""
+
     def batch_condition(self) -> bool:
         """Return whether there are batches left in the current epoch."""
+        if self._epoch_batches is None:
+            self._begin_epoch()
         return self.batch_id < (self._epoch_batches or 0)
 
     def batch_begin(self) -> None:
@@ -250,6 +256,8 @@ class Training(NewSessionPipeline):
 
     def batch_produce(self) -> None:
         """Read the next batch, or have the environments generate it and the dataset store it."""
+        if self._epoch_batches is None:
+            self._begin_epoch()
         self.batch = self.data.next_batch()
         if self.data.produces:  # the normalization grows with the samples
             self.learner.bind(self.data.fields, self.data.normalization())
@@ -277,6 +285,11 @@ class Training(NewSessionPipeline):
     def batch_count(self) -> None:
         """Count the batch and record its losses."""
         self.batch_id += 1
+        self._record_batch()
+
+    def _record_batch(self) -> None:
+        """Record the batch's losses."""
+        self._recorded = self.losses
         values = self._record.add(self.losses)
         if not self._told_fields:
             self.observers.fields(list(self.learner.fields.values()))
@@ -299,12 +312,15 @@ class Training(NewSessionPipeline):
         """Called after each batch."""
 
     def epoch_count(self) -> None:
-        """Count the epoch."""
+        """Count the epoch, validate, and record its losses."""
         self.epoch_id += 1
-        self.batch_id = 0
+        self._finish_epoch()
 
-    def epoch_end(self) -> None:
-        """Validate, record the epoch's losses, and write a checkpoint if configured."""
+    def _finish_epoch(self) -> None:
+        """Validate, record the epoch's losses, and note the best network, unless that is done."""
+        if self._epoch_batches is None:
+            return
+        self._epoch_batches, self.batch_id = None, 0
         values = self._record.take_epoch()
         self.training_loss = values.get("loss/training", float("nan"))
         if self.learner.learning_rate is not None:
@@ -325,8 +341,16 @@ class Training(NewSessionPipeline):
             self.learner.epoch_end(judged)
         except DivergedError as error:
             raise self._diverged(f"{error}", 0) from None
+
+    def epoch_end(self) -> None:
+        """Called after each epoch, when its losses are known; before its checkpoint is written."""
+
+    def _leave_epoch(self, interrupt: Interrupt) -> None:
+        """Write a checkpoint if one is due; after a signal, end."""
         if self.network_config.save_each_epoch and self.epoch_id < self.epoch_nb:
             self.save_checkpoint()
+        if self.group.any(bool(interrupt)):
+            self._end_early(interrupt)
 
     def _validate(self, values: dict[str, float]) -> float:
         losses = self.validate()
@@ -341,6 +365,9 @@ class Training(NewSessionPipeline):
         return self.validation_loss
 
     def train_end(self) -> None:
+        """Called after the last epoch; before the last checkpoint is written."""
+
+    def _finish(self) -> None:
         """Write the last checkpoint and report an early stop."""
         self.observers.end()
         if self.stopped and self._leads:
@@ -471,6 +498,14 @@ class Training(NewSessionPipeline):
             self.session.note(text)
         self._met_nan = True
 
+    def _close(self, kind: Any, error: BaseException | None, trace: Any) -> None:
+        """Keep what was trained since the last checkpoint, by `execute` or by a user's own loop."""
+        with deferred_interrupt():
+            if isinstance(error, (Exception, SystemExit)) and not isinstance(error, Terminated):
+                self._save_after(error)
+            elif error is None and self._saved != (self.epoch_id, self.batch_id):
+                self._finish()
+
     # Opening --------------------------------------------------------------------------------
 
     def _open(self, resources: contextlib.ExitStack) -> None:
@@ -514,6 +549,11 @@ class Training(NewSessionPipeline):
         )
         self.data = opening.open(resources, dataset)
         self._prepare_learner(start)
+        resources.push(self._close)
+
+    def _begin(self) -> None:
+        self.epoch_id, self.batch_id = self._resumed.epoch, self._resumed.batch
+        self._epoch_batches, self.batch = None, {}
 
     def _begin_at(self, start: Start) -> None:
         """Start at the first batch, or where a checkpoint was written."""
