@@ -12,7 +12,7 @@ import torch
 from physx_core import Field
 from physx_core.errors import ConfigError, FieldsMismatchError
 from physx_torch.choices import make_activation
-from physx_torch.networks.network import TorchNetwork
+from physx_torch.networks.network import TorchNetwork, reject_complex
 
 
 class FC(TorchNetwork):
@@ -81,6 +81,7 @@ class FC(TorchNetwork):
                 values in the fields differs from the size of the first or last layer.
         """
         super().bind(fields)
+        reject_complex(self, fields)
         self._check("first", self.sizes[0], {name: fields[name] for name in self.net_fields})
         targets = {name: fields[name] for name in self.opt_fields}
         self._check("last", self.sizes[-1], targets)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
@@ -9,11 +10,12 @@ from typing import Any, ClassVar
 import numpy as np
 import torch
 
-from physx_core import Network
+from physx_core import Field, Network
 from physx_core.components import Group, options_of
 from physx_core.errors import (
     ConfigError,
     FieldsMismatchError,
+    FieldTypeError,
     MissingFieldError,
     UnknownOptionError,
     UsageError,
@@ -23,6 +25,10 @@ from physx_core.typing import Array, Batch, Tensors
 from physx_torch.devices import find_device
 from physx_torch.parallel import join_group
 from physx_torch.storage.parameters import check_match, read_shapes, read_tensors, write_tensors
+
+_ABOUT_TYPES = re.compile("type|implemented for")
+"""Matches torch's errors about the types of tensors."""
+_WIDEST = {"f": 8, "c": 16}
 
 DATA_TYPES = {"float32": torch.float32, "float64": torch.float64}
 """Floating-point types that a network can compute in, by name."""
@@ -171,9 +177,33 @@ class TorchNetwork(torch.nn.Module, Network):
 
     def __call__(self, *inputs: Any) -> Any:
         """Return the result of ``forward`` for the tensors of `net_fields`."""
-        if self.training and self._training_forward is not None:
-            return self._training_forward(*inputs)
-        return super().__call__(*inputs)
+        try:
+            if self.training and self._training_forward is not None:
+                return self._training_forward(*inputs)
+            return super().__call__(*inputs)
+        except (RuntimeError, TypeError) as error:
+            found = self._find_other_types(inputs) if _ABOUT_TYPES.search(str(error)) else None
+            if found is None:
+                raise
+            raise found from error
+
+    def _find_other_types(self, inputs: Iterable[torch.Tensor]) -> FieldTypeError | None:
+        """Return the error for inputs that are not real numbers; None if all are."""
+        others = {
+            name: str(tensor.dtype).removeprefix("torch.")
+            for name, tensor in zip(self.net_fields, inputs, strict=False)
+            if isinstance(tensor, torch.Tensor) and not tensor.is_floating_point()
+        }
+        if not others:
+            return None
+        text = ", ".join(f'"{name}" ({kind})' for name, kind in others.items())
+        return FieldTypeError(
+            f"{type(self).__name__}.forward() does not accept the types of its inputs: {text}. "
+            "Integers, booleans and complex numbers are passed as such, for embeddings, masks and "
+            "complex layers. To compute with them as real numbers, convert them in forward(), for "
+            "example x.to(torch.float32), or store them as floating-point numbers.",
+            field=next(iter(others)),
+        )
 
     def set_training_forward(self, forward: Callable[..., Any] | None) -> None:
         """Replace ``forward`` in training mode; None: do not replace it.
@@ -301,23 +331,58 @@ class TorchNetwork(torch.nn.Module, Network):
     def numpy_to_tensor(self, batch: Batch) -> Tensors:
         """Return arrays as tensors on the network's device.
 
-        Floating-point arrays are converted to the network's data type; integers, booleans and
-        complex numbers keep theirs. On the CPU, writable arrays of the right type share memory.
+        Floating-point arrays of any precision are converted to the network's data type, complex
+        ones to the complex type of that precision, integers to int64, which indices and class
+        labels need; booleans stay booleans. On the CPU, writable arrays of the right type share
+        memory.
 
         Args:
             batch: Arrays by field, each of shape (samples, *field shape).
-        """
-        return {name: self._tensor(array) for name, array in batch.items()}
 
-    def _tensor(self, array: Array) -> torch.Tensor:
+        Raises:
+            FieldTypeError: If an integer does not fit into int64.
+        """
+        return {name: self._tensor(name, array) for name, array in batch.items()}
+
+    def _tensor(self, name: str, array: Array) -> torch.Tensor:
+        kind = array.dtype.kind
+        if kind in "iu" and array.dtype != np.int64:
+            array = _to_int64(name, array)
+        elif array.dtype.itemsize > _WIDEST.get(kind, np.inf):  # unknown to torch
+            array = array.astype(np.float64 if kind == "f" else np.complex128)
         tensor = torch.from_numpy(_to_compatible(array))
-        if tensor.is_floating_point():
-            return tensor.to(self.device, self.data_type)
-        return tensor.to(self.device)
+        return _to_precision(tensor, self.data_type).to(self.device)
 
     def tensor_to_numpy(self, tensors: Tensors) -> Batch:
         """Return tensors as arrays; those on the CPU share memory."""
         return {name: tensor.numpy(force=True) for name, tensor in tensors.items()}
+
+
+def _to_int64(name: str, array: Array) -> Array:
+    if array.dtype.kind == "u" and array.dtype.itemsize == 8 and array.size:
+        largest = array.max()
+        if largest > np.iinfo(np.int64).max:
+            raise FieldTypeError(
+                f'The field "{name}" contains {largest}, which does not fit into int64, the type '
+                "of integers in networks: store it as floating-point numbers.",
+                field=name,
+            )
+    return array.astype(np.int64)
+
+
+def reject_complex(network: TorchNetwork, fields: Mapping[str, Field]) -> None:
+    """Check that a network that computes with real numbers has no complex fields.
+
+    Raises:
+        FieldsMismatchError: If it has.
+    """
+    names = (*network.net_fields, *network.opt_fields)
+    found = [name for name in names if np.dtype(fields[name].dtype).kind == "c"]
+    if found:
+        text = "complex: store its real and imaginary parts as fields"
+        raise FieldsMismatchError(
+            f"{type(network).__name__} computes with real numbers", dict.fromkeys(found, text)
+        )
 
 
 def _to_compatible(array: Array) -> Array:

@@ -19,7 +19,7 @@ from physx_torch.networks.grid import (
     grid_size,
     make_border,
 )
-from physx_torch.networks.network import TorchNetwork
+from physx_torch.networks.network import TorchNetwork, reject_complex
 
 Modules = list[torch.nn.Module]
 
@@ -179,6 +179,7 @@ class UNet(TorchNetwork):
                 channels of the fields differs from the network's.
         """
         super().bind(fields)
+        reject_complex(self, fields)
         mine = {name: fields[name] for name in (*self.net_fields, *self.opt_fields)}
         self.size = self._given_size or self._size_of(mine[self.net_fields[0]])
         wrong = find_mismatches(mine, self.size)

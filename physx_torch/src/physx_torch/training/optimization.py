@@ -76,6 +76,21 @@ def _pairs(network: TorchNetwork) -> Iterable[tuple[str, str]]:
     return zip(predicted, targets, strict=True)
 
 
+def _as_target(target: torch.Tensor, prediction: torch.Tensor, loss: Loss) -> torch.Tensor:
+    """Return integers and booleans as numbers if they have the prediction's shape, else as labels.
+
+    Args:
+        target: The target.
+        prediction: What it is compared with.
+        loss: The loss function, which may need labels of the prediction's shape.
+    """
+    if target.is_floating_point() or target.is_complex():
+        return target
+    if target.shape != prediction.shape or isinstance(loss, torch.nn.MultiLabelMarginLoss):
+        return target.to(torch.int64)
+    return target.to(prediction.dtype)
+
+
 class TorchOptimization(Optimization):
     """Gradient descent with any PyTorch loss, optimizer and scheduler.
 
@@ -151,6 +166,7 @@ class TorchOptimization(Optimization):
         self._loss_kwargs = dict(loss_kwargs or {})
         self._network: TorchNetwork | None = None
         self._scaler: torch.amp.GradScaler | None = None
+        self._sums = False
         self._learned_by_loss: dict[str, torch.nn.Parameter] = {}
         self._shared: torch.nn.Module | None = None  # what all processes have in common
         self._total = (0, 0)  # epochs of the training, batches in each
@@ -181,6 +197,8 @@ class TorchOptimization(Optimization):
         if not callable(chosen):
             raise ConfigError(f"The loss {loss!r} cannot be called with prediction and target.")
         self.loss = chosen
+        options = getattr(chosen, "keywords", {})  # of a functools.partial
+        self._sums = getattr(chosen, "reduction", options.get("reduction")) == "sum"
         self._place_loss()
         if self.optimizer is not None and self._learned_by_loss:
             self.optimizer.add_param_group({"params": list(self._learned_by_loss.values())})
@@ -337,7 +355,7 @@ class TorchOptimization(Optimization):
             if pred.shape != target.shape and target.is_floating_point():
                 text = f'shape {tuple(pred.shape)}, but "{opt_name}" has {tuple(target.shape)}'
                 raise FieldsMismatchError("Prediction and target differ", {pred_name: text})
-            losses.append(self.loss(pred, target))
+            losses.append(self.loss(pred, _as_target(target, pred, self.loss)))
         return losses[0] if len(losses) == 1 else torch.stack(losses).mean()
 
     def compute_row_losses(self, batch: PredictedBatch) -> torch.Tensor:
@@ -356,20 +374,23 @@ class TorchOptimization(Optimization):
             # With gradients, which the loss of a subclass may need.
             return torch.stack([self.compute_loss(batch[row : row + 1]).detach() for row in rows])
         with torch.no_grad():
-            losses = [
-                by_row(batch.prediction[pred_name], batch.targets[opt_name])
-                for pred_name, opt_name in _pairs(self._network)
-            ]
+            losses = []
+            for pred_name, opt_name in _pairs(self._network):
+                pred, target = batch.prediction[pred_name], batch.targets[opt_name]
+                losses.append(by_row(pred, _as_target(target, pred, self.loss)))
             flat = [loss.reshape(len(loss), -1).mean(1) for loss in losses]
             return torch.stack(flat).mean(0)
 
     def transform_loss(self, loss: torch.Tensor, batch: PredictedBatch) -> dict[str, Any]:
-        """Return ``{"loss": <number>}``."""
-        if loss is self._known[0]:  # already read: on a GPU, reading it again waits for the step
-            number = self._known[1]
-            self._known = (None, 0.0)
-            return {"loss": number}
-        return {"loss": loss.item()}
+        """Return ``{"loss": <number>}``, for a loss with the reduction "sum" per sample.
+
+        Losses are thus comparable, whatever the sizes of the batches.
+        """
+        number = self._known[1]
+        if loss is not self._known[0]:  # on a GPU, reading it again would wait for the step
+            number = loss.item()
+        self._known = (None, 0.0)
+        return {"loss": number / len(next(iter(batch.data.values()))) if self._sums else number}
 
     def optimize(self, loss: torch.Tensor) -> None:
         """Update the parameters along the gradient of the loss, or of the mean of several batches.
