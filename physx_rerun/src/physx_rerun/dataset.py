@@ -16,6 +16,7 @@ from physx_core import Dataset, Field
 from physx_core.errors import printable
 from physx_core.typing import Array
 from physx_rerun.drawing import colors
+from physx_rerun.drawing.legends import legend
 
 TIMELINE = "row"
 """Timeline of the recording: the number of the row in its mode."""
@@ -168,7 +169,8 @@ def _views(columns: Sequence[_Column], instances: Sequence[int]) -> Iterator[rrb
     for column in columns:
         if column.is_curve:
             entities = [column.entity(instance) for instance in instances]
-            yield rrb.TimeSeriesView(contents=entities, name=column.title)
+            shown = legend(math.prod(column.shape) * len(entities))
+            yield rrb.TimeSeriesView(contents=entities, name=column.title, plot_legend=shown)
         elif not column.is_cloud(3) and not column.is_cloud(2):
             for instance in instances:
                 name = f"instance {instance}: {column.title}"

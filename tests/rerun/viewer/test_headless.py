@@ -10,7 +10,7 @@ from PIL import Image, ImageSequence
 from physx_core.components import Factory
 from physx_core.errors import ConfigError, VisualizerError
 from physx_rerun.viewer import viewer
-from physx_rerun.viewer.headless import render_film, render_picture
+from physx_rerun.viewer.headless import choose_timeline, render_film, render_picture
 
 
 @pytest.fixture
@@ -82,6 +82,21 @@ def test_headless_mode_leaves_a_picture(opened, tmp_path):
     visualizer.close()
     assert f"picture: {tmp_path / 'run.png'}" in visualizer.outputs()
     assert pixels(tmp_path / "run.png").shape == (200, 320, 3)
+
+
+@pytest.mark.parametrize(
+    ("known", "chosen"),
+    [
+        (["time", "step", "sim_time"], "step"),
+        (["time", "epoch", "batch"], "epoch"),
+        (["step", "time", "batch"], "time"),
+        (["epoch", "row", "time"], "time"),
+        (["step", "batch"], "step"),
+        (["frame"], "frame"),
+    ],
+)
+def test_scenes_and_curves_of_a_training_are_shown_on_a_timeline_that_both_have(known, chosen):
+    assert choose_timeline(known) == chosen
 
 
 @pytest.mark.usefixtures("vulkan")

@@ -16,6 +16,8 @@ from physx_gym.bridge.make_env import make_env
 from physx_gym.bridge.policy import single_action
 from physx_gym.spaces import SpaceFields
 
+_PICTURE = "picture"
+
 
 class GymEnvironment(Environment):
     """Stores the transitions of a Gymnasium environment, as in ``"gym/CartPole-v1"``.
@@ -75,11 +77,44 @@ class GymEnvironment(Environment):
             ]
         )
 
+    def init_visualization(self) -> None:
+        """Draw a robot, or show the pictures that another environment renders.
+
+        Raises:
+            ConfigError: If it renders no pictures.
+        """
+        from physx_gym.env.robot_env import RobotEnv
+        from physx_gym.show.environment_drawing import EnvironmentDrawing
+
+        env = self.env.unwrapped
+        self._show: Callable[[], None]
+        self._begin_episode()  # a world exists only then
+        if isinstance(env, RobotEnv):
+            self.step_time = env.step_dt
+            self._show = EnvironmentDrawing(env, self.factory).draw
+        elif self.env.render_mode == "rgb_array":
+            self.factory.add_image(_PICTURE, self._render())
+            self._show = lambda: self.factory.update_image(_PICTURE, self._render())
+            return
+        else:
+            raise ConfigError(
+                f"{self._id} cannot be drawn: it is not a robot of physx, and it renders no "
+                'pictures. Have it render them with env_kwargs={"render_mode": "rgb_array"}, if it '
+                "can (--environment.env-kwargs render_mode=rgb_array), or set no visualizer."
+            )
+        self._show()
+
+    def _begin_episode(self) -> None:
+        self._observation, _ = self.env.reset(seed=self._first_seed)
+        self._first_seed = None
+
+    def _render(self) -> Any:
+        return self.env.render()
+
     def step(self) -> None:
         """Generate one transition; start a new episode after the end of the last one."""
         if self._observation is None:
-            self._observation, _ = self.env.reset(seed=self._first_seed)
-            self._first_seed = None
+            self._begin_episode()
         before = self._observations.arrays(self._observation)
         if self.sample:
             action = self._actions.value(self.sample)
@@ -97,6 +132,8 @@ class GymEnvironment(Environment):
             truncated=bool(truncated),
         )
         self._observation = observation
+        if self.factory:
+            self._show()
         if terminated or truncated:
             self._observation = None
             self.new_episode()

@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from physx_core import plugins
 from physx_core.components import Factory, Visualizer
 from physx_core.errors import UnknownOptionError, VisualizerError
-from physx_core.simulation import World
 from physx_gym.defaults import VIEWER
 from physx_gym.show.display import has_display
-from physx_gym.show.drawing import WorldDrawing
+from physx_gym.show.environment_drawing import EnvironmentDrawing
 from physx_gym.show.playable import Drawable
 
 MODES = ("human", "rgb_array")
@@ -64,8 +63,7 @@ class Renderer:
         self._env, self._follow = env, follow
         self._viewer: Visualizer | None = None
         self._factory = Factory()
-        self._drawing: WorldDrawing | None = None
-        self._world: World | None = None
+        self._drawing: EnvironmentDrawing | None = None
         self._frames = 0
 
     def frame(self) -> Picture | None:
@@ -75,27 +73,12 @@ class Renderer:
             A picture, shape (height, width, 3); None in the mode ``"human"``.
         """
         simulator = self._env.simulator
-        poses = simulator.simulation.body_poses()
-        if self._world is not simulator.world:
+        if self._drawing is not None and self._drawing.world is not simulator.world:
             self.close()
         if self._drawing is None or self._viewer is None:
-            self._world, self._factory = simulator.world, Factory()
-            self._viewer = self._open()
-            backend = plugins.resolve("backend", simulator.backend)
-            self._drawing = WorldDrawing(
-                self._factory,
-                simulator.world,
-                backend,
-                simulator.layout,
-                type(self._env).__name__,
-                follow=self._follow,
-                view=self._env.view,
-            )
-            self._drawing.add(poses)
-            self._env._draw(self._factory)
-        else:
-            self._drawing.move(poses)
-            self._env._redraw(self._factory)
+            self._factory, self._viewer = Factory(), self._open()
+            self._drawing = EnvironmentDrawing(self._env, self._factory, follow=self._follow)
+        self._drawing.draw()
         self._factory.set_time(simulator.simulation.time)
         self._viewer.events(1, self._frames, self._factory.take_events())
         self._frames += 1
@@ -120,4 +103,4 @@ class Renderer:
             self._drawing.close()
         if self._viewer is not None:
             self._viewer.close()
-        self._drawing = self._viewer = self._world = None
+        self._drawing = self._viewer = None

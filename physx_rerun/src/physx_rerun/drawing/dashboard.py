@@ -16,9 +16,9 @@ from physx_core.fields import Field
 from physx_core.typing import Array
 from physx_rerun.drawing import colors
 from physx_rerun.drawing.chunks import ChunkBuilder, Times
+from physx_rerun.drawing.legends import legend
 
 _BINS = 30
-_LEGEND = 8  # largest number of names in a plot's legend
 _POINTS = 2000  # largest number of predicted values shown per field
 _FIELDS, _PREDICTIONS = "fields", "predictions"
 _RUN = "run"
@@ -204,11 +204,10 @@ class Dashboard:
     def _view(self, title: str) -> rrb.View:
         plot = self._plots[title]
         logarithms = plot.logarithms if plot.is_positive else []
-        visible = len(plot.curves) <= _LEGEND
         return rrb.TimeSeriesView(
             name=f"{title} (log10)" if logarithms else title,
             contents=logarithms or plot.curves,
-            plot_legend=rrb.PlotLegend(rrb.Corner2D.RightTop, visible=visible),
+            plot_legend=legend(len(plot.curves)),
             axis_x=rrb.TimeAxis(view_range=_ALL),
             axis_y=rrb.ScalarAxis(range=(0.0, plot.highest)) if plot.highest else None,
         )

@@ -13,13 +13,13 @@ import rerun.blueprint as rrb
 from physx_core.typing import Array
 from physx_rerun.drawing.chunks import SIM_TIME, TIME
 from physx_rerun.drawing.framing import Frame
+from physx_rerun.drawing.legends import legend
 
 _BACKGROUND = (25, 28, 36)
 _GRID = (58, 63, 76)
 
 _ROW = 3  # largest number of scenes next to each other
 _COLUMN = 4  # largest number of plots in a column
-_LEGEND = 8  # largest number of names in a plot's legend
 
 _Window = type[rrb.Spatial2DView | rrb.TensorView]
 Container = rrb.Grid | rrb.Vertical | rrb.Horizontal | rrb.Tabs
@@ -151,7 +151,7 @@ class WindowLayout:
             parts.append(rrb.Grid(*scenes, grid_columns=columns))
             shares.append(3)
         if plots and (len(plots) > _COLUMN or not scenes):
-            parts.append(rrb.Grid(*plots, grid_columns=math.ceil(math.sqrt(len(plots)))))
+            parts.append(_rows_of(plots))
             shares.append(3)
             plots = []
         if plots or texts:
@@ -219,7 +219,13 @@ class WindowLayout:
         )
 
 
+def _rows_of(plots: Sequence[rrb.View | Container]) -> Container:
+    """Return plots in rows of a square; unlike in a grid, those of the last row fill it."""
+    count = math.ceil(math.sqrt(len(plots)))
+    rows = [plots[first : first + count] for first in range(0, len(plots), count)]
+    return rrb.Vertical(*(rrb.Horizontal(*row) for row in rows))
+
+
 def _plot_view(name: str, curves: Mapping[str, int]) -> rrb.TimeSeriesView:
-    visible = sum(curves.values()) <= _LEGEND
-    legend = rrb.PlotLegend(rrb.Corner2D.RightTop, visible=visible)
-    return rrb.TimeSeriesView(name=name, contents=list(curves), plot_legend=legend)
+    shown = legend(sum(curves.values()))
+    return rrb.TimeSeriesView(name=name, contents=list(curves), plot_legend=shown)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -13,12 +13,14 @@ from rerun.experimental import ViewerClient
 
 from physx_core.errors import ConfigError, VisualizerError
 from physx_core.processes import TemporaryFolder
+from physx_rerun.drawing.chunks import TIME
 from physx_rerun.viewer.viewer import Viewer
 
 T = TypeVar("T")
 _TOP_BAR = 36  # height of the viewer's menu bar in pixels, which is cropped
 _QUIET_SECONDS = 0.4  # without a change of state, after which everything counts as loaded
-_TIMELINES = ("step", "row", "epoch", "batch")  # in order of preference
+_SCENES, _CURVES = ("step", "row"), ("epoch", "batch")
+_TIMELINES = (*_SCENES, *_CURVES)  # in order of preference
 _NOTES = 30  # frames after which the viewer's startup notifications are gone
 _QUALITY = 60  # of a film's pictures, from 0 to 100
 _PATIENCE = 5  # equal pictures in a row, after which missing assets are ignored
@@ -39,7 +41,7 @@ def render_picture(
         png_path: Picture to write.
         size: Width and height in pixels.
         at: Position on the timeline, in s on ``sim_time`` and ``time``; None: its end.
-        timeline: Name of the timeline; None: ``step`` if there is one.
+        timeline: Name of the timeline; None: see `choose_timeline`.
         timeout: Time limit in s.
 
     Returns:
@@ -74,7 +76,7 @@ def render_film(
         frames: Number of pictures, at equal distances from the start to the end of the timeline,
             both included.
         frame_rate: Pictures per second.
-        timeline: Name of the timeline; None: ``step`` if there is one.
+        timeline: Name of the timeline; None: see `choose_timeline`.
         timeout: Time limit in s.
 
     Returns:
@@ -96,6 +98,20 @@ def render_film(
     duration = round(1000 / frame_rate)
     first.save(film_path, save_all=True, append_images=others, duration=duration, **look)
     return film_path
+
+
+def choose_timeline(known: Collection[str]) -> str:
+    """Return the timeline on which most of a recording is visible.
+
+    Scenes are on ``step`` or ``row``, the curves of a training on ``epoch`` and ``batch``, and all
+    of them on ``time``: a recording with both is empty in part on any other.
+
+    Args:
+        known: The recording's timelines.
+    """
+    if TIME in known and any(n in known for n in _SCENES) and any(n in known for n in _CURVES):
+        return TIME
+    return next((name for name in _TIMELINES if name in known), next(iter(known)))
 
 
 def _pictures(
@@ -180,7 +196,7 @@ class Camera:
         state = self._request(self._client.get_state)
         known = {line.name: line for line in state.recordings[0].timelines}
         if timeline is None:
-            timeline = next((name for name in _TIMELINES if name in known), next(iter(known)))
+            timeline = choose_timeline(known)
         if timeline not in known:
             raise VisualizerError(
                 f'The recording has no timeline "{timeline}". Timelines: {", ".join(known)}.'
