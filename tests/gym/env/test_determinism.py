@@ -5,11 +5,16 @@ import pickle
 import runpy
 import subprocess
 import sys
+from collections import deque
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from physx_core.errors import SimulationError
 from physx_core.simulation import Encoder, Imu, Motor
 from physx_gym import Layer, RobotEnv
 from physx_gym.spaces import copy_tree
@@ -95,6 +100,158 @@ def test_snapshots(backend):
     env.stop()
     env.restore(state)
     assert env.is_simulation_running and onward(env, actions) == first
+
+
+class Tally:
+    """An object of a user's, without methods for copying."""
+
+    def __init__(self):
+        self.count, self.rows = 0, [np.zeros(2)]
+
+
+class Wandering(RobotEnv):
+    """Its future depends on attributes of every kind, which methods change in every way."""
+
+    def __init__(self, backend, drawn, **options):
+        self.changes, self.goal = list(drawn), np.zeros(2)
+        super().__init__("cartpole", 0.04, backend=backend, **options)
+
+    def _initialize_buffers(self):
+        self.goal[:] = self.np_random.uniform(-1, 1, 2)
+        self.part, self.positions = self.goal[1:], self.robot_state.q
+        self.target = self.previous = self.goal.copy()
+        self.random, self.shared = np.random.default_rng(5), self.np_random
+        self.table = {"rows": [self.goal * 2, {"last": self.positions[:1]}], "n": 0}
+        self.recent, self.names = deque(maxlen=3), {"start"}
+        self.tally = Tally()
+        self.alias = self.tally.rows
+        self.mode = self.forward
+        self.register_variable("goal", self.goal)
+
+    def forward(self):
+        return 1.0
+
+    def backward(self):
+        return -1.0
+
+    def _refresh_buffers(self):
+        if self.num_steps > 0:
+            getattr(self, f"change_{self.changes[int(self.num_steps) % len(self.changes)]}")()
+
+    def change_place(self):
+        self.goal += self.random.uniform(-0.1, 0.1, 2)
+        self.tally.rows[0][:] += self.goal
+
+    def change_binding(self):
+        self.previous, self.target = self.target, self.target + self.shared.uniform(-1, 1, 2)
+        self.positions = self.positions.copy()
+
+    def change_containers(self):
+        self.table["n"] += 1
+        self.table["rows"].append(self.target)
+        self.recent.append(float(self.goal[0]))
+        self.names = self.names | {str(self.table["n"])}
+
+    def change_objects(self):
+        self.tally.count += 1
+        self.alias.append(self.target.copy())
+        self.mode = self.backward if self.mode == self.forward else self.forward
+
+    def change_members(self):
+        if hasattr(self, "late"):
+            del self.late
+        else:
+            self.late = Tally()
+        self.positions = self.robot_state.q
+
+    def compute_reward(self, terminated, info):
+        rows = [np.ravel(each) for each in (*self.table["rows"][:1], *self.tally.rows[-2:])]
+        last = self.table["rows"][1]["last"]
+        parts = (*rows, self.goal, self.part, self.positions, self.target, self.previous, last)
+        numbers = (self.table["n"], self.tally.count, len(self.names), sum(self.recent))
+        own = sum(float(np.sum(np.sin(each))) for each in parts)
+        return own + sum(numbers) + self.mode() + hasattr(self, "late")
+
+
+WAYS = ("place", "binding", "containers", "objects", "members")
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.lists(st.sampled_from(WAYS), min_size=1, max_size=6), st.integers(0, 5))
+def test_a_snapshot_has_the_future_of_a_copy(changes, steps):
+    """Whatever attributes a subclass has, and however it changes them."""
+    env = Wandering("dart", changes)
+    env.reset(seed=3)
+    actions = [env.action_space.sample() for _ in range(6)]
+    for action in actions[:steps]:
+        env.step(action)
+    state = env.snapshot()
+    copies = [copy.deepcopy(env), unpickled(env)]
+    goal = env.goal
+    first = onward(env, actions)
+    assert [onward(each, actions) for each in copies] == [first, first]
+    for each in (state, unpickled(state), copy.deepcopy(state)):
+        env.restore(each)
+        assert env.goal is goal and np.shares_memory(env.part, goal)
+        assert env.alias is env.tally.rows and env.shared is env.np_random
+        last = env.table["rows"][1]["last"]
+        assert np.shares_memory(last, env.robot_state.q)
+        assert onward(env, actions) == first
+    other = Wandering("dart", changes)
+    other.restore(unpickled(state))
+    assert np.shares_memory(other.table["rows"][1]["last"], other.robot_state.q)
+    assert onward(other, actions) == first
+
+
+def test_a_layer_takes_its_attributes_along(backend):
+    class Ramp(Layer):
+        def _initialize_buffers(self):
+            super()._initialize_buffers()
+            self.height, self.below = np.zeros(1), self.env
+
+        def compute_reward(self, terminated, info):
+            self.height = self.height + 0.5
+            return float(self.height[0])
+
+    env = Ramp(make(backend))
+    env.reset(seed=0)
+    action = env.action_space.sample()
+    state = env.snapshot()
+    rewards = [env.step(action)[1] for _ in range(3)]
+    env.restore(state)
+    assert [env.step(action)[1] for _ in range(3)] == rewards == [0.5, 1.0, 1.5]
+    assert env.below is env.env
+
+
+def test_what_a_snapshot_cannot_take_along_is_named(backend, tmp_path):
+    class Noting(RobotEnv):
+        pass
+
+    env = Noting("cartpole", 0.04, backend=backend)
+    env.reset(seed=0)
+    with (tmp_path / "notes").open("w") as env.notes:
+        with pytest.raises(
+            SimulationError, match=r"Noting\.notes along.*constants = \(\"notes\",\)"
+        ):
+            env.snapshot()
+
+        class Silent(Noting):
+            constants = ("notes",)
+
+        env = Silent("cartpole", 0.04, backend=backend)
+        env.reset(seed=0)
+        env.notes = tmp_path
+        env.restore(env.snapshot())
+        assert env.notes == tmp_path
+
+
+def test_registered_environments_have_no_attributes_to_take_along():
+    """They say what changes, so that their snapshots are as fast as they can be."""
+    for id in [id for id in gymnasium.registry if id.startswith("physx/")]:
+        env = gymnasium.make(id).unwrapped
+        env.reset(seed=0)
+        env.step(env.action_space.sample())
+        assert [own["attributes"] for own in env.snapshot()["own"]] == [{}], id
 
 
 @pytest.mark.parametrize("way", [copy.deepcopy, unpickled])

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import gymnasium
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from physx_core.simulation import Part
 from physx_core.typing import Vector
+from physx_gym.env import own_state
 from physx_gym.shared_arrays import SharedArrays
 from physx_gym.simulator.simulator import Simulator
 from physx_gym.simulator.states import RobotState, StepperState
@@ -48,6 +49,10 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         control_dt: Time between two commands, in s; for a layer, between two of its own.
         observe_dt: Time between two observations within a step, in s; likewise.
     """
+
+    constants: ClassVar[tuple[str, ...]] = ()
+    """Names of the attributes of this class that snapshots leave out: they never change during an
+    episode, or `_memory` has them. A subclass names only its own."""
 
     observation: Any
     action: Any
@@ -321,9 +326,14 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
     # State -----------------------------------------------------------------------------------
 
     def snapshot(self) -> Any:
-        """Return everything that `restore` needs to continue exactly from here, as plain data.
+        """Return everything that `restore` needs to continue exactly from here.
 
-        It contains the simulation, all random generators, and every layer up to this one.
+        It contains the simulation, all random generators, and every layer up to this one, with the
+        attributes that subclasses have added: arrays, numbers, random generators, containers and
+        objects of these, but for those named in `constants`. It can be pickled if they can.
+
+        Raises:
+            SimulationError: If an attribute cannot be copied, such as a file or a generator.
         """
         layers = self.layers
         return {
@@ -340,9 +350,10 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         """
 
     def _memory(self) -> Any:
-        """Return what this layer itself keeps from one step to the next, as plain data.
+        """Return what this layer keeps from one step to the next besides its attributes.
 
-        Override it together with `_recall`; None: nothing.
+        Override it together with `_recall` for state that is not in attributes, or in attributes
+        that cannot be copied, which `constants` names; None: nothing.
         """
         return None
 
@@ -365,12 +376,14 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         return {
             "action": copy_tree(self.action),
             "observation": copy_tree(self.observation),
+            "attributes": own_state.take(self),
             "memory": copy_tree(self._memory()),
         }
 
     def _restore_own(self, own: dict[str, Any]) -> None:
         self.action = fill(self.action, own["action"])
         self.observation = fill(self.observation, own["observation"])
+        own_state.put_back(self, own["attributes"])
         self._recall(copy_tree(own["memory"]))
 
 

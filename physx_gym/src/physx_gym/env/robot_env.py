@@ -59,6 +59,14 @@ class RobotEnv(PipelineEnv):
     """``eye`` and ``target`` of the camera that `render` uses, in m; by default it shows all
     objects."""
 
+    constants: ClassVar[tuple[str, ...]] = (
+        *("simulator", "robot", "robot_state", "stepper_state", "measurements", "num_steps"),
+        *("is_simulation_running", "action_space", "observation_space", "action", "observation"),
+        *("render_mode", "debug", "step_dt", "metadata", "simulation_duration_max", "control_dt"),
+        *("observe_dt", "reset_options", "viewer_kwargs", "recorder", "_control_loop", "_spec"),
+        *("_outermost", "_own_renderer", "_own_quantities", "_is_training", "_has_left_space"),
+        *("_flat_observation", "_observed_index", "_np_random", "_np_random_seed"),
+    )
     _spec: EnvSpec | None = None
     _left_out: ClassVar[frozenset[str]] = frozenset({"_outermost", "_own_renderer"})
 

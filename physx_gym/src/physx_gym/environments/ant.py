@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -36,6 +36,11 @@ class AntEnv(RobotEnv):
     advantage estimation", 2015, with another robot. Options have the same names as in Gymnasium's
     ``Ant-v5``.
     """
+
+    constants: ClassVar[tuple[str, ...]] = (
+        *("_forward_weight", "_effort_weight", "_healthy_reward", "_terminates", "_noise"),
+        *("_lowest", "_highest", "_first_seen", "_strength", "_place", "_before"),
+    )
 
     def __init__(
         self,

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -37,6 +37,8 @@ class ArmReachEnv(GoalTask):
     """
 
     ACHIEVED, CLOSE = slice(14, 17), 0.05
+
+    constants: ClassVar[tuple[str, ...]] = ("goal", "_still", "_lower", "_upper", "_target")
 
     def __init__(self, *, backend: Any = BACKEND, **options: Any) -> None:
         """Create the environment.

@@ -45,6 +45,8 @@ class GoalEnv(GoalTask):
     ``"desired_goal"``. The reward depends only on the two goals, and no episode terminates.
     """
 
+    constants: ClassVar[tuple[str, ...]] = ("_flat", "_is_sparse")
+
     def __init__(self, *, reward_type: str = "sparse", **options: Any) -> None:
         """Create the environment.
 

@@ -38,6 +38,8 @@ class OneMotorEnv(RobotEnv):
     STEP: ClassVar[float]
     DURATION: ClassVar[float]
 
+    constants: ClassVar[tuple[str, ...]] = ("continuous",)
+
     def __init__(self, *, backend: Any = "dart", continuous: bool = False, **options: Any) -> None:
         """Create the environment.
 

@@ -43,6 +43,8 @@ class PushBoxEnv(GoalTask):
         "target": (0.0, 0.0, 0.1),
     }
 
+    constants: ClassVar[tuple[str, ...]] = ("goal", "_box")
+
     def __init__(self, *, backend: Any = BACKEND, **options: Any) -> None:
         """Create the environment.
 

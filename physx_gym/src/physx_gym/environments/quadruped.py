@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 from gymnasium import spaces
@@ -40,6 +40,15 @@ class QuadrupedEnv(RobotEnv):
     step, in m/s. An episode terminates if the trunk is below 0.12 m or leans by more than 1 rad,
     and is truncated after 1000 steps of 20 ms.
     """
+
+    constants: ClassVar[tuple[str, ...]] = (
+        "speed",
+        "_stand",
+        "_previous",
+        "_haste",
+        "_place",
+        "_before",
+    )
 
     def __init__(self, *, backend: Any = BACKEND, speed: float = 0.6, **options: Any) -> None:
         """Create the environment.

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 from gymnasium import spaces
 
@@ -56,6 +56,10 @@ class BlockLayer(Layer):
         block: The block.
     """
 
+    constants: ClassVar[tuple[str, ...]] = (
+        *("block", "observer", "controller", "augment_observation"),
+        *("_basis", "_build", "_schedule"),
+    )
     block: ObserverBlock | ControllerBlock
 
     def __init__(self, env: PipelineEnv, block: ObserverBlock | ControllerBlock) -> None:

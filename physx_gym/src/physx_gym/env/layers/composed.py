@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 from physx_core.errors import ConfigError
 from physx_gym.env.layers.layer import Layer
@@ -24,6 +24,8 @@ class ComposedEnv(Layer):
         reward: The reward; None: none is added.
         terminations: The terminations.
     """
+
+    constants: ClassVar[tuple[str, ...]] = ("reward", "terminations")
 
     def __init__(
         self,

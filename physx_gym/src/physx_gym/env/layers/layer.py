@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import Any
+from typing import Any, ClassVar
 
 from physx_core.errors import ConfigError
 from physx_core.typing import Vector
@@ -26,13 +26,22 @@ def _property_of_base(name: str) -> property:
 class Layer(PipelineEnv):
     """An environment on top of another one; it forwards what it does not override.
 
-    Attributes that it does not have are looked up in the layer below. Subclasses with memory
-    override `_memory` and `_recall`; those with their own action or observation set both the space
-    and the buffer in `_initialize_action_space` or `_initialize_observation_space`.
+    Attributes that it does not have are looked up in the layer below. Its own are in snapshots: see
+    `PipelineEnv.snapshot`. Subclasses with their own action or observation set both the space and
+    the buffer in `_initialize_action_space` or `_initialize_observation_space`.
 
     Attributes:
         env: The layer below.
     """
+
+    constants: ClassVar[tuple[str, ...]] = (
+        "env",
+        "_base",
+        "action_space",
+        "action",
+        "observation_space",
+        "observation",
+    )
 
     def __init__(self, env: PipelineEnv) -> None:
         """Put a layer on an environment, and make it the outermost of the pipeline.

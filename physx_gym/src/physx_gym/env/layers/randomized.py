@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, ClassVar
 
 import numpy as np
 
@@ -28,6 +28,14 @@ class RandomizedEnv(Layer):
         drawn: Values drawn for the present episode, by the randomizations' names; also in the
             constants of the log, as ``"randomization"``.
     """
+
+    constants: ClassVar[tuple[str, ...]] = (
+        "randomizations",
+        "every",
+        "drawn",
+        "_foreseen",
+        "_nominal_options",
+    )
 
     def __init__(
         self,
