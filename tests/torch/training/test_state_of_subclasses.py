@@ -81,9 +81,9 @@ class GanOptimization(TorchOptimization):
         parts = {"generator": network.generator, "critic": network.critic}
         self.each = {k: torch.optim.Adam(part.parameters(), **kwargs) for k, part in parts.items()}
 
-    def compute_loss(self, prediction, targets, data):
-        critic, fake = self.network.critic, prediction["y"]
-        self.critic_loss = (critic(targets["y"]) - 1).square().mean()
+    def compute_loss(self, batch):
+        critic, fake = self.network.critic, batch.prediction["y"]
+        self.critic_loss = (critic(batch.targets["y"]) - 1).square().mean()
         self.critic_loss = self.critic_loss + critic(fake.detach()).square().mean()
         return (critic(fake) - 1).square().mean()
 
@@ -140,8 +140,8 @@ class Kinds(TorchOptimization):
         self.call = partial(max, 0)
         self.text = collections.Counter()
 
-    def compute_loss(self, prediction, targets, data):
-        self.error = prediction["y"] - targets["y"]
+    def compute_loss(self, batch):
+        self.error = batch.prediction["y"] - batch.targets["y"]
         first, second, third = self.drawn
         noise = first.random() + second.random() + torch.rand(1, generator=third)
         self.steps += 1
@@ -150,7 +150,7 @@ class Kinds(TorchOptimization):
         self.pair[0].add_(1)
         self.text[f"step {self.steps % 2}"] += 1
         scale = 1 + sum(self.recent) * self.steps + self.numbers.sum() + self.pair[0].sum()
-        return super().compute_loss(prediction, targets, data) * float(scale)
+        return super().compute_loss(batch) * float(scale)
 
 
 def test_state_of_every_kind_resumes_bit_for_bit():
@@ -236,9 +236,8 @@ def test_a_loss_set_after_the_optimizer_is_trained_too():
     network, optimization = FC([2, 1]), TorchOptimization()
     optimization.set_optimizer("SGD", network, lr=0.1)
     optimization.set_loss(Learned)
-    tensors = {"input": torch.ones(4, 2), "ground_truth": torch.ones(4, 1)}
-    network.set_train()
-    optimization.optimize(optimization.compute_loss(network.predict(tensors), tensors, tensors))
+    loss = optimization.loss(network(torch.ones(4, 2)), torch.ones(4, 1))
+    optimization.optimize(loss)
     assert optimization.loss.log_variance != 0
 
 
