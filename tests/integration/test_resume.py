@@ -164,5 +164,5 @@ def test_what_cannot_be_resumed(training):
     other = NetworkConfig("toy/linear", network_kwargs={"net_fields": "x", "opt_fields": "y"})
     training(1, session_name="run").execute()
     data = DatasetConfig(existing_dir="data")
-    with pytest.raises(CheckpointError, match="parameters.npz"):
+    with pytest.raises(ConfigError, match="network.network was 'torch/fc' and is now 'toy/linear'"):
         Training(other, data, session_name="run", resume=True, epoch_nb=2, batch_size=5).execute()

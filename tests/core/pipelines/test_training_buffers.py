@@ -16,7 +16,7 @@ from physx_core import (
 from physx_core.checkpoint import BUFFER, read_buffer
 from physx_core.checkpoint import read as read_checkpoint
 from physx_core.cli import main
-from physx_core.errors import CheckpointError, ConfigError, SessionError
+from physx_core.errors import ConfigError, SessionError
 from physx_core.observers import read_scalars
 from physx_core.pipelines import load_learner, read_drawn_rows
 from physx_core.toy import LeastSquares
@@ -185,7 +185,7 @@ def test_a_training_is_made_longer_with_the_rows_of_its_buffer():
 def test_a_training_cannot_be_resumed_with_another_buffer():
     with pytest.raises(RuntimeError, match="cut"):
         train("cut", "reservoir", kind=Cut)
-    with pytest.raises(CheckpointError, match="other options. Resume with the same online"):
+    with pytest.raises(ConfigError, match="online was 'physx/reservoir' and is now 'physx/window'"):
         train("cut", "window", resume=True)
 
 

@@ -163,8 +163,10 @@ def test_a_schedule_that_ends_before_the_training_is_refused():
         train(ONE_CYCLE, 4)
     assert "total_steps=16" in str(caught.value)
     train(ONE_CYCLE, 2)
-    longer = ("OneCycleLR", {"max_lr": 0.05, "total_steps": 16})  # the checkpoint's has 12
     with pytest.raises(ConfigError, match="has 12 steps, but the training takes 16"):
+        train(ONE_CYCLE, 4, resume=True)
+    longer = ("OneCycleLR", {"max_lr": 0.05, "total_steps": 16})
+    with pytest.raises(ConfigError, match=r"scheduler_kwargs was .*12\} and is now .*16\}"):
         train(longer, 4, resume=True)
 
 

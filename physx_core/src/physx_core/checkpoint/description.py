@@ -54,6 +54,9 @@ class Progress:
         record: State of `TrainingRecord`.
         order: The `ReadingOrder` of the stored samples; empty before the first is read, or if they
             are not shuffled.
+        options: Options that a resumed training must have, as returned by `bound_options`; empty
+            if an older physx wrote the checkpoint.
+        data: The data that the network was trained on, as returned by `record_data`; likewise.
     """
 
     epoch: int
@@ -64,6 +67,8 @@ class Progress:
     best: dict[str, Any] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
     order: dict[str, Any] = field(default_factory=dict)
+    options: dict[str, Any] = field(default_factory=dict)
+    data: dict[str, Any] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

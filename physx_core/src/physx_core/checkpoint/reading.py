@@ -231,7 +231,7 @@ def _read(path: Path, *, content: bool = True) -> Checkpoint:
             network={key: plain[key] for key in KEPT if key in plain},
             fields=fields,
             normalization=_read_normalization(path, plain["files"], fields) if content else {},
-            progress=Progress(**plain["progress"]),
+            progress=_parse_progress(plain["progress"]),
             crc=crc32(text),
         )
     except _INVALID as error:
@@ -240,6 +240,18 @@ def _read(path: Path, *, content: bool = True) -> Checkpoint:
         raise UnreadableError(
             f"{DESCRIPTION}{size} does not describe a checkpoint: {reason}"
         ) from error
+    return found
+
+
+def _parse_progress(plain: dict[str, Any]) -> Progress:
+    found = Progress(**plain)
+    for mode in found.data.values():
+        types = [[type(part) for part in each] for each in mode["partitions"]]
+        right = type(mode["rows"]) is int and type(mode["digest"]) is str
+        if not right or any(each != [str, int, int, str] for each in types):
+            raise ValueError("its record of the data is not one")
+    if not isinstance(found.options, dict):
+        raise TypeError("its options are not a table")
     return found
 
 

@@ -356,6 +356,17 @@ class Dataset(Closeable):
         self._prepare_reading()
         return summarize(self._manifest)
 
+    def contents(self, mode: str) -> list[tuple[str, int, int, str]]:
+        """Return what identifies the rows of a mode, from the manifest alone.
+
+        Returns:
+            For each partition the session that wrote it, its number there, its rows, and a digest
+            of its fields and their checksums; empty while rows are being written or updated. Rows
+            that are not committed yet do not count.
+        """
+        found = self._manifest.modes[mode]
+        return [(p.session, p.index, p.rows, p.digest(found.fields)) for p in found.partitions]
+
     def verify(self, *, content: bool = True) -> list[str]:
         """Check that all partition files exist and are complete, consistent and unchanged.
 

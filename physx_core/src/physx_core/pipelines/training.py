@@ -6,6 +6,7 @@ import contextlib
 import math
 import shlex
 import time
+import warnings
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
@@ -27,7 +28,9 @@ from physx_core.config import (
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, DivergedError
 from physx_core.observers import statistics_observers
+from physx_core.pipelines.learning.bound_options import bound_options, check_bound
 from physx_core.pipelines.learning.components import create
+from physx_core.pipelines.learning.data_record import describe_changes, record_data
 from physx_core.pipelines.learning.learner import Learner
 from physx_core.pipelines.learning.opening import DataOpening, join_group, open_dataset
 from physx_core.pipelines.learning.resuming import Start, can_resume, find_start
@@ -418,6 +421,8 @@ class Training(NewSessionPipeline):
             self.best.state,
             self._record.state,
             self.data.order,
+            bound_options(self, self._resumed.seed, self.group.size),
+            self._data_record(),
         )
         generated = self.data.generated
         states = generated.states(self._blocks) if generated is not None else ()
@@ -521,6 +526,8 @@ class Training(NewSessionPipeline):
             name = self.network_config.network_name or checkpoint.NAME
             start = find_start(session, name, start.environment, start.config)
         self._begin_at(start)
+        if start.checkpoint is not None and start.session is not None:
+            self._check_resumed(start.session.path)
         buffer = self._create_buffer()
         network_class.set_seed(self._resumed.seed)
         self.learner = Learner(self.network_config, trains=True, stops_at_nan=self.on_nan == "stop")
@@ -549,11 +556,40 @@ class Training(NewSessionPipeline):
         )
         self.data = opening.open(resources, dataset)
         self._prepare_learner(start)
+        if start.checkpoint is not None and start.environment is None and self._leads:
+            self._tell_changed_data(dataset, start.config.mode)
         resources.push(self._close)
 
     def _begin(self) -> None:
         self.epoch_id, self.batch_id = self._resumed.epoch, self._resumed.batch
         self._epoch_batches, self.batch = None, {}
+
+    def _check_resumed(self, session: Path) -> None:
+        """Check that the options are those of the checkpoint, as far as it depends on them."""
+        seed = self._resumed.seed if self.seed is None else self.seed
+        now = bound_options(self, seed, self.group.size)
+        check_bound(session, self._resumed.options, now)
+
+    def _tell_changed_data(self, dataset: Dataset, mode: str) -> None:
+        """Warn if the data are not those that the training had, as then it is another one."""
+        changes = describe_changes(self._resumed.data, dataset, mode)
+        if changes:
+            text = (
+                f"The data in {dataset.directory} changed since the checkpoint was written: "
+                f"{'; '.join(changes)}. The training goes on with the data as they are, so their "
+                "order, normalization and validation samples may differ, and the network will not "
+                "be the one of an uninterrupted training."
+            )
+            warnings.warn(text, stacklevel=2)
+            self.session.note(text)
+
+    def _data_record(self) -> dict[str, Any]:
+        """Return what identifies the data; nothing while they are replaced by a replay."""
+        environment = self.environment_config
+        if environment is not None and environment.load_samples:
+            return {}
+        config = self.dataset_config or DatasetConfig()
+        return record_data(self.data.dataset, config.mode)
 
     def _begin_at(self, start: Start) -> None:
         """Start at the first batch, or where a checkpoint was written."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated
@@ -15,7 +15,10 @@ from physx_core.cli import installation
 from physx_core.cli.commands.plugins import load_all
 from physx_core.cli.dataset_tables import print_dataset
 from physx_core.cli.output import show, show_table
-from physx_core.errors import CheckpointError, DatasetNotFoundError, UsageError
+from physx_core.config import read_toml
+from physx_core.dataset import Dataset
+from physx_core.errors import CheckpointError, DatasetNotFoundError, PhysxError, UsageError
+from physx_core.pipelines.learning.data_record import describe_changes, describe_record
 
 
 @dataclass
@@ -66,6 +69,22 @@ def _show_installation() -> None:
         pass
 
 
+def _data_of(place: Path, found: checkpoint.Checkpoint) -> Iterator[str]:
+    """Yield what data a network was trained on, and whether they changed since."""
+    progress = found.progress
+    if not progress.data:
+        return
+    yield f"trained on {describe_record(progress.data)}"
+    tables = read_toml(place / "config.toml") if (place / "config.toml").is_file() else {}
+    config = tables.get("training", {}).get("dataset", {})
+    try:
+        with Dataset.open(config.get("existing_dir") or place) as dataset:
+            changes = describe_changes(progress.data, dataset, config.get("mode", "training"))
+            yield f"data in {dataset.directory}: {'; '.join(changes) or 'unchanged since'}"
+    except PhysxError as error:
+        yield f"whether they changed since is not known: {error}"
+
+
 def _show_session(place: Path, options: Info) -> None:
     checkpoints = checkpoint.list_all(place / "network")
     try:
@@ -85,5 +104,7 @@ def _show_session(place: Path, options: Info) -> None:
             f"checkpoint {path.name}: {found.network['network']}, {found.progress.epoch} epochs, "
             f"fields {', '.join(found.fields)}"
         )
+        for line in _data_of(place, found):
+            show(f"  {line}")
     if problems and problems == len(checkpoints):
         raise CheckpointError(f"None of the checkpoints in {place / 'network'} can be read.")

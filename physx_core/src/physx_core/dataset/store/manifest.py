@@ -16,6 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from xxhash import xxh3_64_intdigest
 
 from physx_core.dataset.store.partition.commits import Commit
 from physx_core.dataset.store.partition.format import (
@@ -123,6 +124,13 @@ class Partition:
             self.checksums.get(of.name),
             self._commit_of(of),
         )
+
+    def digest(self, fields: Mapping[str, Field]) -> str:
+        """Return a digest of its fields and checksums; empty while it has no checksums."""
+        if not self.sealed or not self.checksums:
+            return ""
+        kept = [(name, of.dtype, of.shape, self.checksums.get(name)) for name, of in fields.items()]
+        return f"{xxh3_64_intdigest(repr(kept).encode()):016x}"
 
     def _commit_of(self, of: Field) -> Commit | None:
         commit = self.commits.get(of.name)

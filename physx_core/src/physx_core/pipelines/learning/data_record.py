@@ -1,0 +1,77 @@
+"""What a checkpoint records about the data that its network was trained on."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from hashlib import blake2b
+from typing import Any
+
+from physx_core.dataset import Dataset
+from physx_core.errors import DatasetError
+
+_READ = ("training", "validation")
+
+
+def record_data(dataset: Dataset, mode: str) -> dict[str, Any]:
+    """Return what identifies the rows that a training reads, by mode, from the manifest alone.
+
+    Each mode has its number of ``rows``, a ``digest`` of their checksums, and its ``partitions``,
+    each with session, number, rows and checksum; a partition that is still written has none.
+
+    Args:
+        dataset: The dataset.
+        mode: Mode of the training samples.
+    """
+    found = {}
+    for name in dict.fromkeys((mode, *_READ[1:])):
+        if name in dataset:
+            partitions: list[list[Any]] = [list(each) for each in dataset.contents(name)]
+            digest = blake2b(repr(partitions).encode(), digest_size=8).hexdigest()
+            rows = sum(each[2] for each in partitions)
+            found[name] = {"rows": rows, "digest": digest, "partitions": partitions}
+    return found
+
+
+def describe_record(former: Mapping[str, Any]) -> str:
+    """Return a recorded state of the data in words; empty if there is none."""
+    parts = (f"{each['rows']:,} {mode} ({each['digest']})" for mode, each in former.items())
+    return ", ".join(parts)
+
+
+def describe_changes(former: Mapping[str, Any], dataset: Dataset, mode: str) -> list[str]:
+    """Return how the data differ from what a checkpoint recorded; empty if they do not.
+
+    Args:
+        former: What `record_data` returned then; empty if an older physx wrote the checkpoint.
+        dataset: The dataset now.
+        mode: Mode of the training samples.
+    """
+    if not former:
+        return []
+    try:
+        now = record_data(dataset, mode)
+        return [
+            f"{name}: {text}"
+            for name in dict.fromkeys([*former, *now])
+            for text in _changes(former.get(name, _NOTHING), now.get(name, _NOTHING))
+        ]
+    except (DatasetError, LookupError, TypeError, ValueError) as error:
+        return [f"they cannot be compared: {error}"]
+
+
+_NOTHING: dict[str, Any] = {"rows": 0, "digest": "none", "partitions": []}
+
+
+def _changes(former: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
+    before = {(session, index): rest for session, index, *rest in former["partitions"]}
+    after = {(session, index): rest for session, index, *rest in now["partitions"]}
+    pairs = [(old, after.get(key)) for key, old in before.items()]
+    kept = [(old, new) for old, new in pairs if new is not None and new[0] >= old[0]]
+    if len(kept) < len(pairs):
+        yield f"rows were removed ({former['rows']:,} then, {now['rows']:,} now)"
+    elif now["rows"] > former["rows"]:
+        yield f"{now['rows'] - former['rows']:,} rows were appended to {former['rows']:,}"
+    updated = [old for old, new in kept if old[0] == new[0] and old[1] and old[1] != new[1]]
+    if updated:
+        many = sum(rows for rows, _ in updated)
+        yield f"rows were updated, in partitions of {many:,} rows"
