@@ -424,3 +424,15 @@ class Snapshots(RuleBasedStateMachine):
 
 TestSnapshots = Snapshots.TestCase
 TestSnapshots.settings = settings(max_examples=10, stateful_step_count=10, deadline=None)
+
+
+@pytest.mark.parametrize("contacts", ["all", "static"])
+def test_things_rest_on_scenery_from_a_file(backend, tmp_path, contacts):
+    shape = '<collision><geometry><box size="1 1 0.1"/></geometry></collision>'
+    path = tmp_path / "shelf.urdf"
+    path.write_text(f'<robot name="shelf"><link name="world">{shape}</link></robot>')
+    shelf = Robot(path, "shelf", position=(0.0, 0.0, 0.5))
+    box = Box(name="box", size=(0.2, 0.2, 0.2), mass=2.0, position=(0.2, 0.0, 0.66))
+    with backend.build(World([shelf], objects=[box], contacts=contacts)) as simulation:
+        simulation.step(500)
+        assert simulation.body_poses(["box"])[0, 2] == pytest.approx(0.65, abs=1e-3)

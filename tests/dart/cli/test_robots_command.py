@@ -15,7 +15,7 @@ class Engine(Backend):
         from pathlib import Path
 
         broken = RobotInfo("broken", Path("b.urdf"), error="it has no link:\nmore")
-        return [RobotInfo("arm", Path("a.urdf"), 7, 12.5, "meshes", "slow: 3"), broken]
+        return [RobotInfo("arm", Path("a.urdf"), 7, 12.5, "meshes", ("slow: 3", "odd")), broken]
 
 
 @pytest.fixture
@@ -35,7 +35,7 @@ def test_robots_of_all_backends_are_listed_once(only, capsys):
     only(first=Engine, second=Engine)
     assert main(["robots"]) == 0
     lines = capsys.readouterr().out.splitlines()
-    assert lines[1].split() == ["arm", "7", "12.5", "meshes", "slow:", "3"]
+    assert lines[1].split() == ["arm", "7", "12.5", "meshes", "slow:", "3;", "odd"]
     assert lines[2].split(maxsplit=1)[1] == "cannot be loaded: it has no link"
     assert len([line for line in lines if line.startswith("arm")]) == 1
 

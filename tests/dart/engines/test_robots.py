@@ -54,10 +54,10 @@ def test_the_catalog_describes_each_robot(backend):
     found = {info.name: info for info in backend.robots()}
     for name, (joints, collisions) in OWN.items():
         info = found[name]
-        assert (info.joints, info.collisions, info.warning, info.error) == (
+        assert (info.joints, info.collisions, info.warnings, info.error) == (
             joints,
             collisions,
-            "",
+            (),
             "",
         )
         assert info.path.is_file() and 0 < info.mass < 20
@@ -68,8 +68,9 @@ def test_installed_robots_are_in_the_catalog(backend, example):
     assert found["a1/a1"].path == example("a1_description/urdf/a1.urdf")
     assert found["a1/a1"].collisions == "primitives" and found["a1/a1"].joints == 12
     assert found["a1/a1"].mass == pytest.approx(13.74, abs=0.01)
-    assert found["go2/go2"].warning.startswith("slow: 19 collision meshes")
+    assert found["go2/go2"].warnings[0].startswith("slow: 19 collision meshes")
     assert found["human/human"].collisions == "none"
+    assert "LHand" in found["romeo/romeo"].warnings[-1]  # whose fingers have no inertia
     assert "mesh file(s) that do not exist" in found["romeo/romeo_laas_small"].error
     assert "has no link" in found["ur/ur3"].error
     assert {"anymal_b_simple/anymal", "anymal_c_simple/anymal"} < set(found)

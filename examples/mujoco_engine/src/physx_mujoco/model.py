@@ -147,7 +147,8 @@ class ModelBuilder:
 
     def _masks(self, place: int, mover: Mover) -> dict[str, int]:
         if self._parts.world.contacts == "static":
-            return {"contype": 0, "conaffinity": _STATIC}
+            own = 0 if mover.moves else _STATIC | _MOVING
+            return {"contype": own, "conaffinity": _STATIC if mover.moves else 0}
         if mover.is_object or mover.self_collisions:
             return {"contype": _MOVING, "conaffinity": _ALL}
         if place + _OWN > 30:

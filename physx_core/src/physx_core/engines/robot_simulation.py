@@ -244,10 +244,12 @@ class RobotSimulation(Simulation, Generic[Engine]):
     def _check_finite(self) -> None:
         for robot in self._robots:
             if not robot.speed() < _FASTEST:
+                reasons = [f"In this file, {text}." for text in robot.model.warnings]
+                advice = reasons or ["Use a smaller period or smaller torques."]
                 raise SimulationError(
                     f"The state is no longer finite, or faster than {_FASTEST:g} rad/s or m/s, "
                     f'after frame {self._frame} ("{robot.mover.name}", {robot.model.path.name}). '
-                    "Use a smaller period or smaller torques."
+                    + " ".join(advice)
                 )
 
     def _watch(self) -> None:

@@ -31,7 +31,7 @@ class RobotInfo:
         mass: Total mass of its links, in kg.
         collisions: Kind of its collision shapes: ``"primitives"``, ``"meshes"``, ``"both"`` or
             ``"none"``.
-        warning: Caveat about using it; empty if there is none.
+        warnings: Caveats about using it.
         error: Reason why it cannot be loaded; empty if it can. Otherwise the other values are 0
             and ``"none"``.
     """
@@ -41,7 +41,7 @@ class RobotInfo:
     joints: int = 0
     mass: float = 0.0
     collisions: str = "none"
-    warning: str = ""
+    warnings: tuple[str, ...] = ()
     error: str = ""
 
 

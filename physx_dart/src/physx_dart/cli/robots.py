@@ -50,8 +50,8 @@ def _print_table(robots: Sequence[RobotInfo]) -> None:
             rows.append([info.name, "", "", "", f"cannot be loaded: {reason}"])
         else:
             figures = [str(info.joints), f"{info.mass:.4g}"]
-            rows.append([info.name, *figures, info.collisions, info.warning])
+            rows.append([info.name, *figures, info.collisions, "; ".join(info.warnings)])
     numbers = ("dof", "mass [kg]")
     show_table(["name", *numbers, "collisions", ""], rows, numbers=numbers)
-    if any(info.warning for info in robots):
+    if any(text.startswith("slow:") for info in robots for text in info.warnings):
         show('slow: Robot(collisions="boxes") or "capsules" replaces meshes by bounding shapes')

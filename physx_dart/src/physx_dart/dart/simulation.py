@@ -99,9 +99,11 @@ class DartSimulation(RobotSimulation[DartRobot]):
             self._world.addSkeleton(skeleton)
         bodies = [body for robot in robots for body in robot.bodies]
         bodies += [skeleton.getBodyNode(0) for skeleton in self._statics]
-        _disable_contacts(self._world, [[each.getBodyNode(0)] for each in self._statics])
+        immobile = [[each.getBodyNode(0)] for each in self._statics]
+        immobile += [robot.bodies for robot in robots if not robot.mover.moves]
+        _disable_contacts(self._world, immobile)
         if world.contacts == "static":
-            _disable_contacts(self._world, [robot.bodies for robot in robots])
+            _disable_contacts(self._world, [robot.bodies for robot in robots if robot.mover.moves])
         self._reader = ContactReader(self._world, bodies, world.period)
         self._step_world = self._world.step
         lacks = [] if solver in _ISOTROPIC else ["isotropic_friction"]
@@ -127,7 +129,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
         robot = DartRobot(mover, parts.world.gravity)
         if parts.world.contacts != "none":
             attach_shapes(robot.skeleton, mover.model.shapes)
-        if mover.self_collisions and parts.world.contacts == "all":
+        if mover.self_collisions and mover.moves and parts.world.contacts == "all":
             robot.skeleton.enableSelfCollisionCheck()
         self._world.addSkeleton(robot.skeleton)
         return robot

@@ -255,7 +255,7 @@ def poses_of(data: Any) -> Vector:
 
     It changes with each algorithm that places joints, and is valid as long as the data exists.
     """
-    first, second = data.oMi[0].rotation, data.oMi[1].rotation
+    first, second = data.oMi[0].rotation, data.oMi[len(data.oMi) > 1].rotation
     pace = second.__array_interface__["data"][0] - first.__array_interface__["data"][0]
     strides = (pace, 3 * first.itemsize, first.itemsize)
     return np.lib.stride_tricks.as_strided(first, (len(data.oMi), 4, 3), strides)

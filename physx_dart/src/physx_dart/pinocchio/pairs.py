@@ -130,9 +130,10 @@ class PairFinder:
 
     def _possible(self, solids: Sequence[_Solid]) -> Iterator[tuple[int, int]]:
         """Yield the pairs of shapes that may touch: those that can move relative to each other."""
-        contacts = self._parts.world.contacts
+        contacts, movers = self._parts.world.contacts, self._parts.movers
+        moves = [solid.owner is not None and movers[solid.owner].moves for solid in solids]
         for (i, a), (j, b) in itertools.combinations(enumerate(solids), 2):
-            wanted = contacts == "all" or (contacts == "static" and b.owner is None)
+            wanted = contacts == "all" or (contacts == "static" and moves[i] != moves[j])
             if a.owner is None or not wanted:
                 continue
             if a.joint == 0 and (b.owner is None or b.joint == 0):
@@ -144,7 +145,7 @@ class PairFinder:
                 )
                 if near:
                     continue
-                if not self._parts.movers[a.owner].self_collisions:
+                if not movers[a.owner].self_collisions:
                     continue
             yield i, j
 
@@ -242,7 +243,12 @@ class PairFinder:
             np.array([a.shape.restitution * b.shape.restitution for a, b in touching]),
             jacobian.reshape(len(gaps), 3, -1)[close].reshape(3 * len(close), -1),
         )
-        owners = {solid.owner for both in touching for solid in both if solid.owner is not None}
+        owners = {
+            solid.owner
+            for both in touching
+            for solid in both
+            if solid.owner is not None and self._parts.movers[solid.owner].moves
+        }
         bodies = np.array([(a.body, b.body) for a, b in touching], np.intp)
         return PairPoints(pairs, bodies, owners, contacts)
 

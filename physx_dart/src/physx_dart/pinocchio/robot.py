@@ -61,7 +61,12 @@ class PinocchioRobot(RobotEngine):
         self._more: tuple[Any, ...] = ()  # the wrenches, if there are any
         self._joints = JointConstraints(self.model.joints, dt, self.base)
         self._contacts = ContactFinder(
-            mover, statics, self.model_in_motion, self.data, self.frames, features
+            mover,
+            statics if mover.moves else (),
+            self.model_in_motion,
+            self.data,
+            self.frames,
+            features,
         )
         self._acted_on = bool(self._contacts) or self._joints.acts
         self._solver = solver

@@ -39,7 +39,7 @@ def describe(name: str, path: Path) -> RobotInfo:
         len(model.joints),
         sum(body.mass for body in model.bodies),
         _kind(len(shapes) - len(meshes), len(meshes)),
-        _warning(path, meshes),
+        _mesh_warnings(path, meshes) + model.warnings,
     )
 
 
@@ -49,10 +49,11 @@ def _kind(primitives: int, meshes: int) -> str:
     return "primitives" if primitives else "meshes" if meshes else "none"
 
 
-def _warning(path: Path, meshes: list[Element]) -> str:
-    """Return a warning about collision meshes; their files are located but not read."""
+def _mesh_warnings(path: Path, meshes: list[Element]) -> tuple[str, ...]:
+    """Return a warning about collision meshes, if any; their files are located but not read."""
     if not meshes:
-        return ""
+        return ()
     files = {mesh_path(path, mesh.get("filename", ""), _NO_DIRS) for mesh in meshes}
     size = sum(file.stat().st_size for file in files if file is not None) / 1e6
-    return f"slow: {len(meshes)} collision mesh{'es' if len(meshes) > 1 else ''} ({size:.2g} MB)"
+    plural = "es" if len(meshes) > 1 else ""
+    return (f"slow: {len(meshes)} collision mesh{plural} ({size:.2g} MB)",)

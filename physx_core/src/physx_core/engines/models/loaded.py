@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 
 from physx_core.engines.models.parts import Mover
-from physx_core.engines.models.rigid_bodies import RigidBody
+from physx_core.engines.models.rigid_bodies import RigidBody, together
 from physx_core.errors import ModelError, listed
 from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
@@ -89,7 +88,7 @@ def _compare_inertia(
     where: _Where, bodies: Sequence[RigidBody], loaded: Sequence[LoadedBody]
 ) -> None:
     names = [_names([bodies[link].name for link in each.links]) for each in loaded]
-    wanted = [_together(bodies, each.links) for each in loaded]
+    wanted = [together(bodies, each.links) for each in loaded]
     masses = np.array([each.mass for each in wanted])
     found = np.array([each.mass for each in loaded])
     where.compare(names, "mass", found, masses, 0.0)
@@ -106,38 +105,6 @@ def _names(links: Sequence[str]) -> str:
     return (
         f'link "{links[0]}"' if len(links) == 1 else f"links {listed(links)}, which are one body,"
     )
-
-
-class _Together(NamedTuple):
-    """Links as one body, as in `LoadedBody`; rounding errors of its inertia are below `scale`."""
-
-    mass: float
-    center: Vector
-    inertia: Vector
-    scale: float = 0.0
-
-
-def _together(bodies: Sequence[RigidBody], links: Sequence[int]) -> _Together:
-    first = bodies[links[0]]
-    if len(links) == 1:
-        return _Together(first.mass, first.center, first.inertia)
-    poses = {links[0]: np.eye(4)}
-    for link in links[1:]:
-        poses[link] = poses[bodies[link].parent] @ bodies[link].pose
-    rows = list(poses)
-    turns, places = (np.array([pose[:3, x] for pose in poses.values()]) for x in (slice(3), 3))
-    masses = np.array([bodies[link].mass for link in rows])
-    centers = np.array([bodies[link].center for link in rows])
-    centers = np.einsum("nij,nj->ni", turns, centers) + places
-    mass = float(masses.sum())
-    center = masses @ centers / mass
-    arms = centers - center
-    squares = masses * np.square(arms).sum(axis=1)
-    inertia = squares.sum() * np.eye(3) - (masses * arms.T) @ arms
-    own = np.array([bodies[link].inertia for link in rows])
-    inertia += (turns @ own @ turns.transpose(0, 2, 1)).sum(axis=0)
-    scale = float(masses @ np.square(centers).sum(axis=1))
-    return _Together(mass, center, inertia, scale)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import functools
+import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -12,7 +14,16 @@ from physx_core.engines.models.rigid_bodies import Inertial, Joint
 from physx_core.engines.models.shapes import CollisionShape, moments, shape_of_object
 from physx_core.engines.models.urdf import RobotModel, model_of_body, read_robot
 from physx_core.errors import ModelError
-from physx_core.simulation import Ground, HeightField, Layout, Part, Stairs, World, WorldObject
+from physx_core.simulation import (
+    Ground,
+    HeightField,
+    Layout,
+    Part,
+    Robot,
+    Stairs,
+    World,
+    WorldObject,
+)
 
 
 @dataclass(frozen=True)
@@ -36,6 +47,11 @@ class Mover:
     orientation: tuple[float, ...]
     self_collisions: bool = False
     is_object: bool = False
+
+    @property
+    def moves(self) -> bool:
+        """Whether any of its links can move; otherwise it is static, like scenery."""
+        return not self.fixed_base or bool(self.model.joints)
 
 
 @dataclass(frozen=True)
@@ -71,22 +87,18 @@ class Parts:
 
 
 def read_parts(world: World) -> Parts:
-    """Read a world's files.
+    """Read a world's files, and warn once about robots whose inertia is wrong.
 
     Raises:
-        ModelError: If a robot or mesh cannot be loaded, or a robot with a fixed base has no movable
-            joint.
+        ModelError: If a robot or mesh cannot be loaded, or nothing can move.
     """
-    movers = []
-    for robot in world.robots:
-        model = read_robot(robot, touching=_touches(world, robot.self_collisions))
-        if robot.fixed_base and not model.joints:
-            raise ModelError(
-                f'Robot "{robot.name}", {model.path}: it has no movable joint and a fixed base. '
-                "Use fixed_base=False."
-            )
-        pose = robot.position, robot.orientation
-        movers.append(Mover(robot.name, model, robot.fixed_base, *pose, robot.self_collisions))
+    movers = [_robot(robot, _touches(world, robot.self_collisions)) for robot in world.robots]
+    scenery = [mover for mover in movers if not mover.moves]
+    if scenery and world.contacts == "static":  # they touch like static objects
+        movers = [_robot(robot, True) for robot in world.robots]
+    for mover in movers:
+        for text in mover.model.warnings:
+            _warn(f'Robot "{mover.name}", {mover.model.path}: {text}.')
     statics = [] if world.ground is None else [Static("ground", world.ground)]
     for thing in world.objects:
         if thing.static:
@@ -94,11 +106,35 @@ def read_parts(world: World) -> Parts:
             statics.append(Static(thing.name, shape, thing.position, thing.orientation))
         else:
             movers.append(_object(thing))
+    if not any(mover.moves for mover in movers):
+        raise _nothing_moves(scenery[0])
     return Parts(world, tuple(movers), tuple(statics))
 
 
+def _robot(robot: Robot, touching: bool) -> Mover:
+    model = read_robot(robot, touching=touching)
+    pose = robot.position, robot.orientation
+    return Mover(robot.name, model, robot.fixed_base, *pose, robot.self_collisions)
+
+
+@functools.cache
+def _warn(text: str) -> None:
+    """Warn once: simulations of the same file are built many times."""
+    warnings.warn(text, stacklevel=5)
+
+
+def _nothing_moves(scenery: Mover) -> ModelError:
+    floats = scenery.model.links[0] != "world"
+    return ModelError(
+        f'Robot "{scenery.name}", {scenery.model.path}: it has no movable joint and a fixed base, '
+        "so it is static, and nothing else in the world can move. "
+        f"{'Use fixed_base=False to let it float, or add' if floats else 'Add'} a robot or an "
+        "object that moves."
+    )
+
+
 def _touches(world: World, itself: bool) -> bool:
-    """Return whether a robot of this world can touch anything."""
+    """Return whether a robot of this world can touch anything, if no robot is static."""
     if world.contacts == "none":
         return False
     static = world.ground is not None or any(thing.static for thing in world.objects)

@@ -104,3 +104,43 @@ class Inertial(NamedTuple):
             turn = self.origin.matrix()[:3, :3]
             inertia = turn @ inertia @ turn.T
         return self.mass, np.array(self.origin.xyz, np.float64), inertia
+
+
+class Together(NamedTuple):
+    """Links as one body.
+
+    Attributes:
+        mass: In kg.
+        center: Center of mass in the frame of the first link, shape (3,), in m.
+        inertia: Moments of inertia about it there, shape (3, 3), in kg m².
+        scale: Inertia to which its rounding errors are relative, in kg m².
+    """
+
+    mass: float
+    center: Vector
+    inertia: Vector
+    scale: float = 0.0
+
+
+def together(bodies: Sequence[RigidBody], links: Sequence[int]) -> Together:
+    """Return links, parents before children, that cannot move relative to each other as one."""
+    first = bodies[links[0]]
+    if len(links) == 1:
+        return Together(first.mass, first.center, first.inertia)
+    poses = {links[0]: np.eye(4)}
+    for link in links[1:]:
+        poses[link] = poses[bodies[link].parent] @ bodies[link].pose
+    rows = list(poses)
+    turns, places = (np.array([pose[:3, x] for pose in poses.values()]) for x in (slice(3), 3))
+    masses = np.array([bodies[link].mass for link in rows])
+    centers = np.array([bodies[link].center for link in rows])
+    centers = np.einsum("nij,nj->ni", turns, centers) + places
+    mass = float(masses.sum())
+    center = masses @ centers / mass
+    arms = centers - center
+    squares = masses * np.square(arms).sum(axis=1)
+    inertia = squares.sum() * np.eye(3) - (masses * arms.T) @ arms
+    own = np.array([bodies[link].inertia for link in rows])
+    inertia += (turns @ own @ turns.transpose(0, 2, 1)).sum(axis=0)
+    scale = float(masses @ np.square(centers).sum(axis=1))
+    return Together(mass, center, inertia, scale)

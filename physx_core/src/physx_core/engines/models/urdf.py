@@ -24,6 +24,7 @@ from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from physx_core.engines.models.inertias import MASSLESS, NEGLIGIBLE, inertia_warnings
 from physx_core.engines.models.rigid_bodies import Inertial, Joint, Origin, RigidBody
 from physx_core.engines.models.robot_files import check_meshes, find_robot
 from physx_core.engines.models.shapes import CollisionShape, shapes_of_robot
@@ -42,7 +43,7 @@ _UNLIMITED = '<limit lower="-1e9" upper="1e9" effort="1e9" velocity="1e9"/>'
 _PLAIN = JointSettings()
 _SPECIAL = re.compile('[&<>"\t\n\r]')
 _MOMENTS = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-_NEGLIGIBLE = Inertial(1e-9, (1e-12, 1e-12, 1e-12, 0.0, 0.0, 0.0))
+_NO_INERTIA = Inertial(MASSLESS, (NEGLIGIBLE, NEGLIGIBLE, NEGLIGIBLE, 0.0, 0.0, 0.0))
 
 
 @dataclass(frozen=True)
@@ -56,6 +57,7 @@ class RobotModel:
         joints: The joints with one degree of freedom, in tree order.
         bodies: The links as numbers, those of `text`, in the order of `links`.
         shapes: Collision shapes; empty if there is nothing to touch.
+        warnings: What is wrong with the file, although it can be simulated.
     """
 
     path: Path
@@ -64,6 +66,7 @@ class RobotModel:
     joints: tuple[Joint, ...]
     bodies: tuple[RigidBody, ...]
     shapes: tuple[CollisionShape, ...] = ()
+    warnings: tuple[str, ...] = ()
 
 
 class _Link(NamedTuple):
@@ -110,12 +113,13 @@ def read_robot(robot: Robot, *, touching: bool = False) -> RobotModel:
             for name in tree.links
         ]
         links = _links(tree, joints)
-        text = _engine_text(links, inertials)
+        bodies = _bodies(links, inertials)
+        doubts = inertia_warnings(bodies, robot.fixed_base)
         shapes = shapes_of_robot(robot, path, tree) if touching else ()
     except (ModelError, ValueError) as error:
         raise ModelError(f'Robot "{robot.name}", {path}: {error}.') from error
-    bodies = _bodies(links, inertials)
-    return RobotModel(path, text, tuple(tree.links), joints, bodies, shapes)
+    text = _engine_text(links, inertials)
+    return RobotModel(path, text, tuple(tree.links), joints, bodies, shapes, doubts)
 
 
 def model_of_body(name: str, path: Path, inertial: Inertial, shape: CollisionShape) -> RobotModel:
@@ -259,7 +263,7 @@ def _inertial(name: str, link: Element, factor: float) -> Inertial:
     given, where = link.find("inertial"), f'link "{name}"'
     element = None if given is None else given.find("mass")
     if given is None or element is None:
-        return _NEGLIGIBLE
+        return _NO_INERTIA
     (mass,) = numbers_of(where, element, "value", "0", 1)
     if mass < 0:
         raise ModelError(f'{where} has the mass "{element.get("value")}"')
@@ -269,8 +273,8 @@ def _inertial(name: str, link: Element, factor: float) -> Inertial:
     if not all(map(math.isfinite, [factor * mass, *moments])):
         raise ModelError(f"{where} is too heavy for numbers with its mass factor {factor}")
     if mass == 0 and not any(moments):
-        return _NEGLIGIBLE
-    return Inertial(factor * mass or _NEGLIGIBLE.mass, moments, _origin(where, given))
+        return _NO_INERTIA
+    return Inertial(factor * mass or MASSLESS, moments, _origin(where, given))
 
 
 def _origin(where: str, given: Element) -> Origin:

@@ -63,7 +63,8 @@ class Robot:
     Attributes:
         urdf: Path of the URDF file.
         name: Name of the robot in the world.
-        fixed_base: Whether the root link is welded to the world; otherwise it floats freely.
+        fixed_base: Whether the root link is welded to the world; otherwise it floats freely. A
+            welded robot without a movable joint is scenery: static, like a static object.
         package_dirs: Folder of each package in mesh names of the form ``package://<name>/...``.
         position: Initial position of the root link, in m; permanent if the base is fixed.
         orientation: Initial orientation of the root link, quaternion x, y, z, w; permanent if the
