@@ -1,12 +1,15 @@
 """Saved policies, evaluated by a command on any engine."""
 
 import json
+import sys
 
 import gymnasium
 import numpy as np
 import pytest
+from gymnasium.envs.classic_control import PendulumEnv
 
 from physx_core import DataGeneration, DatasetConfig, EnvironmentConfig, NetworkConfig, Training
+from physx_core.cli import main
 from physx_core.errors import ConfigError, PhysxError
 from physx_gym import ComposedEnv, Policy, RobotEnv, plain
 from physx_gym.cli import evaluate
@@ -69,6 +72,17 @@ def test_a_policy_is_evaluated_as_a_table_and_as_json(session, capsys):
         seen, reward, *_ = env.step(policy(seen))
         total += reward
     assert found["episodes"][1]["reward"] == pytest.approx(total)
+
+
+def test_an_environment_that_exits_does_not_end_the_command_as_a_success(session, capsys):
+    class Exits(PendulumEnv):
+        def step(self, action):
+            sys.exit(0)
+
+    gymnasium.register("Exits-v0", Exits)
+    assert main(["evaluate", session, "--env", "Exits-v0"]) == 1
+    error = capsys.readouterr().err
+    assert "Exits.step() (test_evaluate.py" in error and "not finished" in error
 
 
 def test_speeds_and_successes_are_those_of_the_information():

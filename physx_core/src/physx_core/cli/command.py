@@ -25,7 +25,7 @@ from physx_core.plugins.entries import (
     owner_of,
 )
 from physx_core.plugins.loading import loading
-from physx_core.processes import Terminated, raised_at_sigterm
+from physx_core.processes import Terminated, describe_ending, ends_in, raised_at_sigterm
 
 if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
@@ -64,7 +64,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         return _interrupted(error, "interrupted", signal.SIGINT)
     except Terminated as error:
         return _interrupted(error, "terminated", signal.SIGTERM)
-    except SystemExit as end:  # raised by the parser after --help or an invalid option
+    except SystemExit as end:  # the parser's, after --help or an invalid option, or a command's
         return 1 if end.code else 0
 
 
@@ -128,7 +128,13 @@ def _run(name: str, words: list[str]) -> None:
         raise PluginError(name, describe_conflict("command", commands[name]))
     with loading(name, f"physx {name} ({owner_of(entry)})", f"fails to import {entry.value}"):
         run = entry.load().run
-    run(words)
+    try:
+        run(words)
+    except SystemExit as end:
+        ours = entry.value.partition(".")[0]
+        if end.code or not ours.startswith("physx_") or ends_in(end, "argparse", "tyro", ours):
+            raise
+        raise UsageError(f"{describe_ending(end)}, but the command is not finished.") from end
 
 
 def _overview() -> str:

@@ -10,6 +10,7 @@ from typing import Any
 from physx_core.components.scene.event import Event
 from physx_core.components.visualizer import Observer
 from physx_core.fields import Field
+from physx_core.processes import is_ending
 from physx_core.typing import Array
 
 
@@ -103,7 +104,9 @@ class Observers(Observer):
         for observer in self._observers:
             try:
                 returned.append(getattr(observer, method)(*arguments))
-            except Exception as error:
+            except BaseException as error:
+                if not isinstance(error, Exception) and not is_ending(error):
+                    raise
                 # A new list: this loop continues with the old one.
                 self._observers = [other for other in self._observers if other is not observer]
                 self._muted.append(observer)

@@ -23,7 +23,13 @@ from physx_core.observers import Observers, ProgressBar, ScalarsFile
 from physx_core.pipelines.services import Predict, RunServices, Show
 from physx_core.pipelines.storage import remove_unused
 from physx_core.plugins import resolve
-from physx_core.processes import Terminated, raised_at_sigterm
+from physx_core.processes import (
+    Terminated,
+    describe_ending,
+    is_ending,
+    passes_through,
+    raised_at_sigterm,
+)
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.workers.instance import NOTHING, Skip
@@ -135,10 +141,13 @@ class Pipeline(ABC):
                 self._begin()
                 self._describe_components()
                 self._resources = resources.pop_all()
-        except BaseException:
+        except BaseException as error:
             if self.session is not None:
                 remove_unused(self.session, opened=False)
-            raise
+            judged = _judge(error, error.__traceback__)
+            if judged is error:
+                raise
+            raise judged from error
         announcements = (*self._plan(), *self.observers.announcements())
         self._say(f"session: {self.session.path}{self._why_here()}", *announcements)
         return self
@@ -153,14 +162,19 @@ class Pipeline(ABC):
         resources, self._resources = self._resources, None
         if resources is None:
             return
-        self._note_end(error)
+        judged = None if error is None else _judge(error, trace)
+        self._note_end(judged)
         try:
-            resources.__exit__(kind, error, trace)
+            resources.__exit__(None if judged is None else type(judged), judged, trace)
         except BaseException as closing:
+            judged = _judge(closing, closing.__traceback__)
+            if judged is closing:
+                raise
             error = closing
-            raise
         finally:
-            self._end(error)
+            self._end(judged)
+        if judged is not None and judged is not error:
+            raise judged from error
 
     def _end(self, error: BaseException | None) -> None:
         """Report what the run stored, or remove its session if that is nothing."""
@@ -339,6 +353,19 @@ class NewSessionPipeline(Pipeline):
 
     def _create_session(self) -> Session:
         return Session.create(self.session_dir, self.session_name, self.new_session)
+
+
+def _judge(error: BaseException, trace: TracebackType | None) -> BaseException:
+    """Return the error of a run that ended: user code that exits does not finish it.
+
+    What the user's own ``with`` block raises is returned as it is.
+    """
+    if not is_ending(error) or not passes_through(trace, "physx_core"):
+        return error
+    return UsageError(
+        f"{describe_ending(error)}, but the run is not finished. To end it early, let a condition "
+        "return False; after a failure, raise an error."
+    )
 
 
 def choose_seed(seed: int | None) -> int:

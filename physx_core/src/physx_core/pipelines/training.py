@@ -48,7 +48,7 @@ from physx_core.pipelines.storage import (
     reject_client_writers,
     reject_environments,
 )
-from physx_core.processes import Interrupt, Terminated, deferred_interrupt
+from physx_core.processes import Interrupt, deferred_interrupt, is_from_signal
 from physx_core.session import Session
 from physx_core.typing import Batch
 
@@ -506,7 +506,7 @@ class Training(NewSessionPipeline):
     def _close(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         """Keep what was trained since the last checkpoint, by `execute` or by a user's own loop."""
         with deferred_interrupt():
-            if isinstance(error, (Exception, SystemExit)) and not isinstance(error, Terminated):
+            if error is not None and not is_from_signal(error):
                 self._save_after(error)
             elif error is None and self._saved != (self.epoch_id, self.batch_id):
                 self._finish()

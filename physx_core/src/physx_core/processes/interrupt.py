@@ -72,6 +72,13 @@ _LAST = Interrupt()
 """The last signal whose exception was raised."""
 
 
+def is_from_signal(error: BaseException) -> bool:
+    """Return whether a signal, and not the user's code, raised the exception that ended a run."""
+    if isinstance(error, KeyboardInterrupt):
+        return _LAST.number == signal.SIGINT
+    return isinstance(error, Terminated)
+
+
 @contextlib.contextmanager
 def deferred_interrupt() -> Iterator[Interrupt]:
     """Defer the first Ctrl-C or SIGTERM, and yield the record of whether it came.
