@@ -78,7 +78,7 @@ def test_h5py_reads_the_partitions_and_the_index(folder):
                 assert file["rows"][()] == len(file["data"])
                 parts.append(file["data"][:])
                 assert dict(file.attrs) == {
-                    "format": "physx partition", "format_version": 2, "session": "run",
+                    "format": "physx partition", "format_version": 4, "session": "run",
                     "mode": "training", "field": name, "partition": index,
                     "unit": "m" if name == "x" else "", "first_row": 340 * index,
                     "role": "training" if name == "x" else "additional",

@@ -16,6 +16,7 @@ from physx_core.checkpoint import writing
 from physx_core.dataset.repair import recovery
 from physx_core.dataset.store import statistics_file, syncing
 from physx_core.dataset.store.partition import format as partition_format
+from physx_core.dataset.store.partition.commits import Kept
 from physx_core.dataset.store.partition.file import PartitionFile
 from physx_core.dataset.write import updating
 from physx_core.dataset.write.writer import OpenPartition
@@ -131,8 +132,8 @@ _mark, _settle, _replace = PartitionFile.mark, PartitionFile.settle, files.repla
 _write_statistics = statistics_file.write
 
 
-def _newest_record(_: int, __: int, ___: int, commits: Any) -> Any:
-    return max(commits)
+def _newest_record(_: int, rows: Any, commits: Any, *, certain: bool) -> Any:
+    return Kept(max(commits), rows)
 
 
 def _publish_removing_first(partial: Path, path: Path) -> None:
@@ -178,7 +179,7 @@ BUGS = (
         first=6,
     ),
     Bug("rows are committed first", _instead(OpenPartition, "append", _append_committing_early)),
-    Bug("digests are not compared", _instead(partition_format, "find_intact", _newest_record)),
+    Bug("digests are not compared", _instead(partition_format, "find_kept", _newest_record)),
     Bug(
         "a power cut is not noticed",
         _instead(partition_format.Inspection, "certain", property(lambda self: True)),

@@ -10,6 +10,7 @@ import numpy as np
 from physx_core import files
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
+from physx_core.dataset.store.partition.commits import name_rows
 from physx_core.dataset.store.partition.format import inspect
 from physx_core.dataset.store.partition.segment import BLOCK, RowsCheck, Segment, rows_per_block
 from physx_core.errors import DatasetError, listed, nearest
@@ -160,35 +161,42 @@ class Reader:
         file, offset = segment.open()
         with file:
             segment.read(file, offset + first * segment.field.nbytes, view)
-        if _differs(segment, first, len(out), view, checks):
-            self._report(mode, segment)
+        failed = _add(segment, first, len(out), view, checks)
+        if failed is not None:
+            self._report(mode, segment, failed)
 
-    def _report(self, mode: str, segment: Segment) -> None:
+    def _report(self, mode: str, segment: Segment, check: RowsCheck) -> None:
         """Raise the error for a wrong checksum, unless another process has updated the rows."""
-        name, commit = segment.field.name, segment.commit
-        if commit is not None and inspect(segment.path).commits[0].base > commit.base:
+        name, kept = segment.field.name, segment.kept
+        if kept is not None and inspect(segment.path).commits[0].base > kept.commit.base:
             return
         for partition in self.mode(mode).partitions:
             mine = partition.path(self.directory, name) == segment.path
             if mine and manifest_file.was_updated(self.directory, partition, name):
                 return
+        if check.damaged:
+            raise DatasetError(
+                f"{segment.path} was changed or is damaged: {name_rows(check.damaged)} do not "
+                "match their stored digests. Restore it from a backup, or leave these rows out "
+                "with `physx verify --repair`."
+            )
         raise DatasetError(
             f"{segment.path} was changed or is damaged: its rows do not match their stored "
             "checksum. Restore it from a backup, or set it aside with `physx verify --repair`."
         )
 
 
-def _differs(
+def _add(
     segment: Segment, first: int, count: int, part: memoryview, checks: dict[int, RowsCheck]
-) -> bool:
-    """Add rows to their segment's check; return whether it fails after the last rows."""
-    known = segment.checksum is not None or segment.commit is not None
+) -> RowsCheck | None:
+    """Add rows to their segment's check; return it if it fails after the last rows."""
+    known = segment.checksum is not None or segment.kept is not None
     start = segment.span.start
     if not known or (first and start not in checks):
-        return False
+        return None
     check = checks.pop(start, None) or RowsCheck(segment)
     check.add(part)
     if first + count == segment.rows:
-        return not check.passed
+        return None if check.passed else check
     checks[start] = check
-    return False
+    return None

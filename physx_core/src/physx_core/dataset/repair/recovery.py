@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -12,10 +12,17 @@ from typing import Any
 
 from physx_core import files
 from physx_core.dataset.repair.aside import FOLDER, keep, set_aside
+from physx_core.dataset.repair.salvage import seal_without_damage
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.definitions import compare_fields
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition, trim_stripes
-from physx_core.dataset.store.partition.commits import SECTOR
+from physx_core.dataset.store.partition.commits import (
+    SECTOR,
+    Range,
+    merge_ranges,
+    name_rows,
+    within,
+)
 from physx_core.dataset.store.partition.format import (
     FORMAT,
     MAGIC,
@@ -131,8 +138,8 @@ def recover(directory: Path, manifest: Manifest) -> list[str]:
     for draft in chain(directory.glob("*.h5.tmp"), directory.glob(manifest_file.FILE + ".tmp")):
         files.remove(draft)
     for mode in manifest.modes.values():
-        for partition in [p for p in mode.partitions if not p.sealed]:
-            done.append(f"{_label(partition)} {_close(directory, mode, partition)}")
+        for group in [group for group in mode.groups if not group[0].sealed]:
+            done += _close(directory, manifest, mode, group)
     if complete_checksums(directory, manifest):
         done.append("Rows were being updated in place: their checksums have been recomputed.")
     if any(mode.dropped for mode in manifest.modes.values()):
@@ -154,22 +161,32 @@ def _label(partition: Partition) -> str:
     )
 
 
-def _close(directory: Path, mode: Mode, partition: Partition) -> str:
-    """Seal an open partition whose writer is gone, or remove it; return what was done."""
-    lost = partition.problem
-    if lost:  # the original files are kept
-        keep(directory, [partition.path(directory, name) for name in mode.fields])
-    if partition.rows:
+def _close(
+    directory: Path, manifest: Manifest, mode: Mode, group: Sequence[Partition]
+) -> list[str]:
+    """Seal open partitions whose writer is gone, or remove them; return what was done."""
+    done = []
+    for partition in group:
+        without = " without its damaged ones" if partition.damaged else ""
+        what = f"of {partition.rows} rows was left open and has been sealed{without}."
+        if not partition.rows:
+            what = "had no committed rows and has been removed."
+        if partition.problem:  # the original files are kept
+            keep(directory, [partition.path(directory, name) for name in mode.fields])
+            what += f" {partition.problem} The original files are in {directory / FOLDER}."
+        done.append(f"{_label(partition)} {what}")
+    with_rows = [partition for partition in group if partition.rows]
+    for partition in group:
+        if not partition.rows:
+            mode.partitions.remove(partition)
+            mode.dropped.append(partition)
+    if any(partition.damaged for partition in with_rows):
+        seal_without_damage(directory, manifest, mode, with_rows)
+        return done
+    for partition in with_rows:
         listed = bool(partition.offsets)  # other files may be sealed, as an older manifest says
         mode.swap(seal(directory, mode.fields, partition, rewrite=listed))
-        what = f"of {partition.rows} rows was left open and has been sealed."
-    else:
-        mode.partitions.remove(partition)
-        mode.dropped.append(partition)
-        what = "had no committed rows and has been removed."
-    if lost:
-        what += f" {lost} The original files are in {directory / FOLDER}."
-    return what
+    return done
 
 
 def clear_dropped(directory: Path, manifest: Manifest) -> None:
@@ -253,32 +270,41 @@ def _count_open(directory: Path, mode: Mode, partition: Partition, thorough: boo
     The files' headers reach the disk before the manifest lists the files, hence before any row is
     committed. A partition without rows in any file is therefore no error, whatever it lacks.
     """
-    counted, rows, unreadable = [], [], None
+    counted, rows, losses, unreadable = [], [], [], None
+    damaged: list[Range] = []
     for name, field in mode.fields.items():
         path = partition.path(directory, name)
         try:
-            found, commit = partition.find_rows(directory, field, thorough=thorough)
+            found, kept = partition.find_rows(directory, field, thorough=thorough)
         except DatasetError as error:
             unreadable = error
             continue
         have = found.identity.field
         if have != field and field.shape is not None:
             raise DatasetError(f"{path} holds {have}, but the dataset says {field}.")
-        if commit is None:
+        if kept is None:
             raise DatasetError(
                 f"{path} was changed or is damaged: its rows do not match their recorded "
                 "checksums. Restore it from a backup, or set it aside with `physx verify --repair`."
             )
-        counted.append(found.rows)
-        rows.append(commit.rows)
-        partition.commits[name] = commit
+        counted.append(found.rows if found.is_consistent else kept.commit.rows)
+        rows.append(kept.commit.rows)
+        damaged += kept.damaged
+        partition.kept[name] = kept
+        if not found.is_consistent:
+            losses.append(
+                f"The row count in {path.name} is damaged; {kept.commit.rows} rows match."
+            )
     if unreadable is not None and any(counted):
         raise unreadable
     partition.rows = 0 if unreadable is not None else min(rows)
-    missing = min(counted, default=0) - partition.rows
-    partition.problem = f"Its last {missing} rows did not reach the disk." if missing else ""
-    if unreadable is not None:
-        partition.problem = str(unreadable)
+    if missing := min(counted, default=0) - partition.rows:
+        losses.append(f"Its last {missing} rows did not reach the disk.")
+    partition.damaged = tuple(within(merge_ranges(damaged), partition.rows))
+    if partition.damaged:
+        what = name_rows(partition.damaged).capitalize()
+        losses.append(f"{what} are damaged: their bits have changed since they were stored.")
+    partition.problem = str(unreadable) if unreadable is not None else " ".join(losses)
 
 
 def _discard_behind_gaps(mode: Mode) -> None:

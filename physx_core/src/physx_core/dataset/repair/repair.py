@@ -164,12 +164,12 @@ def _repair_partition(folder: Path, mode: Mode, partition: Partition) -> list[st
 def _find_damage(folder: Path, partition: Partition, field: Field) -> str | None:
     """Return what is wrong with one file of a partition, or None.
 
-    Rows of an open partition that did not reach the disk are not damage: the others are sealed.
+    Rows of an open partition that are lost or damaged are left out when the others are sealed.
     """
     problem = find_problem(folder, partition, field, content=partition.sealed)
     if problem is None and not partition.sealed:
-        _, commit = partition.find_rows(folder, field, thorough=True)
-        if commit is None:
+        _, kept = partition.find_rows(folder, field, thorough=True)
+        if kept is None:
             problem = find_problem(folder, partition, field)
     return problem
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from physx_core.dataset.store import manifest_file, statistics_file
 from physx_core.dataset.store.manifest import Manifest, Partition
+from physx_core.dataset.store.partition.commits import Kept, name_rows
 from physx_core.dataset.store.partition.format import Inspection
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
@@ -95,11 +96,8 @@ def find_problem(
     try:
         problem = _difference(partition.inspect(directory, field), partition, field)
         if problem is None and content and not partition.sealed:
-            found, commit = partition.find_rows(directory, field, thorough=True)
-            if commit is None:
-                problem = "was changed: its rows do not match their recorded checksums."
-            elif commit.rows < found.rows:
-                problem = f"counts {found.rows - commit.rows} rows that did not reach the disk."
+            found, kept = partition.find_rows(directory, field, thorough=True)
+            problem = find_loss(found, kept)
         wanted = partition.checksums.get(field.name)
         if problem is None and content and wanted is not None:
             crc = partition.segment(directory, field).compute_checksum()
@@ -108,6 +106,23 @@ def find_problem(
     except DatasetError as error:
         return str(error)
     return problem and f"{partition.path(directory, field.name)} {problem}"
+
+
+def find_loss(found: Inspection, kept: Kept | None) -> str | None:
+    """Return which rows of an open partition's file are lost or damaged, or None."""
+    if kept is None:
+        return "was changed: its rows do not match their recorded checksums."
+    if kept.damaged:
+        return f"is damaged: the bits of {name_rows(kept.damaged)} changed after they were stored."
+    if not found.is_consistent:
+        return (
+            f"is damaged: of its rows, the number of which has changed, {kept.commit.rows} match."
+        )
+    if kept.commit.rows < found.rows:
+        count = found.rows - kept.commit.rows
+        why = "did not reach the disk" if found.was_off else "were damaged after they were stored"
+        return f"counts {count} rows that {why}."
+    return None
 
 
 def _difference(found: Inspection, partition: Partition, field: Field) -> str | None:

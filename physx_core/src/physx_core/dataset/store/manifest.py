@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 from xxhash import xxh3_64_intdigest
 
-from physx_core.dataset.store.partition.commits import Commit
+from physx_core.dataset.store.partition.commits import Kept, Range
 from physx_core.dataset.store.partition.format import (
     Identity,
     Inspection,
@@ -56,8 +56,9 @@ class Partition:
         writing: Whether this process writes it, so that `offsets` are valid before it is sealed.
         follows: While it is not sealed, number of the partition that its writer filled before it,
             and that one's number of rows: if any of them is missing, its own rows do not count.
-        commits: While it is not sealed, the records of its rows as found in its files, by field;
-            not stored.
+        kept: While it is not sealed, what counts in its files as found in them, by field; not
+            stored.
+        damaged: While it is not sealed, which of its rows are damaged in any field; not stored.
         problem: Why some of its rows cannot be read although its files count them; not stored.
         running: Statistics of its first rows while it is not counted, by field; not stored.
     """
@@ -74,7 +75,8 @@ class Partition:
     counted: bool = False
     writing: bool = False
     follows: tuple[int, int] | None = None
-    commits: dict[str, Commit] = field(default_factory=dict, compare=False)
+    kept: dict[str, Kept] = field(default_factory=dict, compare=False)
+    damaged: tuple[Range, ...] = field(default=(), compare=False)
     problem: str = field(default="", compare=False)
     running: dict[str, RunningStatistics] = field(default_factory=dict, compare=False)
 
@@ -108,8 +110,8 @@ class Partition:
 
     def find_rows(
         self, directory: Path, of: Field, *, thorough: bool
-    ) -> tuple[Inspection, Commit | None]:
-        """Return the header of a field's file and the record of the rows that it holds."""
+    ) -> tuple[Inspection, Kept | None]:
+        """Return the header of a field's file and the rows that count in it."""
         path, offset = self.path(directory, of.name), self.offsets.get(of.name)
         return find_rows(path, offset, of.nbytes, thorough=thorough)
 
@@ -122,7 +124,7 @@ class Partition:
             self.offsets.get(of.name, 0),
             self.sealed,
             self.checksums.get(of.name),
-            self._commit_of(of),
+            self._kept_of(of),
         )
 
     def digest(self, fields: Mapping[str, Field]) -> str:
@@ -132,9 +134,9 @@ class Partition:
         kept = [(name, of.dtype, of.shape, self.checksums.get(name)) for name, of in fields.items()]
         return f"{xxh3_64_intdigest(repr(kept).encode()):016x}"
 
-    def _commit_of(self, of: Field) -> Commit | None:
-        commit = self.commits.get(of.name)
-        return commit if commit is not None and commit.rows == self.rows else None
+    def _kept_of(self, of: Field) -> Kept | None:
+        kept = self.kept.get(of.name)
+        return kept if kept is not None and kept.commit.rows >= self.rows else None
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON; the row count of an open partition is only in its files."""

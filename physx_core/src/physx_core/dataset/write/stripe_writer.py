@@ -140,11 +140,13 @@ class StripeWriter(Closeable):
             self._syncer.close()
 
     def _count(self, entry: Partition) -> int:
-        """Return the actual number of rows that a partition has in all fields."""
+        """Return the number of rows before the first lost or damaged one of any field."""
         found = []
         for field in self.fields:
-            _, commit = entry.find_rows(self._directory, field, thorough=True)
-            found.append(0 if commit is None else commit.rows)
+            _, kept = entry.find_rows(self._directory, field, thorough=True)
+            if kept is None:
+                return 0
+            found += [kept.commit.rows, *(start for start, _ in kept.damaged)]
         return min(found)
 
     def _open(self, number: int, rows: int) -> OpenPartition:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from queue import SimpleQueue
 
-from xxhash import xxh3_64
+from physx_core.dataset.store.partition.commits import BlockDigests
 
 LARGE = 2**17
 """Bytes from which a second thread saves more time than it costs."""
@@ -22,21 +22,21 @@ class Digester:
     """
 
     def __init__(self) -> None:
-        self._blocks: SimpleQueue[tuple[xxh3_64, memoryview] | None] = SimpleQueue()
+        self._blocks: SimpleQueue[tuple[BlockDigests, memoryview] | None] = SimpleQueue()
         self._done: SimpleQueue[None] = SimpleQueue()
         self.pending = 0
         self._thread: threading.Thread | None = None
 
-    def update(self, digest: xxh3_64, content: memoryview) -> None:
-        """Add bytes to a digest, which is up to date once `wait` has returned."""
+    def update(self, digests: BlockDigests, content: memoryview) -> None:
+        """Add bytes to digests, which are up to date once `wait` has returned."""
         if len(content) < LARGE:
             self.wait()
-            digest.update(content)
+            digests.update(content)
             return
         if self._thread is None:
             self._thread = threading.Thread(target=self._run, name="physx-digest", daemon=True)
             self._thread.start()
-        self._blocks.put((digest, content))
+        self._blocks.put((digests, content))
         self.pending += 1
 
     def wait(self) -> None:
@@ -54,7 +54,7 @@ class Digester:
 
     def _run(self) -> None:
         while (block := self._blocks.get()) is not None:
-            digest, content = block
-            digest.update(content)
-            del block, digest, content
+            digests, content = block
+            digests.update(content)
+            del block, digests, content
             self._done.put(None)

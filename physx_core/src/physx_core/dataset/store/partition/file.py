@@ -6,13 +6,21 @@ import errno
 import os
 import struct
 import threading
+from collections.abc import Sequence
 from pathlib import Path
 
-from xxhash import xxh3_64
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
-from physx_core.dataset.store.partition.commits import COUNT, RECORD, Commit, digest_of, encode
+from physx_core.dataset.store.partition.commits import (
+    COUNT,
+    DIGEST,
+    RECORD,
+    Commit,
+    Range,
+    Rows,
+    encode,
+)
 from physx_core.dataset.store.partition.digesting import LARGE, Digester
 from physx_core.dataset.store.partition.format import Header, Identity, inspect, make_header
 from physx_core.errors import DatasetError
@@ -50,11 +58,12 @@ class PartitionFile:
         self.data_offset = header.data_offset
         self.path = path
         self.committed: tuple[int, int, int] = Commit.unchecked(0)
-        self._digest, self._digester = xxh3_64(), digester
+        self._rows = Rows(header.data_offset, identity.field.nbytes, header.capacity, b"")
+        self._digests, self._digester = self._rows.begin(0), digester
         self._next_mark = 0
         self._lock = threading.Lock()
         self._row_nbytes = identity.field.nbytes
-        self._rows_offset = header.rows_offset
+        self._rows_offset, self._table_offset = header.rows_offset, header.table_offset
         self._size = header.size
         self._reserved = len(header.content)
         self.room = 0
@@ -108,8 +117,9 @@ class PartitionFile:
             files.close(descriptor)
             raise
         nbytes = identity.field.nbytes
+        size = found.data_offset + found.capacity * nbytes
         header = Header(
-            b"", found.rows_offset, found.data_offset, found.data_offset + found.capacity * nbytes
+            b"", found.rows_offset, found.table_offset, found.data_offset, found.capacity, size
         )
         file = cls(path, identity, header, descriptor, digester)
         file._reserved = file.data_offset + rows * nbytes
@@ -154,9 +164,9 @@ class PartitionFile:
             return
         content = files.as_bytes(block)
         if len(content) < LARGE and not self._digester.pending:
-            self._digest.update(content)
+            self._digests.update(content)
         else:
-            self._digester.update(self._digest, content)
+            self._digester.update(self._digests, content)
         files.write_at(self.descriptor, content, self.data_offset + row * self._row_nbytes)
 
     def commit(self, rows: int, *, durable: bool) -> None:
@@ -168,8 +178,10 @@ class PartitionFile:
         """
         if self._digester.pending:
             self._digester.wait()
+        if self._digests.finished:  # their digests must be there before rows that rely on them
+            self._store_digests()
         before = self.committed
-        commit = rows, before[1], self._digest.intdigest()
+        commit = rows, before[1], self._digests.intdigest()
         content = _NEWEST.pack(rows, *commit)
         if durable:
             first, second = (before, commit) if self._next_mark else (commit, before)
@@ -187,9 +199,10 @@ class PartitionFile:
         self._digester.wait()
         rows, base, _ = commit
         with self._lock:
-            start, stop = (self.data_offset + row * self._row_nbytes for row in (base, rows))
-            self._digest = digest_of(self.descriptor, start, stop) or xxh3_64()
-            self.committed = rows, base, self._digest.intdigest()
+            found = self._rows.read(self.descriptor, base, rows)
+            self._digests = self._rows.begin(rows) if found is None else found
+            self._store_digests()
+            self.committed = rows, base, self._digests.intdigest()
             files.sync(self.descriptor)
             files.write_at(self.descriptor, encode(self.committed), self._rows_offset)
             files.sync(self.descriptor)
@@ -220,7 +233,7 @@ class PartitionFile:
             settled = Commit.unchecked(self.committed[0])
             files.write_at(self.descriptor, encode(settled), self._rows_offset)
             files.sync(self.descriptor)
-            self.committed, self._digest = settled, xxh3_64()
+            self.committed, self._digests = settled, self._rows.begin(settled.rows)
 
     def sync(self) -> None:
         """Wait until everything written is on disk."""
@@ -233,6 +246,10 @@ class PartitionFile:
                 descriptor, self.descriptor = self.descriptor, -1
             files.close(descriptor)
 
+    def _store_digests(self) -> None:
+        first, content = self._digests.take()
+        files.write_at(self.descriptor, content, self._table_offset + first * DIGEST.size)
+
     def _allocate(self, end: int) -> None:
         if end > self._reserved:
             files.reserve(self.descriptor, self._reserved, end)
@@ -241,7 +258,12 @@ class PartitionFile:
 
 
 def copy(
-    source: Path, source_offset: int, path: Path, identity: Identity, rows: int
+    source: Path,
+    source_offset: int,
+    path: Path,
+    identity: Identity,
+    rows: int,
+    without: Sequence[Range] = (),
 ) -> tuple[int, int]:
     """Copy rows of a partition file to a new one, which gets its final name once it is complete.
 
@@ -250,18 +272,25 @@ def copy(
         source_offset: Offset of its first row.
         path: The new file; an existing one is replaced, even the source itself.
         identity: Its identity.
-        rows: Number of rows to copy, from the first.
+        rows: Number of rows of the other file, from the first.
+        without: Which of them are left out, in order.
 
     Returns:
         Offset of the first row in the new file, and the CRC-32 of the rows.
     """
-    header = make_header(identity, rows, rows)
+    nbytes = identity.field.nbytes
+    parts = complement(rows, without)
+    count = sum(stop - start for start, stop in parts)
+    header = make_header(identity, count, count)
     draft = files.temporary_path(path)
     descriptor = _write_header(draft, header)
     try:
         try:
-            count = rows * identity.field.nbytes
-            crc = _copy(source, source_offset, descriptor, header.data_offset, count)
+            crc, place = 0, header.data_offset
+            for start, stop in parts:
+                part = (stop - start) * nbytes
+                crc = _copy(source, source_offset + start * nbytes, descriptor, place, part, crc)
+                place += part
             files.sync(descriptor)
         finally:
             files.close(descriptor)
@@ -291,8 +320,17 @@ def _write_header(path: Path, header: Header) -> int:
     return descriptor
 
 
-def _copy(source: Path, source_offset: int, target: int, target_offset: int, count: int) -> int:
-    buffer, done, crc = memoryview(bytearray(min(count, _COPY))), 0, 0
+def complement(rows: int, without: Sequence[Range]) -> list[Range]:
+    """Return which of the first rows are in none of some ranges, which are in order."""
+    starts, stops = [0, *(stop for _, stop in without)], [*(start for start, _ in without), rows]
+    return [(start, stop) for start, stop in zip(starts, stops, strict=True) if start < stop]
+
+
+def _copy(
+    source: Path, source_offset: int, target: int, target_offset: int, count: int, crc: int
+) -> int:
+    """Copy bytes; return the CRC-32 of them and of what had `crc`."""
+    buffer, done = memoryview(bytearray(min(count, _COPY))), 0
     origin = files.open_regular(source)
     try:
         while done < count:

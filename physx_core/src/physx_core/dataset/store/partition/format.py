@@ -1,7 +1,8 @@
 """The partition file: an ordinary HDF5 file whose rows are written without HDF5.
 
 It holds contiguous datasets: ``data`` (capacity, *field shape); the scalar ``rows``, the number of
-committed rows; and ``commits``, the records that show which rows have reached the disk. Its
+committed rows; ``commits``, the records that show which rows have reached the disk; and
+``digests``, those of the blocks of rows. Its
 attributes state what it is part of; ``header`` repeats that, with a digest of everything that never
 changes. h5py creates all of it once, in memory; after that, rows are written at known file offsets,
 so that HDF5 never runs while samples arrive, and h5py can open the file at any time.
@@ -24,14 +25,18 @@ from xxhash import xxh3_64_intdigest
 from physx_core import files
 from physx_core.dataset.store.partition.commits import (
     COUNT,
+    DIGEST,
     NBYTES,
     RECORDS,
     SECTOR,
     Commit,
+    Kept,
+    Rows,
+    block_ends,
     boot_id,
     decode,
     encode,
-    find_intact,
+    find_kept,
 )
 from physx_core.dataset.store.partition.version_1 import HeaderV1, read_header
 from physx_core.dataset.store.validation import SESSION, checked, parse_field, parse_name, whole
@@ -39,17 +44,17 @@ from physx_core.errors import DatasetError, PhysxError
 from physx_core.fields import Field
 
 FORMAT = "physx partition"
-VERSION = 2
-STRIPED_VERSION = 3
+VERSION = 4
+STRIPED_VERSION = 5
 READABLE = (VERSION, STRIPED_VERSION)
 """Versions of the header; `version_1` reads files of version 1, which have none. Only files of
-stripes have version 3, so that a physx that does not support stripes rejects them."""
+stripes have version 5, so that a physx that does not support stripes rejects them."""
 MOST_STRIPES = 2**24
 MAGIC = b"\x89physx\r\n"
 """Start of the dataset ``header``, which physx reads without HDF5."""
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
 _PAGE = 4096
-_NUMBERS = struct.Struct("<5QI")  # digest and size of the header, offsets, capacity, length of text
+_NUMBERS = struct.Struct("<6QI")  # digest and size of the header, offsets, capacity, length of text
 _ALIGNMENT = 16  # no number in a row crosses a sector boundary
 _COMMON_HEADER = 2**14
 _LARGEST_HEADER = 2**20
@@ -127,13 +132,17 @@ class Header:
     Attributes:
         content: Beginning of the file; the rows may begin before its end.
         rows_offset: Offset of the committed row count, which the records follow.
+        table_offset: Offset of the digests of the blocks.
         data_offset: Offset of the first row.
+        capacity: Number of rows that fit in.
         size: Size of the whole file in bytes.
     """
 
     content: bytes
     rows_offset: int
+    table_offset: int
     data_offset: int
+    capacity: int
     size: int
 
 
@@ -146,7 +155,9 @@ class Inspection:
         capacity: Number of rows that fit in.
         rows: Number of committed rows.
         rows_offset: Offset of the committed row count.
+        table_offset: Offset of the digests of the blocks.
         data_offset: Offset of the first row.
+        table: The digests of the blocks.
         commits: The records of committed rows, newest first.
         boot: `boot_id` when the file was created.
     """
@@ -155,16 +166,26 @@ class Inspection:
     capacity: int
     rows: int
     rows_offset: int
+    table_offset: int
     data_offset: int
+    table: bytes
     commits: tuple[Commit, ...]
     boot: str
 
     @property
+    def was_off(self) -> bool:
+        """Whether the machine may have been off since the file was created."""
+        return not self.boot == boot_id() != ""
+
+    @property
+    def is_consistent(self) -> bool:
+        """Whether the row count is that of the newest record, as each commit leaves them."""
+        return not self.commits or self.rows == self.commits[0].rows
+
+    @property
     def certain(self) -> bool:
         """Whether all counted rows can be read because the machine has not been off since."""
-        if not self.commits:
-            return True
-        return self.rows == self.commits[0].rows and self.boot == boot_id() != ""
+        return not self.commits or (self.is_consistent and not self.was_off)
 
 
 def partition_file(session: str, mode: str, field: str, index: int) -> str:
@@ -214,6 +235,10 @@ def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
         counter = h5d.create(file.id, b"rows", h5t.STD_U64LE, scalar, layout)
         records = h5d.create(file.id, b"commits", h5t.STD_U64LE, table, layout)
         own = h5d.create(file.id, b"header", h5t.STD_U8LE, h5s.create_simple((block,)), layout)
+        blocks = len(block_ends(field.nbytes, capacity))
+        digests = h5d.create(
+            file.id, b"digests", h5t.STD_U64LE, h5s.create_simple((blocks,)), layout
+        )
         space = h5s.create_simple((capacity, *(field.shape or ())))
         layout.set_alloc_time(h5d.ALLOC_TIME_LATE)  # after everything that HDF5 needs
         data = h5d.create(file.id, b"data", kind, space, layout)
@@ -223,6 +248,7 @@ def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
             data.write(h5s.create_simple(one), space, np.zeros(one, field.dtype))
         rows_offset, data_offset = counter.get_offset(), data.get_offset() or 0
         own_offset, records_offset = own.get_offset(), records.get_offset()
+        table_offset = digests.get_offset() or 0
     if (
         records_offset != rows_offset + COUNT.size
         or rows_offset // SECTOR != (rows_offset + NBYTES - 1) // SECTOR
@@ -230,13 +256,16 @@ def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
         raise RuntimeError("HDF5 has put the row count and the records into different sectors.")
     content = bytearray(image.getvalue())
     content[rows_offset : rows_offset + NBYTES] = encode(Commit.unchecked(rows))
-    nbytes, numbers = len(content), (rows_offset, data_offset, capacity, len(description))
+    nbytes = len(content)
+    numbers = rows_offset, table_offset, data_offset, capacity, len(description)
     filled = MAGIC + _NUMBERS.pack(0, nbytes, *numbers) + description
     content[own_offset : own_offset + block] = filled
-    digest = _digest_header(content, own_offset, rows_offset, data_offset, capacity * field.nbytes)
+    content[table_offset : table_offset + blocks * DIGEST.size] = bytes(blocks * DIGEST.size)
+    changing = _changing(rows_offset, table_offset, data_offset, capacity, field.nbytes)
+    digest = _digest_header(content, own_offset, changing)
     _NUMBERS.pack_into(content, own_offset + len(MAGIC), digest, nbytes, *numbers)
     size = max(len(content), data_offset + capacity * field.nbytes)
-    return Header(bytes(content), rows_offset, data_offset, size)
+    return Header(bytes(content), rows_offset, table_offset, data_offset, capacity, size)
 
 
 def inspect(path: Path, offset: int | None = None, row_nbytes: int = 0) -> Inspection:
@@ -253,10 +282,10 @@ def inspect(path: Path, offset: int | None = None, row_nbytes: int = 0) -> Inspe
 
 def find_rows(
     path: Path, offset: int | None, row_nbytes: int, *, thorough: bool
-) -> tuple[Inspection, Commit | None]:
-    """Read the header of an unsealed partition file and find the rows that can be read.
+) -> tuple[Inspection, Kept | None]:
+    """Read the header of an unsealed partition file and find the rows that count.
 
-    The record is None if the file was changed: its rows match the digest of none of its records.
+    They are None if all records of the file are damaged.
 
     Args:
         path: The file.
@@ -269,19 +298,18 @@ def find_rows(
         before = None
         while True:
             found = inspect_open(file, path, offset, row_nbytes)
-            if not found.commits:
-                return found, Commit.unchecked(found.rows)
-            if found.certain and not thorough:
-                return found, found.commits[0]
             nbytes = found.identity.field.nbytes
+            rows = Rows(found.data_offset, nbytes, found.capacity, found.table)
+            if not found.commits:
+                return found, Kept(Commit.unchecked(found.rows), rows)
+            if found.certain and not thorough:
+                return found, Kept(found.commits[0], rows)
             try:
-                intact = find_intact(file.fileno(), found.data_offset, nbytes, found.commits)
+                kept = find_kept(file.fileno(), rows, found.commits, certain=found.certain)
             except OSError as error:
                 raise cannot_read(path, error) from error
-            if intact is not None and intact.rows <= found.capacity:
-                return found, intact
-            if found == before:
-                return found, None
+            if found == before or (kept is not None and not kept.damaged):
+                return found, kept
             before = found  # a writer may have just updated rows
 
 
@@ -326,7 +354,15 @@ def inspect_open(
 def _from_version_1(header: HeaderV1) -> Inspection:
     identity = Identity(header.session, header.mode, header.field, header.index, header.first_row)
     return Inspection(
-        identity, header.capacity, header.rows, header.rows_offset, header.data_offset, (), ""
+        identity,
+        header.capacity,
+        header.rows,
+        header.rows_offset,
+        0,
+        header.data_offset,
+        b"",
+        (),
+        "",
     )
 
 
@@ -384,7 +420,7 @@ def _parse_header(head: bytes) -> Inspection:
     if start < 0:
         raise ValueError("it has no physx header")
     numbers = _NUMBERS.unpack_from(head, start + len(MAGIC))
-    digest, nbytes, rows_offset, data_offset, capacity, length = numbers
+    digest, nbytes, rows_offset, table_offset, data_offset, capacity, length = numbers
     for number in numbers[1:]:
         whole(number, "a number of its header")
     begin = start + len(MAGIC) + _NUMBERS.size
@@ -398,9 +434,10 @@ def _parse_header(head: bytes) -> Inspection:
     if field.shape is None:
         raise ValueError("the shape of its field is missing")
     whole(data_offset + capacity * field.nbytes, "the end of its rows")
-    if _digest_header(head[:nbytes], start, rows_offset, data_offset, capacity * field.nbytes) != (
-        digest
-    ):
+    changing = _changing(rows_offset, table_offset, data_offset, capacity, field.nbytes)
+    if changing[1][1] > nbytes:
+        raise ValueError("its header is incomplete")
+    if _digest_header(head[:nbytes], start, changing) != digest:
         raise ValueError("its header does not match its checksum")
     session = checked(str, plain["session"], "a session")
     if not SESSION.fullmatch(session):
@@ -416,19 +453,30 @@ def _parse_header(head: bytes) -> Inspection:
     rows, commits = decode(head[rows_offset : rows_offset + NBYTES])
     boot = checked(str, plain["boot"], "'boot'")
     rows = min(rows, capacity)
-    return Inspection(identity, capacity, rows, rows_offset, data_offset, commits, boot)
+    table = head[slice(*changing[1])]
+    return Inspection(
+        identity, capacity, rows, rows_offset, table_offset, data_offset, table, commits, boot
+    )
+
+
+def _changing(
+    rows_offset: int, table_offset: int, data_offset: int, capacity: int, row_nbytes: int
+) -> tuple[tuple[int, int], ...]:
+    """Return the start and end of what changes in a file: records, digests of blocks, rows."""
+    table_nbytes = len(block_ends(row_nbytes, capacity)) * DIGEST.size
+    return (
+        (rows_offset, rows_offset + NBYTES),
+        (table_offset, table_offset + table_nbytes),
+        (data_offset, data_offset + capacity * row_nbytes),
+    )
 
 
 def _digest_header(
-    content: bytes | bytearray, start: int, rows_offset: int, data_offset: int, data_nbytes: int
+    content: bytes | bytearray, start: int, changing: tuple[tuple[int, int], ...]
 ) -> int:
-    """Return the digest of a header, excluding the digest itself, row counts and rows."""
+    """Return the digest of a header, excluding the digest itself and what changes."""
     fixed = bytearray(content)
     place = start + len(MAGIC)
-    for first, last in (
-        (place, place + 8),
-        (rows_offset, rows_offset + NBYTES),
-        (data_offset, data_offset + data_nbytes),
-    ):
+    for first, last in ((place, place + 8), *changing):
         fixed[first:last] = bytes(len(fixed[first:last]))
     return int(xxh3_64_intdigest(fixed))

@@ -9,11 +9,10 @@ from io import FileIO
 from pathlib import Path
 
 import numpy as np
-from xxhash import xxh3_64
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
-from physx_core.dataset.store.partition.commits import Commit
+from physx_core.dataset.store.partition.commits import Kept, Range
 from physx_core.dataset.store.partition.format import (
     SIGNATURE,
     cannot_read,
@@ -42,7 +41,8 @@ class Segment:
         certain: Whether `offset` can be relied on; otherwise it is read from the file, because
             another process may replace the file with its final form at any time.
         checksum: CRC-32 of all its rows; None if unknown.
-        commit: Record of all its rows, if the partition is open and was left by its writer.
+        kept: Record and digests of its rows and perhaps some more, if the partition is open and
+            was left by its writer.
     """
 
     path: Path
@@ -51,7 +51,7 @@ class Segment:
     offset: int
     certain: bool
     checksum: int | None = None
-    commit: Commit | None = None
+    kept: Kept | None = None
 
     @property
     def rows(self) -> int:
@@ -109,28 +109,37 @@ class Segment:
 
 
 class RowsCheck:
-    """Compares all rows of a segment, given in order, with their checksum or digest."""
+    """Compares all rows of a segment, given in order, with their checksum or digests."""
 
     def __init__(self, segment: Segment) -> None:
-        self._segment = segment
-        self._crc, self._digest = 0, xxh3_64()
-        self._unchecked = segment.commit.base * segment.field.nbytes if segment.commit else 0
+        self._checksum, self._kept, self._rows = segment.checksum, segment.kept, segment.rows
+        self._crc, self._unchecked = 0, 0
+        if self._kept is not None:
+            base = self._kept.commit.base
+            self._digests = self._kept.rows.begin(base)
+            self._unchecked = base * segment.field.nbytes
 
     def add(self, part: memoryview) -> None:
         """Add the next rows."""
-        if self._segment.checksum is not None:
+        if self._checksum is not None:
             self._crc = crc32(part, self._crc)
-        elif self._segment.commit is not None:
-            self._digest.update(part[self._unchecked :])
+        elif self._kept is not None:
+            self._digests.update(part[self._unchecked :])
             self._unchecked = max(0, self._unchecked - len(part))
 
     @property
     def passed(self) -> bool:
         """Whether the added rows are those of the segment."""
-        wanted, commit = self._segment.checksum, self._segment.commit
-        if wanted is not None:
-            return self._crc == wanted
-        return commit is None or self._digest.intdigest() == commit.digest
+        if self._checksum is not None:
+            return self._crc == self._checksum
+        return not self.damaged
+
+    @property
+    def damaged(self) -> list[Range]:
+        """The rows in the blocks that do not match their digests, if digests are known."""
+        if self._checksum is not None or self._kept is None:
+            return []
+        return self._kept.rows.differences(self._digests, self._kept.commit, self._rows)
 
 
 def rows_per_block(row_nbytes: int, nbytes: int = BLOCK) -> int:
