@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import math
 import os
-import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -27,10 +27,6 @@ _SIZES: dict[str, dict[str, int]] = {
     "capsule": {"radius": 1, "length": 1},
 }
 """Attributes that give the size of each kind of shape, and how many numbers each has."""
-_NUMBER = re.compile(r"[+-]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][+-]?[0-9]+)?")
-"""A number as every URDF reader takes it; Python's `float` also takes 1_0, inf and digits that are
-not ASCII."""
-_BLANKS = re.compile(r"[ \t\r\n]+")
 _LARGEST = 2**24
 """Maximum size of a URDF file, in bytes."""
 _MOST = {"link": 400, "visual": 4000, "collision": 4000}
@@ -194,9 +190,12 @@ def numbers_of(
         ModelError: If they are not `count` finite decimal numbers in ASCII characters.
     """
     text = element.get(attribute, default)
-    parts = _BLANKS.split(text.strip(" \t\r\n"))
-    numbers = [float(part) for part in parts if _NUMBER.fullmatch(part)]
-    if not len(numbers) == len(parts) == count or not all(map(math.isfinite, numbers)):
+    numbers: list[float] = []
+    # Only Python reads 1_0 and digits that are not ASCII.
+    if text.isascii() and "_" not in text:
+        with contextlib.suppress(ValueError):
+            numbers = [float(part) for part in text.split()]
+    if len(numbers) != count or not all(map(math.isfinite, numbers)):
         wanted = "a finite number" if count == 1 else f"{count} finite numbers"
         raise ModelError(f'{where} has {attribute}="{text}", which is not {wanted} such as -2.5e-3')
     return numbers

@@ -126,7 +126,8 @@ class _Where:
             wanted: Those of the file.
             scale: Smallest number to which rounding errors are relative; one, or one for each row.
         """
-        if not (rows := len(names)):
+        rows = len(names)
+        if not rows or np.array_equal(found, wanted):  # mostly, and much faster
             return
         left, right = found.reshape(rows, -1), wanted.reshape(rows, -1)
         with np.errstate(invalid="ignore"):  # infinite limits
