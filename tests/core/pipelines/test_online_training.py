@@ -9,6 +9,7 @@ import signal
 import threading
 import time
 import zipfile
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -263,9 +264,15 @@ class Stopped(Recorded):
 
 
 def result(run, name):
-    normalization = run.learner.transformation.normalization
-    numbers = {name: item.to_dict() for name, item in normalization.items()}
+    numbers = plain(run.learner.transformation.normalization)
     return stored(name), run.learner.network.weights, numbers
+
+
+def plain(normalization):
+    return {
+        field: {name: values.tobytes() for name, values in item.arrays().items()}
+        for field, item in normalization.items()
+    }
 
 
 REFUSING = {"refuse": 3, "record_wrong_samples": True}
@@ -363,8 +370,9 @@ def last_checkpoint(name):
     found = checkpoint.find(Path(f"sessions/{name}"), None, -1)
     with zipfile.ZipFile(found.path / "parameters.npz") as file:
         weights = file.read("weights.npy")
-    normalization = {field: item.to_dict() for field, item in found.normalization.items()}
-    return weights, normalization, found.progress
+    # Which files hold the rows depends on when the training was killed.
+    rows = {mode: each["rows"] for mode, each in found.progress.data.items()}
+    return weights, plain(found.normalization), replace(found.progress, data=rows)
 
 
 def survives(run_killed, random, kills, words):

@@ -107,7 +107,11 @@ class RayLauncher(Launcher):
         return self._driver.host
 
     def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
-        """Start the clients: see `Launcher.launch`."""
+        """Start the clients: see `Launcher.launch`.
+
+        Raises:
+            ClientError: If they have no place, or if Ray was lost.
+        """
         assert self._driver is not None
         handles = self._driver.launch(instances, address, token)
         if self._driver.end and not self.elastic:  # an elastic run goes on with the others

@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from physx_core.config import to_plain
+from physx_core.config import DatasetConfig, to_plain
 from physx_core.errors import ConfigError
 from physx_core.plugins.references import is_recorded_as
 
@@ -37,11 +37,15 @@ def bound_options(training: Any, seed: int, processes: int) -> dict[str, Any]:
         processes: Number of processes; `batch_size` is that of all of them together.
     """
     plain = to_plain(training)
-    tables = {name: plain.get(f"{name}_config", {}) for name in ("network", "dataset")}
+    configs = {
+        "network": training.network_config,
+        "dataset": training.dataset_config or DatasetConfig(),
+    }
     found = {name: value for name, value in plain.items() if not name.endswith("_config")}
     found = {name: value for name, value in found.items() if name not in _FREE[""]}
     found |= {"seed": seed, "batch_size": training.batch_size * processes}
-    for table, options in tables.items():
+    for table, config in configs.items():
+        options = to_plain(config)
         found[table] = {n: value for n, value in options.items() if n not in _FREE[table]}
     if "environment_config" in plain:
         options = plain["environment_config"]
