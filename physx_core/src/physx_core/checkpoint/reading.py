@@ -224,7 +224,7 @@ def _read(path: Path, *, content: bool = True) -> Checkpoint:
     try:
         plain = _parse(text)
         for name, written in plain["files"].items():
-            _check_file(path, name, written, content)
+            _check_file(path, name, written, content and name != NORMALIZATION)
         fields = {item["name"]: Field.from_dict(item) for item in plain["fields"]}
         found = Checkpoint(
             path=path,
