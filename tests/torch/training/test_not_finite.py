@@ -105,7 +105,7 @@ def test_gradients_that_no_scale_makes_finite_are():
     for _ in range(60):
         learn(network, optimization, samples(network))
     with pytest.raises(DivergedError, match='mixed_precision="bfloat16"'):
-        optimization.epoch_end(0.0)
+        optimization.schedule(0.0)
 
 
 def test_masks_may_hold_infinity_and_buffers_no_nan():

@@ -225,14 +225,14 @@ def test_scheduler_changes_the_rate_after_each_epoch():
     for _ in range(10):
         learn(network, optimization, data, 2)
         rates.append(optimization.learning_rate())
-        optimization.epoch_end(1.0)
+        optimization.schedule(1.0)
     expected = [(1 + np.cos(np.pi * epoch / 10)) / 2 for epoch in range(10)]
     np.testing.assert_allclose(rates, expected, atol=1e-12)
 
 
 def test_no_scheduler_keeps_the_rate():
     _, optimization = made(lr=0.125)
-    optimization.epoch_end(1.0)
+    optimization.schedule(1.0)
     assert rate(optimization) == 0.125
     assert TorchOptimization().learning_rate() is None
 
@@ -242,7 +242,7 @@ def test_plateau_looks_at_the_loss_of_the_epoch():
     _, optimization = made(scheduler=plateau, lr=1.0)
     rates = []
     for loss in (3.0, 2.0, 2.5, 1.0, 1.0):
-        optimization.epoch_end(loss)
+        optimization.schedule(loss)
         rates.append(rate(optimization))
     assert rates == [1.0, 1.0, 0.5, 0.5, 0.25]
 
@@ -304,7 +304,7 @@ def test_a_resumed_training_is_the_uninterrupted_one(tmp_path, plan):
         data = network.numpy_to_tensor(regression(8))
         for _ in range(number):
             losses = learn(network, optimization, data, 3)
-            optimization.epoch_end(losses[-1])
+            optimization.schedule(losses[-1])
 
     first, optimization = start()
     epochs(first, optimization, 3)

@@ -147,6 +147,22 @@ def test_a_replaced_step_still_steps_the_schedule():
     assert training.rates == rates_of_torch(lambda o: OneCycleLR(o, 0.05, total_steps=12), 12)
 
 
+class OwnEpochEnd(TorchOptimization):
+    """Overrides the event without the base class's method."""
+
+    def epoch_end(self, loss):
+        self.judged = [*getattr(self, "judged", ()), loss]
+
+
+def test_overriding_epoch_end_keeps_the_schedule():
+    plain, own = (
+        train(("StepLR", {"step_size": 1}), name=name, network={"optimization": optimization})
+        for name, optimization in (("plain", None), ("own", OwnEpochEnd))
+    )
+    assert own.rates == plain.rates and own.rates[-1] < own.rates[0]
+    assert len(own.learner.optimization.judged) == 3
+
+
 @pytest.mark.parametrize("interval", ["epoch", "step"])
 def test_schedules_resume_bit_for_bit(interval):
     scheduler = ("OneCycleLR", {"max_lr": 0.05, "total_steps": 16})

@@ -67,7 +67,7 @@ def test_batches_left_over_wait_for_the_next_epoch():
     network, optimization = made({"accumulate": 2})
     data = samples(network)
     learn(network, optimization, data)
-    optimization.epoch_end(1.0)
+    optimization.schedule(1.0)
     before = vector(network)
     learn(network, optimization, data)
     assert not torch.equal(vector(network), before)

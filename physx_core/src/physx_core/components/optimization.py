@@ -154,12 +154,18 @@ class Optimization(ABC):
                 f"{type(self).__name__} cannot work in several processes: run it without torchrun."
             )
 
-    def epoch_end(self, loss: float) -> None:  # noqa: B027
-        """Called after each epoch, for example to schedule the learning rate.
+    def schedule(self, loss: float) -> None:  # noqa: B027
+        """Adapt what depends on epochs, such as the learning rate, after each epoch.
 
         Args:
             loss: Validation loss of the epoch, or its mean training loss if nothing is validated.
                 NaN: this epoch is not validated, although others are.
+        """
+
+    def epoch_end(self, loss: float) -> None:  # noqa: B027
+        """Called after each epoch, after `schedule` and with the same loss.
+
+        An override loses nothing: there is nothing here.
         """
 
     def save_state(self, path: Path) -> None:  # noqa: B027

@@ -515,8 +515,8 @@ class TorchOptimization(Optimization):
             return None
         return float(self.optimizer.param_groups[0]["lr"])
 
-    def epoch_end(self, loss: float) -> None:
-        """Step a scheduler that counts epochs; see `Optimization.epoch_end`.
+    def schedule(self, loss: float) -> None:
+        """Step a scheduler that counts epochs; see `Optimization.schedule`.
 
         Raises:
             DivergedError: If gradients stayed infinite in float16, regardless of their scaling.

@@ -268,7 +268,9 @@ class Learner:
 
     def epoch_end(self, loss: float) -> None:
         """Pass the loss of a finished epoch to the optimization."""
-        self._trainer().epoch_end(loss)
+        optimization = self._trainer()
+        optimization.schedule(loss)
+        optimization.epoch_end(loss)
 
     def predict_in_training(self, batch: Batch) -> Batch:
         """Return the current network's prediction between two optimization steps.
