@@ -21,13 +21,15 @@ from PIL import Image
 import physx_gym
 from physx_core import Visualizer
 from physx_core.components import Event, Factory
+from physx_core.pipelines import Learner
 from physx_rerun import RerunVisualizer, render_picture
 
 HERE = Path(__file__).parent
 EXAMPLES = HERE.parent / "examples"
 DEMO = HERE / "examples" / "09_robot_arm.webp"
 sys.path.insert(0, str(EXAMPLES))  # their modules import each other
-GUESSES = {"ground_truth": "prediction", "correction": "correction"}
+PUSHES, CLOUDS = 1600, 20_000
+"""Numbers of samples that the networks of the beam and of the cloud learn from in the examples."""
 NAMES = ("Cartpole", "Acrobot", "Ant", "Quadruped", "ArmReach", "PushBox")
 COLUMNS = 3
 FEET = ("FR_foot", "FL_foot", "RR_foot", "RL_foot")
@@ -93,15 +95,37 @@ def load(name: str) -> Any:
     return module
 
 
-def play(environment: Any, number: int, steps: int) -> Iterator[list[Event]]:
-    """Step an example's environment, and yield what it draws in each step.
+def learn(folder: Path, pushes: int, clouds: int) -> tuple[Learner, Learner]:
+    """Train the networks of 06_deformable_solid and 03_predict.
 
-    In place of a network's prediction, it gets the truth of the previous step.
+    Args:
+        folder: Folder for their sessions.
+        pushes: Number of samples of the beam.
+        clouds: Number of samples of the cloud.
+    """
+    common, bending = load("common.py"), load("06_deformable_solid.py")
+    cloud, beam = load("environments/cloud.py"), load("environments/beam.py").Beam
+    session = common.generate(beam, pushes, folder, as_tcp_ip_client=False)
+    made = {name: rest for name, *rest in bending.networks(epochs=40)}
+    kind, wanted, epochs, arguments = made[bending.OWN]
+    options = {**arguments, "activation": "SiLU"}
+    network = common.config(kind, "forces", wanted, epochs, 2e-3, **options)
+    bent = common.trained(session, network, epochs, seed=0)
+    session = common.generate(cloud.Cloud, clouds, folder, as_tcp_ip_client=False)
+    spread = common.trained(session, cloud.network(), epochs=12, seed=0, batch_size=64)
+    return bent.learner, spread.learner
+
+
+def play(
+    environment: Any, number: int, steps: int, learner: Learner | None = None
+) -> Iterator[list[Event]]:
+    """Step an example's environment, and yield what it draws in each step.
 
     Args:
         environment: Class of the environment.
         number: Number of the instance, counted from 1.
         steps: Number of steps.
+        learner: The network whose predictions it gets; None: none.
     """
     env = environment(instance_id=number, seed=3)
     try:
@@ -110,24 +134,33 @@ def play(environment: Any, number: int, steps: int) -> Iterator[list[Event]]:
         env.init_database()
         env.factory = Factory()
         env.init_visualization()
-        before: dict[str, Any] = {}
         for env.step_index in range(steps):
             env.step()
-            for truth, guess in GUESSES.items():
-                if truth in before:
-                    env.apply_prediction({guess: before[truth]})
-            before = env.take_sample()
+            sample = env.take_sample()
+            if learner is not None:
+                given = {name: sample[name][None] for name in learner.network.net_fields}
+                found = learner.predict_in_training(given)
+                env.apply_prediction({name: rows[0] for name, rows in found.items()})
             yield env.factory.take_events()
     finally:
         env.close()
 
 
-def show_environments(folder: Path, *visualizers: Visualizer) -> None:
-    """Show the arm, the beam and the cloud of the examples, side by side."""
+def show_environments(
+    folder: Path, learners: tuple[Learner, Learner], *visualizers: Visualizer
+) -> None:
+    """Show the arm, the beam and the cloud of the examples, side by side.
+
+    Args:
+        folder: Folder for what is recorded.
+        learners: The networks of the beam and of the cloud; the arm has none.
+        visualizers: Show the scenes.
+    """
+    bending, spread = learners
     scenes = (
         play(load("environments/arm.py").ComparedArm, 1, 100),
-        play(load("environments/beam.py").Beam, 2, 10),
-        play(load("environments/cloud.py").Cloud, 3, 4),
+        play(load("environments/beam.py").Beam, 2, 10, bending),
+        play(load("environments/cloud.py").Cloud, 3, 4, spread),
     )
     for visualizer in visualizers:
         visualizer.open("examples", folder, len(scenes))
@@ -156,8 +189,15 @@ def show_robots(path: Path) -> None:
     physx_gym.replay(logs, plots=False, frame_rate=5.0, path=path)
 
 
-def examples() -> dict[str, np.ndarray]:
+def examples(
+    *watching: Visualizer, pushes: int = PUSHES, clouds: int = CLOUDS
+) -> dict[str, np.ndarray]:
     """Return pictures of the examples' scenes, by name.
+
+    Args:
+        watching: Show the environments, too.
+        pushes: Number of samples that the network of the beam learns from.
+        clouds: Number of samples that the network of the cloud learns from.
 
     Returns:
         Pictures 1000 pixels wide: the environments and the robots in Rerun's viewer, and the
@@ -167,7 +207,7 @@ def examples() -> dict[str, np.ndarray]:
         folder = Path(name)
         rerun = RerunVisualizer(path=folder / "environments.rrd")
         plain = load("05_own_plugin/src/physx_matplotlib.py").MatplotlibVisualizer((1000, 340))
-        show_environments(folder, rerun, plain)
+        show_environments(folder, learn(folder, pushes, clouds), rerun, plain, *watching)
         drawn = {"matplotlib": plain.capture()}
         rerun.close()
         show_robots(folder / "robots.rrd")

@@ -72,7 +72,7 @@ def main() -> int:
     errors["network"] = [relative_error(guess, right) for guess in guesses]
     if asked.picture:
         draw(asked.picture, training.session.path, right, guesses[0])
-    return verdict(errors, "network") and not asked.small
+    return verdict(errors, "network", small=asked.small)
 
 
 if __name__ == "__main__":

@@ -67,7 +67,7 @@ def main() -> int:
         name: [rivals.relative_error(each, later) for each in found]
         for name, found in guesses.items()
     }
-    return rivals.verdict(errors, "FNO") and not asked.small
+    return rivals.verdict(errors, "FNO", small=asked.small)
 
 
 if __name__ == "__main__":

@@ -62,7 +62,7 @@ def main() -> int:
         name: [rivals.relative_error(each, after) for each in found]
         for name, found in guesses.items()
     }
-    return rivals.verdict(errors, "graph network") and not asked.small
+    return rivals.verdict(errors, "graph network", small=asked.small)
 
 
 if __name__ == "__main__":

@@ -17,6 +17,7 @@ import numpy as np
 from common import SEEDS, options
 from matplotlib.figure import Figure
 from ppo import SETTINGS, train
+from rivals import TOO_SMALL
 
 from physx_gym import Policy
 from physx_gym.cli.evaluate import evaluate, summary
@@ -56,7 +57,8 @@ def main():
         if name in rivals:
             axes.axhline(means[name], color="0.3", dashes=(1 + 3 * number, 2), label=name)
     worst, best = min(means[name] for name in policies), max(means[name] for name in rivals)
-    print(f"\nworst seed {worst:.1f}, best rival {best:.1f}")
+    compared = f"worst seed {worst:.1f}, best rival {best:.1f}"
+    print(f"\n{TOO_SMALL if chosen.small else compared}")
     axes.set(xlabel="steps", ylabel="reward of an episode", title=f"physx/{chosen.env}-v0")
     axes.legend()
     if chosen.picture:

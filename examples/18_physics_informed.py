@@ -72,7 +72,7 @@ def main() -> int:
         errors = {name: [error(way, unseen) for way in found] for name, found in ways.items()}
         if chosen.picture:
             draw(chosen.picture, real, model, law, NETWORK, ways[NETWORK][0])
-    return int(verdict(errors, NETWORK) and not chosen.small)
+    return verdict(errors, NETWORK, small=chosen.small)
 
 
 if __name__ == "__main__":

@@ -10,6 +10,8 @@ from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
+TOO_SMALL = "Too small to judge: this run only shows that it works. Without --small it compares."
+
 
 def linear_map(inputs: np.ndarray, outputs: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
     """Fit a linear map by ridge regression; a held-out fifth of the samples sets the penalty."""
@@ -49,18 +51,47 @@ def verdict(
     errors: Mapping[str, Sequence[float]],
     network: str,
     *,
+    small: bool = False,
     what: str = "relative error",
     form: str = ".2%",
+    networks: Sequence[str] = (),
+    alone: str | None = None,
     references: Sequence[str] = (),
 ) -> int:
     """Print mean and worst errors; return 0 if the network's worst error beats the best rival.
 
-    References are printed but are not rivals.
+    Args:
+        errors: Errors of each candidate, one for each seed.
+        network: The network to judge.
+        small: Whether the run is too small to judge; nothing is compared then.
+        what: Name and unit of the errors.
+        form: Format of the errors.
+        networks: Rivals that are networks, too. The network is also compared with the best of the
+            others.
+        alone: The rival that uses neither a network nor a model.
+        references: Exact models, which are compared with the network but are not rivals.
     """
     table(errors, what, form)
-    others = errors.keys() - {network, *references}
-    means = {name: np.mean(errors[name]) for name in errors if name in others}
-    rival = min(means, key=means.get)
-    ratio = np.mean(errors[network]) / means[rival]
+    if small:
+        print(f"\n{TOO_SMALL}")
+        return 0
+    means = {name: float(np.mean(found)) for name, found in errors.items()}
+    rivals = [name for name in errors if name not in (network, *references)]
+    rival = min(rivals, key=means.__getitem__)
+    ratio = means[network] / means[rival]
     print(f"\n{network}: {ratio:.2f} times the error of the best rival, {rival}")
+    if networks:
+        best = min((n for n in rivals if n not in networks), key=means.__getitem__)
+        compared = [f"{_times(means[network], means[best])} {best}, the best without a network"]
+        if alone not in (None, best):
+            compared.insert(0, f"{_times(means[network], means[alone])} {alone}")
+        print(f"{network}: {', '.join(compared)}")
+    for name in references:
+        print(f"{name}: {_times(means[name], means[network])} {network}")
     return int(max(errors[network]) >= means[rival])
+
+
+def _times(error: float, other: float) -> str:
+    if error > other:
+        return f"{error / other:.2g} times farther off than"
+    return f"{other / error:.2g} times closer than"

@@ -96,6 +96,9 @@ def test_an_example_runs_and_draws_its_picture(path, run, tmp_path):
     assert done.returncode == 0, done.stdout + done.stderr
     for pattern in PRINTED.get(path.stem, (".",)):
         assert re.search(pattern, done.stdout), (pattern, done.stdout)
+    kept = (gallery.PAGE.kept / f"{path.stem}.txt").read_text()
+    assert ("Too small to judge" in done.stdout) == ("best rival" in kept)
+    assert "best rival" not in done.stdout
     assert_not_blank(picture)
     if path.stem in SMALL_FILMS:
         assert_same_film(picture, gallery.picture(path.stem))

@@ -49,5 +49,41 @@ def test_the_worst_seed_has_to_beat_the_mean_of_the_best_rival(
     assert lines[1].split() == ["error", "in", "m", "mean", "worst", "seed"]
     assert ["linear", "0.30", "0.40"] in [line.split() for line in lines]
     best = "linear" if references else "truth"
-    assert lines[-1].startswith("network: ")
-    assert lines[-1].endswith(f" times the error of the best rival, {best}")
+    [verdict] = [line for line in lines if line.startswith("network: ")]
+    assert verdict.endswith(f" times the error of the best rival, {best}")
+
+
+ARMS = {
+    "nothing": [32.0],
+    "linear map": [10.0],
+    "gravity": [4.0],
+    "narrow": [0.6],
+    "wide": [0.4, 0.6],
+    "exact": [0.02],
+}
+KINDS = {"networks": ["narrow", "wide"], "alone": "nothing", "references": ["exact"]}
+
+
+def test_a_verdict_ends_with_what_a_person_would_do_without_the_network(rivals, capsys):
+    assert rivals.verdict(ARMS, "wide", **KINDS) == 1  # its worst seed is as good as the narrow one
+    lines = capsys.readouterr().out.splitlines()[-3:]
+    assert lines[0] == "wide: 0.83 times the error of the best rival, narrow"
+    best = "8 times closer than gravity, the best without a network"
+    assert lines[1] == f"wide: 64 times closer than nothing, {best}"
+    assert lines[2] == "exact: 25 times closer than wide"
+    worse = {**ARMS, "wide": [8.0], "narrow": [9.0]}
+    assert rivals.verdict(worse, "wide", **KINDS) == 1
+    told = capsys.readouterr().out.splitlines()[-2]
+    assert told.endswith("2 times farther off than gravity, the best without a network")
+    alone = {name: errors for name, errors in ARMS.items() if name not in ("gravity", "linear map")}
+    rivals.verdict(alone, "wide", **KINDS)
+    told = capsys.readouterr().out.splitlines()[-2]
+    assert told == "wide: 64 times closer than nothing, the best without a network"
+
+
+@pytest.mark.parametrize("wide", [[0.1], [900.0]])
+def test_a_small_run_is_not_judged(wide, rivals, capsys):
+    assert rivals.verdict({**ARMS, "wide": wide}, "wide", small=True, **KINDS) == 0
+    out = capsys.readouterr().out
+    assert out.splitlines()[-1].startswith("Too small to judge: ")
+    assert "linear map" in out and "times" not in out
