@@ -11,25 +11,27 @@ import copy
 import functools
 import itertools
 from collections import deque
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from types import MethodType
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from physx_core.errors import SimulationError
 from physx_gym.shared_arrays import SharedArrays, Window
 
-if TYPE_CHECKING:
-    from physx_gym.env.pipeline_env import PipelineEnv
-
 _KNOWN = "known"
 _FORMS = ("__reduce__", "__reduce_ex__", "__deepcopy__", "__getstate__", "__setstate__")
 _ATOMS = (type(None), bool, int, float, complex, str, bytes, np.generic, type)
 
 
-def take(env: PipelineEnv) -> dict[str, Any]:
+def take(env: Any, layers: Sequence[Any], simulator: Any) -> dict[str, Any]:
     """Return copies of the attributes that subclasses have added to an environment.
+
+    Args:
+        env: The environment, or a layer of it.
+        layers: All layers of its pipeline.
+        simulator: The pipeline's simulator.
 
     Raises:
         SimulationError: If one cannot be copied.
@@ -37,7 +39,9 @@ def take(env: PipelineEnv) -> dict[str, Any]:
     names = _own_names(env)
     if not names:
         return {}
-    memo: dict[int, Any] = {id(each): _Known(name) for name, each in _known(env).items()}
+    memo: dict[int, Any] = {
+        id(each): _Known(name) for name, each in _known(layers, simulator).items()
+    }
     found = {}
     for name in names:
         value = vars(env)[name]
@@ -53,12 +57,19 @@ def take(env: PipelineEnv) -> dict[str, Any]:
     return found
 
 
-def put_back(env: PipelineEnv, taken: dict[str, Any]) -> None:
-    """Restore what `take` returned, and remove attributes added since."""
+def put_back(env: Any, layers: Sequence[Any], simulator: Any, taken: dict[str, Any]) -> None:
+    """Restore what `take` returned, and remove attributes added since.
+
+    Args:
+        env: As in `take`.
+        layers: As in `take`.
+        simulator: As in `take`.
+        taken: What `take` returned.
+    """
     names = _own_names(env)
     if not names and not taken:
         return
-    known, own = _known(env), vars(env)
+    known, own = _known(layers, simulator), vars(env)
     memo: dict[Any, Any] = {_KNOWN: known}
     copies = copy.deepcopy(taken, memo)
     settle = _Settling(known)
@@ -69,8 +80,9 @@ def put_back(env: PipelineEnv, taken: dict[str, Any]) -> None:
         own[name] = settle(own.get(name), value)
 
 
-def _own_names(env: PipelineEnv) -> list[str]:
-    constants = _constants_of(type(env))
+def _own_names(env: Any) -> list[str]:
+    kind: Any = type(env)
+    constants = _constants_of(kind)
     return [name for name in vars(env) if name not in constants]
 
 
@@ -95,18 +107,17 @@ class _Known:
         return found if self.method is None else getattr(found, self.method)
 
 
-def _known(env: PipelineEnv) -> dict[str, Any]:
+def _known(layers: Sequence[Any], simulator: Any) -> dict[str, Any]:
     """Return the objects of an environment's pipeline and simulator, by name."""
     found: dict[str, Any] = {}
     seen: set[int] = set()
-    base = env.unwrapped
-    layers: tuple[PipelineEnv, ...] = base.derived.layers
     for number, layer in enumerate(layers):
         found[f"{number}"] = layer
         seen.add(id(layer))
-        for name in sorted(_constants_of(type(layer))):
+        kind: Any = type(layer)
+        for name in sorted(_constants_of(kind)):
             _collect(f"{number}.{name}", vars(layer).get(name), found, seen)
-    for name, value in vars(base.simulator).items():
+    for name, value in vars(simulator).items():
         _collect(f"simulator.{name}", value, found, seen)
     return found
 

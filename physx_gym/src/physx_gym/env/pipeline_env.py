@@ -373,17 +373,19 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         return {}
 
     def _snapshot_own(self) -> dict[str, Any]:
+        base = self.unwrapped
         return {
             "action": copy_tree(self.action),
             "observation": copy_tree(self.observation),
-            "attributes": own_state.take(self),
+            "attributes": own_state.take(self, base.derived.layers, base.simulator),
             "memory": copy_tree(self._memory()),
         }
 
     def _restore_own(self, own: dict[str, Any]) -> None:
         self.action = fill(self.action, own["action"])
         self.observation = fill(self.observation, own["observation"])
-        own_state.put_back(self, own["attributes"])
+        base = self.unwrapped
+        own_state.put_back(self, base.derived.layers, base.simulator, own["attributes"])
         self._recall(copy_tree(own["memory"]))
 
 
