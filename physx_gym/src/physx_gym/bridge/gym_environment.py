@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -80,8 +81,7 @@ class GymEnvironment(Environment):
     def init_visualization(self) -> None:
         """Draw a robot, or show the pictures that another environment renders.
 
-        Raises:
-            ConfigError: If it renders no pictures.
+        An environment that renders none is not drawn, and a warning says how to change that.
         """
         from physx_gym.env.robot_env import RobotEnv
         from physx_gym.show.environment_drawing import EnvironmentDrawing
@@ -97,10 +97,12 @@ class GymEnvironment(Environment):
             self._show = lambda: self.factory.update_image(_PICTURE, self._render())
             return
         else:
-            raise ConfigError(
+            self._show = lambda: None
+            warnings.warn(
                 f"{self._id} cannot be drawn: it is not a robot of physx, and it renders no "
                 'pictures. Have it render them with env_kwargs={"render_mode": "rgb_array"}, if it '
-                "can (--environment.env-kwargs render_mode=rgb_array), or set no visualizer."
+                "can (--environment.env-kwargs render_mode=rgb_array), or set no visualizer.",
+                stacklevel=1,
             )
         self._show()
 
