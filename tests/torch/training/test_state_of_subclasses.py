@@ -14,7 +14,7 @@ import pytest
 import torch
 
 from physx_core import Dataset, DatasetConfig, NetworkConfig, Training
-from physx_core.errors import CheckpointError
+from physx_core.errors import CheckpointError, ConfigError
 from physx_torch import FC, TorchNetwork, TorchOptimization
 from physx_torch.storage.state import read_state, write_state
 
@@ -161,10 +161,10 @@ def test_state_of_every_kind_resumes_bit_for_bit():
     assert resumed.pair[0].tolist() == [24, 24]
 
 
-def test_options_are_those_of_the_constructor():
+def test_other_options_of_the_constructor_are_refused_when_resuming():
     train(2, optimization=Kinds, optimization_kwargs={"decay": 0.9})
-    training = train(4, optimization=Kinds, optimization_kwargs={"decay": 0.5}, resume=True)
-    assert training.learner.optimization.decay == 0.5
+    with pytest.raises(ConfigError, match=r"optimization_kwargs was .*0\.9.* and is now .*0\.5"):
+        train(4, optimization=Kinds, optimization_kwargs={"decay": 0.5}, resume=True)
 
 
 # The loss --------------------------------------------------------------------------------------
