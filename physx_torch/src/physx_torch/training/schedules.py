@@ -1,4 +1,4 @@
-"""When a learning-rate scheduler is stepped, and how many steps its schedule has."""
+"""Interval and length of learning-rate schedules, found by inspecting the scheduler."""
 
 from __future__ import annotations
 

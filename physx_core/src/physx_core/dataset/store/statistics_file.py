@@ -6,7 +6,7 @@ counted. Its name ends in its CRC-32. It never changes: new statistics go into a
 on the disk before the manifest refers to it, and the old file is removed after that.
 
 Everything in it can be recomputed from the rows. A lost or damaged file is therefore no error: its
-statistics are forgotten.
+statistics are computed from the rows when they are needed.
 """
 
 from __future__ import annotations

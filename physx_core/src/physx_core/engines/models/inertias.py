@@ -1,4 +1,4 @@
-"""Whether a robot's inertia is that of bodies that exist, and enough to move."""
+"""Checks of a robot's masses and moments of inertia, when it is loaded."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a checkpoint records about the data that its network was trained on."""
+"""Record of the data that a network was trained on, as checkpoints keep and compare it."""
 
 from __future__ import annotations
 
