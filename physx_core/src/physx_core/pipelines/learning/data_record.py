@@ -9,7 +9,7 @@ from typing import Any
 from physx_core.dataset import Dataset
 from physx_core.errors import DatasetError
 
-_READ = ("training", "validation")
+_NOTHING: dict[str, Any] = {"rows": 0, "digest": "none", "partitions": []}
 
 
 def record_data(dataset: Dataset, mode: str) -> dict[str, Any]:
@@ -23,7 +23,7 @@ def record_data(dataset: Dataset, mode: str) -> dict[str, Any]:
         mode: Mode of the training samples.
     """
     found = {}
-    for name in dict.fromkeys((mode, *_READ[1:])):
+    for name in dict.fromkeys((mode, "validation")):
         if name in dataset:
             partitions: list[list[Any]] = [list(each) for each in dataset.contents(name)]
             digest = blake2b(repr(partitions).encode(), digest_size=8).hexdigest()
@@ -57,9 +57,6 @@ def describe_changes(former: Mapping[str, Any], dataset: Dataset, mode: str) -> 
         ]
     except (DatasetError, LookupError, TypeError, ValueError) as error:
         return [f"they cannot be compared: {error}"]
-
-
-_NOTHING: dict[str, Any] = {"rows": 0, "digest": "none", "partitions": []}
 
 
 def _changes(former: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
