@@ -32,7 +32,6 @@ from .spin_wait import count_cores as count_cores
 from .spin_wait import fence as fence
 from .spin_wait import has_core_for_each as has_core_for_each
 from .spin_wait import order as order
-from .spin_wait import spin_until as spin_until
 from .spin_wait import yield_core as yield_core
 from .strangers import Handshakes as Handshakes
 from .strangers import Strangers as Strangers
