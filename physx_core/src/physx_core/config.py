@@ -29,6 +29,7 @@ __all__ = [
     "NetworkConfig",
     "at_least",
     "configuration",
+    "configuration_in",
     "from_plain",
     "merge_arguments",
     "options",
@@ -114,7 +115,7 @@ def _misfit(where: str, value: Any, hint: Any, error: Exception) -> str:
     """Return why a value is not valid for an option."""
     name = type(value).__name__
     if dataclasses.is_dataclass(value):
-        wanted = _configuration_in(hint)
+        wanted = configuration_in(hint)
         return f"{where} is {name}(...)" + (f", not {wanted.__name__}(...)." if wanted else ".")
     accepts_class = any(typing.get_origin(part) is type for part in typing.get_args(hint))
     if accepts_class and type(value).__module__ != "builtins":
@@ -384,7 +385,7 @@ def from_plain(make: Callable[..., T], plain: Mapping[str, Any]) -> T:
     hints = _hints(make)
     values = {}
     for name, value in plain.items():
-        nested = _configuration_in(hints.get(name))
+        nested = configuration_in(hints.get(name))
         is_table = nested is not None and isinstance(value, Mapping)
         values[name] = from_plain(nested, value) if nested and is_table else value
     return make(**values)
@@ -416,12 +417,14 @@ def merge_arguments(former: Mapping[str, Any], given: Mapping[str, Any]) -> dict
     merged = dict(former)
     for name, value in given.items():
         old = merged.get(name)
-        nested = isinstance(value, Mapping) and isinstance(old, Mapping)
-        merged[name] = merge_arguments(old, value) if nested and old else value
+        if isinstance(old, Mapping) and isinstance(value, Mapping):
+            value = merge_arguments(old, value)
+        merged[name] = value
     return merged
 
 
-def _configuration_in(hint: Any) -> type[Any] | None:
+def configuration_in(hint: Any) -> Any:
+    """Return the configuration class in an annotation; None if there is none."""
     for candidate in (hint, *typing.get_args(hint)):
         if isinstance(candidate, type) and dataclasses.is_dataclass(candidate):
             return candidate

@@ -19,7 +19,7 @@ from typing import Annotated, Any, TypeVar
 import tyro
 
 from physx_core.cli.arguments import argument_registry, take_changes
-from physx_core.config import from_plain, read_toml, set_option
+from physx_core.config import configuration_in, from_plain, read_toml, set_option
 from physx_core.errors import ConfigFileError, UnknownOptionError, UsageError, listed
 from physx_core.pipelines.pipeline import Pipeline
 
@@ -89,7 +89,7 @@ def _argument_path(make: type[Any], option: str) -> tuple[str, ...] | None:
     place, path = first.replace("-", "_"), others
     hints = {_option_name(name): hint for name, hint in typing.get_type_hints(make).items()}
     found = [place]
-    configuration = _configuration_of(hints.get(place))
+    configuration = configuration_in(hints.get(place))
     if configuration is not None and path:
         found.append(path.pop(0).replace("-", "_"))
         hints = typing.get_type_hints(configuration)
@@ -224,12 +224,7 @@ def _python_name(make: type[Pipeline], name: str) -> str:
 
 def _configuration(make: type[Pipeline], python_name: str) -> Any:
     hint = typing.get_type_hints(make)[python_name]
-    return _configuration_of(hint) or hint
-
-
-def _configuration_of(hint: Any) -> Any:
-    """Return the configuration in an annotation; None if there is none."""
-    return next((c for c in (hint, *typing.get_args(hint)) if dataclasses.is_dataclass(c)), None)
+    return configuration_in(hint) or hint
 
 
 def _set_help(cls: type[Any]) -> None:
