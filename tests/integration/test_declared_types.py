@@ -92,7 +92,8 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
         "batch_size": 4,
     },
     physx_core.Training: {"network_config": NetworkConfig(), "epoch_nb": 2, "batch_size": 4}
-    | {"batch_nb": 2, "seed": 1, "patience": 2, "checkpoint_every": 5},
+    | {"batch_nb": 2, "seed": 1, "patience": 2, "checkpoint_every": 5}
+    | {"validation_batch_size": 8},
     physx_core.Prediction: {
         "network_config": NetworkConfig(),
         "environment_config": ENVIRONMENT,
@@ -109,11 +110,11 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     quantities.Delta: {"quantity": quantities.JointPositions()},
     quantities.Mean: {"quantity": quantities.JointPositions(), "steps": 3},
 }
-# What physx returns; nobody writes these.
+# What physx returns, and what engines hold; users do not write these.
 RECORDS = {
     *("Layout", "Part", "State", "AppliedWrench", "MotorState", "SensorState", "RobotInfo"),
     *("UrdfShape", "Episode", "StepperState", "Result", "Trial", "Normalization"),
-    *("CollisionShape", "Joint", "Mover", "RigidBody", "Static"),
+    *("CollisionShape", "Joint", "Mover", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
 }
 ABSTRACT = {"Pipeline", "Sensor"}
 
