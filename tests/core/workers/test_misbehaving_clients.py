@@ -188,7 +188,10 @@ BEFORE = {
     "objects": (plain_fields(Kind.READY, {**X, "dtype": "|O"}), "is malformed"),
     "a type in parts": (plain_fields(Kind.READY, {**X, "dtype": "f8,f8"}), "is malformed"),
     "a type that is none": (plain_fields(Kind.READY, {**X, "dtype": "<f5"}), "not a NumPy type"),
-    "a negative shape": (plain_fields(Kind.READY, {**X, "shape": [-1]}), "not a shape"),
+    "a negative shape": (
+        plain_fields(Kind.READY, {**X, "shape": [-1]}),
+        "shape is (-1,) but must not be negative",
+    ),
     "a shape in words": (plain_fields(Kind.READY, {**X, "shape": "2"}), "is malformed"),
 }
 

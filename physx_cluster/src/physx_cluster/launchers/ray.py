@@ -19,7 +19,7 @@ from physx_core import Closeable
 from physx_core.components import ClientHandle, Launcher
 from physx_core.errors import ClientError, ConfigError
 from physx_core.origin import install_hint
-from physx_core.processes import ChildProcess, OutputTail, describe_exit
+from physx_core.processes import BackgroundThread, ChildProcess, OutputTail, describe_exit
 from physx_core.workers import ClientProcess
 
 if importlib.util.find_spec("ray") is None:
@@ -248,7 +248,7 @@ class _DriverProcess(Closeable):
         assert self._process.stderr is not None
         self._tail = OutputTail(self._process.stderr)
         self._messages = Messages(ours)
-        self._thread = threading.Thread(target=self._listen, daemon=True)
+        self._thread = BackgroundThread(self._listen, "physx-ray")
         self._thread.start()
         try:
             self._messages.send(**options)

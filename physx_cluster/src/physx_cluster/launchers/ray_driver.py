@@ -11,7 +11,6 @@ import asyncio
 import signal
 import socket
 import sys
-import threading
 from collections.abc import Coroutine, Mapping, Sequence
 from typing import Any
 
@@ -29,6 +28,7 @@ from physx_cluster.launchers.ray_agent import Agent
 from physx_cluster.launchers.ray_connection import RayConnection
 from physx_cluster.placement.bundles import Bundle, describe, find_misfit, share_of_processors
 from physx_core.errors import ConfigError
+from physx_core.processes import BackgroundThread
 
 _CALLS = 100_000  # concurrent calls of one agent: two for each client
 # A Ray process kills its children when it is told to exit: the clients, whose own children would
@@ -66,7 +66,7 @@ class Driver:
         self._places: dict[int, tuple[Any, int, Bundle]] = {}
         self._clients: dict[int, _Client] = {}
         self._loop = asyncio.new_event_loop()
-        self._thread = threading.Thread(target=self._loop.run_forever, daemon=True)
+        self._thread = BackgroundThread(self._loop.run_forever, "physx-ray")
         self._thread.start()
 
     @property

@@ -17,6 +17,7 @@ from .interrupt import raised_at_sigterm as raised_at_sigterm
 from .memory import anonymous_file as anonymous_file
 from .tail import OutputFile as OutputFile
 from .tail import OutputTail as OutputTail
+from .thread import BackgroundThread as BackgroundThread
 from .worker import CLIENT_VARIABLE as CLIENT_VARIABLE
 from .worker import describe_exit as describe_exit
 from .worker import prepare_worker as prepare_worker

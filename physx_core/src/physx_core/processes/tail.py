@@ -5,10 +5,10 @@ from __future__ import annotations
 import fcntl
 import os
 import tempfile
-import threading
 from typing import IO
 
 from physx_core.closeable import Closeable
+from physx_core.processes.thread import BackgroundThread
 
 _BYTES = 8192  # per read
 _LINE_BYTES = 140  # kept per line
@@ -26,7 +26,7 @@ class OutputTail:
             lines: Number of lines to keep.
         """
         self._bytes, self._lines = b"", lines
-        self._reader = threading.Thread(target=self._read, args=(stream,), daemon=True)
+        self._reader = BackgroundThread(lambda: self._read(stream), "physx-output")
         self._reader.start()
 
     def text(self, patience: float = 0.0) -> str:

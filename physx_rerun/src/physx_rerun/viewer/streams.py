@@ -16,6 +16,7 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from physx_core.errors import VisualizerError
+from physx_core.processes import BackgroundThread
 from physx_rerun.drawing.chunks import Chunk
 from physx_rerun.viewer.viewer import connect
 
@@ -142,7 +143,7 @@ class LiveWriter:
         self._stream: rr.RecordingStream | None = None
         self._canary: socket.socket | None = None
         self._failure: BaseException | None = None
-        self._thread = threading.Thread(target=self._run, name="physx-rerun", daemon=True)
+        self._thread = BackgroundThread(self._run, "physx-rerun")
         self._thread.start()
 
     def put(self, item: _Item) -> None:

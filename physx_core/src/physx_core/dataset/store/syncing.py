@@ -10,6 +10,7 @@ from typing import Protocol
 
 from physx_core import files
 from physx_core.dataset.store.partition.file import PartitionFile, sync_named
+from physx_core.processes import BackgroundThread
 
 PERIOD = 1.0
 """Seconds between two syncs of the same file."""
@@ -34,7 +35,7 @@ class Syncer:
         self._paths: dict[Path, None] = {}
         self._lock = threading.Lock()
         self._wake, self._end = threading.Event(), threading.Event()
-        self._thread: threading.Thread | None = None
+        self._thread: BackgroundThread | None = None
         self._error: OSError | None = None
 
     def note(self, partition: Written) -> None:
@@ -89,7 +90,7 @@ class Syncer:
     def _start(self) -> None:
         self._wake.set()
         if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name="physx-sync", daemon=True)
+            self._thread = BackgroundThread(self._run, "physx-sync")
             self._thread.start()
 
     def _run(self) -> None:

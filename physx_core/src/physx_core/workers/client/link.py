@@ -17,7 +17,7 @@ from physx_core.net.liveness import poll_peer
 from physx_core.net.remote_errors import decode_error
 from physx_core.net.spin_wait import spin_until
 from physx_core.net.values import decode, pack_value
-from physx_core.processes import kill_descendants
+from physx_core.processes import BackgroundThread, kill_descendants
 
 _SPIN_TIME = 2e-4
 _CLEANUP_TIME = 1.0
@@ -60,7 +60,7 @@ class WorkerLink:
         self._poll = select.poll()
         self._poll.register(connection, select.POLLIN)
         self._over = threading.Event()
-        threading.Thread(target=self._watch, daemon=True).start()
+        BackgroundThread(self._watch, "physx-orders").start()
 
     def send(self, message: bytes) -> None:
         """Send a message."""

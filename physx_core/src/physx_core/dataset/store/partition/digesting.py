@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import threading
 from queue import SimpleQueue
 
 from physx_core.dataset.store.partition.commits import BlockDigests
+from physx_core.processes import BackgroundThread
 
 LARGE = 2**17
 """Bytes from which a second thread saves more time than it costs."""
@@ -25,7 +25,7 @@ class Digester:
         self._blocks: SimpleQueue[tuple[BlockDigests, memoryview] | None] = SimpleQueue()
         self._done: SimpleQueue[None] = SimpleQueue()
         self.pending = 0
-        self._thread: threading.Thread | None = None
+        self._thread: BackgroundThread | None = None
 
     def update(self, digests: BlockDigests, content: memoryview) -> None:
         """Add bytes to digests, which are up to date once `wait` has returned."""
@@ -34,7 +34,7 @@ class Digester:
             digests.update(content)
             return
         if self._thread is None:
-            self._thread = threading.Thread(target=self._run, name="physx-digest", daemon=True)
+            self._thread = BackgroundThread(self._run, "physx-digest")
             self._thread.start()
         self._blocks.put((digests, content))
         self.pending += 1

@@ -9,6 +9,8 @@ from collections.abc import Callable, Iterable
 from functools import partial
 from typing import Any, Generic, ParamSpec, Protocol, TypeVar
 
+from physx_core.processes import BackgroundThread
+
 _MOST_ITEMS = 64
 _MOST_BYTES = 64 << 20
 
@@ -117,7 +119,7 @@ class Feeder(Generic[T]):
             cancel: Called by `close`; makes a running call of `make` end soon.
         """
         self._make, self._cancel = make, cancel
-        self._thread = threading.Thread(target=self._run, name="physx-feeder", daemon=True)
+        self._thread = BackgroundThread(self._run, "physx-feeder")
         self._thread.start()
 
     def expect(self, counts: Iterable[int]) -> None:
