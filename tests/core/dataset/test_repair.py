@@ -3,26 +3,20 @@
 import json
 import os
 import shutil
-import subprocess
-import sys
 import zlib
-from pathlib import Path
 
 import h5py
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from physx_core import Dataset, Field, files
+from physx_core import Dataset, files
 from physx_core.dataset.store.partition.commits import Commit
 from physx_core.errors import (
     DatasetError,
     DatasetLockedError,
     DatasetNotFoundError,
 )
-
-OLD = Path(__file__).parents[2] / "data" / "dataset_v1"
-
 
 # Repairing --------------------------------------------------------------------------------------
 
@@ -262,27 +256,6 @@ def test_a_manifest_is_there_whenever_rebuilding_is_killed(folder, call, thousan
 # Versions ---------------------------------------------------------------------------------------
 
 
-def test_version_1_is_read(folder):
-    shutil.copytree(OLD, folder)
-    x = np.arange(30.0).reshape(10, 3) / 7
-    for _ in range(2):
-        with Dataset.open(folder) as dataset:
-            assert dataset.verify() == [] and dataset.info == {"seed": 1}
-            view = dataset["training"]
-            assert_array_equal(view["x"][:], [*x, -x[0]])
-            assert_array_equal(view["flag"][:], [*(x[:, 0] > 2), True])
-            wave = (x[:, :2] * (1 + 2j)).astype("complex64")
-            assert_array_equal(view["wave"][:], [*wave, np.ones(2)])
-            assert_array_equal(view["step"][:], [*range(10), 99])
-            assert view["x"].field == Field("x", (3,), unit="m")
-            assert_array_equal(dataset["validation"]["x"][:], x[:2].astype("float32"))
-            mean = dataset.normalization["x"].mean
-            np.testing.assert_allclose(mean, np.mean([*x, -x[0]], axis=0))
-        Dataset.rebuild(folder)
-        with Dataset.open(folder, writable=True) as dataset:
-            dataset.update_info(seed=1)
-
-
 def test_a_newer_version_is_rejected(folder, thousand):
     thousand.write(folder)
     path = folder / "dataset.json"
@@ -385,15 +358,3 @@ def test_rebuilding_forgets_what_was_being_removed_and_what_was_never_committed(
         assert_array_equal(dataset["training"]["y"][:], expected)
         assert dataset.verify() == []
     assert not list(folder.glob("*_test_*"))
-
-
-def test_a_header_of_version_1_whose_heap_is_torn_is_an_error_and_not_read_for_ever(folder):
-    shutil.copytree(OLD, folder)
-    path = folder / "first_training_x_0.h5"
-    content = path.read_bytes()
-    objects = content.index(b"GCOL") + 16
-    path.write_bytes(content[:objects] + bytes(512) + content[objects + 512 :])
-    code = "import sys; from physx_core import Dataset; print(Dataset.open(sys.argv[1]).verify())"
-    command = [sys.executable, "-c", code, str(folder)]
-    done = subprocess.run(command, capture_output=True, text=True, timeout=60, check=True)
-    assert path.name in done.stdout

@@ -30,7 +30,7 @@ def parse_manifest(plain: Mapping[str, Any]) -> Manifest:
     info = checked(dict, plain["info"], "'info'")
     if "statistics" in plain:
         return Manifest(modes, info, versions, _statistics_checksum(plain["statistics"]))
-    for mode in modes.values():  # as in early versions, whose rows are read again
+    for mode in modes.values():  # its rows are read again
         mode.forget_statistics()
     return Manifest(modes, info, versions)
 

@@ -72,7 +72,7 @@ def unseal(directory: Path, fields: Mapping[str, Field], partition: Partition) -
     settled = Commit.unchecked(partition.rows)
     for name, field in fields.items():
         found = partition.inspect(directory, field)
-        if found.commits and set(found.commits) != {settled}:
+        if set(found.commits) != {settled}:
             descriptor = files.open_regular(partition.path(directory, name), os.O_WRONLY)
             try:
                 files.write_at(descriptor, encode(settled), found.rows_offset)

@@ -38,7 +38,6 @@ from physx_core.dataset.store.partition.commits import (
     encode,
     find_kept,
 )
-from physx_core.dataset.store.partition.version_1 import HeaderV1, read_header
 from physx_core.dataset.store.validation import SESSION, checked, parse_field, parse_name, whole
 from physx_core.errors import DatasetError, PhysxError
 from physx_core.fields import Field
@@ -47,8 +46,7 @@ FORMAT = "physx partition"
 VERSION = 4
 STRIPED_VERSION = 5
 READABLE = (VERSION, STRIPED_VERSION)
-"""Versions of the header; `version_1` reads files of version 1, which have none. Only files of
-stripes have version 5, so that a physx that does not support stripes rejects them."""
+"""Versions of the header; files of stripes have their own."""
 MOST_STRIPES = 2**24
 MAGIC = b"\x89physx\r\n"
 """Start of the dataset ``header``, which physx reads without HDF5."""
@@ -180,12 +178,12 @@ class Inspection:
     @property
     def is_consistent(self) -> bool:
         """Whether the row count is that of the newest record, as each commit leaves them."""
-        return not self.commits or self.rows == self.commits[0].rows
+        return self.rows == self.commits[0].rows
 
     @property
     def certain(self) -> bool:
         """Whether all counted rows can be read because the machine has not been off since."""
-        return not self.commits or (self.is_consistent and not self.was_off)
+        return self.is_consistent and not self.was_off
 
 
 def partition_file(session: str, mode: str, field: str, index: int) -> str:
@@ -300,8 +298,6 @@ def find_rows(
             found = inspect_open(file, path, offset, row_nbytes)
             nbytes = found.identity.field.nbytes
             rows = Rows(found.data_offset, nbytes, found.capacity, found.table)
-            if not found.commits:
-                return found, Kept(Commit.unchecked(found.rows), rows)
             if found.certain and not thorough:
                 return found, Kept(found.commits[0], rows)
             try:
@@ -340,7 +336,7 @@ def inspect_open(
     _check_superblock(file, path, offset, row_nbytes)
     try:
         head = _read_header(file.fileno())
-        found = _parse_header(head) if MAGIC in head else _from_version_1(read_header(file))
+        found = _parse_header(head)
     except _INVALID as error:
         reason = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
         raise DatasetError(f"{path} is damaged or not a dataset's partition: {reason}.") from error
@@ -349,21 +345,6 @@ def inspect_open(
     if size < expected:
         raise truncated(path, size, expected, found.data_offset, field.nbytes)
     return found
-
-
-def _from_version_1(header: HeaderV1) -> Inspection:
-    identity = Identity(header.session, header.mode, header.field, header.index, header.first_row)
-    return Inspection(
-        identity,
-        header.capacity,
-        header.rows,
-        header.rows_offset,
-        0,
-        header.data_offset,
-        b"",
-        (),
-        "",
-    )
 
 
 def truncated(path: Path, actual: int, expected: int, offset: int, row_nbytes: int) -> DatasetError:
