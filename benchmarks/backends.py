@@ -20,8 +20,9 @@ import numpy as np
 import pinocchio
 from measure import claim, finish, rates, report
 
-from physx_core import Ground, Robot, World, plugins
-from physx_core.engines import EXAMPLE_DATA, example_data_dir, example_robot
+from physx_core import plugins
+from physx_sim import Ground, Robot, World
+from physx_sim.engines import EXAMPLE_DATA, example_data_dir, example_robot
 
 ROUNDS, STEPS, PERIODS = 15, 10, 100
 STAND = np.tile([0.0, 0.8, -1.6], 4)
@@ -184,7 +185,8 @@ def loading() -> bool:
 
 _MEMORY = """
 import os, sys
-from physx_core import Ground, Robot, World, plugins
+from physx_core import plugins
+from physx_sim import Ground, Robot, World
 world = World([Robot(sys.argv[1], "a1", fixed_base=False)], ground=Ground())
 kept = []
 

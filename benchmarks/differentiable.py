@@ -17,8 +17,9 @@ import pinocchio
 import torch
 from measure import finish, rates, report
 
-from physx_core import Robot, World, plugins
+from physx_core import plugins
 from physx_dart.pinocchio.algorithms import PinocchioAlgorithms
+from physx_sim import Robot, World
 from physx_torch import ForwardDynamics
 
 STATES, ROUNDS, REPEATS = 256, 25, 4

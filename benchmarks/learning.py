@@ -29,11 +29,11 @@ from typing import Any
 import torch
 from measure import claim, finish
 
-from physx_core.errors import FeatureNotSupportedError
 from physx_gym import Policy, RobotEnv
 from physx_gym.bridge.make_env import make_env
 from physx_gym.cli.evaluate import evaluate, summary
 from physx_gym.show.film import write_film
+from physx_sim.errors import FeatureNotSupportedError
 
 TRAIN = Path(__file__).parent.parent / "examples" / "12_reinforcement_learning.py"
 TARGETS = {

@@ -22,7 +22,8 @@ import numpy as np
 from measure import claim, finish, rates, report
 
 import physx_gym  # noqa: F401 - registers the environments
-from physx_core import Box, Ground, Robot, Simulation, World, Wrench, plugins
+from physx_core import plugins
+from physx_sim import Box, Ground, Robot, Simulation, World, Wrench
 
 SOLVERS = {"dart": ("nsgs", "fbf", "dantzig"), "pinocchio": ("pgs",)}
 GRAVITY = 9.81

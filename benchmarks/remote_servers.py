@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from physx_core import Field, Simulation, plugins
-from physx_core.simulation import Ground, JointSettings, Robot, World
+from physx_core import Field, plugins
 from physx_remote import Messages, RLAgent, RLEnvironment, RLEnvWorld
 from physx_remote.godot_gym.messages import fill
+from physx_sim import Ground, JointSettings, Robot, Simulation, World
 
 FRAME = 1 / 60
 WHEELS = ("left_wheel_joint", "right_wheel_joint")

@@ -18,9 +18,9 @@ from pathlib import Path
 
 import numpy as np
 
-from physx_core import PhysxError, Robot, Simulation, World, plugins
-from physx_core.engines import find_robot, read_robot
-from physx_core.simulation import RobotInfo
+from physx_core import PhysxError, plugins
+from physx_sim import Robot, RobotInfo, Simulation, World
+from physx_sim.engines import find_robot, read_robot
 
 ENGINES = ("pinocchio", "dart", "mujoco")
 STATES, STEPS, LOADS, TIMEOUT, NEGLIGIBLE = 20, 200, 5, 300, 1e-6

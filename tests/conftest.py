@@ -167,3 +167,56 @@ def marked(mark):
         except OSError:
             continue
     return found
+
+
+@pytest.fixture
+def drive():
+    """Bring an environment to life as a pipeline does, step it, and return its samples."""
+    alive = []
+
+    def make(environment, **options):
+        made = environment(**{"seed": 3, **options})
+        alive.append(made)
+        made.create()
+        made.init()
+        made.init_database()
+        return made
+
+    def run(environment, steps, predict=None, **options):
+        made = make(environment, **options) if isinstance(environment, type) else environment
+        samples = []
+        for _ in range(steps):
+            made.step()
+            samples.append(made.take_sample())
+            assert made.check_sample()
+            if made.factory.has_events:
+                made.update_visualization()
+            made.step_index += 1
+            if predict is not None:
+                made.apply_prediction(predict(samples[-1]))
+        return samples
+
+    run.make = make
+    yield run
+    for made in alive:
+        made.close()
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "data"
+
+
+@pytest.fixture
+def small_disk(tmp_path):
+    """An 8 MB disk."""
+    place = tmp_path / "disk"
+    place.mkdir()
+    mounted = subprocess.run(
+        ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(place)], capture_output=True
+    )
+    if mounted.returncode and os.environ.get("CI") != "true":
+        pytest.skip("no right to mount a small disk here")
+    assert not mounted.returncode, mounted.stderr
+    yield place
+    subprocess.run(["umount", str(place)], check=True)

@@ -8,7 +8,8 @@ import numpy as np
 import torch
 from rivals import linear_map, relative_error
 
-from physx_core import JointSettings, Robot, Simulation, World, plugins
+from physx_core import plugins
+from physx_sim import JointSettings, Robot, Simulation, World
 
 JOINTS, VISCOUS, DRY = ("shoulder", "elbow"), np.array([0.3, 0.15]), np.array([0.2, 0.1])
 Function = Callable[..., torch.Tensor]

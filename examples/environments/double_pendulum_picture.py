@@ -10,7 +10,7 @@ import torch
 from environments.double_pendulum import DRY, JOINTS, VISCOUS, Function, as_torch
 from matplotlib.figure import Figure
 
-from physx_core import Simulation
+from physx_sim import Simulation
 
 PERIOD, STEPS = 5e-3, 1000
 STYLES = ({"color": "black", "lw": 4, "alpha": 0.3}, {"color": "tab:orange"}, {"color": "tab:blue"})

@@ -6,8 +6,8 @@ import numpy as np
 from environments.seeker import Seeker
 
 from physx_core import Field, plugins
-from physx_core.simulation import Box, Ground, World
 from physx_remote import Messages, RLEnvironment, RLEnvWorld, fill
+from physx_sim import Box, Ground, World
 
 SIZE, HEIGHT, THICK = 6.0, 0.5, 0.1  # of the room and its walls, in m
 APPLES = 5

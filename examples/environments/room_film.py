@@ -11,8 +11,8 @@ from environments.room import APPLES, SIZE, WALLS
 from PIL import Image
 
 from physx_core.components import Factory
-from physx_core.engines import find_robot
 from physx_rerun import RerunVisualizer
+from physx_sim.engines import find_robot
 
 BODIES = "base", "caster_fork", "caster_wheel", "left_wheel", "right_wheel"
 

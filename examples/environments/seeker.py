@@ -6,8 +6,8 @@ import numpy as np
 from gymnasium import spaces
 
 from physx_core import Field
-from physx_core.simulation import JointSettings, Robot
 from physx_remote import RLAgent, fill
+from physx_sim import JointSettings, Robot
 
 RAYS = 16
 NEAR, FAR = 0.4, 6.0  # where rays start and end, in m from the robot's center

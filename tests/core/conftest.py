@@ -27,27 +27,7 @@ def in_a_folder_of_its_own(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-@pytest.fixture
-def small_disk(tmp_path):
-    """An 8 MB disk."""
-    place = tmp_path / "disk"
-    place.mkdir()
-    mounted = subprocess.run(
-        ["mount", "-t", "tmpfs", "-o", "size=8m", "tmpfs", str(place)], capture_output=True
-    )
-    if mounted.returncode and os.environ.get("CI") != "true":
-        pytest.skip("no right to mount a small disk here")
-    assert not mounted.returncode, mounted.stderr
-    yield place
-    subprocess.run(["umount", str(place)], check=True)
-
-
 # Datasets ---------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def folder(tmp_path):
-    return tmp_path / "data"
 
 
 @pytest.fixture

@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
 
 from physx_core import DataGeneration, Dataset, Environment, EnvironmentConfig, Field
-from physx_core.dataset.exchange.importing import import_file
 from physx_core.errors import (
     FieldShapeError,
     FieldTypeError,
@@ -21,6 +20,7 @@ from physx_core.errors import (
     SampleError,
 )
 from physx_core.sources import LocalSource
+from physx_formats.importing import import_file
 
 PROGRAM = Path(__file__).parent / "programs" / "value_envs.py"
 VALUES = f"{PROGRAM}:Values"

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from physx_core.engines import example_robot
+from physx_sim.engines import example_robot
 
 pytest.importorskip("torch")
 pytest.importorskip("dartpy")

@@ -2,7 +2,18 @@
 
 import re
 
-PACKAGES = ("core", "dart", "torch", "rerun", "gym", "remote", "cluster")
+PACKAGES = (
+    "core",
+    "sim",
+    "testing",
+    "formats",
+    "dart",
+    "torch",
+    "rerun",
+    "gym",
+    "remote",
+    "cluster",
+)
 
 
 def test_every_file_on_the_ways_exists(root):

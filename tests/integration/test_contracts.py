@@ -9,7 +9,7 @@ import pytest
 
 from physx_core import NetworkConfig, plugins
 from physx_core.external import INCLUDE
-from physx_core.testing import check_plugin
+from physx_testing import check_plugin
 
 pytestmark = pytest.mark.slow
 

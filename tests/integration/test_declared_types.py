@@ -19,15 +19,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 import physx_core
+import physx_sim
 from physx_core import (
     DatasetConfig,
     EnvironmentConfig,
     NetworkConfig,
     checks,
-    simulation,
 )
 from physx_core.config import from_plain, read_toml, to_plain, write_toml
 from physx_core.errors import ConfigError
+from physx_formats import ExportOptions
 from physx_gym import Trajectory
 from physx_gym.tasks import quantities
 from physx_rerun import RerunVisualizer
@@ -44,35 +45,35 @@ BODY = {"name": "thing", "position": (1.0, 0.5, 0.25), "orientation": (0.5, 0.1,
 
 # Options that make an object of each class and hold a number wherever one can be.
 GIVEN: dict[type[Any], dict[str, Any]] = {
-    simulation.Box: {**BODY, "size": (1.0, 0.5, 0.25)},
-    simulation.Sphere: {**BODY, "radius": 0.5},
-    simulation.Capsule: {**BODY, "radius": 0.5, "length": 2.0},
-    simulation.Cylinder: {**BODY, "radius": 0.5, "length": 2.0},
-    simulation.Mesh: {**BODY, "path": "shape.stl"},
-    simulation.WorldObject: BODY,
-    simulation.Ground: {"normal": (0.1, 0.2, 0.7)},
-    simulation.Stairs: {},
-    simulation.HeightField: {"heights": [[0.0, 1.0], [0.5, 0.25]], "origin": (1.0, 0.5)},
-    simulation.JointSettings: {"damping": 0.5, "friction": 0.25},
-    simulation.Robot: {
+    physx_sim.Box: {**BODY, "size": (1.0, 0.5, 0.25)},
+    physx_sim.Sphere: {**BODY, "radius": 0.5},
+    physx_sim.Capsule: {**BODY, "radius": 0.5, "length": 2.0},
+    physx_sim.Cylinder: {**BODY, "radius": 0.5, "length": 2.0},
+    physx_sim.Mesh: {**BODY, "path": "shape.stl"},
+    physx_sim.WorldObject: BODY,
+    physx_sim.Ground: {"normal": (0.1, 0.2, 0.7)},
+    physx_sim.Stairs: {},
+    physx_sim.HeightField: {"heights": [[0.0, 1.0], [0.5, 0.25]], "origin": (1.0, 0.5)},
+    physx_sim.JointSettings: {"damping": 0.5, "friction": 0.25},
+    physx_sim.Robot: {
         "urdf": "arm.urdf",
         "feet": {"foot": 0.25},
         "mass_factors": {"link": 1.25, "hand": 0.5},
     },
-    simulation.World: {"robots": [simulation.Robot("arm.urdf")], "iterations": 3},
-    simulation.Wrench: {
+    physx_sim.World: {"robots": [physx_sim.Robot("arm.urdf")], "iterations": 3},
+    physx_sim.Wrench: {
         "body": "hand",
         "force": [[1.0, 0.5, 2.0], [0.0, 1.0, 0.0]],
         "duration": 0.5,
         "times": (0.25, 1.0),
     },
-    simulation.Motor: {"joint": "knee", "stiffness": 4.0, "inertia": 0.5, "period": 0.25}
+    physx_sim.Motor: {"joint": "knee", "stiffness": 4.0, "inertia": 0.5, "period": 0.25}
     | {"max_torque": 2.0, "max_velocity": 4.0, "slope": 0.5, "viscous": (0.5, 0.25), "dry": 1.0},
-    simulation.Encoder: {"name": "knee", "joint": "knee", **ERRORS},
-    simulation.Imu: {"name": "imu", "body": "head", "period": 0.25},
-    simulation.ContactSensor: {"name": "sole", "body": "foot", "period": 0.25},
-    simulation.ForceTorqueSensor: {"name": "wrist", "joint": "wrist", "period": 0.25},
-    simulation.EffortSensor: {"name": "knee", "joint": "knee", "period": 0.25},
+    physx_sim.Encoder: {"name": "knee", "joint": "knee", **ERRORS},
+    physx_sim.Imu: {"name": "imu", "body": "head", "period": 0.25},
+    physx_sim.ContactSensor: {"name": "sole", "body": "foot", "period": 0.25},
+    physx_sim.ForceTorqueSensor: {"name": "wrist", "joint": "wrist", "period": 0.25},
+    physx_sim.EffortSensor: {"name": "knee", "joint": "knee", "period": 0.25},
     physx_core.Field: {"name": "q", "shape": (3, 2)},
     physx_core.Parameter: {
         "name": "load",
@@ -104,6 +105,7 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
         "step_nb": 4,
     },
     RerunVisualizer: {},
+    ExportOptions: {"fps": 30},
     Trajectory: {"times": [0.0, 1.0], "positions": [[1.0], [2.0]], "velocities": [[0.5], [0.0]]},
     quantities.Masked: {"quantity": quantities.JointPositions(), "entries": [2, 0]},
     quantities.Stacked: {"quantity": quantities.JointPositions(), "steps": 2},
@@ -115,6 +117,7 @@ RECORDS = {
     *("Layout", "Part", "State", "AppliedWrench", "MotorState", "SensorState", "RobotInfo"),
     *("UrdfShape", "Episode", "StepperState", "Result", "Trial", "Normalization"),
     *("CollisionShape", "Joint", "Mover", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
+    *("Kind", "Format", "Table"),
 }
 ABSTRACT = {"Pipeline", "Sensor"}
 

@@ -14,13 +14,35 @@ import pytest
 pytestmark = pytest.mark.slow
 
 PACKAGES = (
-    *("physx_core", "physx_dart", "physx_torch", "physx_rerun", "physx_gym", "physx_remote"),
-    "physx_cluster",
+    *("physx_core", "physx_testing", "physx_sim", "physx_formats", "physx_dart", "physx_torch"),
+    *("physx_rerun", "physx_gym", "physx_remote", "physx_cluster"),
 )
 PHYSX = ("-m", "physx_core")
 GENERATE = "--batch-nb 2 --batch-size 10"
 CONSTRAINTS = Path(__file__).parents[2] / "constraints.txt"
 OPTIONS = ("--quiet", "--no-compile", "-c", CONSTRAINTS)
+WORKSHOP = Path(__file__).parent / "programs" / "physx_workshop"
+STUDY = """
+[run]
+executor = "patient"
+[parameters]
+"training.network.network_kwargs.net_fields" = [["state", "force"], ["state"]]
+[pipelines.linear.training]
+epoch_nb = 1
+batch_size = 5
+[pipelines.linear.training.dataset]
+existing_dir = "sessions/data_generation"
+validation_split = 0.5
+[pipelines.linear.training.network]
+network = "toy/linear"
+"""
+ASK = """
+import socket, sys
+with socket.socket(type=socket.SOCK_DGRAM) as link:
+    link.settimeout(10)
+    link.sendto(b"1", ("127.0.0.1", int(sys.argv[1])))
+    print(link.recv(100).decode(), "reward")
+"""
 SERVE = """
 import threading
 from physx_remote import connect, serve
@@ -65,7 +87,9 @@ def python(tmp_path_factory, wheels):
 def add(python, wheels):
     """Install a package beside the core; it goes after the test, with all that came with it."""
     before = installed(python)
-    yield lambda name: pip(python, "install", *OPTIONS, next(wheels.glob(f"{name}-*.whl")))
+    yield lambda name: pip(
+        python, "install", *OPTIONS, "--find-links", wheels, next(wheels.glob(f"{name}-*.whl"))
+    )
     pip(python, "uninstall", "--quiet", "--yes", *sorted(installed(python) - before))
 
 
@@ -154,3 +178,49 @@ def test_the_plugin_of_clusters_works_with_the_core_alone(python, add, run):
         assert missing.returncode == 1
         assert f"needs {library}" in missing.stderr
         assert "physx_cluster" in missing.stderr and "pip install" in missing.stderr
+
+
+@pytest.fixture
+def workshop(python, add, wheels, tmp_path):
+    """Install a package that brings a format, a protocol, an executor, and a kind of its own."""
+    for name in ("physx_testing", "physx_formats", "physx_remote", "physx_cluster"):
+        add(name)
+    source = shutil.copytree(WORKSHOP, tmp_path / "source")
+    command = (sys.executable, "-m", "build", "--wheel", "--no-isolation", "-o", tmp_path, source)
+    subprocess.run(list(map(str, command)), check=True, capture_output=True)
+    pip(python, "install", *OPTIONS, "--no-deps", next(tmp_path.glob("*.whl")))
+
+
+@pytest.mark.usefixtures("workshop")
+def test_a_package_adds_components_of_every_kind_and_a_kind_of_its_own(python, run, tmp_path):
+    def physx(*words, ok=True):
+        return run(*PHYSX, *words, python=python, ok=ok)
+
+    listed = physx("plugins").stdout
+    for text in (
+        *("format: workshop/columns", "protocol: workshop/datagrams"),
+        *("trial_executor: workshop/patient", "material: workshop/steel, workshop/antimatter"),
+    ):
+        assert text in listed
+
+    generate(run, python)
+    physx("export", "sessions/data_generation", "spring.txt", "--to", "columns")
+    assert "20 training samples" in physx("import", "spring.txt", "copy").stdout
+    physx("export", "sessions/data_generation", "again.txt", "--to", "workshop/columns")
+    assert (tmp_path / "again.txt").read_bytes() == (tmp_path / "spring.txt").read_bytes()
+
+    words = [python, *PHYSX, "serve", "CartPole-v1", "--protocol", "datagrams"]
+    with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as service:
+        port = service.stdout.readline().split()[-1].rpartition(":")[2]
+        assert "1.0 reward" in run("-c", ASK, port, python=python).stdout
+        service.terminate()
+
+    (tmp_path / "study.toml").write_text(STUDY)
+    assert "2 trials" in physx("sweep", "study.toml").stderr
+    assert len([*(tmp_path / "studies").rglob("patient.log")]) == 2
+
+    assert physx("weigh", "steel", "2").stdout == "15700 kg\n"
+    assert 'Did you mean "steel"' in physx("weigh", "stel", "2", ok=False).stderr
+    found = physx("check", "workshop", "--kind", "material", ok=False)
+    assert found.returncode == 1
+    assert "its density is -1.0 kg/m³" in found.stdout and "1 of 2" in found.stderr

@@ -10,7 +10,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from physx_core import Dataset
-from physx_core.dataset.exchange import ExportOptions, export
+from physx_formats import ExportOptions, export
 
 PROGRAMS = Path(__file__).parent / "programs"
 ROWS = 60

@@ -36,7 +36,8 @@ CALLS = {
     'StoredDataset("folder")': "StoredDataset",
 }
 HEADER = """
-from physx_core import Dataset, EnvironmentConfig, Field, Robot, World, plugins
+from physx_core import Dataset, EnvironmentConfig, Field, plugins
+from physx_sim import Robot, World
 from physx_gym import Policy, RobotEnv
 from physx_remote import connect, connect_vector, serve
 from physx_torch import StoredDataset

@@ -7,8 +7,9 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 
-from physx_core import Box, JointSettings, PhysxError, Robot, World, Wrench
-from physx_core.engines import named_robots, read_robot
+from physx_core import PhysxError
+from physx_sim import Box, JointSettings, Robot, World, Wrench
+from physx_sim.engines import named_robots, read_robot
 
 pytest.importorskip("mujoco")
 

@@ -8,7 +8,9 @@ from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 
-from physx_core import (
+from physx_core.errors import UnknownOptionError
+from physx_core.rotations import to_matrix
+from physx_sim import (
     Box,
     Capsule,
     Cylinder,
@@ -22,14 +24,8 @@ from physx_core import (
     World,
     Wrench,
 )
-from physx_core.engines import read_robot
-from physx_core.errors import (
-    FeatureNotSupportedError,
-    ModelError,
-    SimulationError,
-    UnknownOptionError,
-)
-from physx_core.rotations import to_matrix
+from physx_sim.engines import read_robot
+from physx_sim.errors import FeatureNotSupportedError, ModelError, SimulationError
 
 mujoco = pytest.importorskip("mujoco")
 

@@ -1,7 +1,7 @@
 """The visualizer keeps the contract that other visualizers keep."""
 
-from physx_core.testing import check_visualizer
 from physx_rerun.visualizer import RerunVisualizer
+from physx_testing import check_visualizer
 
 
 def test_the_visualizer_keeps_the_contract():

@@ -4,8 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from physx_core import Box, JointSettings, Robot, Simulation, World, plugins
-from physx_core.errors import FeatureNotSupportedError, SimulationError
+from physx_core import plugins
+from physx_sim import Box, JointSettings, Robot, Simulation, World
+from physx_sim.errors import FeatureNotSupportedError, SimulationError
 from physx_torch import ForwardDynamics
 
 SPRUNG = JointSettings(stiffness=3.0, rest=0.2, damping=0.4, friction=0.1)

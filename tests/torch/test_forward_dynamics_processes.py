@@ -13,8 +13,9 @@ import numpy as np
 import pytest
 import torch
 
-from physx_core import Box, JointSettings, Robot, Simulation, World, plugins
-from physx_core.errors import SimulationError
+from physx_core import plugins
+from physx_sim import Box, JointSettings, Robot, Simulation, World
+from physx_sim.errors import SimulationError
 from physx_torch import ForwardDynamics
 
 SPRUNG = JointSettings(stiffness=3.0, rest=0.2, damping=0.4, friction=0.1, armature=0.01)
@@ -30,7 +31,8 @@ WORLDS = {
 KILLED = """
 import os, signal, sys
 import numpy as np
-from physx_core import Robot, World, plugins
+from physx_core import plugins
+from physx_sim import Robot, World
 simulation = plugins.resolve("backend", "pinocchio").build(World([Robot("double_pendulum")]))
 simulation.forward_dynamics_batch(*np.zeros((3, 64, 2)), processes=3)
 print("started", flush=True)

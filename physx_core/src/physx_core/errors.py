@@ -323,10 +323,6 @@ class SessionError(PhysxError):
     """A session folder is missing, or does not fit the pipeline."""
 
 
-class StudyError(PhysxError):
-    """A study cannot be started, continued, or shown, or some of its trials have no result."""
-
-
 class DatasetError(PhysxError):
     """A dataset is missing, damaged, or lacks the requested data."""
 
@@ -337,10 +333,6 @@ class DatasetNotFoundError(DatasetError):
 
 class DatasetLockedError(DatasetError):
     """Another process is writing to the dataset."""
-
-
-class ExchangeError(DatasetError):
-    """Rows cannot be exported to or imported from a file of another format."""
 
 
 class MissingLibraryError(PhysxError):
@@ -400,49 +392,6 @@ class DivergedError(PhysxError):
 # Simulations and viewers --------------------------------------------------------------------
 
 
-class ModelError(PhysxError):
-    """A robot or world description cannot be loaded."""
-
-
-class MissingMeshesError(ModelError):
-    """A robot description names mesh files that do not exist.
-
-    Attributes:
-        missing: All missing files, as named in the description.
-    """
-
-    def __init__(self, model: str, missing: Sequence[str]) -> None:
-        self.missing = list(missing)
-        lines = "".join(f"\n  {name}" for name in self.missing)
-        super().__init__(
-            f"{model} names {len(self.missing)} mesh file(s) that do not exist:{lines}\n"
-            "Give the folder of each package in Robot(package_dirs={name: folder})."
-        )
-
-
-class SimulationError(PhysxError):
-    """A simulation cannot perform a call, or its state is no longer finite."""
-
-
-class FeatureNotSupportedError(SimulationError):
-    """The engine does not have the requested feature.
-
-    Attributes:
-        engine: Name of the engine.
-        feature: The requested feature.
-        features: The engine's features.
-    """
-
-    def __init__(
-        self, engine: str, feature: str, features: Iterable[str], advice: str = ""
-    ) -> None:
-        self.engine, self.feature, self.features = engine, feature, sorted(features)
-        super().__init__(
-            f'{engine} does not have the feature "{feature}".{advice and " " + advice} '
-            f"It has: {listed(self.features)}."
-        )
-
-
 class EpisodeError(PhysxError):
     """A call came at the wrong time in an episode, for example a step before the first reset."""
 
@@ -460,32 +409,5 @@ class ActionError(PhysxError):
         super().__init__(message)
 
 
-class LogError(PhysxError):
-    """An episode's log is missing, damaged, or lacks the requested data."""
-
-
 class VisualizerError(PhysxError):
     """A viewer cannot be started, reached or written to."""
-
-
-# Environments in other processes ------------------------------------------------------------
-
-
-class RemoteError(PhysxError):
-    """An environment in another process cannot be served, reached or stepped."""
-
-
-class RemoteClosedError(RemoteError):
-    """The connection was closed by either side."""
-
-
-class RemoteTimeoutError(RemoteError):
-    """The other side did not respond in time."""
-
-
-class RemoteProtocolError(RemoteError):
-    """The other side violated the protocol."""
-
-
-class RequestError(RemoteError):
-    """An environment cannot perform a request. It keeps running."""

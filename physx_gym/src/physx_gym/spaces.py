@@ -16,8 +16,9 @@ import numpy as np
 from gymnasium import spaces
 
 from physx_core import Field
-from physx_core.errors import ConfigError, SimulationError
+from physx_core.errors import ConfigError
 from physx_core.typing import Array
+from physx_sim.errors import SimulationError
 
 Path = tuple[Any, ...]
 Leaf = spaces.Box | spaces.Discrete | spaces.MultiDiscrete | spaces.MultiBinary

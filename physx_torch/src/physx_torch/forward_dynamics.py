@@ -11,11 +11,10 @@ import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from physx_core import Simulation
-from physx_core.errors import FeatureNotSupportedError, SimulationError
 from physx_core.rotations import cross_rows, rotate_rows
-from physx_core.simulation import Layout
 from physx_core.typing import Vector
+from physx_sim import Layout, Simulation
+from physx_sim.errors import FeatureNotSupportedError, SimulationError
 
 
 class ForwardDynamics:
@@ -55,7 +54,7 @@ class ForwardDynamics:
         """Return the accelerations, shape (..., nv), with the dtype and device of the input.
 
         Args:
-            positions: Shape (..., nq), in the convention of `physx_core.simulation.layout`.
+            positions: Shape (..., nq), in the convention of `physx_sim.layout`.
             velocities: Shape (..., nv).
             torques: Shape (..., nv), in N m or N; a floating base's first six are a force and a
                 torque on it, along its own axes. The leading axes of all three are broadcast.

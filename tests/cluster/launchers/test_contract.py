@@ -2,7 +2,7 @@
 
 import pytest
 
-from physx_core.testing import check_launcher
+from physx_testing import check_launcher
 
 pytest.importorskip("submitit")
 

@@ -47,7 +47,7 @@ def plus(table, text, base=LINEAR):
         (plus("study", "sampler = 'random'"), ["trials is missing"]),
         (plus("study", "sampler_kwargs = {a = 1}"), ['not for "grid"']),
         (plus("study", "pruner_kwargs = {a = 1}"), ["without a pruner"]),
-        (plus("run", "executor = 'slrm'"), ["[run] executor is 'slrm'", "'slurm'"]),
+        (plus("run", "executor = 'slrm'"), ["[run] executor: ", 'Did you mean "slurm"?']),
         (plus("run", "paralell = 2"), ["[run]", 'Did you mean "parallel"?']),
         (plus("parameters", "training.network.lr = 3"), ["[parameters]: training.network.lr is 3"]),
         (plus("parameters", "training.network.lr = []"), ["must be a list of values"]),

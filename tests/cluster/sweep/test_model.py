@@ -21,11 +21,11 @@ from hypothesis.stateful import (
     rule,
 )
 
+from physx_cluster.errors import StudyError
 from physx_cluster.sweep import Definition, Result, Study, run_study
 from physx_cluster.sweep.executors.executor import Executor, Job
 from physx_cluster.sweep.results import FAILURE, RESULT, TRIAL, Failure
 from physx_core.config import read_toml
-from physx_core.errors import StudyError
 
 optuna = pytest.importorskip("optuna")
 

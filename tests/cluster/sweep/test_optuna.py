@@ -7,11 +7,12 @@ from pathlib import Path
 
 import pytest
 
+from physx_cluster.errors import StudyError
 from physx_cluster.sweep import Definition, Result, run_study
 from physx_cluster.sweep.optuna import OptunaSearch, Pruning
 from physx_cluster.sweep.parameters import Choices, Range
 from physx_cluster.sweep.plan import Plan
-from physx_core.errors import ConfigError, MissingLibraryError, StudyError
+from physx_core.errors import ConfigError, MissingLibraryError
 
 pytest.importorskip("optuna")
 

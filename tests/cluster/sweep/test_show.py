@@ -5,10 +5,11 @@ from typing import ClassVar
 
 import pytest
 
+from physx_cluster.errors import StudyError
 from physx_cluster.sweep import Definition, Study, run_study
 from physx_cluster.sweep.show import draw_figure, record_curves, show_status, summary
 from physx_core import Visualizer
-from physx_core.errors import StudyError, UsageError
+from physx_core.errors import UsageError
 
 
 class Noted(Visualizer):

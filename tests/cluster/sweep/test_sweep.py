@@ -9,10 +9,11 @@ from pathlib import Path
 
 import pytest
 
+from physx_cluster.errors import StudyError
 from physx_cluster.sweep import Definition, Study, run_study
 from physx_core import Dataset, NetworkConfig, Training
 from physx_core.config import DatasetConfig
-from physx_core.errors import ConfigError, StudyError
+from physx_core.errors import ConfigError
 
 
 def table(folder):

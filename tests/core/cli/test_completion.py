@@ -87,8 +87,8 @@ def after(capsys):
     [
         ("completion", ["bash", "zsh"]),
         ("new", ["backend", "environment", "network", "plugin", "visualizer"]),
-        ("export --to", ["hdf5-single", "lerobot", "minari", "npz", "parquet", "zarr"]),
-        ("export --to =", ["hdf5-single", "lerobot", "minari", "npz", "parquet", "zarr"]),
+        ("export --to", ["npz", "parquet", "minari", "lerobot", "zarr", "hdf5-single"]),
+        ("export --to =", ["npz", "parquet", "minari", "lerobot", "zarr", "hdf5-single"]),
         ("train --on-nan", ["stop", "continue"]),
         ("train --checkpoint-every", ["epoch"]),
         ("train --network.optimizer-kwargs a=1 b=2 --on-nan", ["stop", "continue"]),

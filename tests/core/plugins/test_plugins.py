@@ -406,3 +406,87 @@ def test_of_many_components_the_nearest_are_named():
     known = [f"Cart-v{number}" for number in range(50)] + ["Acrobot"]
     text = str(ComponentNotFoundError("environment", "Acrobat", 'Plugin "gym"', known))
     assert 'Did you mean "Acrobot"?' in text and "and 43 others (physx plugins)" in text
+
+
+KIND = """
+from physx_core.plugins import hookimpl, kind_hook
+class Material:
+    pass
+class Steel(Material):
+    pass
+@kind_hook(f"{__name__}:Material")
+def physx_materials():
+    pass
+"""
+MATERIALS = """
+from physx_core.plugins import hookimpl
+@hookimpl
+def physx_materials():
+    return {"steel": "plugin_of_kind:Steel"}
+"""
+KIND_TESTS = {
+    "kind_names": "assert {'network', 'material'} <= set(p.kind_names())",
+    "resolve": "assert p.resolve('material', 'workshop/steel').__name__ == 'Steel'",
+    "complete_reference": "assert p.complete_reference('material', 'steel') == 'workshop/steel'",
+    "find_kind": "assert p.find_kind('material').base == 'plugin_of_kind:Material'",
+    "another class": "import pytest\n"
+    "with pytest.raises(ReferenceFormError, match='not a physx material'):\n"
+    "    p.resolve('material', 'physx_core.toy:Spring')",
+    "no such name": "import pytest\n"
+    "with pytest.raises(ComponentNotFoundError, match='Did you mean \"steel\"'):\n"
+    "    p.complete_reference('material', 'stel')",
+    "no such kind": "import pytest\n"
+    "with pytest.raises(ReferenceFormError, match='launcher, .*material'):\n"
+    "    p.resolve('metal', 'workshop/steel')",
+}
+
+
+@pytest.mark.parametrize("case", KIND_TESTS)
+def test_a_package_adds_a_kind_of_component(tmp_path, case):
+    add_plugin(tmp_path, "physx_materials", KIND, "kind", "physx.hookspecs")
+    add_plugin(tmp_path, "workshop", MATERIALS)
+    code = "from physx_core import plugins as p\nfrom physx_core.errors import *\n"
+    done = subprocess.run(
+        [sys.executable, "-c", code + KIND_TESTS[case]],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("code", "message"),
+    [
+        ("", "has no function physx_materials marked with kind_hook"),
+        ("1 / 0", "division by zero"),
+    ],
+)
+def test_a_broken_kind_is_named_and_breaks_no_other_plugin(tmp_path, code, message):
+    add_plugin(tmp_path, "physx_materials", code, "kind", "physx.hookspecs")
+    add_plugin(tmp_path, "workshop", MATERIALS)
+    done = physx(tmp_path, "plugins")
+    assert done.returncode == 0
+    assert message in " ".join(done.stdout.split()) and "environment: toy/spring" in done.stdout
+
+
+def test_a_hook_of_a_package_that_is_not_installed_is_named(tmp_path):
+    add_plugin(tmp_path, "workshop", MATERIALS)
+    out = " ".join(physx(tmp_path, "plugins").stdout.split())
+    assert "broken:" in out and "unknown hook" in out and "physx_materials" in out
+
+
+def test_a_name_that_two_plugins_have_must_say_which(tmp_path):
+    for name in ("one", "two"):
+        add_plugin(tmp_path, name, MATERIALS)
+    add_plugin(tmp_path, "physx_materials", KIND, "kind", "physx.hookspecs")
+    code = "from physx_core import plugins; plugins.complete_reference('material', 'steel')"
+    done = subprocess.run(
+        [sys.executable, "-c", code],
+        env={**os.environ, "PYTHONPATH": str(tmp_path)},
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert '"steel" may be one/steel or two/steel: give one of these.' in done.stderr

@@ -1,10 +1,10 @@
 import pytest
 
-from physx_core import Backend, plugins
+from physx_core import plugins
 from physx_core.cli import main
 from physx_core.origin import install_hint
 from physx_core.plugins import Plugin
-from physx_core.simulation import RobotInfo
+from physx_sim import Backend, RobotInfo
 
 
 class Engine(Backend):

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 
 from physx_core import Factory, plugins
-from physx_core.errors import ConfigError, ModelError, UnknownOptionError
+from physx_core.errors import ConfigError, UnknownOptionError
 from physx_dart.environments.arm import DartArm, PinocchioArm
 from physx_dart.environments.double_pendulum import DartDoublePendulum, PinocchioDoublePendulum
 from physx_dart.environments.trajectories import SmoothTrajectory
+from physx_sim.errors import ModelError
 
 ARMS = [DartArm, PinocchioArm]
 PENDULUMS = [DartDoublePendulum, PinocchioDoublePendulum]
@@ -237,7 +238,7 @@ def test_without_the_robots_the_arm_names_the_package_to_install(monkeypatch):
         raise importlib.metadata.PackageNotFoundError(name)
 
     monkeypatch.setattr(importlib.metadata, "distribution", missing)
-    with pytest.raises(ModelError, match=r'pip install .*physx.core\[robots\]"'):
+    with pytest.raises(ModelError, match=r'pip install .*physx.sim\[robots\]"'):
         DartArm().create()
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from physx_core.errors import SimulationError
 from physx_dart.pinocchio.contact_problem import ContactProblem
 from physx_dart.pinocchio.solver import ImpulseSolver
+from physx_sim.errors import SimulationError
 
 
 def random_problem(rng, points, limits, bounded, spare):

@@ -5,9 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from physx_core import Encoder, Robot, World
 from physx_core.errors import ConfigError
-from physx_core.simulation import Motor
 from physx_gym import (
     ControlledEnv,
     MotorSafetyLimit,
@@ -16,6 +14,7 @@ from physx_gym import (
     RobotEnv,
     Simulator,
 )
+from physx_sim import Encoder, Motor, Robot, World
 
 DT = 0.005
 

@@ -5,8 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from physx_core import Encoder, Imu
-from physx_core.errors import ConfigError, SimulationError
+from physx_core.errors import ConfigError
 from physx_core.rotations import rotate_back_rows, to_roll_pitch_yaw
 from physx_gym import (
     BodyObserver,
@@ -19,6 +18,8 @@ from physx_gym import (
     Simulator,
 )
 from physx_gym.tasks.quantities import BaseHeight, BodiesInContact
+from physx_sim import Encoder, Imu
+from physx_sim.errors import SimulationError
 
 DT = 0.005
 TILTED = (0.1, -0.2, 0.3, 0.927361849549570)

@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 
 from physx_core.errors import ConfigError, PhysxError, UnknownArgumentError, UnknownOptionError
-from physx_core.simulation import Robot, World
 from physx_gym import ParallelVectorEnv, RobotEnv, Simulator, build_pipeline, plain
+from physx_sim import Robot, World
 
 IDS = sorted(id for id in gymnasium.registry if id.startswith("physx/"))
 ENGINES = ["dart", "pinocchio"]

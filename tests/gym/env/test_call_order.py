@@ -5,8 +5,8 @@ import pytest
 from gymnasium import spaces
 
 from physx_core.errors import ConfigError, EpisodeError
-from physx_core.simulation import Motor
 from physx_gym import Layer, RobotEnv
+from physx_sim import Motor
 
 HOOKS = (
     "_setup",

@@ -8,9 +8,10 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from physx_core.errors import ConfigError, EpisodeError, SimulationError
-from physx_core.simulation import Motor, Robot, World
+from physx_core.errors import ConfigError, EpisodeError
 from physx_gym import Layer, PipelineEnv, RobotEnv, Simulator
+from physx_sim import Motor, Robot, World
+from physx_sim.errors import SimulationError
 
 SLIDER = [Motor(joint="slider")]
 

@@ -14,10 +14,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from physx_core.errors import SimulationError
-from physx_core.simulation import Encoder, Imu, Motor
 from physx_gym import Layer, RobotEnv
 from physx_gym.spaces import copy_tree
+from physx_sim import Encoder, Imu, Motor
+from physx_sim.errors import SimulationError
 
 PROGRAM = Path(__file__).parents[1] / "programs" / "noisy_ant.py"
 program = runpy.run_path(str(PROGRAM))

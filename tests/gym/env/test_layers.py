@@ -12,7 +12,7 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from physx_core.errors import ConfigError, SimulationError
+from physx_core.errors import ConfigError
 from physx_gym import (
     BodyObserver,
     ControlledEnv,
@@ -27,6 +27,7 @@ from physx_gym import (
     RobotEnv,
     Simulator,
 )
+from physx_sim.errors import SimulationError
 
 DT = 0.005
 

@@ -12,9 +12,9 @@ from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
 from physx_core.errors import EpisodeError, VisualizerError
-from physx_core.simulation import Encoder, Motor
 from physx_gym import Layer, RobotEnv
 from physx_gym.tasks.quantities import BodyPositions, Delta, JointPositions
+from physx_sim import Encoder, Motor
 
 MEMBERS = (
     "simulator", "render_mode", "stepper_state", "is_simulation_running", "robot", "robot_state",

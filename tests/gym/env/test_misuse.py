@@ -10,11 +10,11 @@ from physx_core.errors import (
     ComponentNotFoundError,
     ConfigError,
     EpisodeError,
-    SimulationError,
     UnknownOptionError,
 )
-from physx_core.simulation import Encoder, Motor, Wrench
 from physx_gym import RobotEnv
+from physx_sim import Encoder, Motor, Wrench
+from physx_sim.errors import SimulationError
 
 
 def cart(**options):

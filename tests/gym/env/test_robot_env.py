@@ -10,8 +10,8 @@ import pytest
 from gymnasium import spaces
 
 from physx_core.errors import ConfigError, EpisodeError, UnknownOptionError, UsageError
-from physx_core.simulation import Encoder, Ground, Motor
 from physx_gym import RobotEnv, Simulator
+from physx_sim import Encoder, Ground, Motor
 
 SLIDER = [Motor(joint="slider")]
 

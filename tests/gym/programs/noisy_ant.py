@@ -2,8 +2,8 @@
 
 import sys
 
-from physx_core.simulation import Encoder, Imu
 from physx_gym import RobotEnv
+from physx_sim import Encoder, Imu
 
 
 def make(backend):

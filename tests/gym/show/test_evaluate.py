@@ -8,8 +8,9 @@ import signal
 import numpy as np
 import pytest
 
-from physx_core.errors import ConfigError, SimulationError
+from physx_core.errors import ConfigError
 from physx_gym import RobotEnv, read_log
+from physx_sim.errors import SimulationError
 
 
 class Balance(RobotEnv):

@@ -7,8 +7,9 @@ import sys
 import numpy as np
 import pytest
 
-from physx_core.errors import LogError, MissingLibraryError
+from physx_core.errors import MissingLibraryError
 from physx_gym import Log, RobotEnv, plot
+from physx_gym.errors import LogError
 
 
 def log_of(*names, rows=5, units=None):

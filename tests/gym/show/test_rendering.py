@@ -14,14 +14,12 @@ from PIL import Image
 
 from physx_core import plugins
 from physx_core.components import Factory, Visualizer
-from physx_core.errors import (
-    ConfigError,
-    LogError,
-    PluginNotFoundError,
-    UnknownOptionError,
-    VisualizerError,
-)
-from physx_core.simulation import (
+from physx_core.errors import ConfigError, PluginNotFoundError, UnknownOptionError, VisualizerError
+from physx_gym import RobotEnv, Simulator, replay
+from physx_gym.errors import LogError
+from physx_gym.show.drawing import WorldDrawing
+from physx_gym.show.film import write_film
+from physx_sim import (
     Box,
     Capsule,
     Cylinder,
@@ -33,9 +31,6 @@ from physx_core.simulation import (
     Stairs,
     World,
 )
-from physx_gym import RobotEnv, Simulator, replay
-from physx_gym.show.drawing import WorldDrawing
-from physx_gym.show.film import write_film
 
 SIZE = (160, 120)
 

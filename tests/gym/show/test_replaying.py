@@ -11,11 +11,12 @@ import numpy as np
 import pytest
 
 from physx_core.components import Visualizer
-from physx_core.errors import LogError, SimulationError
-from physx_core.simulation import Ground, Robot, World
 from physx_gym import RobotEnv, Simulator, replay
 from physx_gym.cli import log as log_command
+from physx_gym.errors import LogError
 from physx_gym.telemetry.log_file import read_log
+from physx_sim import Ground, Robot, World
+from physx_sim.errors import SimulationError
 
 
 class Witness(Visualizer):

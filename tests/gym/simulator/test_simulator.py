@@ -3,8 +3,9 @@
 import numpy as np
 import pytest
 
-from physx_core.errors import ConfigError, EpisodeError, SimulationError
-from physx_core.simulation import (
+from physx_core.errors import ConfigError, EpisodeError
+from physx_gym import RobotEnv, Simulator
+from physx_sim import (
     Box,
     ContactSensor,
     EffortSensor,
@@ -21,7 +22,7 @@ from physx_core.simulation import (
     World,
     Wrench,
 )
-from physx_gym import RobotEnv, Simulator
+from physx_sim.errors import SimulationError
 
 
 def test_one_line_from_a_robots_name(backend):

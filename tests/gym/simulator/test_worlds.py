@@ -12,11 +12,11 @@ from gymnasium.utils.env_checker import check_env
 
 from physx_core import PhysxError
 from physx_core.errors import ActionError, ConfigError, EpisodeError, UnknownOptionError
-from physx_core.simulation import Encoder, Motor, Robot, Sphere, World
 from physx_gym import ComposedEnv, PDController, RobotEnv, Simulator, build_pipeline
 from physx_gym.tasks.quantities import BodyPositions, JointPositions, Stacked
 from physx_gym.tasks.rewards import Minimizing, Sum, Survival, Tracking
 from physx_gym.tasks.terminations import OutOfBounds
+from physx_sim import Encoder, Motor, Robot, Sphere, World
 
 
 def cart(kind=RobotEnv, **options):

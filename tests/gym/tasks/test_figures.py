@@ -13,12 +13,13 @@ import pinocchio as pin
 import pytest
 from gymnasium import spaces
 
-from physx_core.errors import SimulationError, VisualizerError
+from physx_core.errors import VisualizerError
 from physx_core.rotations import from_rotation_vector_rows, multiply_rows, to_matrix_rows
-from physx_core.simulation import Encoder, Imu, Motor, Wrench
 from physx_gym import ControlledEnv, PDController, RobotEnv, Simulator, read_log
 from physx_gym.tasks.quantities import BodyPoses, geometry
 from physx_gym.tasks.terminations import lost_ground, roll_pitch, unsafe_joints
+from physx_sim import Encoder, Imu, Motor, Wrench
+from physx_sim.errors import SimulationError
 
 STAND = np.tile([0.0, 0.8, -1.6], 4)
 SHINS = ("back_left_shin", "back_right_shin", "front_left_shin", "front_right_shin")

@@ -7,8 +7,7 @@ import pinocchio as pin
 import pytest
 
 from physx_core import rotations
-from physx_core.engines import find_robot
-from physx_core.errors import ComponentNotFoundError, ConfigError, FeatureNotSupportedError
+from physx_core.errors import ComponentNotFoundError, ConfigError
 from physx_gym import RobotEnv, Simulator
 from physx_gym.env.layers.composed import ComposedEnv
 from physx_gym.tasks.quantities import (
@@ -52,6 +51,8 @@ from physx_gym.tasks.quantities import (
 )
 from physx_gym.tasks.quantities.quantity import Quantity
 from physx_gym.tasks.trajectory import Trajectory
+from physx_sim.engines import find_robot
+from physx_sim.errors import FeatureNotSupportedError
 
 SHINS = ("back_left_shin", "back_right_shin", "front_left_shin", "front_right_shin")
 ENGINES = ("dart", "pinocchio")

@@ -7,7 +7,6 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 from physx_core.errors import ComponentNotFoundError, ConfigError
-from physx_core.simulation import Encoder, Robot, Sphere, World
 from physx_gym import (
     ComposedEnv,
     PDController,
@@ -27,6 +26,7 @@ from physx_gym.tasks.randomizations import (
     RandomNoise,
     RandomPushes,
 )
+from physx_sim import Encoder, Robot, Sphere, World
 
 TABLE = """
 env_config.cls = "RobotEnv"

@@ -5,9 +5,10 @@ import math
 import numpy as np
 import pytest
 
-from physx_core.errors import ConfigError, LogError
+from physx_core.errors import ConfigError
 from physx_gym import RobotEnv, Simulator
 from physx_gym.env.layers.composed import ComposedEnv
+from physx_gym.errors import LogError
 from physx_gym.tasks.quantities import (
     BaseHeight,
     JointPositions,

@@ -11,8 +11,8 @@ import h5py
 import numpy as np
 import pytest
 
-from physx_core.errors import LogError
 from physx_gym import Log, RobotEnv, read_log, replay
+from physx_gym.errors import LogError
 
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.6, 0.9, 0.999])

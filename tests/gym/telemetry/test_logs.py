@@ -11,8 +11,12 @@ import pytest
 
 from physx_core import plugins
 from physx_core.cli import main
-from physx_core.errors import ComponentNotFoundError, LogError
-from physx_core.simulation import (
+from physx_core.errors import ComponentNotFoundError
+from physx_gym import Log, RobotEnv, Simulator, read_log
+from physx_gym.errors import LogError
+from physx_gym.telemetry.log_folder import KEPT, LogFolder
+from physx_gym.telemetry.telemetry import Telemetry
+from physx_sim import (
     Box,
     Cylinder,
     Ground,
@@ -24,9 +28,6 @@ from physx_core.simulation import (
     Stairs,
     World,
 )
-from physx_gym import Log, RobotEnv, Simulator, read_log
-from physx_gym.telemetry.log_folder import KEPT, LogFolder
-from physx_gym.telemetry.telemetry import Telemetry
 
 
 def run(env, steps, seed=0):

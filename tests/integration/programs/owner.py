@@ -14,10 +14,11 @@ from pathlib import Path
 
 import numpy as np
 
-from physx_core import DataGeneration, Environment, EnvironmentConfig, Robot, World, plugins
+from physx_core import DataGeneration, Environment, EnvironmentConfig, plugins
 from physx_core.components import Factory
 from physx_core.errors import VisualizerError
 from physx_core.processes import ChildProcess
+from physx_sim import Robot, World
 
 kept = []
 

@@ -14,8 +14,8 @@ import pytest
 from gymnasium import spaces
 
 from physx_core import Field
-from physx_core.errors import RemoteClosedError, RemoteTimeoutError
 from physx_remote import connect, connect_vector
+from physx_remote.errors import RemoteClosedError, RemoteTimeoutError
 from physx_remote.godot_gym.messages import Messages
 
 PROJECT = Path(__file__).parents[1] / "programs" / "godot"

@@ -10,8 +10,8 @@ import time
 import numpy as np
 import pytest
 
-from physx_core import Field, PhysxError, Robot, World, plugins
-from physx_core.errors import ConfigError, RequestError, UsageError
+from physx_core import Field, PhysxError, plugins
+from physx_core.errors import ConfigError, UsageError
 from physx_remote import (
     GodotGymClient,
     Messages,
@@ -20,7 +20,9 @@ from physx_remote import (
     RLEnvWorld,
     connect,
 )
+from physx_remote.errors import RequestError
 from physx_remote.godot_gym.messages import fill
+from physx_sim import Robot, World
 
 LIVES = {"observation": {"world": []}}
 ALIVE = bytes.fromhex("120d080110ffffffffffffffffff01")

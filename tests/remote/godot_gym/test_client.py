@@ -11,14 +11,14 @@ import pytest
 from gymnasium import spaces
 
 from physx_core import Field
-from physx_core.errors import (
-    ConfigError,
+from physx_core.errors import ConfigError
+from physx_remote import GodotGymClient, GodotGymEnv, Messages, connect
+from physx_remote.errors import (
     RemoteClosedError,
     RemoteError,
     RemoteProtocolError,
     RemoteTimeoutError,
 )
-from physx_remote import GodotGymClient, GodotGymEnv, Messages, connect
 from physx_remote.godot_gym.messages import fill
 
 

@@ -7,9 +7,10 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from physx_core import Field, Robot, World, plugins
+from physx_core import Field, plugins
 from physx_remote import Messages, RLAgent, RLEnvironment, RLEnvWorld
 from physx_remote.godot_gym.messages import fill
+from physx_sim import Robot, World
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*Box:UserWarning")
 

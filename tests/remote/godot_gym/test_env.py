@@ -8,8 +8,9 @@ import pytest
 from gymnasium import spaces
 from gymnasium.utils.env_checker import check_env
 
-from physx_core.errors import RemoteError, UsageError
+from physx_core.errors import UsageError
 from physx_remote import serve
+from physx_remote.errors import RemoteError
 from physx_remote.serving.spaces import to_json
 
 pytestmark = pytest.mark.filterwarnings("ignore:.*Box observation space:UserWarning")

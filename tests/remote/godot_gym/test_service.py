@@ -8,8 +8,9 @@ import threading
 import pytest
 
 from physx_core import PhysxError
-from physx_core.errors import ConfigError, RemoteError, UnknownOptionError, UsageError
+from physx_core.errors import ConfigError, UnknownOptionError, UsageError
 from physx_remote import serve
+from physx_remote.errors import RemoteError
 
 LIVES = {"observation": {"world": []}}
 ALIVE = bytes.fromhex("120d080110ffffffffffffffffff01")

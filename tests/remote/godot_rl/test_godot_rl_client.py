@@ -14,15 +14,15 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from physx_core.errors import (
+from physx_core.errors import UsageError
+from physx_core.plugins import find
+from physx_remote import connect, connect_vector, open_worlds, serve
+from physx_remote.errors import (
     RemoteClosedError,
     RemoteError,
     RemoteProtocolError,
     RemoteTimeoutError,
-    UsageError,
 )
-from physx_core.plugins import find
-from physx_remote import connect, connect_vector, open_worlds, serve
 from physx_remote.godot_rl.protocol import GodotRL
 
 CART = f"{Path(__file__).with_name('envs.py')}:Cart"

@@ -9,8 +9,9 @@ import struct
 
 import pytest
 
-from physx_core.errors import ConfigError, RemoteError, UnknownOptionError
+from physx_core.errors import ConfigError, UnknownOptionError
 from physx_remote import Worlds
+from physx_remote.errors import RemoteError
 from physx_remote.godot_rl.protocol import GodotRL
 
 ACTION = {"force": [0.0, -1.0], "gear": 1}

@@ -12,16 +12,15 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from physx_core.errors import (
-    ConfigError,
+from physx_core.errors import ConfigError, UsageError
+from physx_core.net import FrameReader, Kind, ServerHandshake, pack, pack_header, pack_value
+from physx_remote import PhysxObserver, RLEnvironment, connect, serve
+from physx_remote.errors import (
     RemoteClosedError,
     RemoteError,
     RemoteProtocolError,
     RemoteTimeoutError,
-    UsageError,
 )
-from physx_core.net import FrameReader, Kind, ServerHandshake, pack, pack_header, pack_value
-from physx_remote import PhysxObserver, RLEnvironment, connect, serve
 from physx_remote.physx.link import PhysxLink
 from physx_remote.physx.wire import ACT, SERVICE, VERSION
 from physx_remote.serving.spaces import describe_space

@@ -13,14 +13,9 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from physx_core.errors import (
-    RemoteClosedError,
-    RemoteError,
-    RemoteTimeoutError,
-    RequestError,
-)
 from physx_core.net import HEADER, Kind, decode_error, pack, pack_header, pack_value
 from physx_remote import PhysxObserver, connect, connect_vector
+from physx_remote.errors import RemoteClosedError, RemoteError, RemoteTimeoutError, RequestError
 from physx_remote.physx.link import PhysxLink
 from physx_remote.physx.wire import ACT
 

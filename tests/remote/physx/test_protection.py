@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from physx_core.errors import RemoteClosedError, RemoteError
 from physx_core.net import (
     FrameReader,
     PlainRefusedError,
@@ -22,6 +21,7 @@ from physx_core.net import (
 )
 from physx_core.net.tls import Identity
 from physx_remote import PhysxObserver, connect, connect_vector, serve
+from physx_remote.errors import RemoteClosedError, RemoteError
 from physx_remote.physx.wire import ACT
 
 TOKEN = "0123456789abcdef"

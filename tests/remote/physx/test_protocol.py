@@ -15,15 +15,7 @@ from gymnasium.utils.env_checker import check_env
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from gymnasium.vector.utils import batch_space
 
-from physx_core.errors import (
-    ActionError,
-    ConfigError,
-    EpisodeError,
-    RemoteClosedError,
-    RemoteError,
-    RequestError,
-    UsageError,
-)
+from physx_core.errors import ActionError, ConfigError, EpisodeError, UsageError
 from physx_remote import (
     PhysxClient,
     PhysxEnv,
@@ -31,6 +23,7 @@ from physx_remote import (
     connect,
     connect_vector,
 )
+from physx_remote.errors import RemoteClosedError, RemoteError, RequestError
 
 TOKEN = "0123456789abcdef"
 PATIENCE = 30.0

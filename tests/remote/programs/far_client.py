@@ -8,8 +8,8 @@ from __future__ import annotations
 import sys
 import time
 
-from physx_core.errors import RemoteError
 from physx_remote import connect
+from physx_remote.errors import RemoteError
 
 protocol, address, what = sys.argv[1:]
 env = connect(address, protocol, timeout=None)

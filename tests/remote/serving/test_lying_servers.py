@@ -13,9 +13,10 @@ import numpy as np
 import pytest
 from gymnasium import spaces
 
-from physx_core.errors import ConfigError, RemoteError, RemoteProtocolError, RemoteTimeoutError
+from physx_core.errors import ConfigError
 from physx_core.net import FrameReader, Kind, ServerHandshake, encode_error, pack, pack_value
 from physx_remote import Messages, PhysxObserver, connect, connect_vector
+from physx_remote.errors import RemoteError, RemoteProtocolError, RemoteTimeoutError
 from physx_remote.godot_gym.messages import DESCRIPTION, encode_extension
 from physx_remote.physx.wire import SERVICE, VERSION
 from physx_remote.serving.spaces import describe_space

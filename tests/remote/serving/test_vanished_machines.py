@@ -15,8 +15,8 @@ from pathlib import Path
 
 import pytest
 
-from physx_core.errors import RemoteError
 from physx_remote import connect
+from physx_remote.errors import RemoteError
 
 PROGRAMS = Path(__file__).parents[1] / "programs"
 SLOW = f"{PROGRAMS / 'slow_env.py'}:Slow"

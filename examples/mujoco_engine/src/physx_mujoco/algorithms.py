@@ -11,7 +11,11 @@ from collections.abc import Mapping, Sequence
 import mujoco
 import numpy as np
 
-from physx_core.engines import (
+from physx_core.rotations import cross, to_matrix
+from physx_core.typing import Vector
+from physx_mujoco.model import WorldModel
+from physx_mujoco.robot import INWARDS, outwards
+from physx_sim.engines import (
     Algorithms,
     Parts,
     Resistance,
@@ -19,10 +23,6 @@ from physx_core.engines import (
     layout_of,
     static_poses,
 )
-from physx_core.rotations import cross, to_matrix
-from physx_core.typing import Vector
-from physx_mujoco.model import WorldModel
-from physx_mujoco.robot import INWARDS, outwards
 
 
 class MujocoAlgorithms(Algorithms):

@@ -8,9 +8,9 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from physx_core.simulation import Layout
 from physx_core.typing import Vector
 from physx_mujoco.robot import Running
+from physx_sim import Layout
 
 _MOST, _EXACT = 30, 1e-10
 """Maximum repetitions of a step, and the relative velocity error at which they end."""

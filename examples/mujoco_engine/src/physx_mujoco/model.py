@@ -12,7 +12,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from physx_core.engines import (
+from physx_core.rotations import to_matrix
+from physx_core.typing import Index, Vector
+from physx_sim import Ground, HeightField, Stairs
+from physx_sim.engines import (
     CollisionShape,
     Joint,
     LoadedBody,
@@ -24,10 +27,7 @@ from physx_core.engines import (
     check_loaded,
     read_vertices,
 )
-from physx_core.errors import ModelError
-from physx_core.rotations import to_matrix
-from physx_core.simulation import Ground, HeightField, Stairs
-from physx_core.typing import Index, Vector
+from physx_sim.errors import ModelError
 
 _SHAPES = {
     "box": mujoco.mjtGeom.mjGEOM_BOX,

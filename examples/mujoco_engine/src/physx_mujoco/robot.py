@@ -8,10 +8,10 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from physx_core.engines import Mover, RobotEngine, twist_change
 from physx_core.rotations import rotate, rotate_back
-from physx_core.simulation import Part
 from physx_core.typing import Index, Vector
+from physx_sim import Part
+from physx_sim.engines import Mover, RobotEngine, twist_change
 
 INWARDS = [0, 1, 2, 6, 3, 4, 5]
 """Order of a floating base's positions in MuJoCo, whose quaternions are w, x, y, z."""

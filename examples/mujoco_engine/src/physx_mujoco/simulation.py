@@ -10,7 +10,14 @@ from typing import ClassVar
 import mujoco
 import numpy as np
 
-from physx_core.engines import (
+from physx_core.errors import UnknownOptionError
+from physx_core.typing import Records
+from physx_mujoco.algorithms import MujocoAlgorithms
+from physx_mujoco.drives import Drives
+from physx_mujoco.model import ModelBuilder, WorldModel
+from physx_mujoco.robot import MujocoRobot, Running
+from physx_sim import CONTACT, FEATURES, Simulation, World
+from physx_sim.engines import (
     RK4_LACKS,
     Algorithms,
     Parts,
@@ -20,13 +27,7 @@ from physx_core.engines import (
     layout_of,
     read_parts,
 )
-from physx_core.errors import FeatureNotSupportedError, SimulationError, UnknownOptionError
-from physx_core.simulation import CONTACT, FEATURES, Simulation, World
-from physx_core.typing import Records
-from physx_mujoco.algorithms import MujocoAlgorithms
-from physx_mujoco.drives import Drives
-from physx_mujoco.model import ModelBuilder, WorldModel
-from physx_mujoco.robot import MujocoRobot, Running
+from physx_sim.errors import FeatureNotSupportedError, SimulationError
 
 _SOLVERS = {
     "newton": mujoco.mjtSolver.mjSOL_NEWTON,

@@ -88,9 +88,9 @@ def _show(study: Any, options: Sweep) -> None:
 
 
 def _report(study: Any, folder: Path) -> None:
+    from physx_cluster.errors import StudyError
     from physx_cluster.sweep.show import summary
     from physx_cluster.sweep.study import TABLE
-    from physx_core.errors import StudyError
 
     for line in summary(study):
         _say(line)

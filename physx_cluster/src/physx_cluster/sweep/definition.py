@@ -63,8 +63,9 @@ class StudyOptions:
 class RunOptions:
     """How the trials run. No result depends on these."""
 
-    executor: str = field(default="local", metadata={"choices": ("local", "ray", "slurm")})
-    """Where trials run: "local", in processes on this machine, "ray", or "slurm"."""
+    executor: str = "local"
+    """Where trials run: "local", in processes on this machine, "ray", "slurm", or that of another
+    plugin."""
     options: dict[str, Any] = field(default_factory=dict)
     """Options of the executor: those of Ray tasks, or submitit's parameters."""
     parallel: int = at_least(1, 1)
@@ -144,6 +145,10 @@ class Definition:
         tables = {key: _table(path, key, plain.get(key, {})) for key in known}
         study = _options(StudyOptions, f"{path}: [study]", tables["study"])
         options = _options(RunOptions, f"{path}: [run]", {**tables["run"], **run})
+        try:
+            plugins.complete_reference("trial_executor", options.executor)
+        except PhysxError as error:
+            raise ConfigError(f"{path}: [run] executor: {error}") from error
         common = read_parameters(f"{path}: [parameters]", tables["parameters"])
         if not tables["pipelines"]:
             raise ConfigFileError(

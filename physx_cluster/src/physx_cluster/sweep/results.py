@@ -10,10 +10,11 @@ from typing import Any
 
 import tomli_w
 
+from physx_cluster.errors import StudyError
 from physx_cluster.sweep.parameters import Setting
 from physx_core import files
 from physx_core.config import read_toml
-from physx_core.errors import PhysxError, StudyError
+from physx_core.errors import PhysxError
 
 TRIAL, RESULT, FAILURE = "trial.toml", "result.toml", "failure.toml"
 LOCK, OUTPUT = "trial.lock", "output.txt"

@@ -7,13 +7,14 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 
+from physx_cluster.errors import StudyError
 from physx_cluster.sweep.definition import Definition
 from physx_cluster.sweep.executors.executor import Executor, Job
 from physx_cluster.sweep.plan import Plan
 from physx_cluster.sweep.results import FAILED, FAILURE, OUTPUT, Failure, Result, Trial
 from physx_cluster.sweep.study import Study
-from physx_core import files
-from physx_core.errors import PhysxError, StudyError
+from physx_core import files, plugins
+from physx_core.errors import PhysxError
 
 Say = Callable[[str], None]
 Start = Callable[[Definition], Executor]
@@ -52,19 +53,10 @@ def run_study(definition: Definition, folder: Path, say: Say, start: Start | Non
 
 
 def _start_executor(definition: Definition) -> Executor:
-    options, threads = definition.run.options, definition.study.threads
-    match definition.run.executor:
-        case "ray":
-            from physx_cluster.sweep.executors.ray import RayExecutor
-
-            return RayExecutor(options, threads)
-        case "slurm":
-            from physx_cluster.sweep.executors.slurm import SlurmExecutor
-
-            return SlurmExecutor(options, threads)
-    from physx_cluster.sweep.executors.local import LocalExecutor
-
-    return LocalExecutor(options, threads)
+    kind, run = "trial_executor", definition.run
+    make = plugins.resolve(kind, plugins.complete_reference(kind, run.executor))
+    executor: Executor = make(run.options, definition.study.threads)
+    return executor
 
 
 @dataclass

@@ -8,13 +8,14 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
+from physx_cluster.errors import StudyError
 from physx_cluster.sweep.parameters import Range
 from physx_cluster.sweep.results import COMPLETE, PRUNED, Trial
 from physx_cluster.sweep.runner import describe_trial
 from physx_cluster.sweep.study import Best, Study
 from physx_core import plugins, read_scalars
 from physx_core.cli import show, show_table, spark_line, width
-from physx_core.errors import MissingLibraryError, SessionError, StudyError, UsageError
+from physx_core.errors import MissingLibraryError, SessionError, UsageError
 
 _BARS = 16
 _GAP = 2  # characters between the columns of a table

@@ -14,13 +14,14 @@ from typing import Any, Self
 
 import tomli_w
 
+from physx_cluster.errors import StudyError
 from physx_cluster.sweep.definition import Definition
 from physx_cluster.sweep.optuna import check_optuna
 from physx_cluster.sweep.plan import Plan
 from physx_cluster.sweep.results import COMPLETE, LOCK, TRIAL, Result, Trial
 from physx_core import Closeable, files
 from physx_core.config import read_toml
-from physx_core.errors import PhysxError, StudyError
+from physx_core.errors import PhysxError
 
 STUDY, TABLE = "study.toml", "trials.csv"
 _LOCK = "study.lock"

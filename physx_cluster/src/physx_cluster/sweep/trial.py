@@ -17,6 +17,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, TypeVar
 
+from physx_cluster.errors import StudyError
 from physx_cluster.sweep.definition import StudyOptions, build_stage
 from physx_cluster.sweep.optuna import Pruning
 from physx_cluster.sweep.results import (
@@ -47,7 +48,6 @@ from physx_core.errors import (
     PluginNotFoundError,
     ReferenceFormError,
     SessionError,
-    StudyError,
     UsageError,
     listed,
     nearest,

@@ -19,9 +19,9 @@ from physx_core.errors import PhysxError, PluginError, UsageError, nearest, prin
 from physx_core.origin import install_hint
 from physx_core.plugins.entries import (
     COMMANDS,
-    OFFICIAL,
     describe_conflict,
     find_entries,
+    official_package,
     owner_of,
 )
 from physx_core.plugins.loading import loading
@@ -118,7 +118,7 @@ def _dispatch(words: list[str]) -> int:
 def _run(name: str, words: list[str]) -> None:
     commands = find_entries(COMMANDS)
     if name not in commands:
-        package = OFFICIAL.get((COMMANDS, name))
+        package = official_package(name, COMMANDS)
         if package is not None:
             raise UsageError(f"physx {name} is part of {package}. {install_hint(package)}")
         guess = nearest(name, commands)

@@ -14,6 +14,7 @@ from .parameter import Parameter as Parameter
 from .predicted_batch import PredictedBatch as PredictedBatch
 from .sampler import LearningSampler as LearningSampler
 from .sampler import Sampler as Sampler
+from .sampler import checked as checked
 from .scene.colors import map_values as map_values
 from .scene.colors import parse_color as parse_color
 from .scene.event import Event as Event

@@ -6,7 +6,18 @@ The format is documented in `physx_core.dataset.store`: `partition.format` and `
 from __future__ import annotations
 
 from physx_core.dataset.dataset import Dataset
-from physx_core.dataset.read.episodes import Episode
+from physx_core.dataset.read.episodes import Episode, find_episodes
 from physx_core.dataset.read.splits import Subset
+from physx_core.dataset.read.views import ModeView
+from physx_core.dataset.repair.recovery import holds_dataset
+from physx_core.dataset.store.partition.segment import rows_per_block
 
-__all__ = ["Dataset", "Episode", "Subset"]
+__all__ = [
+    "Dataset",
+    "Episode",
+    "ModeView",
+    "Subset",
+    "find_episodes",
+    "holds_dataset",
+    "rows_per_block",
+]

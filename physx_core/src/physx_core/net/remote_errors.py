@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 import traceback
 from typing import Any
 
-from physx_core import errors
 from physx_core.errors import ConnectionRefusedByPeerError, PhysxError, UsageError
 from physx_core.net.values import decode, encode
+from physx_core.plugins.entries import official_modules
 
 _PARTS = {"classes": list, "message": str, "attributes": dict, "traceback": str}
 
@@ -25,7 +26,7 @@ def encode_error(error: PhysxError) -> bytes:
     attributes = {name: kept for name, kept in vars(error).items() if _is_plain(kept)}
     return encode(
         {
-            "classes": [cls.__name__ for cls in type(error).__mro__],
+            "classes": [f"{cls.__module__}:{cls.__name__}" for cls in type(error).__mro__],
             "message": str(error),
             "attributes": attributes,
             "traceback": "".join(traceback.format_exception(error)),
@@ -36,8 +37,8 @@ def encode_error(error: PhysxError) -> bytes:
 def decode_error(payload: bytes | bytearray) -> PhysxError:
     """Return the error that was given to `encode_error`.
 
-    Its class is looked up by name in `physx_core.errors` only; an error class of a plugin is
-    replaced by the nearest of these that it derives from.
+    Its class is looked up in `physx_core.errors` and the ``errors`` of physx's other packages only;
+    any other error class is replaced by the nearest of these that it derives from.
 
     Raises:
         ConnectionRefusedByPeerError: If the bytes do not describe an error.
@@ -54,7 +55,14 @@ def decode_error(payload: bytes | bytearray) -> PhysxError:
 
 
 def _error_class(name: str) -> type[PhysxError] | None:
-    found = getattr(errors, name, None)
+    place, _, attribute = name.partition(":")
+    package, _, module = place.rpartition(".")
+    if module != "errors" or package not in {"physx_core", *official_modules()}:
+        return None
+    try:
+        found = getattr(importlib.import_module(place), attribute, None)
+    except ImportError:  # this process does not have the package
+        return None
     return found if isinstance(found, type) and issubclass(found, PhysxError) else None
 
 

@@ -2,6 +2,7 @@
 
 from .data_generation import DataGeneration as DataGeneration
 from .learning.batches.drawn_rows import read_drawn_rows as read_drawn_rows
+from .learning.components import create_network as create_network
 from .learning.learner import Learner as Learner
 from .learning.learner import load_learner as load_learner
 from .pipeline import Pipeline as Pipeline

@@ -1,7 +1,8 @@
 """Plugins: components of pip-installed packages, selected by the name of their entry point.
 
 A plugin is a module named by an entry point in the group ``physx``. It implements some of the hooks
-in `physx_core.plugins.hookspecs`, marked with `hookimpl`.
+in `physx_core.plugins.hookspecs`, or of those that other packages add (see `kind_hook`), and marks
+them with `hookimpl`.
 """
 
 from __future__ import annotations

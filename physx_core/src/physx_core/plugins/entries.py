@@ -5,9 +5,10 @@ from __future__ import annotations
 import contextlib
 import functools
 import sys
+import tomllib
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from physx_core.errors import listed
 
@@ -18,22 +19,37 @@ PLUGINS = "physx"
 """Entry-point group of the plugins."""
 COMMANDS = "physx.commands"
 """Entry-point group of the commands: command name to a module with ``run(words)``."""
+HOOKSPECS = "physx.hookspecs"
+"""Entry-point group of further kinds of components: hook name to a module with the hookspec."""
+CHECKS = "physx.checks"
+"""Entry-point group of conformance checks: kind of component to a module with ``CHECKS``."""
 
-OFFICIAL = {
-    (PLUGINS, "cluster"): "physx-cluster",
-    (COMMANDS, "sweep"): "physx-cluster",
-    (PLUGINS, "dart"): "physx-dart",
-    (PLUGINS, "pinocchio"): "physx-dart",
-    (COMMANDS, "robots"): "physx-dart",
-    (PLUGINS, "gym"): "physx-gym",
-    (COMMANDS, "log"): "physx-gym",
-    (COMMANDS, "serve"): "physx-remote",
-    (PLUGINS, "rerun"): "physx-rerun",
-    (COMMANDS, "snapshot"): "physx-rerun",
-    (COMMANDS, "view"): "physx-rerun",
-    (PLUGINS, "torch"): "physx-torch",
-}
-"""Plugins and commands of the physx project, and the distributions that contain them."""
+_GROUPS = {PLUGINS: "plugins", COMMANDS: "commands", HOOKSPECS: "hooks"}
+
+
+def official_package(name: str, group: str = PLUGINS) -> str | None:
+    """Return the package of the physx project that has an entry point, installed or not."""
+    return _official().get((group, name))
+
+
+def official_modules() -> list[str]:
+    """Return the names of the physx project's other packages, as they are imported."""
+    return [package.replace("-", "_") for package in _packages()]
+
+
+@functools.cache
+def _packages() -> dict[str, Any]:
+    return tomllib.loads(Path(__file__).with_name("packages.toml").read_text())
+
+
+@functools.cache
+def _official() -> dict[tuple[str, str], str]:
+    return {
+        (group, name): package
+        for package, entries in _packages().items()
+        for group, key in _GROUPS.items()
+        for name in entries.get(key, ())
+    }
 
 
 def find_entries(group: str) -> dict[str, list[EntryPoint]]:
@@ -70,7 +86,7 @@ def _last_change(folder: str) -> int:
 def _read_entries(
     installed: tuple[tuple[str, int], ...],
 ) -> tuple[dict[str, dict[str, list[EntryPoint]]], dict[str, str]]:
-    """Read the metadata of all packages, once for both groups; cached until one is installed.
+    """Read the metadata of all packages, once for all groups; cached until one is installed.
 
     Returns:
         Group to name to entry points, and the unreadable packages with the reason.
@@ -85,7 +101,7 @@ def _read_entries(
             elif name not in seen:  # Python imports from the first folder that contains it
                 found += entries
             seen.add(name)
-    groups = (PLUGINS, COMMANDS)
+    groups = (PLUGINS, COMMANDS, HOOKSPECS, CHECKS)
     return {
         group: _by_name(entry for entry in found if entry.group == group) for group in groups
     }, unreadable

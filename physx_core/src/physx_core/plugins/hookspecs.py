@@ -1,4 +1,4 @@
-"""The nine hooks that a plugin may implement.
+"""The hooks of the core that a plugin may implement; packages may add others: see `kinds`.
 
 Each returns a dictionary from component names to components: a class, a function that takes the
 component's keyword arguments and returns it, or a reference ``"package.module:Name"`` that is
@@ -15,7 +15,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
-from typing import Any
+from typing import Any, TypeVar
 
 import pluggy
 
@@ -25,27 +25,37 @@ Components = dict[str, type[Any] | Callable[..., Any] | str]
 """The return value of a hook: name to class, to a function that creates the component, or to its
 reference ``"package.module:Class"``, which is imported on request."""
 
+Hook = TypeVar("Hook", bound=Callable[[], Components])
+
 _NAME = r"\w[\w.-]*"
 
 hookspec = pluggy.HookspecMarker(PLUGINS)
 hookimpl = pluggy.HookimplMarker(PLUGINS)
 """Marks a plugin's function as the implementation of the hook with the same name."""
 
+MARK = "physx_kind"
+"""Attribute of a hook's function that says what `kind_hook` was told."""
 ADAPTER = "module"
 """Name of the component that adapts what other libraries define, and of its argument."""
 
-KINDS = {
-    "environment": "physx_environments",
-    "network": "physx_networks",
-    "optimization": "physx_optimizations",
-    "transformation": "physx_transformations",
-    "visualizer": "physx_visualizers",
-    "backend": "physx_backends",
-    "launcher": "physx_launchers",
-    "buffer": "physx_buffers",
-    "sampler": "physx_samplers",
-}
-"""Kind of component to the hook that returns it."""
+
+def kind_hook(base: str, *, is_instance: bool = False) -> Callable[[Hook], Hook]:
+    """Mark a function ``physx_<kind>s`` as the hook that returns components of a kind.
+
+    A package that adds a kind names the function's module in its entry points: ``[project.
+    entry-points."physx.hookspecs"]``, ``physx_<kind>s = "package.module"``.
+
+    Args:
+        base: See `kinds.Kind`.
+        is_instance: See `kinds.Kind`.
+    """
+
+    def mark(hook: Hook) -> Hook:
+        marked = hookspec(hook)
+        vars(marked)[MARK] = base, is_instance
+        return marked
+
+    return mark
 
 
 def is_plugin_name(name: Any) -> bool:
@@ -58,46 +68,41 @@ def is_component_name(name: Any) -> bool:
     return isinstance(name, str) and re.fullmatch(f"{_NAME}(/{_NAME})*", name) is not None
 
 
-@hookspec
+@kind_hook("physx_core.components:Environment")
 def physx_environments() -> Components:  # type: ignore[empty-body]
     """Return subclasses of `physx_core.Environment` by name."""
 
 
-@hookspec
+@kind_hook("physx_core.components:Network")
 def physx_networks() -> Components:  # type: ignore[empty-body]
     """Return subclasses of `physx_core.Network` by name."""
 
 
-@hookspec
+@kind_hook("physx_core.components:Optimization")
 def physx_optimizations() -> Components:  # type: ignore[empty-body]
     """Return subclasses of `physx_core.Optimization` by name."""
 
 
-@hookspec
+@kind_hook("physx_core.components:Transformation")
 def physx_transformations() -> Components:  # type: ignore[empty-body]
     """Return subclasses of `physx_core.Transformation` by name."""
 
 
-@hookspec
+@kind_hook("physx_core.components:Observer")
 def physx_visualizers() -> Components:  # type: ignore[empty-body]
     """Return subclasses of `physx_core.Visualizer` by name."""
 
 
-@hookspec
-def physx_backends() -> Components:  # type: ignore[empty-body]
-    """Return subclasses of `physx_core.Backend` by name."""
-
-
-@hookspec
+@kind_hook("physx_core.components:Launcher")
 def physx_launchers() -> Components:  # type: ignore[empty-body]
     """Return subclasses of `physx_core.Launcher` by name."""
 
 
-@hookspec
+@kind_hook("physx_core.components:Buffer")
 def physx_buffers() -> Components:  # type: ignore[empty-body]
     """Return subclasses of `physx_core.Buffer` by name."""
 
 
-@hookspec
+@kind_hook("physx_core.components:Sampler")
 def physx_samplers() -> Components:  # type: ignore[empty-body]
     """Return subclasses of `physx_core.Sampler` by name."""

@@ -12,7 +12,7 @@ from typing import Any
 
 from physx_core.components.network import Network
 from physx_core.errors import ConfigError
-from physx_core.plugins.entries import OFFICIAL, PLUGINS
+from physx_core.plugins.entries import official_package
 from physx_core.plugins.hookspecs import ADAPTER
 from physx_core.plugins.references import check_kind, find, resolve
 from physx_core.plugins.registry import available, load
@@ -47,7 +47,7 @@ def _library_of(found: Any) -> str | None:
     packages = dict.fromkeys(base.__module__.partition(".")[0] for base in found.__mro__)
     known = available()
     for package in packages:
-        if package not in known and (PLUGINS, package) not in OFFICIAL:
+        if package not in known and official_package(package) is None:
             continue
         if ADAPTER in load(package).components.get("network", {}):
             return package

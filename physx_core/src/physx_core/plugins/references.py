@@ -29,7 +29,8 @@ from physx_core.errors import (
     UntrustedReferenceError,
     listed,
 )
-from physx_core.plugins.hookspecs import ADAPTER, KINDS
+from physx_core.plugins.hookspecs import ADAPTER
+from physx_core.plugins.kinds import find_kind, kind_names
 from physx_core.plugins.loading import loading
 from physx_core.plugins.registry import available, load, plugin_hint
 
@@ -44,7 +45,6 @@ if TYPE_CHECKING:
         Transformation,
         Visualizer,
     )
-    from physx_core.simulation import Backend
 
 _MOST_VALUES = 10_000
 """Maximum number of values in the arguments of a component that a file names."""
@@ -67,8 +67,6 @@ def resolve(kind: Literal["buffer"], reference: Any) -> Callable[..., Buffer]: .
 @overload
 def resolve(kind: Literal["sampler"], reference: Any) -> Callable[..., Sampler]: ...
 @overload
-def resolve(kind: Literal["backend"], reference: Any) -> Backend: ...
-@overload
 def resolve(kind: str, reference: Any) -> Any: ...
 
 
@@ -76,14 +74,13 @@ def resolve(kind: str, reference: Any) -> Any:
     """Return the component that a reference names.
 
     Args:
-        kind: ``environment``, ``network``, ``optimization``, ``transformation``, ``visualizer``,
-            ``backend``, ``launcher``, ``buffer``, or ``sampler``.
+        kind: A name of `kind_names`, such as ``environment``.
         reference: ``"plugin/name"``; ``"plugin"`` if it has only one component of the kind;
             ``"package.module:Class"``; ``"script.py:Class"``; either of them after ``"plugin/"``,
             for what that plugin adapts; or the class itself.
 
     Returns:
-        The class or factory; for ``backend`` an instance of it, ready to build simulations.
+        The class or factory; an instance of it for a kind that says so, such as ``backend``.
 
     Raises:
         PluginNotFoundError: If the plugin is not installed.
@@ -94,7 +91,41 @@ def resolve(kind: str, reference: Any) -> Any:
     """
     component = find(kind, reference)
     check_kind(kind, reference, component)
-    return component() if kind == "backend" and isinstance(component, type) else component
+    return component() if find_kind(kind).is_instance and isinstance(component, type) else component
+
+
+def references_of(kind: str) -> dict[str, list[str]]:
+    """Return the components of a kind by name, each with its references ``"plugin/name"``.
+
+    Broken plugins are left out; ``physx plugins`` shows their errors.
+    """
+    found: dict[str, list[str]] = {}
+    for plugin in sorted(available()):
+        with contextlib.suppress(PluginError):
+            for name in load(plugin).components.get(kind, ()):
+                found.setdefault(name, []).append(f"{plugin}/{name}")
+    return found
+
+
+def complete_reference(kind: str, name: Any) -> Any:
+    """Return the reference of a component named alone, such as ``formats/npz`` for ``npz``.
+
+    Args:
+        kind: See `resolve`.
+        name: The name; what is a reference already is returned unchanged.
+
+    Raises:
+        ComponentNotFoundError: If no plugin has a component of that name.
+        ReferenceFormError: If several have one.
+    """
+    if not isinstance(name, str) or ":" in name or "/" in name:
+        return name
+    known = references_of(kind)
+    if name not in known:
+        raise ComponentNotFoundError(kind, name, "physx", known)
+    if len(known[name]) > 1:
+        raise ReferenceFormError(f'"{name}" may be {" or ".join(known[name])}: give one of these.')
+    return known[name][0]
 
 
 def locate(kind: str, reference: Any) -> str:
@@ -180,13 +211,8 @@ def check_kind(kind: str, reference: Any, found: Any) -> None:
 
 
 def _base_of(kind: str) -> type[Any]:
-    from physx_core import components
-    from physx_core.simulation import Backend
-
-    if kind == "backend":
-        return Backend
-    name = "Observer" if kind == "visualizer" else kind.title()
-    base: type[Any] = getattr(components, name)
+    place, _, name = find_kind(kind).base.rpartition(":")
+    base: type[Any] = getattr(importlib.import_module(place), name)
     return base
 
 
@@ -287,8 +313,7 @@ def find(kind: str, reference: Any) -> Any:
         ComponentNotFoundError: If the plugin, module or script has no component of that name.
         ReferenceFormError: If the kind is unknown, or the reference has none of the forms.
     """
-    if kind not in KINDS:
-        raise ReferenceFormError(f'"{kind}" is not a kind of component: {", ".join(KINDS)}.')
+    find_kind(kind)
     if not isinstance(reference, str):
         if isinstance(reference, type):
             return reference
@@ -466,12 +491,10 @@ def _attribute(kind: str, module: ModuleType, name: str, place: str) -> Any:
 
 def _classes(kind: str, module: ModuleType) -> list[str]:
     """Return the names of a module's classes that a reference may have meant."""
-    from physx_core import components
-
-    base = getattr(components, kind.capitalize(), None)
     classes = {name: found for name, found in vars(module).items() if isinstance(found, type)}
-    if base is None:
+    if kind not in kind_names():
         return list(classes)
+    base = _base_of(kind)
     fitting = [name for name, found in classes.items() if issubclass(found, base) and found != base]
     if kind != "network":
         return fitting

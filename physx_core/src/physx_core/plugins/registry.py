@@ -12,14 +12,22 @@ from physx_core.errors import PluginError, PluginNotFoundError
 from physx_core.origin import install_hint
 from physx_core.plugins import hookspecs
 from physx_core.plugins.entries import (
-    OFFICIAL,
     PLUGINS,
     describe_conflict,
     find_entries,
+    official_package,
     owner_of,
     unreadable_hint,
 )
-from physx_core.plugins.hookspecs import KINDS, Components, is_component_name, is_plugin_name
+from physx_core.plugins.hookspecs import Components, is_component_name, is_plugin_name
+from physx_core.plugins.kinds import (
+    CORE_KINDS,
+    further_hooks,
+    hook_of,
+    hookspecs_of,
+    kind_names,
+    kind_of,
+)
 from physx_core.plugins.loading import loading
 
 if TYPE_CHECKING:
@@ -93,15 +101,19 @@ def _load(entry: EntryPoint) -> Plugin:
         module = entry.load()
     manager = pluggy.PluginManager(PLUGINS)
     manager.add_hookspecs(hookspecs)
+    added = [hook for hook in further_hooks() if hasattr(module, hook)]
+    for hook in added:
+        manager.add_hookspecs(hookspecs_of(hook))
+    hooks = {kind: hook_of(kind) for kind in CORE_KINDS} | {kind_of(hook): hook for hook in added}
     try:
         manager.register(module, entry.name)
         manager.check_pending()
     except pluggy.PluginValidationError as error:
-        known = ", ".join(KINDS.values())
+        known = ", ".join(map(hook_of, kind_names()))
         text = f"{who} has an unknown hook (known: {known}): {error}"
         raise PluginError(entry.name, text) from error
     with loading(entry.name, who, "fails in a hook"):
-        components = {kind: _call(manager, hook) for kind, hook in KINDS.items()}
+        components = {kind: _call(manager, hook) for kind, hook in hooks.items()}
     return Plugin(info, {kind: given for kind, given in components.items() if given})
 
 
@@ -119,8 +131,9 @@ def _call(manager: pluggy.PluginManager, hook: str) -> Components:
 
 def plugin_hint(name: str) -> str:
     """Return advice about a plugin that is not installed."""
-    if (PLUGINS, name) in OFFICIAL:
-        return install_hint(OFFICIAL[PLUGINS, name])
+    package = official_package(name)
+    if package is not None:
+        return install_hint(package)
     return unreadable_hint() or (
         "It is not one of physx's own: install the package that contains it. To name a class "
         'without a plugin, use "package.module:Class" or "script.py:Class".'

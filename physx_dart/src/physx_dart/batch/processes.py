@@ -15,7 +15,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from physx_core.errors import SimulationError
 from physx_core.processes import ChildProcess, anonymous_file, describe_exit, worker_variables
 from physx_core.typing import Vector
 from physx_dart.batch.worker import (
@@ -28,6 +27,7 @@ from physx_dart.batch.worker import (
     describe_models,
 )
 from physx_dart.pinocchio.algorithms import MoverAlgorithms, PinocchioAlgorithms
+from physx_sim.errors import SimulationError
 
 _LEAST_ROWS = 16
 """Minimum number of rows for which an additional process pays off."""

@@ -17,9 +17,9 @@ import sys
 import numpy as np
 import pinocchio
 
-from physx_core.engines import Resistance
 from physx_core.typing import Vector
 from physx_dart.pinocchio.algorithms import MoverAlgorithms, PinocchioAlgorithms
+from physx_sim.engines import Resistance
 
 FORWARD, GRADIENTS = range(2)
 REQUEST = struct.Struct("<4q")

@@ -8,7 +8,7 @@ from physx_core import PhysxError, plugins
 from physx_core.cli import show, show_table
 from physx_core.errors import UsageError
 from physx_core.origin import install_hint
-from physx_core.simulation import RobotInfo
+from physx_sim import RobotInfo
 
 _HELP = """usage: physx robots
 

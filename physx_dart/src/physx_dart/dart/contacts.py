@@ -7,8 +7,8 @@ from typing import Any
 import numpy as np
 from dartpy import collision
 
-from physx_core.simulation import CONTACT, RAY_HIT
 from physx_core.typing import Records, Vector
+from physx_sim import CONTACT, RAY_HIT
 
 
 class ContactReader:

@@ -13,7 +13,10 @@ from typing import Any
 import numpy as np
 from dartpy import dynamics, utils
 
-from physx_core.engines import (
+from physx_core.rotations import to_matrix
+from physx_core.typing import Vector
+from physx_sim import Ground, HeightField, Stairs
+from physx_sim.engines import (
     CollisionShape,
     Joint,
     LoadedBody,
@@ -23,10 +26,7 @@ from physx_core.engines import (
     check_loaded,
     geometry_file,
 )
-from physx_core.errors import ModelError
-from physx_core.rotations import to_matrix
-from physx_core.simulation import Ground, HeightField, Stairs
-from physx_core.typing import Vector
+from physx_sim.errors import ModelError
 
 WORLD = "world"
 ROOT = "physx root"

@@ -14,7 +14,13 @@ import numpy as np
 from dartpy import constraint
 from dartpy.simulation import CollisionDetectorType
 
-from physx_core.engines import (
+from physx_core.errors import UnknownOptionError
+from physx_core.typing import Records, Vector
+from physx_dart.dart.contacts import ContactReader
+from physx_dart.dart.loading import attach_shapes, static_skeleton
+from physx_dart.dart.skeleton import DartRobot
+from physx_sim import FEATURES, Simulation, World, finite_rows
+from physx_sim.engines import (
     RK4_LACKS,
     Algorithms,
     CollisionShape,
@@ -24,12 +30,7 @@ from physx_core.engines import (
     check_rk4,
     read_parts,
 )
-from physx_core.errors import FeatureNotSupportedError, SimulationError, UnknownOptionError
-from physx_core.simulation import FEATURES, Simulation, World, finite_rows
-from physx_core.typing import Records, Vector
-from physx_dart.dart.contacts import ContactReader
-from physx_dart.dart.loading import attach_shapes, static_skeleton
-from physx_dart.dart.skeleton import DartRobot
+from physx_sim.errors import FeatureNotSupportedError, SimulationError
 
 _DETECTORS = {
     "dart": CollisionDetectorType.DART,

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.engines import Mover, RobotEngine, base_accelerations, rk4_step
 from physx_core.rotations import (
     from_rotation_vector,
     multiply,
@@ -18,6 +17,7 @@ from physx_core.rotations import (
 )
 from physx_core.typing import Vector
 from physx_dart.dart.loading import link_name, load_skeleton
+from physx_sim.engines import Mover, RobotEngine, base_accelerations, rk4_step
 
 
 class DartRobot(RobotEngine):

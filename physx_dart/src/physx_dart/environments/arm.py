@@ -14,11 +14,11 @@ import numpy as np
 
 from physx_core import Field, plugins
 from physx_core.components import Environment
-from physx_core.engines import EXAMPLE_DATA, example_data_dir, example_robot
 from physx_core.errors import ConfigError, UnknownOptionError
-from physx_core.simulation import Robot, Simulation, World
 from physx_core.typing import Sample, Vector
 from physx_dart.environments.trajectories import SmoothTrajectory
+from physx_sim import Robot, Simulation, World
+from physx_sim.engines import EXAMPLE_DATA, example_data_dir, example_robot
 
 _ARM = "panda_description/urdf/panda.urdf"
 _JOINTS = 7

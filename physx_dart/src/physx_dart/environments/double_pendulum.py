@@ -8,10 +8,10 @@ import numpy as np
 
 from physx_core import Field, plugins
 from physx_core.components import Environment
-from physx_core.engines import OWN_ROBOTS
 from physx_core.errors import ConfigError
-from physx_core.simulation import Robot, Simulation, World
 from physx_dart.environments.trajectories import SmoothTrajectory
+from physx_sim import Robot, Simulation, World
+from physx_sim.engines import OWN_ROBOTS
 
 URDF = OWN_ROBOTS / "double_pendulum.urdf"
 """Two links of 1 kg and 0.5 m that hang down at zero."""

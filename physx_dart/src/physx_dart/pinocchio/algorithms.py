@@ -1,6 +1,6 @@
 """Pinocchio's algorithms for a world's robots and objects, regardless of the simulating engine.
 
-States follow the convention of `physx_core.simulation.layout`. All results are new C-ordered
+States follow the convention of `physx_sim.layout`. All results are new C-ordered
 float64 arrays, which ``torch.from_numpy`` accepts directly.
 """
 
@@ -12,10 +12,10 @@ from typing import Any, Self
 import numpy as np
 import pinocchio
 
-from physx_core.engines import Algorithms, Mover, Parts, Resistance, read_parts, static_poses
-from physx_core.simulation import World
 from physx_core.typing import Vector
 from physx_dart.pinocchio.models import frames_of, load_model, twists_of
+from physx_sim import World
+from physx_sim.engines import Algorithms, Mover, Parts, Resistance, read_parts, static_poses
 
 _WORLD_AXES = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
 _velocity, _acceleration = pinocchio.getFrameVelocity, pinocchio.getFrameClassicalAcceleration

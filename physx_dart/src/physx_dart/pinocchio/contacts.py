@@ -14,12 +14,12 @@ import numpy as np
 import pinocchio
 from numpy.typing import NDArray
 
-from physx_core.engines import CollisionShape, Mover, Static
-from physx_core.errors import FeatureNotSupportedError
-from physx_core.simulation import CONTACT
 from physx_core.typing import Records, Vector
 from physx_dart.pinocchio.models import twists_of
 from physx_dart.pinocchio.surfaces import Plane, surface_of
+from physx_sim import CONTACT
+from physx_sim.engines import CollisionShape, Mover, Static
+from physx_sim.errors import FeatureNotSupportedError
 
 MARGIN = 1e-4
 """Distance, in m, below which a point counts as touching."""

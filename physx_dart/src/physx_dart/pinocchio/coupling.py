@@ -6,13 +6,13 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from physx_core.engines import Parts
-from physx_core.simulation import CONTACT
 from physx_core.typing import Records
 from physx_dart.pinocchio.constraints import constrained
 from physx_dart.pinocchio.pairs import PairFinder, PairPoints
 from physx_dart.pinocchio.robot import PinocchioRobot
 from physx_dart.pinocchio.solver import ImpulseSolver
+from physx_sim import CONTACT
+from physx_sim.engines import Parts
 
 
 class Coupling:

@@ -9,9 +9,9 @@ import eigenpy
 import numpy as np
 from numpy.typing import NDArray
 
-from physx_core.engines import Joint
 from physx_core.typing import Vector
 from physx_dart.pinocchio.contact_problem import regularized, unit
+from physx_sim.engines import Joint
 
 _FASTEST_RETURN = 10.0
 """Maximum speed, in rad/s or m/s, at which a joint returns to within its limits, as in DART."""

@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 import pinocchio
 
-from physx_core.engines import LoadedBody, LoadedRobot, Mover, check_loaded
-from physx_core.errors import ModelError
 from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
+from physx_sim.engines import LoadedBody, LoadedRobot, Mover, check_loaded
+from physx_sim.errors import ModelError
 
 _TRANSLATION, _ROTATION = "physx translation", "physx rotation"
 _LINK = "physx link "

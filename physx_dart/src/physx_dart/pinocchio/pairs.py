@@ -16,14 +16,14 @@ import coal
 import numpy as np
 from numpy.typing import NDArray
 
-from physx_core.engines import CollisionShape, Parts
-from physx_core.errors import FeatureNotSupportedError
 from physx_core.rotations import cross_rows, to_matrix
-from physx_core.simulation import Stairs
 from physx_core.typing import Vector
 from physx_dart.pinocchio.contacts import MARGIN, ContactPoints, poses_of, supports_of
 from physx_dart.pinocchio.robot import PinocchioRobot
 from physx_dart.pinocchio.surfaces import axes_of, moments_of
+from physx_sim import Stairs
+from physx_sim.engines import CollisionShape, Parts
+from physx_sim.errors import FeatureNotSupportedError
 
 _TOLERANCE = 1e-4
 """Distance, in m, from the plane of a patch up to which a point belongs to it."""

@@ -16,15 +16,15 @@ import numpy as np
 import pinocchio
 from numpy import add, multiply
 
-from physx_core.engines import Mover, RobotEngine, Static, rk4_step, twist_change
 from physx_core.rotations import rotate_back, to_matrix
-from physx_core.simulation import CONTACT, World
 from physx_core.typing import Records, Vector
 from physx_dart.pinocchio.constraints import Constraints, Warmth, constrained, limited
 from physx_dart.pinocchio.contacts import ContactFinder
 from physx_dart.pinocchio.limits import JointConstraints
 from physx_dart.pinocchio.models import frames_of, load_stepping_model, twists_of
 from physx_dart.pinocchio.solver import ImpulseSolver
+from physx_sim import CONTACT, World
+from physx_sim.engines import Mover, RobotEngine, Static, rk4_step, twist_change
 
 _UNSEEN = 10
 """Steps between checks of whether a limit might have acted."""

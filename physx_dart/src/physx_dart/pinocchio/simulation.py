@@ -9,7 +9,13 @@ from typing import ClassVar
 
 import numpy as np
 
-from physx_core.engines import (
+from physx_core.typing import Records
+from physx_dart.batch.processes import ParallelAlgorithms
+from physx_dart.pinocchio.coupling import Coupling
+from physx_dart.pinocchio.robot import PinocchioRobot
+from physx_dart.pinocchio.solver import ImpulseSolver
+from physx_sim import FEATURES, Simulation, World
+from physx_sim.engines import (
     RK4_LACKS,
     Algorithms,
     Parts,
@@ -18,13 +24,7 @@ from physx_core.engines import (
     check_rk4,
     read_parts,
 )
-from physx_core.errors import FeatureNotSupportedError
-from physx_core.simulation import FEATURES, Simulation, World
-from physx_core.typing import Records
-from physx_dart.batch.processes import ParallelAlgorithms
-from physx_dart.pinocchio.coupling import Coupling
-from physx_dart.pinocchio.robot import PinocchioRobot
-from physx_dart.pinocchio.solver import ImpulseSolver
+from physx_sim.errors import FeatureNotSupportedError
 
 
 class PinocchioBackend(RobotBackend):

@@ -10,9 +10,10 @@ from typing import Any
 import numpy as np
 import pinocchio
 
-from physx_core.errors import SimulationError, UnknownOptionError
+from physx_core.errors import UnknownOptionError
 from physx_core.typing import Vector
 from physx_dart.pinocchio.contact_problem import ContactProblem
+from physx_sim.errors import SimulationError
 
 SOLVERS = ("pgs", "admm")
 _NEWTON_STEPS = 12

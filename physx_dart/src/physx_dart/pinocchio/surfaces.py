@@ -8,9 +8,9 @@ from functools import cached_property
 
 import numpy as np
 
-from physx_core.engines import Static
-from physx_core.simulation import Ground, HeightField, Stairs
 from physx_core.typing import Vector
+from physx_sim import Ground, HeightField, Stairs
+from physx_sim.engines import Static
 
 _CROSS = np.zeros((3, 9))
 _CROSS[[0, 0, 1, 1, 2, 2], [7, 5, 2, 6, 3, 1]] = -1.0, 1.0, -1.0, 1.0, -1.0, 1.0

@@ -9,11 +9,12 @@ from typing import Any, ClassVar
 import gymnasium
 import numpy as np
 
-from physx_core.errors import ConfigError, SimulationError
+from physx_core.errors import ConfigError
 from physx_core.typing import Vector
 from physx_gym.env.pipeline_env import PipelineEnv
 from physx_gym.shared_arrays import SharedArrays
 from physx_gym.spaces import copy_tree, neutral
+from physx_sim.errors import SimulationError
 
 
 class Block(SharedArrays, ABC):

@@ -7,12 +7,12 @@ from typing import TYPE_CHECKING, Any
 
 from physx_core.errors import ConfigError
 from physx_core.rotations import invert, multiply, rotate_back, to_roll_pitch_yaw
-from physx_core.simulation import Imu
 from physx_gym.blocks.attitude_features import attitude_fieldnames, attitude_space
 from physx_gym.blocks.block import ObserverBlock
 from physx_gym.blocks.mahony_filter import MahonyFilter
 from physx_gym.blocks.motor_joints import JointEncoders
 from physx_gym.blocks.relative_orientation import RelativeOrientation
+from physx_sim import Imu
 
 if TYPE_CHECKING:
     from physx_gym.env.pipeline_env import PipelineEnv

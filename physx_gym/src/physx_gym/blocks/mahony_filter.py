@@ -13,7 +13,6 @@ from gymnasium import spaces
 from physx_core import checks
 from physx_core.errors import ConfigError
 from physx_core.rotations import to_roll_pitch_yaw
-from physx_core.simulation import Imu
 from physx_core.typing import Vector
 from physx_gym.blocks.attitude_features import attitude_fieldnames, attitude_space
 from physx_gym.blocks.block import ObserverBlock
@@ -24,6 +23,7 @@ from physx_gym.blocks.mahony import (
     attitude_from_gravity,
     remove_twist,
 )
+from physx_sim import Imu
 
 if TYPE_CHECKING:
     from physx_gym.env.pipeline_env import PipelineEnv

@@ -8,9 +8,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from physx_core.errors import ConfigError, nearest
-from physx_core.simulation import Encoder
 from physx_core.typing import Vector
 from physx_gym.shared_arrays import SharedArrays
+from physx_sim import Encoder
 
 if TYPE_CHECKING:
     from physx_gym.env.pipeline_env import PipelineEnv

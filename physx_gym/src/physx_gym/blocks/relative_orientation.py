@@ -11,7 +11,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from physx_core.errors import FeatureNotSupportedError
 from physx_core.rotations import (
     IDENTITY,
     Quaternion,
@@ -22,8 +21,9 @@ from physx_core.rotations import (
     rotate,
     rotate_back,
 )
-from physx_core.simulation import Simulation
 from physx_core.typing import Vector
+from physx_sim import Simulation
+from physx_sim.errors import FeatureNotSupportedError
 
 
 class RelativeOrientation:

@@ -79,19 +79,16 @@ class GymEnvironment(Environment):
         )
 
     def init_visualization(self) -> None:
-        """Draw a robot, or show the pictures that another environment renders.
+        """Draw what the environment's ``make_drawing`` draws, or show the pictures that it renders.
 
         An environment that renders none is not drawn, and a warning says how to change that.
         """
-        from physx_gym.env.robot_env import RobotEnv
-        from physx_gym.show.environment_drawing import EnvironmentDrawing
-
-        env = self.env.unwrapped
+        env: Any = self.env.unwrapped
         self._show: Callable[[], None]
         self._begin_episode()  # a world exists only then
-        if isinstance(env, RobotEnv):
+        if hasattr(env, "make_drawing"):
             self.step_time = env.step_dt
-            self._show = EnvironmentDrawing(env, self.factory).draw
+            self._show = env.make_drawing(self.factory)
         elif self.env.render_mode == "rgb_array":
             self.factory.add_image(_PICTURE, self._render())
             self._show = lambda: self.factory.update_image(_PICTURE, self._render())

@@ -8,9 +8,9 @@ import numpy as np
 from gymnasium import spaces
 from numpy.typing import NDArray
 
-from physx_core.errors import SimulationError
 from physx_gym.shared_arrays import SharedArrays
 from physx_gym.spaces import format_path, leaves, value_at
+from physx_sim.errors import SimulationError
 
 
 class ObservationChecks(SharedArrays):

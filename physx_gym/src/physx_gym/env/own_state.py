@@ -17,8 +17,8 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.errors import SimulationError
 from physx_gym.shared_arrays import SharedArrays, Window
+from physx_sim.errors import SimulationError
 
 _KNOWN = "known"
 _FORMS = ("__reduce__", "__reduce_ex__", "__deepcopy__", "__getstate__", "__setstate__")

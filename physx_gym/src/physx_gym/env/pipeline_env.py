@@ -10,7 +10,6 @@ import gymnasium
 import numpy as np
 from numpy.typing import NDArray
 
-from physx_core.simulation import Part
 from physx_core.typing import Vector
 from physx_gym.env import own_state
 from physx_gym.shared_arrays import SharedArrays
@@ -18,6 +17,7 @@ from physx_gym.simulator.simulator import Simulator
 from physx_gym.simulator.states import RobotState, StepperState
 from physx_gym.spaces import copy_tree, fill
 from physx_gym.telemetry.episode_recorder import EpisodeRecorder
+from physx_sim import Part
 
 Info = dict[str, Any]
 Step = tuple[Any, float, bool, bool, Info]

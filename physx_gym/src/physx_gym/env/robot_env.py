@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import warnings
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, ClassVar
 
 import gymnasium
@@ -13,7 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from physx_core import checks
 from physx_core.components import Factory
-from physx_core.errors import ConfigError, EpisodeError, SimulationError, UsageError
+from physx_core.errors import ConfigError, EpisodeError, UsageError
 from physx_core.typing import Vector
 from physx_gym.env import subclass_checks
 from physx_gym.env.control_loop import ControlLoop
@@ -28,6 +28,7 @@ from physx_gym.env.timing import StepTiming
 from physx_gym.simulator.simulator import make_simulator, simulator_options
 from physx_gym.spaces import copy_tree, fill, neutral
 from physx_gym.telemetry.episode_recorder import EpisodeRecorder
+from physx_sim.errors import SimulationError
 
 
 class RobotEnv(PipelineEnv):
@@ -619,6 +620,12 @@ class RobotEnv(PipelineEnv):
 
             self._own_renderer = Renderer(self)
         return self._own_renderer.frame()
+
+    def make_drawing(self, factory: Factory) -> Callable[[], None]:
+        """Return a function that draws the present state with a factory; for pipelines."""
+        from physx_gym.show.environment_drawing import EnvironmentDrawing
+
+        return EnvironmentDrawing(self, factory).draw
 
     # State -------------------------------------------------------------------------------------
 

@@ -7,7 +7,7 @@ import math
 
 from physx_core import checks
 from physx_core.errors import ConfigError
-from physx_core.simulation import steps_of
+from physx_sim import steps_of
 
 Tick = tuple[bool, bool, int]
 """Whether to observe, whether to command, and how many physics steps to simulate afterwards."""

@@ -9,13 +9,13 @@ import numpy as np
 from gymnasium import spaces
 
 from physx_core import checks
-from physx_core.simulation import Ground, Robot, World
 from physx_core.typing import Vector
 from physx_gym.defaults import BACKEND
 from physx_gym.env.pipeline_env import Info
 from physx_gym.env.robot_env import RobotEnv
 from physx_gym.environments import limits
 from physx_gym.simulator.simulator import Simulator
+from physx_sim import Ground, Robot, World
 
 FARTHEST = 1000.0
 

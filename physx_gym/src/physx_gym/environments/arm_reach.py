@@ -9,13 +9,13 @@ import numpy as np
 from gymnasium import spaces
 
 from physx_core.components import Factory
-from physx_core.simulation import JointSettings, Motor, Robot, World
 from physx_core.typing import Vector
 from physx_gym.defaults import BACKEND
 from physx_gym.env.pipeline_env import Info
 from physx_gym.environments import limits
 from physx_gym.environments.goal import GoalEnv, GoalTask
 from physx_gym.simulator.simulator import Simulator
+from physx_sim import JointSettings, Motor, Robot, World
 
 HAND = "panda_hand"
 SPEED = 1.5

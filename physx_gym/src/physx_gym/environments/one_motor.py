@@ -7,10 +7,10 @@ from typing import Any, ClassVar
 import numpy as np
 from gymnasium import spaces
 
-from physx_core.simulation import Motor, Robot, World
 from physx_core.typing import Vector
 from physx_gym.env.robot_env import RobotEnv
 from physx_gym.simulator.simulator import Simulator
+from physx_sim import Motor, Robot, World
 
 _KEYS = {"Left": 0, "Right": 2}
 

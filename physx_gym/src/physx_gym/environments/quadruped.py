@@ -10,13 +10,13 @@ import numpy as np
 from gymnasium import spaces
 
 from physx_core.rotations import rotate_back_rows
-from physx_core.simulation import Ground, Robot, World
 from physx_core.typing import Vector
 from physx_gym.defaults import BACKEND
 from physx_gym.env.pipeline_env import Info
 from physx_gym.env.robot_env import RobotEnv
 from physx_gym.environments import limits
 from physx_gym.simulator.simulator import Simulator
+from physx_sim import Ground, Robot, World
 
 STAND = {"hip": 0.0, "thigh": 0.8, "calf": -1.6}
 RANGE = 0.4

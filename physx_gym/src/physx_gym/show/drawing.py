@@ -11,7 +11,8 @@ import numpy as np
 
 from physx_core.components import Factory
 from physx_core.processes import TemporaryFolder
-from physx_core.simulation import (
+from physx_core.typing import Vector
+from physx_sim import (
     Backend,
     Box,
     Capsule,
@@ -26,7 +27,6 @@ from physx_core.simulation import (
     World,
     WorldObject,
 )
-from physx_core.typing import Vector
 
 _GROUND, _MOVING, _RESTING = "#6d7885", "#ff7f0e", "#a3acb6"
 _THICKNESS, _REACH = 0.01, 100.0  # of a drawn plane, and half its width, in m

@@ -6,7 +6,8 @@ from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from physx_core.errors import LogError, MissingLibraryError, listed
+from physx_core.errors import MissingLibraryError, listed
+from physx_gym.errors import LogError
 from physx_gym.show.display import has_display
 from physx_gym.telemetry.episode_log import TIME, Log
 from physx_gym.telemetry.log_file import Source, as_logs

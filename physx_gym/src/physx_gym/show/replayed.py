@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from physx_core.components import Factory
-from physx_core.errors import ConfigError, LogError
+from physx_core.errors import ConfigError
 from physx_core.typing import Vector
+from physx_gym.errors import LogError
 from physx_gym.show.plotting import Groups, label_of
 from physx_gym.telemetry.episode_log import Log
 

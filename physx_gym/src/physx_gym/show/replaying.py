@@ -11,9 +11,9 @@ import numpy as np
 
 from physx_core import checks, plugins
 from physx_core.components import Factory, Visualizer
-from physx_core.errors import LogError, VisualizerError
-from physx_core.simulation import Backend, World
+from physx_core.errors import VisualizerError
 from physx_core.typing import Vector
+from physx_gym.errors import LogError
 from physx_gym.show.drawing import WorldDrawing
 from physx_gym.show.film import write_film
 from physx_gym.show.plotting import Groups, groups_of
@@ -22,6 +22,7 @@ from physx_gym.show.replayed import Contacts, Line, Plots, Scene, row_at
 from physx_gym.tasks.trajectory import Trajectory
 from physx_gym.telemetry.episode_log import Log
 from physx_gym.telemetry.log_file import Source, as_logs
+from physx_sim import Backend, World
 
 _FRAMES, _FRAMES_PER_ROW = 10_000, 100
 _POINTS = 1000  # of a drawn path, approximately

@@ -8,7 +8,8 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.simulation import (
+from physx_core.typing import Vector
+from physx_sim import (
     Encoder,
     Imu,
     Layout,
@@ -22,7 +23,6 @@ from physx_core.simulation import (
     Simulation,
     World,
 )
-from physx_core.typing import Vector
 
 _KINDS = {"ContactSensor": "Contact", "EffortSensor": "Effort", "ForceTorqueSensor": "ForceTorque"}
 """Names of kinds of sensors in measurements, where they differ from the class names."""

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from physx_core.simulation import Ground, HeightField, Simulation, Stairs
 from physx_core.typing import Vector
+from physx_sim import Ground, HeightField, Simulation, Stairs
 
 
 def offset_to_ground(

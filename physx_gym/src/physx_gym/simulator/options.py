@@ -7,7 +7,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from physx_core.errors import ConfigError, UnknownOptionError
-from physx_core.simulation import Motor, Sensor, World
+from physx_sim import Motor, Sensor, World
 
 _NAMES = frozenset({"name", "joint", "urdf", "package_dirs", "joints", "feet", "path", "heights"})
 """Fields that identify a thing rather than configure it; these are not options."""

@@ -11,13 +11,15 @@ from typing import Any, ClassVar, Self
 import numpy as np
 
 from physx_core import Closeable, checks, plugins
-from physx_core.errors import (
-    ComponentNotFoundError,
-    ConfigError,
-    EpisodeError,
-    SimulationError,
-)
-from physx_core.simulation import (
+from physx_core.errors import ComponentNotFoundError, ConfigError, EpisodeError
+from physx_core.typing import Vector
+from physx_gym.defaults import BACKEND
+from physx_gym.shared_arrays import SharedArrays
+from physx_gym.simulator import options as nested_options
+from physx_gym.simulator.equipment import Equipment, default_motors, default_sensors
+from physx_gym.simulator.ground_placement import offset_to_ground
+from physx_gym.simulator.states import RobotState, StepperState
+from physx_sim import (
     Ground,
     HeightField,
     Layout,
@@ -32,13 +34,7 @@ from physx_core.simulation import (
     Wrench,
     with_rotors,
 )
-from physx_core.typing import Vector
-from physx_gym.defaults import BACKEND
-from physx_gym.shared_arrays import SharedArrays
-from physx_gym.simulator import options as nested_options
-from physx_gym.simulator.equipment import Equipment, default_motors, default_sensors
-from physx_gym.simulator.ground_placement import offset_to_ground
-from physx_gym.simulator.states import RobotState, StepperState
+from physx_sim.errors import SimulationError
 
 _STEPPER = ("control_period", "observe_period")
 

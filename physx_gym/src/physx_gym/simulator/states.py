@@ -7,10 +7,10 @@ from typing import ClassVar
 
 import numpy as np
 
-from physx_core.simulation import Part, Simulation
 from physx_core.typing import Vector
 from physx_gym.shared_arrays import SharedArrays
 from physx_gym.simulator.equipment import Equipment
+from physx_sim import Part, Simulation
 
 
 @dataclass

@@ -9,10 +9,11 @@ from typing import Any, Literal
 import numpy as np
 
 from physx_core import checks
-from physx_core.errors import ConfigError, LogError
+from physx_core.errors import ConfigError
 from physx_core.fields import is_finite
 from physx_core.rotations import interpolate_rows
 from physx_core.typing import Vector
+from physx_gym.errors import LogError
 
 Beyond = Literal["raise", "wrap", "clip"]
 
@@ -26,7 +27,7 @@ class Trajectory:
 
     Attributes:
         times: Non-decreasing, shape (rows,), in s; like the others kept as a read-only copy.
-        positions: Shape (rows, nq), in the convention of `physx_core.simulation.layout`.
+        positions: Shape (rows, nq), in the convention of `physx_sim.layout`.
         velocities: Shape (rows, nv), likewise.
         beyond: What happens before the first and after the last row: ``"raise"``, an error;
             ``"wrap"``, the motion repeats from where it ended on the ground; ``"clip"``, the first

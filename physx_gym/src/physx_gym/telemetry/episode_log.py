@@ -18,11 +18,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from physx_core.errors import ComponentNotFoundError, LogError, nearest
+from physx_core.errors import ComponentNotFoundError, nearest
 from physx_core.files import replace
-from physx_core.simulation import World
+from physx_gym.errors import LogError
 from physx_gym.tasks.trajectory import Trajectory
 from physx_gym.telemetry.plain_description import to_plain, world_of
+from physx_sim import World
 
 TIME = "time"
 """Column of the time since the start of the episode, in s."""

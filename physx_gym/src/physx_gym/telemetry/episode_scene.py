@@ -9,8 +9,8 @@ from typing import Any
 import numpy as np
 
 from physx_core.components import Factory
-from physx_core.simulation import Simulation
 from physx_core.typing import Vector
+from physx_sim import Simulation
 
 _MOST_NUMBERS = 1_000_000  # in all changes: a log's description must stay readable
 _WITHOUT = ("view", "time")  # kinds of events that replays generate themselves

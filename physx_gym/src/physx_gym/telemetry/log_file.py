@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.errors import LogError
 from physx_core.parsing import parse_json
+from physx_gym.errors import LogError
 from physx_gym.telemetry.episode_log import FORMAT, TIME, VERSION, Column, Log
 
 _NAMES_WIDTH = 4096

@@ -10,8 +10,8 @@ from typing import Any
 import numpy as np
 
 from physx_core import PhysxError
-from physx_core.errors import LogError
-from physx_core.simulation import (
+from physx_gym.errors import LogError
+from physx_sim import (
     Box,
     Capsule,
     Cylinder,

@@ -7,11 +7,11 @@ from typing import Any
 
 from physx_core import __version__
 from physx_core.config import reference_of
-from physx_core.simulation import Layout, Part, Sensor
 from physx_gym.simulator.equipment import kind_of
 from physx_gym.simulator.simulator import Simulator
 from physx_gym.telemetry.episode_log import POSITIONS, VELOCITIES
 from physx_gym.telemetry.telemetry import Telemetry
+from physx_sim import Layout, Part, Sensor
 
 BASE_POSITION = {"x": "m", "y": "m", "z": "m", "qx": "", "qy": "", "qz": "", "qw": ""}
 """Coordinates of the position of a floating base or an object, and their units."""

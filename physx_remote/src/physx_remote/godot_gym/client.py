@@ -11,7 +11,8 @@ import numpy as np
 from gymnasium import spaces
 
 from physx_core import Closeable, Field
-from physx_core.errors import ConfigError, RemoteError, RemoteProtocolError, RequestError
+from physx_core.errors import ConfigError
+from physx_remote.errors import RemoteError, RemoteProtocolError, RequestError
 from physx_remote.godot_gym.messages import DESCRIPTION, Messages, read_extension
 from physx_remote.godot_gym.wire import OUTCOME, observation_fields
 from physx_remote.serving.client_link import RequestLink

@@ -4,8 +4,9 @@ from __future__ import annotations
 
 from typing import Any, Literal, get_args
 
-from physx_core.errors import ConfigError, RequestError, UsageError
+from physx_core.errors import ConfigError, UsageError
 from physx_core.net import Reader, check_address
+from physx_remote.errors import RequestError
 from physx_remote.godot_gym.frames_timer import Signal
 from physx_remote.godot_gym.messages import ERROR, encode_extension
 from physx_remote.godot_gym.requests import JsonReader, parse_request

@@ -6,13 +6,13 @@ import contextlib
 import json
 import time
 from collections.abc import Awaitable, Generator, Iterator
-from typing import Any, Self, TypeAlias
+from typing import TYPE_CHECKING, Any, Self, TypeAlias
 
 import gymnasium
 import numpy as np
 
-from physx_core.errors import RequestError, UsageError
-from physx_core.simulation import Simulation
+from physx_core.errors import UsageError
+from physx_remote.errors import RequestError
 from physx_remote.godot_gym.communication import Communication
 from physx_remote.godot_gym.frames_timer import PhysicsFramesTimer
 from physx_remote.godot_gym.messages import DESCRIPTION, Messages, encode_extension
@@ -20,6 +20,9 @@ from physx_remote.godot_gym.parts import RLAgent, RLEnvWorld
 from physx_remote.godot_gym.requests import as_count, as_object, as_seed, as_speed
 from physx_remote.serving.service import poll_until_interrupted
 from physx_remote.serving.spaces import describe_space
+
+if TYPE_CHECKING:
+    from physx_sim import Simulation
 
 FRAME_TIME = 1 / 60
 """Target length of a physics frame in s; frames consist of whole physics steps."""

@@ -5,7 +5,8 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from physx_core.errors import RequestError, UsageError
+from physx_core.errors import UsageError
+from physx_remote.errors import RequestError
 from physx_remote.godot_gym.environment import RLEnvironment, Stepping
 from physx_remote.godot_gym.messages import fill
 from physx_remote.godot_gym.parts import RLAgent, RLEnvWorld

@@ -18,9 +18,10 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from physx_core import Field
-from physx_core.errors import ConfigError, MissingLibraryError, RemoteError, RemoteProtocolError
+from physx_core.errors import ConfigError, MissingLibraryError
 from physx_core.fields import FieldLike, as_fields
 from physx_core.typing import Array
+from physx_remote.errors import RemoteError, RemoteProtocolError
 from physx_remote.serving.spaces import NONSENSE
 
 AGENT, WORLD = "agent_data", "world_data"

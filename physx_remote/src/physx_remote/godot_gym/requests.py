@@ -8,7 +8,7 @@ import re
 from collections.abc import Iterator
 from typing import Any
 
-from physx_core.errors import RemoteProtocolError, RequestError
+from physx_remote.errors import RemoteProtocolError, RequestError
 from physx_remote.serving.framing import BufferReader
 
 _DECODER = json.JSONDecoder()

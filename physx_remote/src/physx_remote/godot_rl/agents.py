@@ -8,7 +8,8 @@ from typing import Any, TypeAlias
 import gymnasium
 import numpy as np
 
-from physx_core.errors import ActionError, RequestError, nearest
+from physx_core.errors import ActionError, nearest
+from physx_remote.errors import RequestError
 from physx_remote.godot_rl.json_spaces import ActionReader, ObservationWriter
 from physx_remote.serving.json_data import to_json_data
 from physx_remote.serving.worlds import Worlds

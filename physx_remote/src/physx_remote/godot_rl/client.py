@@ -15,8 +15,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space, concatenate, create_empty_array
 
 from physx_core import Closeable
-from physx_core.errors import RemoteError, RemoteProtocolError, RemoteTimeoutError, UsageError
+from physx_core.errors import UsageError
 from physx_core.typing import Array
+from physx_remote.errors import RemoteError, RemoteProtocolError, RemoteTimeoutError
 from physx_remote.godot_rl.json_spaces import (
     ACTION,
     OBSERVATION,

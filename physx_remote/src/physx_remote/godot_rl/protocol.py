@@ -12,15 +12,8 @@ import socket
 import time
 from typing import Any, ClassVar
 
-from physx_core.errors import (
-    ActionError,
-    ConfigError,
-    PhysxError,
-    RemoteError,
-    RemoteProtocolError,
-    RequestError,
-    listed,
-)
+from physx_core.errors import ActionError, ConfigError, PhysxError, listed
+from physx_remote.errors import RemoteError, RemoteProtocolError, RequestError
 from physx_remote.godot_rl.agents import Agents, Answer
 from physx_remote.godot_rl.client import GodotRLEnv, GodotRLVectorEnv
 from physx_remote.serving.connect_options import ConnectOptions, check_names

@@ -10,9 +10,10 @@ import gymnasium
 import numpy as np
 
 from physx_core import Closeable
-from physx_core.errors import ConfigError, RemoteProtocolError
+from physx_core.errors import ConfigError
 from physx_core.net import Kind, pack_value
 from physx_core.typing import Array
+from physx_remote.errors import RemoteProtocolError
 from physx_remote.physx.link import PhysxLink
 from physx_remote.physx.space_arrays import SpaceArrays, is_array
 from physx_remote.physx.wire import (

@@ -7,8 +7,8 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.errors import RemoteError
 from physx_core.typing import Array
+from physx_remote.errors import RemoteError
 from physx_remote.physx.space_arrays import SpaceArrays
 from physx_remote.physx.wire import REWARD, TERMINATED, TRUNCATED
 from physx_remote.serving.worlds import Transition

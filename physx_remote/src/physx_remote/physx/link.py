@@ -10,10 +10,6 @@ from physx_core.errors import (
     ConfigError,
     ConnectionRefusedByPeerError,
     PhysxError,
-    RemoteClosedError,
-    RemoteError,
-    RemoteProtocolError,
-    RemoteTimeoutError,
     SilentPeerError,
     UnansweredError,
 )
@@ -28,6 +24,12 @@ from physx_core.net import (
     encrypt,
     find_token,
     introduce,
+)
+from physx_remote.errors import (
+    RemoteClosedError,
+    RemoteError,
+    RemoteProtocolError,
+    RemoteTimeoutError,
 )
 from physx_remote.physx.wire import OBSERVE, SERVICE, VERSION
 from physx_remote.serving.client_connection import ClientConnection

@@ -9,9 +9,9 @@ from typing import Any, Unpack
 import numpy as np
 
 from physx_core import Closeable
-from physx_core.errors import RemoteProtocolError
 from physx_core.net import Frame, Kind, pack_value, parse_address
 from physx_core.typing import Array
+from physx_remote.errors import RemoteProtocolError
 from physx_remote.physx.client import fit_outcome, read_introduction
 from physx_remote.physx.link import PhysxLink
 from physx_remote.physx.space_arrays import is_array

@@ -9,7 +9,7 @@ from typing import Any, ClassVar
 import numpy as np
 
 from physx_core import PhysxError
-from physx_core.errors import ConnectionRefusedByPeerError, RemoteError, RequestError
+from physx_core.errors import ConnectionRefusedByPeerError
 from physx_core.net import (
     HANDSHAKE_LIMIT,
     Frame,
@@ -25,6 +25,7 @@ from physx_core.net import (
     pack_value,
 )
 from physx_core.typing import Array
+from physx_remote.errors import RemoteError, RequestError
 from physx_remote.physx.wire import (
     ACT,
     COUNT,

@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 from gymnasium import spaces
 
-from physx_core.errors import ActionError, RequestError
+from physx_core.errors import ActionError
 from physx_core.typing import Array
+from physx_remote.errors import RequestError
 from physx_remote.serving.spaces import (
     Space,
     SpaceTree,

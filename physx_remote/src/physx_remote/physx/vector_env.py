@@ -10,8 +10,9 @@ from gymnasium.vector import AutoresetMode, VectorEnv
 from gymnasium.vector.utils import batch_space
 
 from physx_core import Closeable
-from physx_core.errors import ActionError, ConfigError, EpisodeError, RemoteProtocolError
+from physx_core.errors import ActionError, ConfigError, EpisodeError
 from physx_core.typing import Array
+from physx_remote.errors import RemoteProtocolError
 from physx_remote.physx.client import PhysxClient
 from physx_remote.physx.wire import REWARD, TERMINATED, TRUNCATED
 from physx_remote.serving.spaces import NONSENSE

@@ -5,8 +5,9 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from typing import Any
 
-from physx_core.errors import RemoteProtocolError, UsageError
+from physx_core.errors import UsageError
 from physx_core.net import encode
+from physx_remote.errors import RemoteProtocolError
 
 VERSION = 1
 """Version of the messages after the handshake."""

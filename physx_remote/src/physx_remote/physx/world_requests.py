@@ -12,8 +12,8 @@ from typing import Any, Self
 import numpy as np
 
 from physx_core import PhysxError
-from physx_core.errors import RequestError
 from physx_core.typing import Array
+from physx_remote.errors import RequestError
 from physx_remote.physx.latest_state import LatestState
 from physx_remote.physx.space_arrays import SpaceArrays
 from physx_remote.physx.wire import WORLDS

@@ -8,8 +8,8 @@ import socket
 from collections.abc import Callable, Collection
 from typing import Any, ClassVar
 
-from physx_core.errors import RemoteClosedError, RemoteError, RemoteTimeoutError
 from physx_core.net import VANISHED, is_loss, poll_peer, prepare_connection, retry
+from physx_remote.errors import RemoteClosedError, RemoteError, RemoteTimeoutError
 
 _RETRY = 0.1
 

@@ -6,7 +6,8 @@ import socket
 import time
 from typing import Any
 
-from physx_core.errors import ConfigError, RemoteClosedError
+from physx_core.errors import ConfigError
+from physx_remote.errors import RemoteClosedError
 from physx_remote.serving.client_connection import ClientConnection
 from physx_remote.serving.framing import MAX_ANSWER, PrefixReader, add_prefix
 

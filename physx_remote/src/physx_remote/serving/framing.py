@@ -5,8 +5,8 @@ from __future__ import annotations
 import socket
 import struct
 
-from physx_core.errors import RemoteProtocolError
 from physx_core.net import Reader
+from physx_remote.errors import RemoteProtocolError
 
 PREFIX = struct.Struct("<I")
 """Length of the body in bytes."""

@@ -4,13 +4,12 @@ from __future__ import annotations
 
 import typing
 from abc import ABC, abstractmethod
-from collections.abc import Mapping
-from importlib import import_module
 from inspect import isabstract
 from typing import TYPE_CHECKING, Any, ClassVar
 
-from physx_core.errors import ConfigError, RemoteError, UnknownOptionError, listed, nearest
-from physx_core.plugins import find
+from physx_core.errors import ConfigError, UnknownOptionError
+from physx_core.plugins import complete_reference, find
+from physx_remote.errors import RemoteError
 
 if TYPE_CHECKING:
     import gymnasium
@@ -19,12 +18,8 @@ if TYPE_CHECKING:
     from physx_remote.serving.service import Service
     from physx_remote.serving.worlds import Worlds
 
-PROTOCOLS: Mapping[str, str] = {
-    "godot-gym": "physx_remote.godot_gym.protocol:GodotGym",
-    "godot-rl": "physx_remote.godot_rl.protocol:GodotRL",
-    "physx": "physx_remote.physx.protocol:Physx",
-}
-"""Names of physx's own protocols."""
+KIND = "protocol"
+"""The kind of component."""
 
 
 class Scene(typing.Protocol):
@@ -94,17 +89,13 @@ class Protocol(ABC):
 
 
 def find_protocol(reference: str | type[Protocol]) -> type[Protocol]:
-    """Return the protocol for a name, ``"package.module:Class"``, or the class itself."""
-    if isinstance(reference, str) and ":" not in reference:
-        if reference not in PROTOCOLS:
-            raise ConfigError(
-                f'There is no protocol "{reference}".{nearest(reference, PROTOCOLS)} '
-                f'Available: {listed(PROTOCOLS)}; or use "package.module:Class".'
-            )
-        module, _, name = PROTOCOLS[reference].partition(":")
-        found = getattr(import_module(module), name)
-    else:
-        found = find("environment", reference)
+    """Return the protocol for a name, a reference, or the class itself.
+
+    Raises:
+        ComponentNotFoundError: If there is none of that name.
+        ConfigError: If it is no protocol.
+    """
+    found = find(KIND, complete_reference(KIND, reference))
     if not (isinstance(found, type) and issubclass(found, Protocol)) or isabstract(found):
         raise ConfigError(
             f"{reference} is not a protocol: it must be a subclass of physx_remote.Protocol that "

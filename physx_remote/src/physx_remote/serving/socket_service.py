@@ -12,8 +12,9 @@ from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, ClassVar
 
-from physx_core.errors import PhysxError, RemoteClosedError, RemoteError
+from physx_core.errors import PhysxError
 from physx_core.net import VANISHED, Listener, Reader, Strangers, is_loopback, is_loss
+from physx_remote.errors import RemoteClosedError, RemoteError
 from physx_remote.serving.client_log import ClientLog
 from physx_remote.serving.connection import MOMENT, RequestConnection
 from physx_remote.serving.framing import PrefixReader

@@ -12,8 +12,9 @@ from typing import Any, TypeAlias
 import numpy as np
 from gymnasium import spaces
 
-from physx_core.errors import RemoteProtocolError, RequestError, UsageError
+from physx_core.errors import UsageError
 from physx_core.typing import Array
+from physx_remote.errors import RemoteProtocolError, RequestError
 
 Space: TypeAlias = spaces.Space[Any]
 Leaf: TypeAlias = spaces.Box | spaces.Discrete | spaces.MultiBinary | spaces.MultiDiscrete

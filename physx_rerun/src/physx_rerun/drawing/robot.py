@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any
 
 import numpy as np
 import rerun as rr
 
+from physx_core.errors import MissingLibraryError
 from physx_core.rotations import from_matrix_rows, rotate_rows
 from physx_core.typing import Array
 from physx_rerun.drawing import colors
 from physx_rerun.drawing.chunks import ChunkBuilder, Times
 from physx_rerun.drawing.meshes import corners_of_mesh
 from physx_rerun.drawing.triangles import SimpleMesh, simple_mesh
-from physx_rerun.drawing.urdf import MESH_TYPES, Model, VisualShape, read
+from physx_rerun.drawing.visual_shapes import MESH_TYPES, Model, VisualShape
 
 _SILVER = (0.75, 0.78, 0.81, 1.0)
 
@@ -45,7 +46,7 @@ def draw_robot(
     Returns:
         The shapes drawn, and the bodies' poses with all joints at zero, shape (bodies, 7).
     """
-    model = read(values["urdf"], values["bodies"], values.get("package_dirs") or {})
+    model = _read(values)
     if model.missing:
         warnings.warn(
             f"{len(model.missing)} meshes of {values['urdf']} are not drawn: Rerun found no mesh "
@@ -63,6 +64,17 @@ def draw_robot(
         rows.add_static(path, rr.CoordinateFrame(frame), _geometry(shape, simple))
         drawn.append((path, shape))
     return drawn, model.rest
+
+
+def _read(values: Mapping[str, Any]) -> Model:
+    """Read the robot's URDF file."""
+    try:
+        from physx_rerun.drawing.urdf import read
+    except ModuleNotFoundError as error:
+        raise MissingLibraryError(
+            "Drawing a robot", "physx-sim", "robots", "physx-rerun"
+        ) from error
+    return read(values["urdf"], values["bodies"], values.get("package_dirs") or {})
 
 
 def place_shapes(

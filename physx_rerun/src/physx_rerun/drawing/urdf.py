@@ -1,4 +1,4 @@
-"""Visual shapes of a URDF file, and their poses on the robot's bodies.
+"""Reads the visual shapes of a URDF file, and their poses on the robot's bodies.
 
 Rerun's `UrdfTree` finds packages only through environment variables, omits missing meshes without
 an error, and does not report sizes, which the camera needs.
@@ -7,65 +7,17 @@ an error, and does not report sizes, which the camera needs.
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from physx_core.errors import ModelError, VisualizerError
+from physx_core.errors import VisualizerError
 from physx_core.rotations import from_matrix_rows
-from physx_core.simulation import UrdfTree, link_of, mesh_path, numbers_of, origin_of, parse_urdf
 from physx_core.typing import Vector
-
-MESH_TYPES = {
-    ".dae": "model/vnd.collada+xml",
-    ".glb": "model/gltf-binary",
-    ".gltf": "model/gltf+json",
-    ".obj": "model/obj",
-    ".stl": "model/stl",
-}
-"""Mesh files that Rerun can draw, by suffix, and their media types."""
-
-
-@dataclass(frozen=True)
-class VisualShape:
-    """A visual shape.
-
-    Attributes:
-        name: Name that is unique in the robot.
-        body: Index of the body that it is attached to; None: the world.
-        pose: Pose in the body's frame, a homogeneous matrix of shape (4, 4).
-        kind: ``mesh``, ``box``, ``cylinder``, ``sphere`` or ``capsule``.
-        size: In m: half edges of a box (3,); radius of a sphere (1,); radius and length (2,). For a
-            mesh: scale factors (3,).
-        mesh: File of a mesh.
-        color: Red, green, blue and alpha in [0, 1] from the URDF; None: not specified there.
-    """
-
-    name: str
-    body: int | None
-    pose: Vector
-    kind: str
-    size: tuple[float, ...]
-    mesh: Path | None
-    color: tuple[float, ...] | None
-
-
-@dataclass(frozen=True)
-class Model:
-    """The visual shapes of a robot.
-
-    Attributes:
-        shapes: The visual shapes whose files exist.
-        missing: Names of mesh files that do not exist or that Rerun cannot draw.
-        rest: Poses of the bodies with all joints at zero and the root at the origin,
-            shape (bodies, 7), x, y, z in m and quaternion x, y, z, w.
-    """
-
-    shapes: list[VisualShape]
-    missing: list[str]
-    rest: Vector
+from physx_rerun.drawing.visual_shapes import MESH_TYPES, Model, VisualShape
+from physx_sim import UrdfTree, link_of, mesh_path, numbers_of, origin_of, parse_urdf
+from physx_sim.errors import ModelError
 
 
 def read(urdf: str | Path, bodies: Sequence[str], package_dirs: Mapping[str, str]) -> Model:

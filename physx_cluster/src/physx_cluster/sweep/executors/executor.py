@@ -28,6 +28,9 @@ class Job(Closeable):
 class Executor(Closeable):
     """Runs the processes of trials. Closing it ends those that are still running.
 
+    It is made with the study's ``run.options`` and the number of threads of each trial's numerical
+    libraries.
+
     Attributes:
         interval: Time in s between checks of the jobs.
     """

@@ -12,7 +12,7 @@ from physx_core import plugins
 from physx_core.cli.arguments import METAVAR
 from physx_core.cli.command import main
 from physx_core.errors import PhysxError, UsageError
-from physx_core.plugins import KINDS
+from physx_core.plugins.kinds import kind_names
 
 _HELP = """usage: physx completion {bash,zsh}
 
@@ -54,8 +54,8 @@ compdef _physx physx
 """,
 }
 
-_KIND_OF = {kind: kind for kind in KINDS} | {"online": "buffer", "statistics": "visualizer"}
-"""Name of an option or argument to the kind of component that it takes."""
+_KIND_OF = {"online": "buffer", "statistics": "visualizer"}
+"""Name of an option to the kind of component that it takes, where the two differ."""
 _WORD = re.compile(r"[\w.][\w./@+-]*|--[\w.-]+")
 """Text that a shell takes as a literal word: names in metadata are not trusted."""
 _OPTION = re.compile(
@@ -137,12 +137,12 @@ def _values(name: str, metavar: str, description: str) -> Iterator[str]:
     yield from sorted(choices - {"None"})
     name = name.lstrip("-").rpartition(".")[2]
     if name == "kind":
-        yield from sorted(KINDS)
-    elif name in _KIND_OF:
-        yield from _components(_KIND_OF[name])
+        yield from sorted(kind_names())
+    elif (kind := _KIND_OF.get(name, name)) in kind_names():
+        yield from _components(kind)
     elif "reference" in name:
         yield from plugins.available()
-        for kind in KINDS:
+        for kind in kind_names():
             yield from _components(kind)
     if "STR" in metavar:
         yield from re.findall(r'"([a-z][\w-]*)"', description)

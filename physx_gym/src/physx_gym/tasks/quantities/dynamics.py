@@ -8,13 +8,14 @@ from typing import Literal
 
 import numpy as np
 
-from physx_core.errors import ConfigError, FeatureNotSupportedError
+from physx_core.errors import ConfigError
 from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
 from physx_gym.tasks.quantities.bodies import BodyPositions
 from physx_gym.tasks.quantities.combined import Rate
 from physx_gym.tasks.quantities.joints import JointTorques, JointVelocities
 from physx_gym.tasks.quantities.quantity import Moment, Quantity
+from physx_sim.errors import FeatureNotSupportedError
 
 
 @dataclass(frozen=True)

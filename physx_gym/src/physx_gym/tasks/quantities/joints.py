@@ -7,9 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from physx_core.errors import ComponentNotFoundError, FeatureNotSupportedError
+from physx_core.errors import ComponentNotFoundError
 from physx_core.typing import Vector
 from physx_gym.tasks.quantities.quantity import Moment, Quantity
+from physx_sim.errors import FeatureNotSupportedError
 
 
 @dataclass(frozen=True)

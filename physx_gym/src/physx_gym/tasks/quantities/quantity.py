@@ -11,12 +11,13 @@ from typing import Any
 import numpy as np
 
 from physx_core import checks
-from physx_core.errors import ComponentNotFoundError, ConfigError, FeatureNotSupportedError
-from physx_core.simulation import Part, Simulation
+from physx_core.errors import ComponentNotFoundError, ConfigError
 from physx_core.typing import Records, Vector
 from physx_gym.simulator.simulator import Simulator
 from physx_gym.spaces import copy_tree
 from physx_gym.tasks.trajectory import Trajectory
+from physx_sim import Part, Simulation
+from physx_sim.errors import FeatureNotSupportedError
 
 
 class Quantity(ABC):

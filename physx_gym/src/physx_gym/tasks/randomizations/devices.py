@@ -8,7 +8,6 @@ from typing import Any
 from numpy.random import Generator
 
 from physx_core.errors import ComponentNotFoundError, ConfigError, listed
-from physx_core.simulation import Sensor
 from physx_gym.blocks.pd_controller import PDController
 from physx_gym.env.pipeline_env import PipelineEnv
 from physx_gym.tasks.randomizations.randomization import (
@@ -19,6 +18,7 @@ from physx_gym.tasks.randomizations.randomization import (
     check_range,
     chosen,
 )
+from physx_sim import Sensor
 
 
 class RandomGains(Randomization):

@@ -9,7 +9,6 @@ from typing import Any
 from numpy.random import Generator
 
 from physx_core import checks
-from physx_core.simulation import Wrench
 from physx_gym.env.pipeline_env import PipelineEnv
 from physx_gym.tasks.randomizations.randomization import (
     Drawn,
@@ -19,6 +18,7 @@ from physx_gym.tasks.randomizations.randomization import (
     check_range,
     chosen,
 )
+from physx_sim import Wrench
 
 
 class RandomMasses(Randomization):

@@ -1,1 +1,0 @@
-"""Contract checks for physics engines."""

@@ -1,0 +1,86 @@
+"""``physx export``: export a dataset as npz, Parquet, Minari, LeRobot, Zarr, or one HDF5 file."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from physx_core.cli import count, show
+from physx_core.dataset import Dataset
+from physx_core.observers import ProgressBar
+from physx_formats import ExportOptions, export
+
+
+@dataclass
+class Export:
+    """Write a dataset's samples as one file or folder of another format.
+
+    npz: NumPy. hdf5-single: one plain HDF5 file with MODE/FIELD. parquet: columns, for pandas,
+    polars, and databases. zarr: chunked arrays, for xarray. minari: episodes for offline
+    reinforcement learning. lerobot: episodes for imitation learning, in version 3 of LeRobot's
+    format.
+    """
+
+    directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
+    """A session's or a dataset's folder."""
+    out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT")]
+    """The file to create, or the folder for zarr, minari, and lerobot."""
+    to: str
+    """The format: "npz", "parquet", "minari", "lerobot", "zarr", "hdf5-single", or one of another
+    plugin."""
+    mode: tuple[str, ...] = ()
+    """Modes to export; by default all that have samples. Parquet, minari, and lerobot take one."""
+    compression: str = "none"
+    """npz: deflate; parquet: snappy, gzip, zstd, lz4, brotli; zarr: zstd, gzip, blosc;
+    hdf5-single: gzip, lzf."""
+    observations: tuple[str, ...] = ()
+    """minari, lerobot: observation fields; by default all training fields not used otherwise. A
+    single field is the observation itself."""
+    actions: tuple[str, ...] = ()
+    """minari, lerobot: action fields; by default minari gets one action without effect."""
+    rewards: str | None = None
+    """minari, lerobot: reward field; by default minari's rewards are 0."""
+    fps: int | None = None
+    """lerobot: frames per second of simulated time; required."""
+    task: str | None = None
+    """lerobot: description of the task."""
+
+
+def run(words: Sequence[str]) -> None:
+    """Export a dataset and print the number of exported samples."""
+    options = tyro.cli(Export, args=words, prog="physx export")
+    form = ExportOptions(
+        options.compression,
+        options.observations,
+        options.actions,
+        options.rewards,
+        options.fps,
+        options.task,
+    )
+    bar = ProgressBar()
+    with Dataset.open(options.directory) as dataset:
+        sizes = {row["mode"]: 0 for row in dataset.describe()}
+        for row in dataset.describe():
+            sizes[row["mode"]] += row["bytes"]
+        wanted = options.mode or sizes
+        bar.begin("export", sum(sizes.get(mode, 0) for mode in wanted), "B")
+        try:
+            written = export(
+                dataset,
+                options.to,
+                options.out,
+                modes=options.mode,
+                options=form,
+                advance=bar.advance,
+            )
+        finally:
+            bar.end()
+        stored = {mode: dataset.num_samples(mode) for mode in written}
+    for mode, rows in written.items():
+        show(f"{count(rows, f'{mode} sample')}: {options.out}")
+        if rows < stored[mode]:
+            left = stored[mode] - rows
+            show(f"left out: {left:,} samples in trajectories of a single sample")

@@ -1,0 +1,56 @@
+"""``physx import``: import an npz file, an HDF5 file, or a DeepPhysX dataset."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Annotated
+
+import tyro
+
+from physx_core.cli import count, show
+from physx_core.observers import ProgressBar
+from physx_formats import import_file
+
+
+@dataclass
+class Import:
+    """Store the arrays of a file as the fields of a dataset.
+
+    Arrays of the same length become the fields of one mode. Group names become part of the field
+    names, except for training, validation, and prediction, which become modes.
+    """
+
+    file: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FILE")]
+    """A NumPy archive (npz), an HDF5 file, a DeepPhysX database, or the folder of a DeepPhysX
+    dataset or session."""
+    directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
+    """The dataset's folder; rows are appended to an existing dataset that has the same fields."""
+    mode: str | None = None
+    """Mode of the rows, regardless of the file's; for a file with several modes, the one to import.
+    By default the file's modes, or training if it has none."""
+    fields: tuple[str, ...] = ()
+    """Arrays to import; by default all."""
+    max_bytes: int | None = None
+    """Maximum size of the arrays in bytes; by default 100 times the size of the file, but at least
+    0.27 GB."""
+
+
+def run(words: Sequence[str]) -> None:
+    """Import a file and print the number of stored samples."""
+    options = tyro.cli(Import, args=words, prog="physx import")
+    bar = ProgressBar()
+    bar.begin("import", None, "B")
+    try:
+        stored = import_file(
+            options.file,
+            options.directory,
+            mode=options.mode,
+            fields=options.fields,
+            max_bytes=options.max_bytes,
+            advance=bar.advance,
+        )
+    finally:
+        bar.end()
+    for mode, rows in stored.items():
+        show(f"{count(rows, f'{mode} sample')}: {options.directory}")

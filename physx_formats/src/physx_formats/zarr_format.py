@@ -1,0 +1,71 @@
+"""Zarr: a folder with ``<mode>/<field>``, chunked along the rows, with units as attributes.
+
+``xarray.open_zarr(folder, group=mode)`` opens a mode. Metadata are consolidated, so that opening
+reads a single file.
+"""
+
+from __future__ import annotations
+
+import json
+import warnings
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physx_core.dataset import rows_per_block
+from physx_formats.errors import ExchangeError
+from physx_formats.format import Format
+from physx_formats.table import (
+    BLOCK,
+    ExportOptions,
+    Table,
+    encode_notes,
+    import_library,
+)
+
+COMPRESSIONS = ("none", "zstd", "gzip", "blosc")
+_CODECS = {"zstd": "ZstdCodec", "gzip": "GzipCodec", "blosc": "BloscCodec"}
+
+
+def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
+    """Write the modes as groups of arrays."""
+    zarr = import_library("zarr", "Exporting to Zarr", "zarr")
+    codecs = import_library("zarr.codecs", "Exporting to Zarr", "zarr")
+    codec = _CODECS.get(options.compression)
+    used = [getattr(codecs, codec)()] if codec else None
+    root = zarr.create_group(str(out), attributes={"physx": json.loads(encode_notes(tables))})
+    for table in tables:
+        group = root.create_group(table.mode)
+        for name in table.fields:
+            _write_field(group, table, name, used)
+    with warnings.catch_warnings():  # that libraries other than zarr and xarray may not support it
+        warnings.simplefilter("ignore")
+        zarr.consolidate_metadata(str(out))
+    return 0
+
+
+def _write_field(group: Any, table: Table, name: str, codecs: list[Any] | None) -> None:
+    field = table.fields[name]
+    step, shape = rows_per_block(field.nbytes, BLOCK), field.shape or ()
+    try:
+        stored = group.create_array(
+            name,
+            shape=(table.rows, *shape),
+            dtype=np.dtype(field.dtype),
+            chunks=(min(step, table.rows), *(max(1, length) for length in shape)),
+            compressors=codecs,
+            dimension_names=["sample", *(f"{name}_{axis}" for axis in range(len(shape)))],
+            attributes={"unit": field.unit, "role": field.role},
+        )
+    except (ValueError, TypeError) as error:
+        raise ExchangeError(
+            f'Zarr cannot hold the field "{name}" of type {np.dtype(field.dtype)}: {error}.'
+        ) from error
+    for start, block in table.column(name, step):
+        if field.nbytes:
+            stored[start : start + len(block)] = block
+
+
+FORMAT = Format(write=write, compressions=COMPRESSIONS, several=True)

@@ -1,0 +1,440 @@
+"""Backend, a physics engine, and Simulation, a world running in it.
+
+States follow the convention of `physx_sim.layout`.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from physx_core import Closeable
+from physx_core.typing import Records, Vector
+from physx_sim.description.world import World
+from physx_sim.description.wrench import Wrench
+from physx_sim.errors import FeatureNotSupportedError
+from physx_sim.layout import Layout, State
+
+
+@dataclass(frozen=True)
+class RobotInfo:
+    """A robot that a world may refer to by name instead of by file, as in ``Robot("cartpole")``.
+
+    Attributes:
+        name: Name of the robot.
+        path: Its model file.
+        joints: Number of its joints' degrees of freedom; a floating base has 6 more.
+        mass: Total mass of its links, in kg.
+        collisions: Kind of its collision shapes: ``"primitives"``, ``"meshes"``, ``"both"`` or
+            ``"none"``.
+        warnings: Caveats about using it.
+        error: Reason why it cannot be loaded; empty if it can. Otherwise the other values are 0
+            and ``"none"``.
+    """
+
+    name: str
+    path: Path
+    joints: int = 0
+    mass: float = 0.0
+    collisions: str = "none"
+    warnings: tuple[str, ...] = ()
+    error: str = ""
+
+
+class Backend(ABC):
+    """A physics engine."""
+
+    @abstractmethod
+    def build(self, world: World, seed: int | None = None) -> Simulation:
+        """Build a simulation of a world, at rest in its neutral configuration.
+
+        Args:
+            world: The world to simulate.
+            seed: Seed of the engine's random numbers, if it draws any.
+
+        Raises:
+            ModelError: If a robot or mesh cannot be loaded; the message gives the reason.
+            FeatureNotSupportedError: If the world needs a feature that the engine does not have.
+        """
+
+    def robots(self) -> Sequence[RobotInfo]:
+        """Return the robots that a world may refer to by name; none unless overridden."""
+        return ()
+
+    def robot_path(self, name: str) -> Path | None:
+        """Return the model file of a named robot, or None if there is none.
+
+        Override this where a lookup is faster than describing all robots.
+        """
+        return next((info.path for info in self.robots() if info.name == name), None)
+
+
+class Simulation(Closeable):
+    """A running world; a context manager. After `close`, every call raises `SimulationError`.
+
+    A method whose feature is not in `features` raises `FeatureNotSupportedError`.
+
+    Attributes:
+        engine: Name of the engine.
+        period: Length of one physics step, in s.
+        layout: Names and indices in the state.
+        features: Features of this simulation: names from `FEATURES`.
+    """
+
+    engine: str = ""
+    period: float
+    layout: Layout
+    features: frozenset[str]
+
+    @property
+    @abstractmethod
+    def frame(self) -> int:
+        """Number of physics steps since the simulation was built."""
+
+    @property
+    def time(self) -> float:
+        """Simulated time, in s."""
+        return self.frame * self.period
+
+    # Running --------------------------------------------------------------------------------
+
+    @abstractmethod
+    def set_torques(self, torques: Vector) -> None:
+        """Hold these torques until they are changed, clipped to the joints' limits.
+
+        Args:
+            torques: Shape (joints,), in N m or N.
+
+        Raises:
+            SimulationError: If the shape is wrong, a value is not finite, or a joint's mode is not
+                ``"force"``.
+        """
+
+    @abstractmethod
+    def set_commands(self, commands: Vector) -> None:
+        """Hold these commands until they are changed, clipped to the joints' limits.
+
+        Args:
+            commands: Shape (joints,): torque, velocity, or position, depending on each joint's
+                mode; copied.
+
+        Raises:
+            SimulationError: If the shape is wrong or a value is not finite.
+        """
+
+    def commands(self) -> Vector:
+        """Return the held commands, clipped to the joints' limits, shape (joints,)."""
+        return self.snapshot().commands
+
+    @abstractmethod
+    def step(self, n: int = 1) -> None:
+        """Simulate n physics steps under the held commands.
+
+        Raises:
+            SimulationError: If the state is no longer finite, or a hook calls `step`.
+        """
+
+    def add_hook(self, hook: Hook, every: int = 1) -> None:
+        """Call a function before the physics steps whose frame is a multiple of `every`.
+
+        It may read everything and set commands and wrenches. Hooks are called in the order in which
+        they were added. Without hooks, `step` has no extra cost. Snapshots do not include hooks.
+        """
+        raise self._lacks("hooks")
+
+    def remove_hook(self, hook: Hook) -> None:
+        """Remove a hook.
+
+        Raises:
+            SimulationError: If the function is not a hook of this simulation.
+        """
+        raise self._lacks("hooks")
+
+    def apply_wrench(self, wrench: Wrench) -> int:
+        """Apply a wrench to a body from now on; return its number for `remove_wrench`.
+
+        Raises:
+            SimulationError: If there is no body with that name, or it cannot move.
+        """
+        raise self._lacks("wrenches")
+
+    def remove_wrench(self, number: int) -> None:
+        """Remove a wrench.
+
+        Raises:
+            SimulationError: If no wrench with that number is active.
+        """
+        raise self._lacks("wrenches")
+
+    # State ----------------------------------------------------------------------------------
+
+    @abstractmethod
+    def positions(self, out: Vector | None = None) -> Vector:
+        """Return the positions, shape (nq,), copied to `out` if given."""
+
+    @abstractmethod
+    def velocities(self, out: Vector | None = None) -> Vector:
+        """Return the velocities, shape (nv,), copied to `out` if given."""
+
+    @abstractmethod
+    def set_state(self, positions: Vector, velocities: Vector) -> None:
+        """Set the state without resetting the time. There are no contacts until the next step.
+
+        Args:
+            positions: Shape (nq,).
+            velocities: Shape (nv,).
+
+        Raises:
+            SimulationError: If a shape is wrong or a value is not finite.
+        """
+
+    @abstractmethod
+    def snapshot(self) -> State:
+        """Return everything that `restore` needs to continue exactly from here.
+
+        An engine that warm-starts each step with impulses or contacts of the last one discards them
+        here, as it does in `restore` and `set_state`. The state alone then determines what follows,
+        bit-identical here and wherever the snapshot is restored. It differs from what would have
+        followed without the snapshot, within the accuracy of the engine's solver.
+        """
+
+    @abstractmethod
+    def restore(self, state: State) -> None:
+        """Return to a snapshot.
+
+        Raises:
+            SimulationError: If the snapshot is of a world with a different layout.
+        """
+
+    # Measurements ---------------------------------------------------------------------------
+
+    def accelerations(self) -> Vector:
+        """Return the velocity change in the last step divided by the period, shape (nv,).
+
+        Uses the convention of the velocities and includes the effects of constraints. 0 before the
+        first step and after `set_state` and `restore`.
+        """
+        raise self._lacks("accelerations")
+
+    def contacts(self) -> Records:
+        """Return the contacts of the last physics step as a new array of `CONTACT` records."""
+        raise self._lacks("contacts")
+
+    def joint_wrenches(self) -> Vector:
+        """Return the joint reactions in the last step, shape (joints, 6): in N, then in N m."""
+        raise self._lacks("joint_wrenches")
+
+    def raycast(self, begins: Vector, ends: Vector) -> Records:
+        """Return the first hit of each ray as an array of `RAY_HIT` records.
+
+        Args:
+            begins: Start points of the rays, shape (n, 3), in m, in the world frame.
+            ends: End points of the rays, in the same form.
+        """
+        raise self._lacks("raycast")
+
+    @abstractmethod
+    def body_poses(
+        self, names: Sequence[str] | None = None, positions: Vector | None = None
+    ) -> Vector:
+        """Return the poses of links and objects in the world frame, shape (names, 7).
+
+        Args:
+            names: Body names, static ones included; None: all of `layout.bodies`.
+            positions: Shape (nq,); None: the current ones.
+
+        Returns:
+            Per row, x, y, z in m and quaternion x, y, z, w, with w not negative.
+
+        Raises:
+            SimulationError: If there is no body with one of these names.
+        """
+
+    @abstractmethod
+    def body_velocities(
+        self,
+        names: Sequence[str] | None = None,
+        positions: Vector | None = None,
+        velocities: Vector | None = None,
+    ) -> Vector:
+        """Return the velocities of the origins of links and objects, shape (names, 6).
+
+        Args:
+            names: Body names, static ones included; None: all of `layout.bodies`.
+            positions: Shape (nq,); None: the current ones.
+            velocities: Shape (nv,); None: the current ones.
+
+        Returns:
+            Per row, the linear velocity in m/s, then the angular velocity in rad/s, both in the
+            world frame.
+
+        Raises:
+            SimulationError: If there is no body with one of these names.
+        """
+
+    def body_accelerations(self, names: Sequence[str] | None = None) -> Vector:
+        """Return the accelerations of the origins of links and objects, shape (names, 6).
+
+        They follow from `accelerations` and the current state; before the first step they contain
+        only centripetal and Coriolis terms.
+
+        Args:
+            names: Body names, static ones included; None: all of `layout.bodies`.
+
+        Returns:
+            Per row, the linear acceleration in m/s², then the angular acceleration in rad/s², both
+            in the world frame.
+
+        Raises:
+            SimulationError: If there is no body with one of these names.
+        """
+        raise self._lacks("accelerations")
+
+    def body_motions(self, names: Sequence[str] | None = None) -> Vector:
+        """Return poses, velocities, and accelerations of links and objects, shape (names, 19).
+
+        Each row holds a pose (7) as from `body_poses`, a velocity (6) as from `body_velocities`,
+        and an acceleration (6) as from `body_accelerations`; faster than three calls.
+        """
+        found = self.body_poses(names), self.body_velocities(names), self.body_accelerations(names)
+        return np.concatenate(found, axis=1)
+
+    def reach(self, name: str, direction: Vector, positions: Vector | None = None) -> float:
+        """Return how far a robot's or object's collision shapes extend along a direction.
+
+        Args:
+            name: Name of the robot or object, as in `layout.parts`.
+            direction: Unit vector, shape (3,), in the world frame.
+            positions: Shape (nq,); None: the current ones.
+
+        Returns:
+            The largest dot product of the direction with a point of the shapes, in m; -inf if there
+            are no collision shapes.
+
+        Raises:
+            SimulationError: If there is no moving robot or object with that name.
+        """
+        raise self._lacks("contacts")
+
+    # Dynamics of any state, not only the current one ----------------------------------------
+
+    @abstractmethod
+    def forward_dynamics(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
+        """Return the accelerations, shape (nv,), caused by torques (nv,) in a state.
+
+        Joint damping, springs, and Coulomb friction are included; contacts and limits are not. All
+        joints are driven by torques here, regardless of their mode. Accelerations are the time
+        derivatives of the velocities, so those of a base are in its own frame.
+        """
+
+    @abstractmethod
+    def inverse_dynamics(
+        self, positions: Vector, velocities: Vector, accelerations: Vector
+    ) -> Vector:
+        """Return the torques, shape (nv,), that produce accelerations (nv,) in a state."""
+
+    def mass_matrix(self, positions: Vector) -> Vector:
+        """Return the mass matrix, shape (nv, nv)."""
+        raise self._lacks("mass_matrix")
+
+    def jacobian(
+        self, body: str, positions: Vector, point: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> Vector:
+        """Return the Jacobian, shape (6, nv), of a point on a link or object.
+
+        It maps the velocities to the point's linear and the body's angular velocity, both in the
+        world frame.
+
+        Args:
+            body: Name of the link or object.
+            positions: Shape (nq,).
+            point: In the body's frame, in m.
+        """
+        raise self._lacks("jacobian")
+
+    def forward_dynamics_derivatives(
+        self, positions: Vector, velocities: Vector, torques: Vector
+    ) -> tuple[Vector, Vector, Vector]:
+        """Return derivatives of `forward_dynamics` w.r.t. positions, velocities, and torques.
+
+        Returns:
+            Three arrays of shape (nv, nv), whose rows are accelerations. Derivatives w.r.t.
+            positions are taken along small motions in velocity space, so a base has six columns,
+            not seven. Coulomb friction is treated as constant.
+        """
+        raise self._lacks("derivatives")
+
+    def forward_dynamics_batch(
+        self, positions: Vector, velocities: Vector, torques: Vector, *, processes: int = 1
+    ) -> Vector:
+        """Return `forward_dynamics` for many states, one per row, shape (n, nv).
+
+        Args:
+            positions: Shape (n, nq).
+            velocities: Shape (n, nv).
+            torques: Shape (n, nv).
+            processes: Maximum number of processes that share the rows, including this one. The
+                others start on first use and end with the simulation. An engine without parallel
+                batches computes all rows in this process, with the same results.
+
+        Raises:
+            SimulationError: If an array has the wrong shape, or one of the processes ended.
+        """
+        states = zip(positions, velocities, torques, strict=True)
+        found = [self.forward_dynamics(*state) for state in states]
+        return np.array(found, np.float64).reshape(-1, self.layout.nv)
+
+    def forward_dynamics_gradients_batch(
+        self,
+        positions: Vector,
+        velocities: Vector,
+        accelerations: Vector,
+        weights: Vector,
+        *,
+        processes: int = 1,
+    ) -> Vector:
+        """Return gradients of weighted sums of `forward_dynamics` for many states.
+
+        Row i is the gradient of ``weights[i] @ forward_dynamics(...)`` in the state whose torques
+        cause ``accelerations[i]``.
+
+        Args:
+            positions: Shape (n, nq); each row is a state.
+            velocities: Shape (n, nv).
+            accelerations: Shape (n, nv), as `forward_dynamics_batch` returned them.
+            weights: Shape (n, nv).
+            processes: As in `forward_dynamics_batch`.
+
+        Returns:
+            Gradients w.r.t. positions, velocities, and torques, shape (3, n, nv); those w.r.t.
+            positions are taken along small motions, as in `forward_dynamics_derivatives`.
+
+        Raises:
+            SimulationError: If an array has the wrong shape, or one of the processes ended.
+        """
+        found = np.empty((3, len(weights), self.layout.nv))
+        rows = zip(positions, velocities, accelerations, weights, strict=True)
+        for number, (q, v, a, weight) in enumerate(rows):
+            torques = self.inverse_dynamics(q, v, a)
+            for out, matrix in zip(
+                found, self.forward_dynamics_derivatives(q, v, torques), strict=True
+            ):
+                out[number] = weight @ matrix
+        return found
+
+    # ----------------------------------------------------------------------------------------
+
+    def _lacks(self, feature: str) -> FeatureNotSupportedError:
+        return FeatureNotSupportedError(self.engine or type(self).__name__, feature, self.features)
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free the world; further calls do nothing."""
+
+
+Hook = Callable[[Simulation], None]
+"""Function called with the simulation before a physics step."""

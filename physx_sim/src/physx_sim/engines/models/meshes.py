@@ -1,0 +1,96 @@
+"""Vertices of mesh files, and the boxes and capsules around them."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+
+from physx_core import files
+from physx_core.origin import install_hint
+from physx_core.processes import TemporaryFolder
+from physx_core.typing import Vector
+from physx_sim.errors import ModelError
+
+_FORMATS = (".stl", ".obj", ".dae")
+_LARGEST = 2**27
+"""Maximum size of a mesh file, in bytes; loading takes several times as much memory."""
+_GEOMETRY = ([b"v"], [b"vn"], [b"vt"], [b"f"], [b"o"], [b"g"])
+
+
+def read_vertices(path: Path, scale: Sequence[float]) -> Vector:
+    """Return the vertices of a mesh file, shape (n, 3), in m.
+
+    Args:
+        path: Path of an stl, obj, or dae file.
+        scale: Scale factor along each axis.
+
+    Raises:
+        ModelError: If the file is missing, too large, damaged, or in another format, has no
+            vertices or some that are not finite, or the package coal is not installed.
+    """
+    if not path.is_file():
+        raise ModelError(f"There is no mesh file {path}.")
+    if path.suffix.lower() not in _FORMATS:
+        raise ModelError(f"The mesh {path} is not in one of the formats {', '.join(_FORMATS)}.")
+    if path.stat().st_size > _LARGEST:
+        raise ModelError(f"The mesh {path} has more than {_LARGEST} bytes: simplify it.")
+    try:
+        import coal  # only worlds with meshes need it
+    except ImportError as error:
+        raise ModelError(
+            f"The mesh {path} is read with the package coal, which cannot be imported: {error}. "
+            f"{install_hint('physx-sim', 'meshes')}"
+        ) from error
+    try:
+        with geometry_file(path) as bare:
+            mesh = coal.MeshLoader().load(str(bare), np.array(scale, np.float64))
+        vertices = np.array(mesh.vertices(), np.float64).reshape(-1, 3)
+    except (ValueError, RuntimeError, TypeError) as error:
+        raise ModelError(f"The mesh {path} cannot be read: {error}") from error
+    if not len(vertices) or not np.isfinite(vertices).all():
+        raise ModelError(f"The mesh {path} has no vertices, or some that are not finite.")
+    return vertices
+
+
+@contextmanager
+def geometry_file(path: Path) -> Iterator[Path]:
+    """Yield a file with the vertices and faces of a mesh that refers to no other file.
+
+    An obj file can refer to material files anywhere, which the engines' libraries would read.
+    """
+    if path.suffix.lower() != ".obj":
+        yield path
+        return
+    content = path.read_bytes().replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    lines = content.splitlines(keepends=True)
+    kept = b"".join(line for line in lines if line.split(None, 1)[:1] in _GEOMETRY)
+    with TemporaryFolder("mesh-") as folder:
+        bare = folder.path / path.name
+        files.replace(bare, kept, wait=False)
+        yield bare
+
+
+def bounding_box(vertices: Vector) -> tuple[Vector, Vector]:
+    """Return the center and full size, shape (3,) each, of the bounding box of vertices (n, 3)."""
+    lowest, highest = vertices.min(axis=0), vertices.max(axis=0)
+    return 0.5 * (lowest + highest), np.maximum(highest - lowest, 1e-4)
+
+
+def bounding_capsule(vertices: Vector) -> tuple[Vector, Vector, Vector]:
+    """Return a capsule that bounds vertices (n, 3), along their bounding box's longest edge.
+
+    Returns:
+        Center (3,), axes (3, 3) with the capsule's axis as last column, and radius and length of
+        the cylindrical part (2,), in m; a length of 0 means a sphere.
+    """
+    center, size = bounding_box(vertices)
+    axis = int(np.argmax(size))
+    axes = np.roll(np.eye(3), 2 - axis, axis=1)
+    local = (vertices - center) @ axes
+    squares = (local[:, :2] ** 2).sum(axis=1)
+    radius = max(float(np.sqrt(squares.max())), 1e-4)
+    reach = np.abs(local[:, 2]) - np.sqrt(np.maximum(radius**2 - squares, 0.0))
+    return center, axes, np.array([radius, max(2 * float(reach.max()), 0.0)])

@@ -1,0 +1,578 @@
+"""Simulation of a world whose robots and objects an engine steps.
+
+An engine implements `RobotEngine` for one robot, `Algorithms` for any state of a world, and the
+abstract methods of `RobotSimulation` for stepping.
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from typing import Any, ClassVar, Generic, TypeVar
+
+import numpy as np
+
+from physx_core.errors import listed
+from physx_core.rotations import cross, to_matrix
+from physx_core.typing import Records, Vector
+from physx_sim import (
+    CONTACT,
+    FEATURES,
+    Hook,
+    Simulation,
+    State,
+    Wrench,
+    copy_to,
+    finite_vector,
+)
+from physx_sim.engines.algorithms import Algorithms
+from physx_sim.engines.checks import LayoutChecks, integer
+from physx_sim.engines.engine import RobotEngine
+from physx_sim.engines.influences import Hooks, Wrenches
+from physx_sim.engines.models.parts import Parts, layout_of
+from physx_sim.engines.models.reach import Reach
+from physx_sim.errors import SimulationError
+
+_FASTEST = 1e8
+"""Speed, in m/s or rad/s, above which a state counts as no longer finite."""
+_BLOCK = 64
+"""Physics steps between checks of the state."""
+
+
+Engine = TypeVar("Engine", bound=RobotEngine)
+
+
+class RobotSimulation(Simulation, Generic[Engine]):
+    """A world whose robots and moving objects are each simulated by a `RobotEngine`."""
+
+    lacks: ClassVar[frozenset[str]] = frozenset()
+    """Features that the engine never supports."""
+
+    def __init__(self, parts: Parts, robots: Sequence[Engine], lacks: Sequence[str]) -> None:
+        """Put the robots at rest in their neutral configuration.
+
+        Args:
+            parts: Everything in the world.
+            robots: One for each mover of the world.
+            lacks: Features that this simulation lacks.
+        """
+        self.features = frozenset(FEATURES) - self.lacks - set(lacks)
+        self.parts = parts
+        self.period = parts.world.period
+        self.layout = layout_of(parts)
+        self._checks = LayoutChecks(self.layout)
+        self._robots = tuple(robots)
+        self._only = robots[0] if len(robots) == 1 else None
+        self._joint_count = len(self.layout.joints)
+        self._closed = self._stepped = self._stepping = False
+        self._frame = 0
+        places = self.layout.parts.values()
+        self._slices = [
+            (robot, place.positions, place.velocities)
+            for robot, place in zip(robots, places, strict=True)
+        ]
+        self._joints = [place.joints for place in places]
+        self._links = [(robot, link) for robot in robots for link in range(len(robot.model.links))]
+        self._made_algorithms: Algorithms | None = None
+        self._reaches: dict[int, Reach] = {}
+        for robot in robots:
+            robot.write(robot.neutral(), np.zeros(robot.nv))
+        self._wrenches, self._hooks = Wrenches(self.period), Hooks()
+        self._set_command_limits()
+        self._watch()
+        commands = np.zeros(self._joint_count)
+        commands[self._positioned] = self.positions()[self._positioned_q]
+        self._hold(commands)
+        self.forget()
+
+    def _set_command_limits(self) -> None:
+        layout = self.layout
+        modes = np.array(layout.modes)
+        most, least = layout.max_torque.copy(), -layout.max_torque
+        for mode, high, low in (
+            ("servo", layout.max_velocity, -layout.max_velocity),
+            ("velocity", layout.max_velocity, -layout.max_velocity),
+            ("position", layout.upper, layout.lower),
+        ):
+            most, least = np.where(modes == mode, high, most), np.where(modes == mode, low, least)
+        self._least, self._most = least, most
+        self._forces_only = bool((modes == "force").all())
+        tame = min(most.min(initial=np.inf), -least.max(initial=-np.inf))
+        # Square of the norm up to which no command needs clipping.
+        self._tame = tame**2 if tame > 0 else -1.0
+        self._positioned = np.flatnonzero(modes == "position")
+        joints = [joint for mover in self.parts.movers for joint in mover.model.joints]
+        gains = np.array([min(joint.settings.gain, 1 / self.period) for joint in joints])
+        self._gains = gains[self._positioned]
+        places = np.array(list(layout.position_index.values()), np.intp)
+        self._positioned_q = places[self._positioned]
+
+    # Running --------------------------------------------------------------------------------
+
+    @abstractmethod
+    def advance(self, n: int) -> None:
+        """Simulate n physics steps."""
+
+    @abstractmethod
+    def make_algorithms(self) -> Algorithms:
+        """Return the algorithms for any state of the world; called on first use."""
+
+    def forget(self) -> None:
+        """Clear what the engine keeps from earlier steps, so that only the state matters."""
+
+    @property
+    def frame(self) -> int:
+        """Number of physics steps since the simulation was built."""
+        self._check_open()
+        return self._frame
+
+    def set_torques(self, torques: Vector) -> None:
+        """Hold torques, shape (joints,), in N m or N, clipped to the joints' limits.
+
+        Raises:
+            SimulationError: If the shape is wrong, a value is not finite, or a joint's mode is not
+                ``"force"``.
+        """
+        if self._closed:
+            self._check_open()
+        if not self._forces_only:
+            others = [
+                name
+                for name, mode in zip(self.layout.joints, self.layout.modes, strict=True)
+                if mode != "force"
+            ]
+            raise SimulationError(
+                f"set_torques: these joints are not driven by torques: {listed(others)}. "
+                "Use set_commands."
+            )
+        self._hold(finite_vector("torques", torques, self._joint_count))
+
+    def set_commands(self, commands: Vector) -> None:
+        """Hold commands, shape (joints,), in each joint's mode, clipped to the limits."""
+        if self._closed:
+            self._check_open()
+        self._hold(finite_vector("commands", commands, self._joint_count))
+
+    def commands(self) -> Vector:
+        """Return the held commands, clipped to the joints' limits, shape (joints,)."""
+        if self._closed:
+            self._check_open()
+        return self._commands.copy()
+
+    def _hold(self, commands: Vector) -> None:
+        if commands.dot(commands) > self._tame:
+            np.maximum(commands, self._least, out=commands)
+            np.minimum(commands, self._most, out=commands)
+        self._commands = commands
+        if self._only is not None:
+            self._only.hold(commands)
+            return
+        for robot, part in zip(self._robots, self._joints, strict=True):
+            robot.hold(commands[part])
+
+    def step(self, n: int = 1) -> None:
+        """Simulate n physics steps under the held commands.
+
+        Raises:
+            SimulationError: If `n` is invalid, the state is no longer finite, or a hook calls
+                `step`.
+        """
+        if self._closed:
+            self._check_open()
+        if type(n) is not int or n < 0:
+            n = integer("n, the number of steps,", n, 0)
+        if self._stepping:
+            raise SimulationError("A hook must not call step, because step calls the hook.")
+        if self._watched:
+            self._step_watched(n)
+            return
+        while n > 0:
+            block = n if n < _BLOCK else _BLOCK
+            self.advance(block)
+            n -= block
+            self._frame += block
+            self._stepped = True
+            self._check_finite()
+
+    def _step_watched(self, n: int) -> None:
+        self._stepping = True
+        try:
+            while n > 0:
+                self._hooks.call(self, self._frame)
+                self._check_open()
+                block = 1
+                if len(self._wrenches) or len(self._positioned):
+                    self._push()
+                    self._steer()
+                else:
+                    block = min(n, _BLOCK, self._hooks.pause(self._frame))
+                self.advance(block)
+                n -= block
+                self._frame += block
+                self._stepped = True
+                self._check_finite()
+        finally:
+            self._stepping = False
+            self._watch()
+            if not self._closed and not len(self._wrenches):
+                self._release()
+
+    def _push(self) -> None:
+        """Apply the wrenches of this frame."""
+        if not len(self._wrenches):
+            return
+        self._release()
+        for wrench, force, torque in self._wrenches.at(self._frame):
+            robot, link = self._links[self._checks.body(wrench.body)]
+            point, local = np.array(wrench.point), wrench.frame == "body"
+            robot.push(link, force, torque, point, local)
+
+    def _release(self) -> None:
+        for robot in self._robots:
+            robot.release()
+
+    def _steer(self) -> None:
+        """Update the velocities of servos that track position commands."""
+        at = self._positioned
+        if not len(at):
+            return
+        commands, most = self._commands.copy(), self.layout.max_velocity[at]
+        errors = commands[at] - self.positions()[self._positioned_q]
+        commands[at] = np.clip(self._gains * errors, -most, most)
+        for robot, part in zip(self._robots, self._joints, strict=True):
+            robot.hold(commands[part])
+
+    def _check_finite(self) -> None:
+        for robot in self._robots:
+            if not robot.speed() < _FASTEST:
+                reasons = [f"In this file, {text}." for text in robot.model.warnings]
+                advice = reasons or ["Use a smaller period or smaller torques."]
+                raise SimulationError(
+                    f"The state is no longer finite, or faster than {_FASTEST:g} rad/s or m/s, "
+                    f'after frame {self._frame} ("{robot.mover.name}", {robot.model.path.name}). '
+                    + " ".join(advice)
+                )
+
+    def _watch(self) -> None:
+        """Note whether any work is needed between steps."""
+        self._watched = bool(len(self._hooks) or len(self._wrenches) or len(self._positioned))
+
+    def add_hook(self, hook: Hook, every: int = 1) -> None:
+        """Call a function before the physics steps whose frame is a multiple of `every`."""
+        self._check_open()
+        self._hooks.add(hook, integer("every", every, 1))
+        self._watch()
+
+    def remove_hook(self, hook: Hook) -> None:
+        """Remove a hook."""
+        self._check_open()
+        self._hooks.remove(hook)
+        self._watch()
+
+    def apply_wrench(self, wrench: Wrench) -> int:
+        """Apply a wrench to a body from now on; return its number for `remove_wrench`."""
+        self._check_open()
+        self._check_wrench(wrench)
+        number = self._wrenches.add(wrench, self._frame)
+        self._watch()
+        return number
+
+    def _check_wrench(self, wrench: Wrench) -> None:
+        if not isinstance(wrench, Wrench):
+            raise SimulationError(f"{wrench!r} is not a Wrench.")
+        body = self._checks.body(wrench.body)
+        if body >= len(self._links) or not self._links[body][0].can_move(self._links[body][1]):
+            raise SimulationError(f'"{wrench.body}" cannot move, so no wrench can act on it.')
+
+    def remove_wrench(self, number: int) -> None:
+        """Remove a wrench."""
+        self._check_open()
+        self._wrenches.remove(number)
+        self._watch()
+        if not len(self._wrenches):
+            self._release()
+
+    # State ----------------------------------------------------------------------------------
+
+    def positions(self, out: Vector | None = None) -> Vector:
+        """Return the positions, shape (nq,), copied to `out` if given."""
+        if self._closed:
+            self._check_open()
+        only = self._only
+        found = only.positions() if only else _join([robot.positions() for robot in self._robots])
+        return found if out is None else copy_to(found, out)
+
+    def velocities(self, out: Vector | None = None) -> Vector:
+        """Return the velocities, shape (nv,), copied to `out` if given."""
+        if self._closed:
+            self._check_open()
+        only = self._only
+        found = only.velocities() if only else _join([each.velocities() for each in self._robots])
+        return found if out is None else copy_to(found, out)
+
+    def accelerations(self) -> Vector:
+        """Return the velocity change in the last step divided by the period, shape (nv,)."""
+        if self._closed:
+            self._check_open()
+        if not self._stepped:
+            return np.zeros(self.layout.nv)
+        only = self._only
+        return only.accelerations() if only else _join([r.accelerations() for r in self._robots])
+
+    def set_state(self, positions: Vector, velocities: Vector) -> None:
+        """Set the state without resetting the time."""
+        self._check_open()
+        q = self._checks.positions(positions)
+        self._write(q, self._checks.velocities("velocities", velocities))
+        self.forget()
+
+    def _write(self, q: Vector, v: Vector) -> None:
+        self._stepped = False
+        for robot, part, speed in self._slices:
+            robot.write(q[part], v[speed])
+
+    def snapshot(self) -> State:
+        """Return everything that `restore` needs to continue exactly from here."""
+        self._check_open()
+        self.forget()
+        return State(
+            self.positions(),
+            self.velocities(),
+            self._commands.copy(),
+            self._frame,
+            self._wrenches.snapshot(),
+            self.engine,
+            tuple(values for robot in self._robots for values in robot.native()),
+        )
+
+    def restore(self, state: State) -> None:
+        """Return to a snapshot: exactly if it is this engine's, within rounding if another's.
+
+        Raises:
+            SimulationError: If it is not a snapshot, or one of a world with a different layout.
+        """
+        self._check_open()
+        if not isinstance(state, State):
+            raise SimulationError(f"restore needs the result of snapshot, not {state!r}.")
+        commands = finite_vector("state.commands", state.commands, len(self.layout.joints))
+        q = self._checks.positions(state.positions)
+        v = finite_vector("state.velocities", state.velocities, self.layout.nv)
+        frame = integer("state.frame", state.frame, 0)
+        for applied in state.wrenches:
+            self._check_wrench(applied.wrench)
+        native = self._checked_native(state) if state.engine == self.engine else []
+        self._write(q, v)
+        for robot, pair in zip(self._robots, native, strict=False):
+            robot.set_native(*pair)
+        self.forget()
+        self._release()
+        self._wrenches.restore(state.wrenches)
+        self._watch()
+        self._hold(commands)
+        self._frame = frame
+
+    def _checked_native(self, state: State) -> list[tuple[Vector, Vector]]:
+        wanted = [len(values) for robot in self._robots for values in robot.native()]
+        if not isinstance(state.native, tuple) or len(state.native) != len(wanted):
+            raise SimulationError("The snapshot is of another world: its native state differs.")
+        given = [
+            finite_vector("state.native", values, length)
+            for values, length in zip(state.native, wanted, strict=True)
+        ]
+        return list(zip(given[::2], given[1::2], strict=True))
+
+    # Measurements ---------------------------------------------------------------------------
+
+    def contacts(self) -> Records:
+        """Return the contacts of the last physics step as a new array of `CONTACT` records."""
+        self._check_has("contacts")
+        return self.read_contacts() if self._stepped else np.zeros(0, CONTACT)
+
+    def joint_wrenches(self) -> Vector:
+        """Return the joint reactions in the last step, shape (joints, 6)."""
+        self._check_has("joint_wrenches")
+        q, v, a = self.positions(), self.velocities(), self.accelerations()
+        return self._algorithms.joint_wrenches(q, v, a, self._outer(q))
+
+    def _outer(self, q: Vector) -> dict[int, list[float]]:
+        """Return the external forces on bodies in the last step, and torques about origins."""
+        found: dict[int, list[float]] = {}
+        if not self._stepped:
+            return found
+        poses = self._algorithms.body_poses(q, range(len(self.layout.bodies)))
+        contacts = self.contacts() if "contacts" in self.features else np.zeros(0, CONTACT)
+        for first, second, (x, y, z), force, *_ in contacts.tolist():
+            for body, sign in ((first, 1.0), (second, -1.0)):
+                if body < len(poses):
+                    a, b, c = poses[body, :3].tolist()
+                    acting = [sign * part for part in force]
+                    _add(found, body, acting, cross(x - a, y - b, z - c, *acting))
+        for wrench, force, torque in self._wrenches.before(self._frame):
+            body = self._checks.body(wrench.body)
+            turn = to_matrix(poses[body, 3:])
+            if wrench.frame == "body":
+                force, torque = turn @ force, turn @ torque
+            arm = turn @ wrench.point
+            _add(found, body, force, torque + cross(*arm.tolist(), *force.tolist()))
+        return found
+
+    @abstractmethod
+    def read_contacts(self) -> Records:
+        """Return the contacts of the last physics step."""
+
+    # Bodies and dynamics of any state -------------------------------------------------------
+
+    def body_poses(
+        self, names: Sequence[str] | None = None, positions: Vector | None = None
+    ) -> Vector:
+        """Return the poses of bodies, shape (names, 7): x, y, z and quaternion x, y, z, w."""
+        self._check_open()
+        q = self.positions() if positions is None else self._checks.positions(positions)
+        return self._algorithms.body_poses(q, self._checks.bodies(names))
+
+    def body_velocities(
+        self,
+        names: Sequence[str] | None = None,
+        positions: Vector | None = None,
+        velocities: Vector | None = None,
+    ) -> Vector:
+        """Return the velocities of body origins, shape (names, 6): linear, angular."""
+        if positions is None and velocities is None:
+            return self.body_motions(names)[:, 7:13].copy()
+        self._check_open()
+        q = self.positions() if positions is None else self._checks.positions(positions)
+        v = self.velocities()
+        if velocities is not None:
+            v = self._checks.velocities("velocities", velocities)
+        chosen, nothing = self._checks.bodies(names), np.zeros(self.layout.nv)
+        return self._algorithms.motions(q, v, nothing, chosen)[:, 7:13].copy()
+
+    def body_accelerations(self, names: Sequence[str] | None = None) -> Vector:
+        """Return the accelerations of body origins, shape (names, 6): linear, angular."""
+        return self.body_motions(names)[:, 13:].copy()
+
+    def body_motions(self, names: Sequence[str] | None = None) -> Vector:
+        """Return the current poses, velocities, and accelerations of bodies, shape (names, 19)."""
+        if self._closed:
+            self._check_open()
+        q, v, a = self.positions(), self.velocities(), self.accelerations()
+        return self._algorithms.motions(q, v, a, self._checks.bodies(names))
+
+    def reach(self, name: str, direction: Vector, positions: Vector | None = None) -> float:
+        """Return how far a robot's or object's collision shapes extend along a direction."""
+        self._check_open()
+        place, along = self._checks.part(name), finite_vector("direction", direction, 3)
+        if place not in self._reaches:
+            self._reaches[place] = Reach(self.parts.movers[place])
+        bodies = self.layout.parts[name].bodies
+        q = self.positions() if positions is None else self._checks.positions(positions)
+        poses = self._algorithms.body_poses(q, range(bodies.start, bodies.stop))
+        return self._reaches[place].along(along, poses)
+
+    def forward_dynamics(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
+        """Return the accelerations, shape (nv,), caused by torques (nv,) in a state."""
+        return self._algorithms.forward_dynamics(
+            *self._checked_state(positions, velocities, torques=torques)
+        )
+
+    def inverse_dynamics(
+        self, positions: Vector, velocities: Vector, accelerations: Vector
+    ) -> Vector:
+        """Return the torques, shape (nv,), that produce accelerations (nv,) in a state."""
+        return self._algorithms.inverse_dynamics(
+            *self._checked_state(positions, velocities, accelerations=accelerations)
+        )
+
+    def mass_matrix(self, positions: Vector) -> Vector:
+        """Return the mass matrix, shape (nv, nv)."""
+        self._check_open()
+        return self._algorithms.mass_matrix(self._checks.positions(positions))
+
+    def jacobian(
+        self, body: str, positions: Vector, point: Sequence[float] = (0.0, 0.0, 0.0)
+    ) -> Vector:
+        """Return the Jacobian, shape (6, nv), of a point on a link or object."""
+        self._check_open()
+        place, at = self._checks.body(body), finite_vector("point", point, 3)
+        return self._algorithms.jacobian(place, self._checks.positions(positions), at)
+
+    def forward_dynamics_derivatives(
+        self, positions: Vector, velocities: Vector, torques: Vector
+    ) -> tuple[Vector, Vector, Vector]:
+        """Return derivatives of `forward_dynamics` w.r.t. positions, velocities, and torques."""
+        self._check_has("derivatives")
+        return self._algorithms.forward_dynamics_derivatives(
+            *self._checked_state(positions, velocities, torques=torques)
+        )
+
+    def forward_dynamics_batch(
+        self, positions: Vector, velocities: Vector, torques: Vector, *, processes: int = 1
+    ) -> Vector:
+        """Return `forward_dynamics` for many states, shape (n, nv)."""
+        self._check_open()
+        processes = integer("processes", processes, 1)
+        q, v, tau = self._checks.rows(positions, velocities=velocities, torques=torques)
+        return self._algorithms.forward_batch(q, v, tau, processes)
+
+    def forward_dynamics_gradients_batch(
+        self,
+        positions: Vector,
+        velocities: Vector,
+        accelerations: Vector,
+        weights: Vector,
+        *,
+        processes: int = 1,
+    ) -> Vector:
+        """Return gradients of weighted sums of `forward_dynamics`, shape (3, n, nv)."""
+        self._check_has("derivatives")
+        processes = integer("processes", processes, 1)
+        q, v, a, w = self._checks.rows(
+            positions, velocities=velocities, accelerations=accelerations, weights=weights
+        )
+        return self._algorithms.gradients_batch(q, v, a, w, processes)
+
+    def _checked_state(
+        self, positions: Any, velocities: Any, **third: Any
+    ) -> tuple[Vector, Vector, Vector]:
+        self._check_open()
+        check = self._checks.velocities
+        ((name, values),) = third.items()
+        q = self._checks.positions(positions)
+        return q, check("velocities", velocities), check(name, values)
+
+    @property
+    def _algorithms(self) -> Algorithms:
+        if self._made_algorithms is None:
+            self._check_open()
+            self._made_algorithms = self.make_algorithms()
+        return self._made_algorithms
+
+    def _check_has(self, feature: str) -> None:
+        self._check_open()
+        if feature not in self.features:
+            raise self._lacks(feature)
+
+    def _check_open(self) -> None:
+        if self._closed:
+            raise SimulationError("The simulation is closed; build a new one.")
+
+    def close(self) -> None:
+        """Free the world; further calls do nothing."""
+        self._closed = True
+        self._robots, self._only = (), None
+        self._links, self._slices = [], []
+        self._hooks.clear()
+        if self._made_algorithms is not None:
+            self._made_algorithms.close()
+        self._made_algorithms = None
+
+
+def _join(parts: Sequence[Vector]) -> Vector:
+    """Concatenate vectors."""
+    return parts[0] if len(parts) == 1 else np.concatenate(parts)
+
+
+def _add(wrenches: dict[int, list[float]], body: int, force: Any, torque: Any) -> None:
+    """Add a force and a torque on a body."""
+    before = wrenches.get(body, (0.0,) * 6)
+    wrenches[body] = [a + b for a, b in zip(before, (*force, *torque), strict=True)]
