@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from physx_core import DataGeneration, DatasetConfig, EnvironmentConfig, NetworkConfig
-from physx_core.config import from_plain, read_toml, to_plain, write_toml
+from physx_core.config import from_plain, options, read_toml, to_plain, write_toml
 from physx_core.errors import ConfigError, ConfigFileError, UnknownOptionError
 
 
@@ -72,3 +72,30 @@ def test_files_that_are_none_are_named(tmp_path):
         read_toml(tmp_path / "bad.toml")
     with pytest.raises(ConfigError, match="cannot be written"):
         to_plain(EnvironmentConfig("x", env_kwargs={"f": object()}))
+
+
+@pytest.mark.parametrize(
+    ("given", "message"),
+    [
+        ({"size": "12"}, r"Viewer\.size is '12' but must be"),
+        ({"size": 3}, r"Viewer\.size is 3 but must be"),
+        ({"name": 5}, r"Viewer\.name is 5, which has the wrong type"),
+        ({"size": (1, 2)}, "too small"),
+        ({"name": "loud"}, "no good name"),
+    ],
+)
+def test_a_value_of_another_type_is_named_before_the_classes_own_checks_meet_it(given, message):
+    @options
+    @dataclasses.dataclass
+    class Viewer:
+        size: tuple[int, int] = (100, 100)
+        name: str = "a"
+
+        def __post_init__(self):
+            if min(self.size) < 64:
+                raise ConfigError("too small")
+            if self.name.upper() == "LOUD":
+                raise ValueError("no good name")
+
+    with pytest.raises((ConfigError, ValueError), match=message):
+        Viewer(**given)

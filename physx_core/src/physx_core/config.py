@@ -17,7 +17,13 @@ from pathlib import Path
 from typing import Any, Literal, TypeVar, dataclass_transform
 
 from physx_core import checks
-from physx_core.errors import ConfigError, ConfigFileError, UnknownOptionError, UsageError
+from physx_core.errors import (
+    ConfigError,
+    ConfigFileError,
+    PhysxError,
+    UnknownOptionError,
+    UsageError,
+)
 from physx_core.parsing import parse_toml
 
 __all__ = [
@@ -66,7 +72,14 @@ def options(cls: type[T]) -> type[T]:
             raise UnknownOptionError(cls.__name__, unknown, names)
         try:
             construct(self, *args, **kwargs)
-        except TypeError as error:
+        except Exception as error:
+            if isinstance(error, PhysxError):
+                raise
+            # The class's own checks run first, and may fail on a value of another type.
+            if all(hasattr(self, name) for name in names):
+                _validate(self, cls)
+            if not isinstance(error, TypeError):
+                raise
             raise ConfigError(f"{cls.__name__}: {str(error).split('() ')[-1]}.") from error
         _validate(self, cls)
 
