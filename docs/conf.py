@@ -11,6 +11,7 @@ from sphinx.util.docutils import SphinxDirective
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+import plain_pages
 import public_names
 
 project = "physx"
@@ -59,8 +60,15 @@ def escape(
     lines[:] = map(public_names.escaped, lines)
 
 
+def write_plain_pages(app: Sphinx, error: Exception | None) -> None:
+    """Write the pages as plain Markdown beside the site."""
+    if error is None:
+        plain_pages.write(Path(app.outdir))
+
+
 def setup(app: Sphinx) -> dict[str, bool]:
     """Add the directive."""
+    app.connect("build-finished", write_plain_pages)
     app.add_directive("face", FaceDirective)
     app.connect("autodoc-process-docstring", escape)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -5,6 +5,7 @@ import inspect
 import re
 
 import figures
+import plain_pages
 import public_names
 import pytest
 import run_pages
@@ -177,3 +178,18 @@ def test_the_page_of_figures_is_what_the_benchmarks_say():
     assert figures.PAGE.path.read_text() == figures.PAGE.text()
     for page, table in figures.tables().items():
         assert page.read_text() == figures.with_table(page, table)
+
+
+def test_llms_txt_lists_every_page_and_each_page_is_plain_markdown(root, tmp_path):
+    plain_pages.write(tmp_path)
+    text = (tmp_path / "llms.txt").read_text()
+    assert text.startswith("# physx\n\n> physx connects")
+    listed = re.findall(r"^- \[.+\]\((.+\.md)\): \S.+\.$", text, re.MULTILINE)
+    pages = {str(page.relative_to(root)) for page in root.glob("docs/**/*.md")}
+    pages -= {name for name in pages if name.startswith("docs/_build")}
+    assert pages - {"docs/index.md"} <= set(listed)
+    for name in listed:
+        plain = (tmp_path / name).read_text()
+        assert plain.startswith("# ") and "{toctree}" not in plain and "{eval-rst}" not in plain
+    reference = plain_pages.plain(root / "docs/reference/physx_core.md")
+    assert "### Environment(" in reference and "#### Dataset.append(" in reference
