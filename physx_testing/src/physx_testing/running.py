@@ -20,7 +20,7 @@ from physx_core.config import NetworkConfig, reference_of, to_plain
 from physx_core.errors import UsageError, listed
 from physx_core.fields import Field
 from physx_core.net import encode
-from physx_core.processes import ChildProcess, OutputTail, describe_exit
+from physx_core.processes import WorkerProcess
 from physx_testing.kinds import checks_of
 from physx_testing.report import Check, Report, Status
 from physx_testing.worker import LENGTH
@@ -29,7 +29,6 @@ TIMEOUT = 120.0
 """Default time limit of a check, in s."""
 _CREATED = "can be imported and created"
 _MOST_LINES = 4
-_PATIENCE = 5.0
 
 
 def run_checks(
@@ -105,19 +104,8 @@ def _file_of(component: Any) -> str:
 
 def _run_some(request: Mapping[str, Any], names: Sequence[str], timeout: float) -> Iterator[Check]:
     """Yield the results of the checks, up to the one that ended the process, if any."""
-    link, theirs = socket.socketpair()
-    command = [sys.executable, "-P", "-m", "physx_testing.worker", str(theirs.fileno())]
-    with link, contextlib.ExitStack() as held:
-        with theirs:
-            process = ChildProcess(
-                command,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                pass_fds=[theirs.fileno()],
-            )
-        held.callback(process.close, 0.0)
-        assert process.stderr is not None
-        tail = OutputTail(process.stderr)
+    with WorkerProcess("physx_testing.worker", variables={}, stdout=subprocess.DEVNULL) as process:
+        link = process.link
         payload = encode(dict(request), f"what the check of {request['reference']} needs")
         lines = _Lines(link)
         with contextlib.suppress(ConnectionError):
@@ -130,7 +118,7 @@ def _run_some(request: Mapping[str, Any], names: Sequence[str], timeout: float) 
                 yield Check(begun, "failed", f"it had not ended after {timeout:g} s")
                 return
             if answer is None:
-                yield Check(begun, "failed", _how_it_ended(process, tail))
+                yield Check(begun, "failed", _how_it_ended(process))
                 return
             if "begin" in answer:
                 begun = answer["begin"]
@@ -150,10 +138,9 @@ def _unusable(answer: Mapping[str, str]) -> Check:
     return Check(_CREATED, "failed", answer["unusable"])
 
 
-def _how_it_ended(process: ChildProcess, tail: OutputTail) -> str:
-    status = process.wait(_PATIENCE)
-    how = "closed its connection" if status is None else describe_exit(status)
-    lines = [line for line in tail.text(0.5).splitlines() if line.strip()]
+def _how_it_ended(process: WorkerProcess) -> str:
+    how = process.describe_end()
+    lines = [line for line in process.stderr(0.5).splitlines() if line.strip()]
     return "\n".join([f"the process {how}", *lines[-_MOST_LINES:]])
 
 

@@ -7,7 +7,6 @@ import itertools
 import logging
 import queue
 import signal
-import socket
 import subprocess
 import sys
 import threading
@@ -19,7 +18,7 @@ from physx_core import Closeable
 from physx_core.components import ClientHandle, Launcher
 from physx_core.errors import ClientError, ConfigError
 from physx_core.origin import install_hint
-from physx_core.processes import BackgroundThread, ChildProcess, OutputTail, describe_exit
+from physx_core.processes import BackgroundThread, WorkerProcess
 from physx_core.workers import ClientProcess
 
 if importlib.util.find_spec("ray") is None:
@@ -236,18 +235,8 @@ class _DriverProcess(Closeable):
         self._handles: dict[int, tuple[RayHandle, str, str]] = {}
         self._answers: queue.Queue[dict[str, Any]] = queue.Queue()
         self._is_in_use = False
-        ours, theirs = socket.socketpair()
-        with theirs:
-            words = [sys.executable, "-P", "-m", _DRIVER, str(theirs.fileno())]
-            self._process = ChildProcess(
-                words,
-                stdout=subprocess.DEVNULL,
-                stderr=subprocess.PIPE,
-                pass_fds=[theirs.fileno()],
-            )
-        assert self._process.stderr is not None
-        self._tail = OutputTail(self._process.stderr)
-        self._messages = Messages(ours)
+        self._process = WorkerProcess(_DRIVER, variables={}, stdout=subprocess.DEVNULL)
+        self._messages = Messages(self._process.link)
         self._thread = BackgroundThread(self._listen, "physx-ray")
         self._thread.start()
         try:
@@ -295,7 +284,7 @@ class _DriverProcess(Closeable):
                 handle.kill()
         self._messages.finish()
         self._process.wait(_LEAVE_TIME)
-        self._process.close(0.0)
+        self._process.close()
         self._thread.join()
         self._messages.close()
 
@@ -313,7 +302,7 @@ class _DriverProcess(Closeable):
         try:
             return self._answers.get(timeout=patience)
         except queue.Empty:
-            self._process.close(0.0)
+            self._process.close()
             return self._answers.get()
 
     def _listen(self) -> None:
@@ -324,8 +313,7 @@ class _DriverProcess(Closeable):
                 handle.take(message, address, token)
             else:
                 self._answers.put(message)
-        status = self._process.wait(_LEAVE_TIME)
-        how = describe_exit(status) if status is not None else "closed the connection"
+        how = self._process.describe_end(_LEAVE_TIME)
         self.end = f"Ray is lost: the process that was connected to it {how}"
         if self._is_in_use:
             _LOG.warning(
@@ -338,7 +326,7 @@ class _DriverProcess(Closeable):
         self._answers.put({})
 
     def _last_lines(self) -> str:
-        return "\n".join(self._tail.text(1.0).strip().splitlines()[-5:])
+        return "\n".join(self._process.stderr(1.0).strip().splitlines()[-5:])
 
 
 def _connected_address() -> str | None:

@@ -22,3 +22,4 @@ from .worker import CLIENT_VARIABLE as CLIENT_VARIABLE
 from .worker import describe_exit as describe_exit
 from .worker import prepare_worker as prepare_worker
 from .worker import worker_variables as worker_variables
+from .worker_process import WorkerProcess as WorkerProcess

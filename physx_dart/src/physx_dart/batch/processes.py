@@ -8,14 +8,12 @@ from __future__ import annotations
 
 import contextlib
 import os
-import socket
-import sys
 import weakref
 from collections.abc import Sequence
 
 import numpy as np
 
-from physx_core.processes import ChildProcess, anonymous_file, describe_exit, worker_variables
+from physx_core.processes import WorkerProcess, anonymous_file
 from physx_core.typing import Vector
 from physx_dart.batch.worker import (
     DONE,
@@ -31,8 +29,6 @@ from physx_sim.errors import SimulationError
 
 _LEAST_ROWS = 16
 """Minimum number of rows for which an additional process pays off."""
-_PATIENCE = 5.0
-"""Time, in s, that a process may take to exit after it closed its connection."""
 
 
 class ParallelAlgorithms(PinocchioAlgorithms):
@@ -124,37 +120,31 @@ class _Worker:
             file: Descriptor of the shared memory.
             held: Stack that ends the process when it is closed.
         """
-        self._link, theirs = socket.socketpair()
-        held.enter_context(self._link)
-        passed = [theirs.fileno(), file]
-        command = [sys.executable, "-P", "-m", "physx_dart.batch.worker", *map(str, passed)]
-        with theirs:
-            try:
-                self._process = ChildProcess(command, variables=worker_variables(), pass_fds=passed)
-            except OSError as error:
-                raise SimulationError(f"Cannot start a process for batches: {error}.") from error
-        held.callback(self._process.close, 0.0)
+        try:
+            self._process = WorkerProcess("physx_dart.batch.worker", file, pass_fds=[file])
+        except OSError as error:
+            raise SimulationError(f"Cannot start a process for batches: {error}.") from error
+        held.callback(self._process.close)
 
     def ask(self, message: bytes) -> None:
         """Send a message."""
         try:
-            self._link.sendall(message)
+            self._process.link.sendall(message)
         except ConnectionError:
             raise self._lost() from None
 
     def wait(self) -> None:
         """Wait until the process has finished its request."""
         with contextlib.suppress(ConnectionError):
-            if self._link.recv(len(DONE)) == DONE:
+            if self._process.link.recv(len(DONE)) == DONE:
                 return
         raise self._lost()
 
     def _lost(self) -> SimulationError:
-        status = self._process.wait(_PATIENCE)
-        how = "closed its connection" if status is None else describe_exit(status)
         return SimulationError(
-            f"A process that computed rows of a batch (pid {self._process.pid}) {how}; its "
-            "standard error may say why. The next batch starts a new one; processes=1 needs none."
+            f"A process that computed rows of a batch (pid {self._process.pid}) "
+            f"{self._process.describe_end()}. The next batch starts a new one; processes=1 needs "
+            f"none.\n{self._process.stderr()}".rstrip()
         )
 
 

@@ -5,8 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 import select
-import socket
-import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +25,7 @@ from physx_core.net import (
     order,
     pack,
 )
-from physx_core.processes import ChildProcess, OutputTail, describe_exit, worker_variables
+from physx_core.processes import WorkerProcess
 from physx_core.typing import Array
 from physx_gym.vector.batch import COMMAND, END, NEVER, SharedBatch
 from physx_gym.vector.spinning import Spinner
@@ -64,7 +62,7 @@ class Workers:
         self._batch, self._timeout = batch, max(timeout, _MAKE_TIME)
         self._shares: Sequence[int] = setup["shares"]
         self._owner = os.getpid()
-        self._links: list[_Link] = []
+        self._workers: list[_Worker] = []
         self._by_file: dict[int, int] = {}
         self._poll = select.poll()
         spins = has_core_for_each(len(self._shares) + 1)  # including this process
@@ -82,9 +80,9 @@ class Workers:
         ]
         try:
             for number in range(len(self._shares)):
-                self._links.append(link := _Link(number, file))
-                self._by_file[link.socket.fileno()] = number
-                self._poll.register(link.socket, select.POLLIN)
+                self._workers.append(worker := _Worker(number, file))
+                self._by_file[worker.process.link.fileno()] = number
+                self._poll.register(worker.process.link, select.POLLIN)
             for number, message in enumerate(messages):
                 self.ask(number, [COMMAND])  # to create the environments
                 self._send(number, message)
@@ -107,7 +105,7 @@ class Workers:
         batch.asked[number] = self.asked[number]
         fence()
         if batch.idle[number]:
-            self._links[number].ring()
+            self._workers[number].ring()
 
     def command(self, name: str, arguments: Sequence[Any]) -> list[Any]:
         """Have each worker execute a command after its other entries.
@@ -189,15 +187,15 @@ class Workers:
             if os.getpid() == self._owner:  # a forked process leaves them alone
                 self._end(orderly)
         finally:
-            for link in self._links:
-                link.socket.close()
+            for worker in self._workers:
+                worker.process.link.close()
         if orderly and self._errors:
             raise self._errors[min(self._errors)]
 
     def _sleep(self, is_done: Callable[[], bool]) -> None:
         """Sleep until something is done; detect workers that exit or hang."""
         batch = self._batch
-        seen, since = list(batch.done), [time.monotonic()] * len(self._links)
+        seen, since = list(batch.done), [time.monotonic()] * len(self._workers)
         looked = since[0]
         while not is_done():
             for file, _ in self._poll.poll(1000 * _TICK):
@@ -215,9 +213,9 @@ class Workers:
 
     def _receive(self, number: int) -> bool:
         """Read what a worker has sent; return whether the link is still open."""
-        link = self._links[number]
+        worker = self._workers[number]
         with contextlib.suppress(EOFError):
-            while (frame := link.reader.read(link.socket)) is not None:
+            while (frame := worker.reader.read(worker.process.link)) is not None:
                 if frame.kind is Kind.READY:  # it only woke this process
                     continue
                 self._received[number] += 1
@@ -230,15 +228,15 @@ class Workers:
 
     def _send(self, number: int, message: bytes) -> None:
         """Send a worker a message that it is waiting for."""
-        link = self._links[number]
-        link.socket.settimeout(self._timeout)
+        link = self._workers[number].process.link
+        link.settimeout(self._timeout)
         try:
-            link.socket.sendall(message)
+            link.sendall(message)
         except TimeoutError:
             self._fail(self._silence_of(number))
         except OSError:
             self._fail(self._end_of(number))
-        link.socket.setblocking(False)
+        link.setblocking(False)
 
     # Ends -----------------------------------------------------------------------------------
 
@@ -248,13 +246,13 @@ class Workers:
 
     def _end(self, orderly: bool) -> None:
         """Ask the processes to exit, and kill those that do not."""
-        running = set(range(len(self._links)))
+        running = set(range(len(self._workers)))
         self._timeout = max(self._timeout, _MAKE_TIME) if orderly else _GRACE
         until = time.monotonic() + self._timeout
         try:
-            for number, link in enumerate(self._links):
+            for number, worker in enumerate(self._workers):
                 self._batch.asked[number] = END
-                link.ring()
+                worker.ring()
             while running and time.monotonic() < until:
                 for file, _ in self._poll.poll(1000 * _TICK):
                     if not self._receive(number := self._by_file[file]):
@@ -262,31 +260,30 @@ class Workers:
                         running.discard(number)
             if running and orderly:
                 raise self._silence_of(min(running))
-            for link in self._links:
-                link.process.wait(_EXIT_TIME if orderly else 0.0)
+            for worker in self._workers:
+                worker.process.wait(_EXIT_TIME if orderly else 0.0)
         finally:
-            for link in self._links:
-                link.process.ask_to_end()
-            for link in self._links:
-                link.process.close(_LAST_WORDS_TIME)
+            for worker in self._workers:
+                worker.process.ask_to_end()
+            for worker in self._workers:
+                worker.process.close(_LAST_WORDS_TIME)
 
     def _end_of(self, number: int) -> ClientError:
         """Return the error for a worker that has exited."""
-        link, doing = self._links[number], self._describe_entry(number)
-        status = link.process.wait(_EXIT_TIME)
-        how = "closed its link" if status is None else describe_exit(status)
-        text = link.tail.text(_LAST_WORDS_TIME)
+        process, doing = self._workers[number].process, self._describe_entry(number)
+        how, text = process.describe_end(_EXIT_TIME), process.stderr(_LAST_WORDS_TIME)
+        status = process.exit_status()
         return ClientError(number + 1, f"{how} {doing}.", exit_status=status, stderr=text)
 
     def _silence_of(self, number: int) -> ClientError:
         """Return the error for a worker whose entry takes too long."""
-        link, doing = self._links[number], self._describe_entry(number)
-        link.process.ask_to_end()  # it then writes where it was
-        link.process.wait(_LAST_WORDS_TIME)
+        process, doing = self._workers[number].process, self._describe_entry(number)
+        process.ask_to_end()  # it then writes where it was
+        process.wait(_LAST_WORDS_TIME)
         text = (
             f"sent nothing for {self._timeout:g} s {doing}. If it needs more time, raise timeout."
         )
-        return ClientError(number + 1, text, stderr=link.tail.text(_LAST_WORDS_TIME))
+        return ClientError(number + 1, text, stderr=process.stderr(_LAST_WORDS_TIME))
 
     def _describe_entry(self, number: int) -> str:
         done = self._batch.done[number]
@@ -308,14 +305,12 @@ def _message(value: Mapping[str, Any], what: str) -> bytes:
     return pack(Kind.REQUEST, encode(value, what))
 
 
-class _Link:
-    """A worker's process, and the connection to it.
+class _Worker:
+    """A worker's process, and what reads its frames.
 
     Attributes:
-        socket: The connection; non-blocking.
-        reader: Reads its frames.
-        process: The process.
-        tail: The end of its standard error output.
+        process: The process; its link does not block.
+        reader: Reads the frames.
     """
 
     def __init__(self, number: int, file: int) -> None:
@@ -325,23 +320,14 @@ class _Link:
             number: Number of the worker.
             file: Descriptor of the shared memory.
         """
-        self.socket, theirs = socket.socketpair()
-        self.socket.setblocking(False)
+        try:
+            self.process = WorkerProcess("physx_gym.vector.worker", file, pass_fds=[file])
+        except OSError as error:
+            raise ClientError(number + 1, f"could not be started: {error}.") from error
+        self.process.link.setblocking(False)
         self.reader = FrameReader(MAX_PAYLOAD)
-        passed = [theirs.fileno(), file]
-        command = [sys.executable, "-P", "-m", "physx_gym.vector.worker", *map(str, passed)]
-        with theirs:
-            try:
-                self.process = ChildProcess(
-                    command, variables=worker_variables(), stderr=subprocess.PIPE, pass_fds=passed
-                )
-            except OSError as error:
-                self.socket.close()
-                raise ClientError(number + 1, f"could not be started: {error}.") from error
-        assert self.process.stderr is not None
-        self.tail = OutputTail(self.process.stderr)
 
     def ring(self) -> None:
         """Wake the worker if it sleeps."""
         with contextlib.suppress(OSError):  # it is gone, or already has something to wake up for
-            self.socket.send(_BELL)
+            self.process.link.send(_BELL)
