@@ -22,6 +22,8 @@ FC = NetworkConfig("torch/fc", network_kwargs={"layers": [4, 8, 3]})
 ADAM = replace(FC, loss="MSELoss", optimizer="Adam", lr=0.01)
 GIVEN = {
     "torch/fc": {"arguments": {"layers": [4, 8, 3]}},
+    "cluster/local": {"arguments": {"options": {}, "threads": 1}},
+    "remote/godot-rl": {"arguments": {"timeout": 0.1}},
     "torch/encoder_decoder": {"arguments": {"encoder": [4, 2]}},
     "torch/module": {
         "arguments": {"module": "torch.nn:Linear", "in_features": 4, "out_features": 3}

@@ -2,6 +2,7 @@
 
 import os
 import subprocess
+from pathlib import Path
 
 from physx_cluster.sweep import Executor, Job, command_of, variables_of
 
@@ -27,10 +28,9 @@ class Patient(Executor):
         self._variables = {**os.environ, **variables_of(threads)}
 
     def start(self, folder):
-        with (folder / "patient.log").open("wb") as log:
-            done = subprocess.run(
-                command_of(folder), env=self._variables, stdout=log, stderr=log, check=False
-            )
+        done = subprocess.run(command_of(folder), env=self._variables, check=False)
+        with Path("patient.log").open("a") as log:
+            print(folder.name, file=log)
         return _Done(done.returncode)
 
     def close(self):
