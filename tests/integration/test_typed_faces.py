@@ -11,7 +11,18 @@ for library in ("mypy", "torch", "rerun", "gymnasium"):
     pytest.importorskip(library)
 
 ROOT = Path(__file__).resolve().parents[2]
-PACKAGES = ("core", "dart", "torch", "rerun", "gym", "remote", "cluster")
+PACKAGES = (
+    "core",
+    "sim",
+    "testing",
+    "formats",
+    "dart",
+    "torch",
+    "rerun",
+    "gym",
+    "remote",
+    "cluster",
+)
 CALLS = {
     'connect("host:1")': "PhysxEnv",
     'connect("host:1", "godot-gym", repeat_action=2)': "GodotGymEnv",
@@ -23,8 +34,6 @@ CALLS = {
     'serve("gym/CartPole-v1", "godot-rl")': "Service",
     'Dataset.open("folder")': "Dataset",
     'Dataset.open("folder")["training"]["x"][0:2]': "ndarray[tuple[Any, ...], dtype[Any]]",
-    'plugins.resolve("backend", "dart")': "Backend",
-    'plugins.resolve("backend", "dart").build(World())': "Simulation",
     'plugins.resolve("environment", "dart/arm")()': "Environment",
     'plugins.resolve("network", "torch/fc")()': "Network",
     "plugins.available()": "dict[str, PluginInfo]",
@@ -71,7 +80,7 @@ def reveal(folder):
         timeout=600,
     )
     found = dict(re.findall(r'program\.py:(\d+): note: Revealed type is "(.*)"', done.stdout))
-    assert "error:" not in done.stdout + done.stderr, done.stdout + done.stderr
+    assert ": error: " not in done.stdout, done.stdout + done.stderr
     revealed = {text: found[str(number)] for number, text in enumerate(texts, start=first)}
     return {text: re.sub(r"\b(\w+\.)+(?=\w)", "", kind) for text, kind in revealed.items()}
 

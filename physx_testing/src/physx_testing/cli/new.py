@@ -31,6 +31,7 @@ class _Part:
         arguments: Arguments of its contract kit.
         options: The same as options of ``physx check``.
         requires: Distributions that it needs.
+        kit: Module of the function that checks it.
     """
 
     summary: str
@@ -38,6 +39,7 @@ class _Part:
     arguments: str = "$class_name"
     options: str = ""
     requires: tuple[str, ...] = ("physx-core",)
+    kit: str = "physx_testing"
 
 
 _GENERATE = "physx generate $name --batch-nb 10 --batch-size 100 --environment.num-clients 2"
@@ -61,12 +63,15 @@ _PARTS = {
     "backend": _Part(
         "a physics engine for articulated rigid bodies, without contacts",
         'python -c "\n'
-        "from physx_core import Sphere, World, plugins\n\n"
+        "from physx_core import plugins\n"
+        "from physx_sim import Sphere, World\n\n"
         "world = World(objects=[Sphere(name='ball', radius=0.1, position=(0, 0, 1))])\n"
         "with plugins.resolve('backend', '$name').build(world) as simulation:\n"
         "    simulation.step(100)\n"
         "    print(simulation.body_poses(['ball']))\n"
         '"',
+        requires=("physx-core", "physx-sim"),
+        kit="physx_sim.conformance",
     ),
 }
 _FIELDS = """
@@ -161,10 +166,13 @@ def _render(name: str, kinds: Sequence[str]) -> dict[str, str]:
         for part, values in zip(parts, each, strict=True)
     ]
     imports = [f"from {package}.{v['kind']} import {v['class_name']}" for v in each]
-    kit = ", ".join(f"check_{kind}" for kind in kinds)
+    kits: dict[str, list[str]] = {}
+    for kind, part in zip(kinds, parts, strict=True):
+        kits.setdefault(part.kit, []).append(f"check_{kind}")
     head = ['"""The components fulfill the contracts that physx and its users rely on."""\n']
     head += ["from physx_core import Field"] if "network" in kinds else []
-    head += [f"from physx_testing import {kit}", *imports]
+    head += [f"from {module} import {', '.join(names)}" for module, names in kits.items()]
+    head += imports
     head += [_FIELDS] if "network" in kinds else []
     source = f"src/{package}"
     return {
