@@ -41,6 +41,31 @@ settings.load_profile("physx")
 signal.signal(signal.SIGINT, signal.default_int_handler)
 
 
+APART = "pytest.mark.processes"  # in a file whose tests start processes
+STARTS = ("subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.system")
+
+
+def pytest_addoption(parser):
+    parser.addoption("--quick", action="store_true", help="only tests that start no process")
+
+
+def pytest_configure(config):
+    if config.getoption("quick"):
+        sys.addaudithook(refuse_processes)
+
+
+def refuse_processes(event, _):
+    """Fail a test that starts a process, in a run of those that start none."""
+    if event in STARTS and "PYTEST_CURRENT_TEST" in os.environ:
+        pytest.fail(f"this test starts a process: its file needs pytestmark = {APART}")
+
+
+def pytest_ignore_collect(collection_path, config):
+    """Leave out files by their text: to import them takes most of the time."""
+    is_test = config.getoption("quick") and collection_path.suffix == ".py"
+    return True if is_test and APART in collection_path.read_text() else None
+
+
 def pytest_collection_modifyitems(config, items):
     """Begin with long tests: one that begins last would prolong the whole run.
 

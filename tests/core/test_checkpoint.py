@@ -30,6 +30,8 @@ from physx_core.errors import CheckpointError, SessionError
 from physx_core.pipelines import Learner, load_learner
 from physx_core.toy import LeastSquares, Linear
 
+pytestmark = pytest.mark.processes
+
 PARAMETERS, STATE = "parameters.npz", "state.txt"
 
 

@@ -22,6 +22,8 @@ from physx_core.errors import (
 from physx_core.sources import LocalSource
 from physx_formats.importing import import_file
 
+pytestmark = pytest.mark.processes
+
 PROGRAM = Path(__file__).parent / "programs" / "value_envs.py"
 VALUES = f"{PROGRAM}:Values"
 program = runpy.run_path(str(PROGRAM))

@@ -8,6 +8,8 @@ import pytest
 
 from physx_core import files
 
+pytestmark = pytest.mark.processes
+
 HOLD = (
     "import sys; from physx_core import files; l = files.try_lock(sys.argv[1]); print(1); input()"
 )

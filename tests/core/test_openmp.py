@@ -6,6 +6,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.processes
+
 CHOSEN = ("GOMP_SPINCOUNT", "OMP_WAIT_POLICY")
 
 

@@ -9,6 +9,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.processes
+
 HINT = "import sys; from physx_core.origin import install_hint; print(install_hint(*sys.argv[1:]))"
 REPOSITORY = "https://example.org/physx.git"
 

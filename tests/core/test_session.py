@@ -18,6 +18,8 @@ from physx_core.cli import main
 from physx_core.errors import EnvironmentFailedError, SessionError
 from physx_core.session import Session
 
+pytestmark = pytest.mark.processes
+
 SPRING = EnvironmentConfig("toy/spring", {"mass": 2.0}, as_tcp_ip_client=False)
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image, ImageSequence
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.processes]
 
 EXAMPLES = gallery.EXAMPLES
 SCRIPTS = sorted(EXAMPLES.glob("[0-9][0-9]_*.py"))

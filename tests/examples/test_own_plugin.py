@@ -10,7 +10,7 @@ import pytest
 import run_pages
 from PIL import Image
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.processes]
 
 pytest.importorskip("matplotlib")
 

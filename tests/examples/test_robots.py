@@ -10,7 +10,7 @@ import pytest
 from physx_gym import Policy
 from physx_gym.cli import evaluate
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.processes]
 
 
 def test_a_policy_is_trained_and_evaluated(root, run, tmp_path, capsys):

@@ -12,6 +12,8 @@ from physx_core import Dataset, Field
 from physx_core.errors import ComponentNotFoundError, ConfigError, DatasetError, MissingLibraryError
 from physx_formats import ExchangeError, ExportOptions, export, import_file
 
+pytestmark = pytest.mark.processes
+
 ROWS = 60
 DTYPES = ["?", "i1", "i2", "i4", "i8", "u1", "u2", "u4", "u8", "f2", "f4", "f8", "c8", "c16"]
 SHAPES = [(), (3,), (2, 3)]

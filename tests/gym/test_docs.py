@@ -12,7 +12,7 @@ import pytest
 
 from physx_gym import RobotEnv
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.processes]
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "gym.md"

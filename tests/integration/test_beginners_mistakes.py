@@ -37,6 +37,8 @@ from physx_core import errors as e
 from physx_core.pipelines import Replay
 from physx_core.toy import LeastSquares, Linear
 
+pytestmark = pytest.mark.processes
+
 PROGRAM = Path(__file__).parent / "programs" / "mistaken_envs.py"
 KEPT = DatasetConfig(existing_dir="sessions/kept")
 LINEAR = NetworkConfig("toy/linear")

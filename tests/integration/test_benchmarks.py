@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-pytestmark = pytest.mark.faults
+pytestmark = [pytest.mark.faults, pytest.mark.processes]
 
 PROGRAM = Path(__file__).with_name("programs") / "one_round.py"
 QUICK = (

@@ -11,7 +11,7 @@ from physx_core import NetworkConfig, plugins
 from physx_core.external import INCLUDE
 from physx_testing import check_plugin
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.processes]
 
 for library in ("torch", "dartpy", "pinocchio", "rerun", "gymnasium"):
     pytest.importorskip(library)

@@ -12,7 +12,7 @@ import run_pages
 
 from physx_core import PhysxError, checkpoint
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.processes]
 
 pytest.importorskip("torch")
 

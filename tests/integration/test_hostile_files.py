@@ -26,6 +26,7 @@ import pytest
 pytestmark = [
     pytest.mark.faults,
     pytest.mark.skipif(sys.platform != "linux", reason="the kernel watches files by inotify"),
+    pytest.mark.processes,
 ]
 
 MEASURED = Path(__file__).with_name("programs") / "measured.py"

@@ -11,7 +11,7 @@ from pathlib import Path
 import filelock
 import pytest
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.processes]
 
 PACKAGES = (
     *("physx_core", "physx_testing", "physx_sim", "physx_formats", "physx_dart", "physx_torch"),

@@ -12,6 +12,8 @@ from numpy.testing import assert_array_equal
 from physx_core import Dataset
 from physx_formats import ExportOptions, export
 
+pytestmark = pytest.mark.processes
+
 PROGRAMS = Path(__file__).parent / "programs"
 ROWS = 60
 

@@ -12,6 +12,8 @@ import pytest
 
 from physx_core import Dataset
 
+pytestmark = pytest.mark.processes
+
 SCRIPT = """
 import sys
 import numpy as np

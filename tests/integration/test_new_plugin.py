@@ -8,6 +8,8 @@ import venv
 
 import pytest
 
+pytestmark = pytest.mark.processes
+
 pytest.importorskip("torch")
 INTERNAL = ("checkpoint", "dataset", "observers", "session", "statistics", "toy")
 TRAIN = (

@@ -11,6 +11,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.processes
+
 OWNER = Path(__file__).parent / "programs" / "owner.py"
 KINDS = {
     "clients": b"physx_core.workers",

@@ -15,6 +15,8 @@ from physx_core import Dataset, DatasetConfig, EnvironmentConfig, NetworkConfig,
 from physx_core.cli import main
 from physx_core.errors import CheckpointError, ConfigError, SessionError
 
+pytestmark = pytest.mark.processes
+
 pytest.importorskip("torch")
 
 SCRIPT = """

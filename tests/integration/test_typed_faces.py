@@ -53,7 +53,7 @@ from physx_torch import StoredDataset
 """
 
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.processes]
 
 
 def reveal(folder):

@@ -14,6 +14,8 @@ import pytest
 
 from physx_core import Dataset
 
+pytestmark = pytest.mark.processes
+
 pytest.importorskip("mujoco")
 
 ROOT = Path(__file__).parents[2]

@@ -27,6 +27,8 @@ from physx_sim import (
 from physx_sim.engines import read_robot
 from physx_sim.errors import FeatureNotSupportedError, ModelError, SimulationError
 
+pytestmark = pytest.mark.processes
+
 mujoco = pytest.importorskip("mujoco")
 
 WEIGHT = 9.81

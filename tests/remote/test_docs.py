@@ -23,6 +23,8 @@ from physx_remote.physx.protocol import Physx
 from physx_remote.serving.client_link import RequestLink
 from physx_remote.serving.protocol import find_protocol
 
+pytestmark = pytest.mark.processes
+
 PAGE = Path(__file__).parents[2] / "docs" / "remote.md"
 README = Path(__file__).parents[2] / "physx_remote" / "README.md"
 TEXT = PAGE.read_text(encoding="utf-8")

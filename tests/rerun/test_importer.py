@@ -17,6 +17,8 @@ from physx_rerun import dataset as drawing
 from physx_rerun.importer import FOREIGN
 from physx_rerun.viewer.viewer import find_executable, find_free_port
 
+pytestmark = pytest.mark.processes
+
 PROGRAM = f"""#!{sys.executable}
 import sys
 from physx_rerun.importer import main

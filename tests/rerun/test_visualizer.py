@@ -21,6 +21,8 @@ from physx_rerun import visualizer as visualizer_module
 from physx_rerun.viewer.viewer import Viewer, find_free_port
 from physx_rerun.visualizer import RerunVisualizer
 
+pytestmark = pytest.mark.processes
+
 
 def ball(visualizer, step=0, instance=1, **look):
     factory = Factory()

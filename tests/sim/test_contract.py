@@ -6,7 +6,7 @@ import pytest
 
 from physx_sim.conformance import check_backend
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.processes]
 
 ENGINES = Path(__file__).parent / "programs" / "wrong_engines.py"
 # Of one engine each, with mistakes that do not hide one another: a run of the kit takes seconds.

@@ -7,6 +7,8 @@ import pytest
 
 from physx_core.cli import main
 
+pytestmark = pytest.mark.processes
+
 PROGRAMS = Path(__file__).with_name("programs")
 
 

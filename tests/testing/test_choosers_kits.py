@@ -5,6 +5,8 @@ import pytest
 from physx_core.errors import UsageError
 from physx_testing import check_buffer, check_sampler
 
+pytestmark = pytest.mark.processes
+
 SAMPLERS = [
     ("InOrder", "chooses the same in any order", "differently"),
     ("Unseeded", "chooses the same again", "same seed"),

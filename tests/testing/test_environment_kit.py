@@ -4,6 +4,8 @@ import pytest
 
 from physx_testing import check_environment
 
+pytestmark = pytest.mark.processes
+
 STEPS = "gives every field in each step, finite and of its shape and type"
 WRONG = [
     ("GlobalRandom", "leaves its process as it was", "NumPy's global random numbers"),

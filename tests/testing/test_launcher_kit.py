@@ -8,7 +8,7 @@ import pytest
 
 from physx_testing import check_launcher
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.processes]
 
 # Of one launcher each, with mistakes that do not hide one another: a run of the kit starts many
 # clients.

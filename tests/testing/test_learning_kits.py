@@ -5,6 +5,8 @@ import pytest
 from physx_core import Field, NetworkConfig
 from physx_testing import check_network, check_optimization, check_transformation
 
+pytestmark = pytest.mark.processes
+
 FIELDS = (Field("x", (4,)), Field("y", (3,)))
 NETWORKS = [
     ("OtherName", "predicts each of its fields, in the shape of its target", "pred_fields"),

@@ -6,6 +6,8 @@ from physx_core.errors import UsageError
 from physx_testing import check_environment, check_sampler
 from physx_testing.process_state import process_state, unchanged
 
+pytestmark = pytest.mark.processes
+
 
 def test_this_process_stays_as_it_is(place):
     before = process_state()

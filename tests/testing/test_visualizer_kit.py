@@ -13,6 +13,8 @@ from physx_core.errors import UsageError
 from physx_testing import check_visualizer
 from physx_testing.scene import OBJECTS
 
+pytestmark = pytest.mark.processes
+
 
 class Silent(Visualizer):
     pass

@@ -14,6 +14,8 @@ from physx_core.cli import main
 from physx_core.errors import CheckpointError, ConfigError, MissingLibraryError
 from physx_core.pipelines import Learner
 
+pytestmark = pytest.mark.processes
+
 FORMS = ("onnx", "torchscript", "pt2")
 NETWORKS = {
     "several fields": (

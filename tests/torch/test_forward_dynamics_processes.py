@@ -18,6 +18,8 @@ from physx_sim import Box, JointSettings, Robot, Simulation, World
 from physx_sim.errors import SimulationError
 from physx_torch import ForwardDynamics
 
+pytestmark = pytest.mark.processes
+
 SPRUNG = JointSettings(stiffness=3.0, rest=0.2, damping=0.4, friction=0.1, armature=0.01)
 WORLDS = {
     "arm": World([Robot("acrobot", joints={"elbow": SPRUNG})]),

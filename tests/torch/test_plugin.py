@@ -8,6 +8,8 @@ import pytest
 from physx_core import Network, Optimization, Transformation, plugins
 from physx_core.errors import ComponentNotFoundError
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.mark.parametrize(
     ("kind", "name", "class_name", "base"),

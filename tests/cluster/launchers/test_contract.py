@@ -4,6 +4,8 @@ import pytest
 
 from physx_testing import check_launcher
 
+pytestmark = pytest.mark.processes
+
 pytest.importorskip("submitit")
 
 

@@ -15,7 +15,7 @@ from one_node_slurm import free_ports
 
 pytest.importorskip("ray")
 
-pytestmark = pytest.mark.faults
+pytestmark = [pytest.mark.faults, pytest.mark.processes]
 
 PAGE = Path(__file__).parents[3] / "docs" / "cluster.md"
 

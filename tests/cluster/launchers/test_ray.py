@@ -18,7 +18,7 @@ pytest.importorskip("ray")
 from physx_cluster import RayLauncher
 from physx_core.errors import ClientError, ConfigError
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.processes]
 
 RAY = ("--environment.launcher", "cluster/ray")
 KWARGS = "--environment.launcher-kwargs"

@@ -16,7 +16,7 @@ pytest.importorskip("submitit")
 from physx_cluster import SlurmLauncher
 from physx_core.errors import ConfigError
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.processes]
 
 TOKEN = "a token that nobody sees"
 

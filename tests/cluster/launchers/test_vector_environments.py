@@ -8,6 +8,8 @@ import pytest
 
 import physx_gym  # noqa: F401 - registers the environments
 
+pytestmark = pytest.mark.processes
+
 pytest.importorskip("ray")
 COUNT = 5
 

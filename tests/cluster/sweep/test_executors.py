@@ -9,7 +9,11 @@ import pytest
 from one_node_slurm import wait_for
 from sweep_kills import processes, start
 
-pytestmark = [pytest.mark.usefixtures("nothing_stays_behind"), pytest.mark.slow]
+pytestmark = [
+    pytest.mark.usefixtures("nothing_stays_behind"),
+    pytest.mark.slow,
+    pytest.mark.processes,
+]
 
 
 @pytest.fixture

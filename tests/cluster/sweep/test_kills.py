@@ -12,7 +12,11 @@ from physx_cluster.sweep import Definition, Study
 from physx_cluster.sweep.plan import Plan
 from physx_core import DataGeneration, EnvironmentConfig, read_scalars
 
-pytestmark = [pytest.mark.usefixtures("nothing_stays_behind"), pytest.mark.slow]
+pytestmark = [
+    pytest.mark.usefixtures("nothing_stays_behind"),
+    pytest.mark.slow,
+    pytest.mark.processes,
+]
 EPOCHS, BATCHES = 4, 8
 
 

@@ -14,6 +14,8 @@ from physx_cluster.sweep.parameters import Choices, Range
 from physx_cluster.sweep.plan import Plan
 from physx_core.errors import ConfigError, MissingLibraryError
 
+pytestmark = pytest.mark.processes
+
 pytest.importorskip("optuna")
 
 RANGES = {"lr": Range(1e-4, 1.0, log=True), "n": Range(1, 64), "kind": Choices(("a", "b"))}

@@ -11,6 +11,8 @@ from physx_cluster.sweep.show import draw_figure, record_curves, show_status, su
 from physx_core import Visualizer
 from physx_core.errors import UsageError
 
+pytestmark = pytest.mark.processes
+
 
 class Noted(Visualizer):
     """Keeps what it is given."""

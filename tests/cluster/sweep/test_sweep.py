@@ -15,6 +15,8 @@ from physx_core import Dataset, NetworkConfig, Training
 from physx_core.config import DatasetConfig
 from physx_core.errors import ConfigError
 
+pytestmark = pytest.mark.processes
+
 
 def table(folder):
     with (Path(folder) / "trials.csv").open(newline="") as file:

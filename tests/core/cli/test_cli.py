@@ -8,6 +8,8 @@ import pytest
 
 from physx_core.cli import main
 
+pytestmark = pytest.mark.processes
+
 GENERATE = ["generate", "toy/spring", "--batch-nb", "2", "--batch-size", "10"]
 TRAIN = ["train", "nowhere", "--network.network", "toy/linear"]
 LOCAL = ["--environment.no-as-tcp-ip-client"]

@@ -9,6 +9,8 @@ import pytest
 
 from physx_core.cli import main
 
+pytestmark = pytest.mark.processes
+
 BASH = """
 COMP_WORDS=({words}); COMP_CWORD=$(( ${{#COMP_WORDS[@]}} - 1 ))
 _physx; printf '%s\\n' "${{COMPREPLY[@]}}"

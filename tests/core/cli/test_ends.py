@@ -17,7 +17,7 @@ from physx_core import Dataset
 from physx_core.cli import main
 from physx_core.errors import DatasetError
 
-pytestmark = pytest.mark.usefixtures("nothing_stays_behind")
+pytestmark = [pytest.mark.usefixtures("nothing_stays_behind"), pytest.mark.processes]
 WAYS = {signal.SIGINT: (130, "interrupted"), signal.SIGTERM: (143, "terminated")}
 
 

@@ -11,6 +11,8 @@ import pytest
 from physx_core import __version__
 from physx_core.cli import installation
 
+pytestmark = pytest.mark.processes
+
 
 def info(**variables):
     """Return what the command prints in a process of its own."""

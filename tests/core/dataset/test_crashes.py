@@ -17,6 +17,8 @@ from numpy.testing import assert_array_equal
 from physx_core import Dataset
 from physx_core.errors import DatasetError, DatasetNotFoundError
 
+pytestmark = pytest.mark.processes
+
 KILLS = Path(__file__).parents[1] / "programs" / "dataset_kills.py"
 WORKS = ["create", "append", "roll-over", "seal", "json", "update"]
 

@@ -14,6 +14,8 @@ from xxhash import xxh3_64_intdigest
 from physx_core import Dataset, Field
 from physx_core.errors import DatasetError
 
+pytestmark = pytest.mark.processes
+
 N = 1000
 ROWS = {
     "x": np.random.default_rng(0).normal(size=(N, 5)),

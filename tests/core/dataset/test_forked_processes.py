@@ -9,6 +9,8 @@ import pytest
 from physx_core import Dataset
 from physx_core.errors import DatasetLockedError
 
+pytestmark = pytest.mark.processes
+
 ROWS = {"x": np.arange(6.0).reshape(3, 2)}
 
 

@@ -20,6 +20,8 @@ from physx_core.errors import (
     UsageError,
 )
 
+pytestmark = pytest.mark.processes
+
 ROWS = {"x": np.ones((2, 3)), "n": np.array([1, 2], "int32")}
 
 

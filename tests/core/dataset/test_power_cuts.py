@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+pytestmark = pytest.mark.processes
+
 POWER_CUTS = Path(__file__).parents[1] / "programs" / "power_cuts.py"
 WORKS = ["append", "roll-over", "extend", "create", "info", "update", "curate", "checkpoint"]
 PROBE = """

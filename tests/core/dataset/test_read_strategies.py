@@ -12,6 +12,8 @@ from physx_core import Dataset, Field, Normalization
 from physx_core.dataset.read.strategies import memory
 from physx_core.errors import ConfigError, DatasetError
 
+pytestmark = pytest.mark.processes
+
 STRATEGIES = ["memory", "disk exact", "disk windowed"]
 
 

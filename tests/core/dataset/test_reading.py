@@ -12,6 +12,8 @@ from numpy.testing import assert_array_equal
 from physx_core import Dataset, Field
 from physx_core.errors import DatasetError
 
+pytestmark = pytest.mark.processes
+
 STRATEGIES = ["memory", "disk exact", "disk windowed"]
 WRITER = """
 import os, sys, time

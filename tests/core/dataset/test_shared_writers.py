@@ -14,6 +14,8 @@ from numpy.testing import assert_array_equal
 from physx_core import Dataset, Field
 from physx_core.errors import DatasetLockedError, FieldsMismatchError, UsageError
 
+pytestmark = pytest.mark.processes
+
 WRITER = """
 import sys
 import numpy as np

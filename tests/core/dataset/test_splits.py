@@ -13,6 +13,8 @@ from physx_core import (
 from physx_core.errors import ConfigError, DatasetError
 from physx_core.statistics import RunningStatistics
 
+pytestmark = pytest.mark.processes
+
 ROWS = 3000
 WALK = f"{__file__}:Walk"
 

@@ -13,6 +13,8 @@ from safetensors.numpy import load_file, save
 from physx_core import Dataset, Field
 from physx_core.cli import main
 
+pytestmark = pytest.mark.processes
+
 PARTS = ("mean", "std", "minimum", "maximum")
 
 

@@ -44,6 +44,8 @@ from physx_core.dataset.store.partition.spans import FlatIndex, Span
 from physx_core.dataset.write.stripe_writer import StripeWriter
 from physx_core.errors import DatasetError
 
+pytestmark = pytest.mark.processes
+
 FIELDS = [Field("n", (), "int64"), Field("x", (3,), unit="m"), Field("f", (), "bool")]
 QUICK = settings(database=None, deadline=None, max_examples=4, stateful_step_count=30)
 LONG = settings(QUICK, max_examples=5, stateful_step_count=50)

@@ -9,8 +9,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from physx_core import Dataset
+
+pytestmark = pytest.mark.processes
 
 TEXT = (Path(__file__).parents[3] / "docs" / "external.md").read_text(encoding="utf-8")
 

@@ -32,6 +32,8 @@ from physx_core.errors import (
 )
 from physx_core.pipelines import load_learner
 
+pytestmark = pytest.mark.processes
+
 SOURCES = Path(__file__).parents[1] / "programs" / "external"
 SIZE, STEPS = 5, 3
 

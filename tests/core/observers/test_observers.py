@@ -16,6 +16,8 @@ from physx_core.cli.commands.stats import spark_line
 from physx_core.errors import SessionError
 from physx_core.observers import Observers, ScalarsFile, read_scalars
 
+pytestmark = pytest.mark.processes
+
 SPRING = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, seed=1)
 
 

@@ -33,6 +33,8 @@ from physx_core.errors import (
     WrongSamplesError,
 )
 
+pytestmark = pytest.mark.processes
+
 SPRING = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, seed=1)
 LINEAR = NetworkConfig("toy/linear", network_kwargs={"net_fields": ["state", "force"]})
 

@@ -26,6 +26,8 @@ from physx_core import (
 from physx_core.errors import ClientError, ConfigError, DatasetError, NotFiniteError, UsageError
 from physx_core.pipelines import Replay
 
+pytestmark = pytest.mark.processes
+
 PROGRAM = Path(__file__).parents[1] / "programs" / "writer_envs.py"
 STEPS = f"{PROGRAM}:Steps"
 

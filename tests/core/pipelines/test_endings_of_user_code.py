@@ -23,6 +23,8 @@ from physx_core.cli import main
 from physx_core.errors import PhysxError, UsageError
 from physx_core.toy import LeastSquares, Linear, Spring
 
+pytestmark = pytest.mark.processes
+
 PROGRAM = Path(__file__).parents[1] / "programs" / "ending_envs.py"
 sys.path.insert(0, str(PROGRAM.parent))
 endings = importlib.import_module("ending_envs")

@@ -27,6 +27,8 @@ from physx_core.cli import main
 from physx_core.errors import ConfigError, DivergedError, EnvironmentFailedError, UsageError
 from physx_core.toy import LeastSquares, Linear, Spring
 
+pytestmark = pytest.mark.processes
+
 SPRING = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, seed=1)
 NETWORK = NetworkConfig("toy/linear", network_kwargs={"net_fields": ["state", "force"]})
 DATA = DatasetConfig(existing_dir="sessions/run")

@@ -38,6 +38,8 @@ from physx_core.errors import (
     UsageError,
 )
 
+pytestmark = pytest.mark.processes
+
 SPRING = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, seed=1)
 NETWORK = NetworkConfig("toy/linear", network_kwargs={"net_fields": ["state", "force"]})
 

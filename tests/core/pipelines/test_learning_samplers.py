@@ -21,6 +21,8 @@ from physx_core.components import LearningSampler
 from physx_core.errors import ConfigError, UsageError
 from physx_core.toy import LeastSquares
 
+pytestmark = pytest.mark.processes
+
 ENVS = Path(__file__).parents[1] / "programs" / "parameter_envs.py"
 PROGRAM = ENVS.with_name("online_run.py")
 SWING, HARD = f"{ENVS}:Swing", f"{ENVS}:Hard"

@@ -31,6 +31,8 @@ from physx_core.pipelines import read_drawn_rows
 from physx_core.sources import client_source
 from physx_core.toy import Linear
 
+pytestmark = pytest.mark.processes
+
 PROGRAM = Path(__file__).parents[1] / "programs" / "online_run.py"
 PUPIL = f"{PROGRAM.with_name('online_envs.py')}:Pupil"
 

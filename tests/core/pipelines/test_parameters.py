@@ -28,6 +28,8 @@ from physx_core.errors import (
     UsageError,
 )
 
+pytestmark = pytest.mark.processes
+
 ENVS = Path(__file__).parents[1] / "programs" / "parameter_envs.py"
 SWING = f"{ENVS}:Swing"
 

@@ -32,6 +32,8 @@ from physx_core.errors import (
     WrongSamplesError,
 )
 
+pytestmark = pytest.mark.processes
+
 ENVS = Path(__file__).parents[1] / "programs" / "source_envs.py"
 NETWORK = NetworkConfig("toy/linear", network_kwargs={"net_fields": "x", "opt_fields": "y"})
 

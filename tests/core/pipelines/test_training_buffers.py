@@ -21,6 +21,8 @@ from physx_core.observers import read_scalars
 from physx_core.pipelines import load_learner, read_drawn_rows
 from physx_core.toy import LeastSquares
 
+pytestmark = pytest.mark.processes
+
 DRAWN = f"{Path(__file__).parents[1] / 'programs' / 'buffer_envs.py'}:Drawn"
 RESERVOIR = {"capacity": 40, "watermark": 20, "views": 3}
 BUFFERS = {

@@ -33,6 +33,8 @@ from physx_core.errors import (
 from physx_core.pipelines import Replay, load_learner
 from physx_core.toy import Linear
 
+pytestmark = pytest.mark.processes
+
 SPRING = EnvironmentConfig("toy/spring", as_tcp_ip_client=False)
 FIELDS = {"net_fields": ["state"], "opt_fields": ["next_state"]}
 

@@ -18,6 +18,8 @@ from physx_core.origin import install_hint
 from physx_core.plugins import registry
 from physx_core.plugins.references import locate
 
+pytestmark = pytest.mark.processes
+
 
 def add_plugin(folder, name, code, distribution=None, group="physx"):
     """Put an installed-looking distribution with one plugin module into a folder."""

@@ -16,7 +16,7 @@ import pytest
 from physx_core.processes import ChildProcess, TemporaryFolder
 from physx_core.processes.watchdog import WATCHDOG
 
-pytestmark = pytest.mark.usefixtures("nothing_stays_behind")
+pytestmark = [pytest.mark.usefixtures("nothing_stays_behind"), pytest.mark.processes]
 SLEEP = ["sleep", "60"]
 
 

@@ -3,7 +3,11 @@
 import subprocess
 import sys
 
+import pytest
+
 from physx_core.processes import OutputFile
+
+pytestmark = pytest.mark.processes
 
 WRITES = """
 import sys

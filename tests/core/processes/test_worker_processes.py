@@ -9,6 +9,8 @@ import pytest
 
 from physx_core.processes import WorkerProcess
 
+pytestmark = pytest.mark.processes
+
 ECHO = """
 import socket, sys
 with socket.socket(fileno=int(sys.argv[1])) as link:

@@ -13,6 +13,8 @@ import pytest
 from physx_core import Environment
 from physx_core.errors import ComponentNotFoundError, UsageError
 
+pytestmark = pytest.mark.processes
+
 ENVS = Path(__file__).parents[1] / "programs" / "worker_envs.py"
 
 

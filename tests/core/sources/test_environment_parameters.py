@@ -20,6 +20,8 @@ from physx_core.components import Observer
 from physx_core.errors import DatasetError
 from physx_core.pipelines.services import RunServices
 
+pytestmark = pytest.mark.processes
+
 ENVS = Path(__file__).parents[1] / "programs" / "source_envs.py"
 
 

@@ -11,6 +11,8 @@ from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.cli import main
 from physx_core.errors import UsageError, WrongSamplesError
 
+pytestmark = pytest.mark.processes
+
 PICKY = f"{(Path(__file__).parents[1] / 'programs' / 'source_envs.py')}:Picky"
 
 

@@ -9,6 +9,8 @@ import pytest
 
 from physx_core.errors import EnvironmentFailedError
 
+pytestmark = pytest.mark.processes
+
 ENVS = Path(__file__).parents[1] / "programs" / "source_envs.py"
 
 

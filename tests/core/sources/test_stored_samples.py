@@ -24,6 +24,8 @@ from physx_core.errors import (
     WrongSamplesError,
 )
 
+pytestmark = pytest.mark.processes
+
 ENVS = Path(__file__).parents[1] / "programs" / "source_envs.py"
 DOUBLING = f"{ENVS}:Doubling"
 NETWORK = {"network_kwargs": {"net_fields": "x", "opt_fields": "y"}}

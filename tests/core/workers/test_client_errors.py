@@ -18,6 +18,8 @@ from physx_core.errors import (
     WrongSamplesError,
 )
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture
 def errors_of(local, clients):

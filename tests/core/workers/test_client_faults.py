@@ -19,6 +19,8 @@ import pytest
 from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.errors import ClientError
 
+pytestmark = pytest.mark.processes
+
 ENVS = Path(__file__).parents[1] / "programs" / "worker_envs.py"
 SOON = 30.0  # far below the time for which a client may be silent, on the busiest machine too
 

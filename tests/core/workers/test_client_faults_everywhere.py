@@ -16,6 +16,8 @@ import pytest
 from physx_core import Dataset, PhysxError
 from physx_core.errors import ClientError, EnvironmentFailedError
 
+pytestmark = pytest.mark.processes
+
 PLACES = ["create", "init_database", "step", "prediction", "close"]
 TEXTS = {
     "raise": r"Instance 2 raised in \w+\(\).*: RuntimeError: no more beans",

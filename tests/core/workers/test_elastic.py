@@ -18,6 +18,8 @@ import pytest
 from physx_core import Dataset, EnvironmentConfig
 from physx_core.errors import ConfigError, TooFewClientsError
 
+pytestmark = pytest.mark.processes
+
 PROGRAMS = Path(__file__).parents[1] / "programs"
 WANDERER = f"{PROGRAMS / 'restart_envs.py'}:Wanderer"
 SWING = f"{PROGRAMS / 'parameter_envs.py'}:Swing"

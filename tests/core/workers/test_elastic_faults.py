@@ -27,6 +27,8 @@ from physx_core.errors import (
 from physx_core.net import Kind, encode, pack
 from physx_core.workers.client.joining import join as join_run
 
+pytestmark = pytest.mark.processes
+
 PROGRAMS = Path(__file__).parents[1] / "programs"
 WANDERER = f"{PROGRAMS / 'restart_envs.py'}:Wanderer"
 TOKEN = "a token for these tests"

@@ -14,6 +14,8 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
+pytestmark = pytest.mark.processes
+
 WANDERER = f"{Path(__file__).parents[1] / 'programs' / 'restart_envs.py'}:Wanderer"
 MOST = 3
 JOINED = "joined the run"

@@ -12,6 +12,8 @@ import pytest
 
 from physx_core import Dataset
 
+pytestmark = pytest.mark.processes
+
 PAGE = Path(__file__).parents[3] / "docs" / "elastic.md"
 ALONE = """physx generate toy/spring --environment.num-clients 4 --environment.seed 1 \
 --batch-nb 20 --batch-size 50"""

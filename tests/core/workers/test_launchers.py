@@ -25,6 +25,8 @@ from physx_core.workers.launchers import (
     stop,
 )
 
+pytestmark = pytest.mark.processes
+
 HERE = Path(__file__)
 
 

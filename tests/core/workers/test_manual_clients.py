@@ -18,6 +18,8 @@ import pytest
 from physx_core.errors import ClientError, ConfigError
 from physx_core.net import Kind, pack
 
+pytestmark = pytest.mark.processes
+
 ENVS = Path(__file__).parents[1] / "programs" / "worker_envs.py"
 WANDERER = f"{(Path(__file__).parents[1] / 'programs' / 'restart_envs.py')}:Wanderer"
 TOKEN = "a token for these tests"

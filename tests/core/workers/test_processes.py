@@ -18,6 +18,8 @@ from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
 from physx_core.workers.client.worker import run_client
 from physx_core.workers.launchers import ClientProcess, stop
 
+pytestmark = pytest.mark.processes
+
 ENVS = Path(__file__).parents[1] / "programs" / "worker_envs.py"
 
 

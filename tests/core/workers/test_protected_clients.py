@@ -36,6 +36,8 @@ from physx_core.net import (
 from physx_core.net.tls import Identity
 from physx_core.workers.client.worker import run_client
 
+pytestmark = pytest.mark.processes
+
 TOKEN = "a token for these tests"
 CLIENT = [sys.executable, "-m", "physx_core", "client"]
 WANDERER = f"{(Path(__file__).parents[1] / 'programs' / 'restart_envs.py')}:Wanderer"

@@ -22,6 +22,8 @@ from physx_core.errors import ClientError, EnvironmentFailedError, SampleError
 from physx_core.net import Kind, pack
 from physx_core.workers.server.journal import Journal
 
+pytestmark = pytest.mark.processes
+
 ENVS = Path(__file__).parents[1] / "programs" / "restart_envs.py"
 WANDERER = f"{ENVS}:Wanderer"
 

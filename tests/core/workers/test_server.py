@@ -14,6 +14,8 @@ from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
 from physx_core.net import HEADER, Kind, introduce, pack
 from physx_core.workers.client.worker import run_client
 
+pytestmark = pytest.mark.processes
+
 
 def test_strangers_do_not_disturb_a_run(clients, port):
     stop_it = threading.Event()

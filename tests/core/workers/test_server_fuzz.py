@@ -22,6 +22,8 @@ from physx_core.net import Kind, pack
 from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.server.client_group import ClientGroup
 
+pytestmark = pytest.mark.processes
+
 ROGUE = Path(__file__).parents[1] / "programs" / "rogue_client.py"
 ENVS = Path(__file__).parents[1] / "programs" / "worker_envs.py"
 TOKEN = "a token for this test"

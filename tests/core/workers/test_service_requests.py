@@ -12,6 +12,8 @@ import pytest
 
 from physx_core.errors import ClientError, EnvironmentFailedError, UsageError
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture
 def batch_services(services):

@@ -16,6 +16,8 @@ import pytest
 
 from physx_core.net import poll_peer, prepare_connection
 
+pytestmark = pytest.mark.processes
+
 TOKEN = "a token for these tests"
 CLIENT = [sys.executable, "-m", "physx_core", "client"]
 WANDERER = f"{(Path(__file__).parents[1] / 'programs' / 'restart_envs.py')}:Wanderer"

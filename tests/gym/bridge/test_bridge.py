@@ -17,6 +17,8 @@ from physx_core.errors import ConfigError, UsageError
 from physx_gym.bridge.policy import Policy, action_arrays
 from physx_gym.spaces import SpaceFields
 
+pytestmark = pytest.mark.processes
+
 
 def lean(observation):
     """Push the cart in the direction in which the pole falls."""

@@ -6,6 +6,8 @@ import pytest
 
 from physx_core import DataGeneration, Dataset, EnvironmentConfig
 
+pytestmark = pytest.mark.processes
+
 rr = pytest.importorskip("rerun")
 pytest.importorskip("physx_rerun")
 

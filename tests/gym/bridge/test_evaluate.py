@@ -16,6 +16,8 @@ from physx_gym.cli import evaluate
 from physx_gym.tasks.quantities import JointPositions
 from physx_gym.tasks.terminations import OutOfBounds
 
+pytestmark = pytest.mark.processes
+
 
 class Walk(gymnasium.Env):
     """Walks as fast as it is told, for three steps; succeeds if it was told to walk forward."""

@@ -12,6 +12,8 @@ from physx_core.errors import ConfigError, PhysxError
 from physx_gym import ParallelVectorEnv
 from physx_gym.bridge.make_env import make_env
 
+pytestmark = pytest.mark.processes
+
 OWN = """
 import gymnasium, numpy as np
 

@@ -15,6 +15,8 @@ from physx_gym.tasks.quantities import JointPositions
 from physx_gym.tasks.rewards import Sum, Survival
 from physx_gym.tasks.terminations import OutOfBounds
 
+pytestmark = pytest.mark.processes
+
 IDS = sorted(id for id in gymnasium.registry if id.startswith("physx/"))
 SAME_STEP = AutoresetMode.SAME_STEP
 

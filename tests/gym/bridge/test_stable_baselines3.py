@@ -22,6 +22,8 @@ from stable_baselines3.common.vec_env import DummyVecEnv, VecMonitor, VecNormali
 
 from physx_gym.stable_baselines3 import GymnasiumVecEnv, save_policy
 
+pytestmark = pytest.mark.processes
+
 COUNT = 3
 WALK = f"{__file__}:Walk"
 SAME_STEP = AutoresetMode.SAME_STEP

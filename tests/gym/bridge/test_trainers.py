@@ -14,6 +14,8 @@ from physx_core.errors import ConfigError, PhysxError, UnknownArgumentError, Unk
 from physx_gym import ParallelVectorEnv, RobotEnv, Simulator, build_pipeline, plain
 from physx_sim import Robot, World
 
+pytestmark = pytest.mark.processes
+
 IDS = sorted(id for id in gymnasium.registry if id.startswith("physx/"))
 ENGINES = ["dart", "pinocchio"]
 ACCEPTED = {

@@ -13,6 +13,8 @@ from physx_gym import Layer, PipelineEnv, RobotEnv, Simulator
 from physx_sim import Motor, Robot, World
 from physx_sim.errors import SimulationError
 
+pytestmark = pytest.mark.processes
+
 SLIDER = [Motor(joint="slider")]
 
 

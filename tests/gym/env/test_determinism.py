@@ -19,6 +19,8 @@ from physx_gym.spaces import copy_tree
 from physx_sim import Encoder, Imu, Motor
 from physx_sim.errors import SimulationError
 
+pytestmark = pytest.mark.processes
+
 PROGRAM = Path(__file__).parents[1] / "programs" / "noisy_ant.py"
 program = runpy.run_path(str(PROGRAM))
 make, run = program["make"], program["run"]

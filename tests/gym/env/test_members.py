@@ -16,6 +16,8 @@ from physx_gym import Layer, RobotEnv
 from physx_gym.tasks.quantities import BodyPositions, Delta, JointPositions
 from physx_sim import Encoder, Motor
 
+pytestmark = pytest.mark.processes
+
 MEMBERS = (
     "simulator", "render_mode", "stepper_state", "is_simulation_running", "robot", "robot_state",
     "derived", "log_fieldnames", "np_random", "np_random_seed", "num_steps", "quantities",

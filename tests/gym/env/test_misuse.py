@@ -16,6 +16,8 @@ from physx_gym import RobotEnv
 from physx_sim import Encoder, Motor, Wrench
 from physx_sim.errors import SimulationError
 
+pytestmark = pytest.mark.processes
+
 
 def cart(**options):
     options = {"motors": [Motor(joint="slider")], "period": 0.01, **options}

@@ -13,6 +13,8 @@ from physx_core.errors import ConfigError, EpisodeError, UnknownOptionError, Usa
 from physx_gym import RobotEnv, Simulator
 from physx_sim import Encoder, Ground, Motor
 
+pytestmark = pytest.mark.processes
+
 SLIDER = [Motor(joint="slider")]
 
 

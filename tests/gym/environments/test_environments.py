@@ -17,6 +17,8 @@ from physx_core.errors import ConfigError, EpisodeError
 from physx_gym import RobotEnv
 from physx_gym.bridge.make_env import make_env
 
+pytestmark = pytest.mark.processes
+
 ENGINES = ("dart", "pinocchio")
 GOALS = ("ArmReachGoal", "PushBoxGoal")
 NAMES = ("Cartpole", "Acrobot", "Ant", "Quadruped", "ArmReach", "PushBox", *GOALS)

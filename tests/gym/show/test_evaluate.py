@@ -12,6 +12,8 @@ from physx_core.errors import ConfigError
 from physx_gym import RobotEnv, read_log
 from physx_sim.errors import SimulationError
 
+pytestmark = pytest.mark.processes
+
 
 class Balance(RobotEnv):
     """A reward of 1 a step, until the pole is down."""

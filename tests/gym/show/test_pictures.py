@@ -11,6 +11,8 @@ from PIL import Image
 
 from physx_core.errors import VisualizerError
 
+pytestmark = pytest.mark.processes
+
 DOCS = Path(__file__).parents[3] / "docs"
 PICTURES = runpy.run_path(str(DOCS / "pictures.py"))
 SIZE = (320, 240)

@@ -11,6 +11,8 @@ from physx_core.errors import MissingLibraryError
 from physx_gym import Log, RobotEnv, plot
 from physx_gym.errors import LogError
 
+pytestmark = pytest.mark.processes
+
 
 def log_of(*names, rows=5, units=None):
     variables = {"time": np.arange(rows) * 0.1}

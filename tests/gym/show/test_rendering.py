@@ -32,6 +32,8 @@ from physx_sim import (
     World,
 )
 
+pytestmark = pytest.mark.processes
+
 SIZE = (160, 120)
 
 

@@ -21,6 +21,8 @@ from physx_gym.tasks.terminations import lost_ground, roll_pitch, unsafe_joints
 from physx_sim import Encoder, Imu, Motor, Wrench
 from physx_sim.errors import SimulationError
 
+pytestmark = pytest.mark.processes
+
 STAND = np.tile([0.0, 0.8, -1.6], 4)
 SHINS = ("back_left_shin", "back_right_shin", "front_left_shin", "front_right_shin")
 

@@ -33,6 +33,8 @@ from physx_gym.tasks.terminations import (
 )
 from physx_gym.tasks.trajectory import Trajectory
 
+pytestmark = pytest.mark.processes
+
 SHINS = ("back_left_shin", "back_right_shin", "front_left_shin", "front_right_shin")
 STEP = 0.02
 

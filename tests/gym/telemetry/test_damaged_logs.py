@@ -14,6 +14,8 @@ import pytest
 from physx_gym import Log, RobotEnv, read_log, replay
 from physx_gym.errors import LogError
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.mark.parametrize("share", [0.0, 0.02, 0.3, 0.6, 0.9, 0.999])
 def test_a_truncated_file_is_rejected(log, tmp_path, share):

@@ -29,6 +29,8 @@ from physx_sim import (
     World,
 )
 
+pytestmark = pytest.mark.processes
+
 
 def run(env, steps, seed=0):
     _, info = env.reset(seed=seed)

@@ -17,6 +17,8 @@ import pytest
 from physx_core.errors import ClientError, ConfigError, EnvironmentFailedError, UsageError
 from physx_gym import ParallelVectorEnv
 
+pytestmark = pytest.mark.processes
+
 WALK = Path(__file__).parents[1] / "programs" / "walk.py"
 spec = importlib.util.spec_from_file_location("walk", WALK)
 walk = importlib.util.module_from_spec(spec)

@@ -16,6 +16,8 @@ import physx_gym  # noqa: F401 - registers the environments
 from physx_core.errors import ClientError, ComponentNotFoundError, EnvironmentFailedError
 from physx_gym import ParallelVectorEnv
 
+pytestmark = pytest.mark.processes
+
 WALK = Path(__file__).parents[1] / "programs" / "walk.py"
 spec = importlib.util.spec_from_file_location("walk", WALK)
 walk = importlib.util.module_from_spec(spec)

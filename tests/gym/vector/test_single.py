@@ -12,6 +12,8 @@ from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from physx_core.errors import ConfigError, EnvironmentFailedError, UsageError
 from physx_gym import ParallelVectorEnv
 
+pytestmark = pytest.mark.processes
+
 HERE = f"{__file__}:"
 
 

@@ -20,6 +20,8 @@ from physx_core.errors import (
 )
 from physx_gym.vector.vector_env import ParallelVectorEnv
 
+pytestmark = pytest.mark.processes
+
 HERE = f"{__file__}:"
 
 

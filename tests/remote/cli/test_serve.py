@@ -17,6 +17,8 @@ import pytest
 from physx_core.cli import main
 from physx_remote import connect, connect_vector
 
+pytestmark = pytest.mark.processes
+
 PATIENCE = 30.0
 GODOT = ["--protocol", "godot-gym"]
 

@@ -18,6 +18,8 @@ from physx_remote import connect, connect_vector
 from physx_remote.errors import RemoteClosedError, RemoteTimeoutError
 from physx_remote.godot_gym.messages import Messages
 
+pytestmark = pytest.mark.processes
+
 PROJECT = Path(__file__).parents[1] / "programs" / "godot"
 BINARY = "godot3-server"
 FRAME = 1 / 60  # s

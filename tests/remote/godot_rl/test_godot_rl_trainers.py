@@ -24,6 +24,8 @@ from physx_remote.godot_rl.launch import (
 from physx_remote.godot_rl.protocol import GodotRL
 from physx_remote.serving.worlds import open_worlds
 
+pytestmark = pytest.mark.processes
+
 HERE = Path(__file__).parent
 CART = f"{HERE / 'envs.py'}:Cart"
 MODULE = "physx_remote.godot_rl.launch"

@@ -24,6 +24,8 @@ from physx_remote import PhysxObserver, connect, connect_vector, serve
 from physx_remote.errors import RemoteClosedError, RemoteError
 from physx_remote.physx.wire import ACT
 
+pytestmark = pytest.mark.processes
+
 TOKEN = "0123456789abcdef"
 PATIENCE = 30.0
 

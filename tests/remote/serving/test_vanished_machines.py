@@ -18,6 +18,8 @@ import pytest
 from physx_remote import connect
 from physx_remote.errors import RemoteError
 
+pytestmark = pytest.mark.processes
+
 PROGRAMS = Path(__file__).parents[1] / "programs"
 SLOW = f"{PROGRAMS / 'slow_env.py'}:Slow"
 TOKEN = "a token for these tests"

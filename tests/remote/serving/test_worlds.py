@@ -25,6 +25,8 @@ from physx_core.errors import (
 from physx_core.toy import Spring
 from physx_remote import Worlds, open_worlds
 
+pytestmark = pytest.mark.processes
+
 BOX = spaces.Box(-1, 1, (2,), np.float64)
 
 

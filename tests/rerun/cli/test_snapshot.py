@@ -11,6 +11,8 @@ from physx_core.components import Factory
 from physx_core.errors import UsageError, VisualizerError
 from physx_rerun.cli import snapshot
 
+pytestmark = pytest.mark.processes
+
 SIZE = ("--width", "320", "--height", "200")
 
 

@@ -19,6 +19,8 @@ from physx_core.errors import VisualizerError
 from physx_rerun.cli import view
 from physx_rerun.viewer.viewer import Viewer
 
+pytestmark = pytest.mark.processes
+
 VIEW = "import sys; from physx_rerun.cli import view; view.run(sys.argv[1:])"
 
 

@@ -14,6 +14,8 @@ from physx_rerun.drawing.chunks import ChunkBuilder
 from physx_rerun.drawing.colors import CURVES
 from physx_rerun.drawing.dashboard import Dashboard
 
+pytestmark = pytest.mark.processes
+
 TIMES = {"batch": 0, "epoch": 0, "time": 0.0}
 
 

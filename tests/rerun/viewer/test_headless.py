@@ -12,6 +12,8 @@ from physx_core.errors import ConfigError, VisualizerError
 from physx_rerun.viewer import viewer
 from physx_rerun.viewer.headless import choose_timeline, render_film, render_picture
 
+pytestmark = pytest.mark.processes
+
 
 @pytest.fixture
 def recording(opened, arm):

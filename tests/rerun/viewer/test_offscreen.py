@@ -10,6 +10,8 @@ from physx_core.components import Factory
 from physx_core.errors import VisualizerError
 from physx_rerun.visualizer import RerunVisualizer
 
+pytestmark = pytest.mark.processes
+
 SIZE = (96, 64)
 
 

@@ -18,6 +18,8 @@ from physx_rerun.drawing.chunks import ChunkBuilder
 from physx_rerun.viewer.streams import LiveWriter
 from physx_rerun.viewer.viewer import Viewer, find_free_port
 
+pytestmark = pytest.mark.processes
+
 
 def steps_of(path, entity="/env_1/error"):
     steps = []

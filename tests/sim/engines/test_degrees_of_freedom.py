@@ -7,6 +7,8 @@ import pytest
 
 from physx_sim import Box, Ground, HeightField, JointSettings, Robot, Sphere, Stairs, World, Wrench
 
+pytestmark = pytest.mark.processes
+
 LINK = """<link name="{name}"><inertial><origin xyz="0.1 0 -0.05"/><mass value="{mass}"/>
 <inertia ixx="0.01" iyy="0.02" izz="0.015" ixy="0.001" ixz="0" iyz="0"/></inertial>
 <collision><origin xyz="0.2 0 0"/><geometry>{shape}</geometry></collision></link>"""

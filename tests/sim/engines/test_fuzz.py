@@ -8,6 +8,8 @@ import sys
 
 import pytest
 
+pytestmark = pytest.mark.processes
+
 CAMPAIGN = r"""
 import dataclasses, gc, json, random, sys
 import numpy as np

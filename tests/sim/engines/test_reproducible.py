@@ -15,6 +15,8 @@ from physx_core import plugins
 from physx_sim import Box, Ground, Robot, Sphere, World, Wrench
 from physx_sim.errors import SimulationError
 
+pytestmark = pytest.mark.processes
+
 DRIVE = """
 import hashlib, pickle, sys
 import numpy as np

@@ -27,6 +27,8 @@ from physx_sim import (
     Wrench,
 )
 
+pytestmark = pytest.mark.processes
+
 TOWER = """
 <robot name="tower">
   <link name="foot">

@@ -15,6 +15,8 @@ from physx_dart.environments.double_pendulum import URDF
 from physx_sim import Robot, World
 from physx_sim.errors import SimulationError
 
+pytestmark = pytest.mark.processes
+
 
 def test_both_plugins_are_found_without_importing_an_engine():
     code = (

@@ -28,6 +28,8 @@ from physx_sim import (
 from physx_sim.engines import bounding_box, bounding_capsule
 from physx_sim.errors import FeatureNotSupportedError, ModelError
 
+pytestmark = pytest.mark.processes
+
 MESH_ROBOT = """
 <robot name="r"><link name="body">
   <inertial><mass value="2"/>

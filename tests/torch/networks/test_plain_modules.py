@@ -21,6 +21,8 @@ from physx_core.pipelines import Learner, load_learner
 from physx_core.plugins.networks import resolve_network
 from physx_torch import FC, ModuleNetwork
 
+pytestmark = pytest.mark.processes
+
 SCRIPT = """
 import sys
 import numpy as np

@@ -13,6 +13,8 @@ from physx_core import Dataset, Field
 from physx_core.errors import DatasetError, DatasetNotFoundError
 from physx_torch import StoredDataset
 
+pytestmark = pytest.mark.processes
+
 ROWS = 500
 
 

@@ -18,7 +18,7 @@ from physx_core import Dataset
 from physx_core.checkpoint import read
 from physx_core.pipelines import read_drawn_rows
 
-pytestmark = pytest.mark.slow
+pytestmark = [pytest.mark.slow, pytest.mark.processes]
 
 pytest.importorskip("torch.distributed")
 

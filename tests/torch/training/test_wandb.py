@@ -13,6 +13,8 @@ from physx_core import Dataset, DatasetConfig, NetworkConfig, Training
 from physx_core.errors import ConfigError, MissingLibraryError
 from physx_torch import WandB
 
+pytestmark = pytest.mark.processes
+
 records = pytest.importorskip("wandb.proto.wandb_internal_pb2")
 BLOCK, HEADER, MAGIC = 2**15, 7, 7
 FULL, FIRST, MIDDLE, LAST = 1, 2, 3, 4
