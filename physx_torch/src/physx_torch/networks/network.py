@@ -346,6 +346,8 @@ class TorchNetwork(torch.nn.Module, Network):
 
     def _tensor(self, name: str, array: Array) -> torch.Tensor:
         kind = array.dtype.kind
+        if kind == "f" and array.dtype.itemsize <= _WIDEST["f"]:  # nearly always: convert once
+            return torch.from_numpy(_to_compatible(array)).to(self.device, self.data_type)
         if kind in "iu" and array.dtype != np.int64:
             array = _to_int64(name, array)
         elif array.dtype.itemsize > _WIDEST.get(kind, np.inf):  # unknown to torch
