@@ -19,15 +19,20 @@ def worker_variables() -> dict[str, str]:
     return {CLIENT_VARIABLE: "1", "OMP_NUM_THREADS": os.environ.get("OMP_NUM_THREADS", "1")}
 
 
-def prepare_worker() -> None:
+def prepare_worker(*, preempts: bool = False) -> None:
     """Leave ending this process to the one that started it, and report failures on stderr.
 
     Ctrl-C does nothing, and a crash or SIGTERM prints a traceback.
+
+    Args:
+        preempts: Whether this process, when it is woken, takes the core from a process that only
+            computes: then its answers come soon on a busy machine.
     """
     faulthandler.enable()
     faulthandler.register(signal.SIGTERM, all_threads=False, chain=True)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
-    if hasattr(os, "SCHED_BATCH"):  # waking it does not preempt its starter, which wakes others
+    if hasattr(os, "SCHED_BATCH") and not preempts:
+        # Waking it does not preempt its starter, which wakes others.
         with contextlib.suppress(OSError):  # not every container allows it
             os.sched_setscheduler(0, os.SCHED_BATCH, os.sched_param(0))
 

@@ -135,7 +135,7 @@ class Worker:
 
 def main() -> None:
     """Run the worker with the arguments from the command line."""
-    prepare_worker()
+    prepare_worker(preempts=True)  # else each step waits for the slice of a busy process
     try:
         with contextlib.suppress(EOFError, ConnectionError):  # the other process is gone
             Worker(socket.socket(fileno=int(sys.argv[1])), int(sys.argv[2])).run()
