@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -18,7 +19,7 @@ from physx_testing.report import NotApplicableError
 from physx_testing.subject import Check, Subject, expect
 
 _ROWS = 12
-_VALUES = {"fps": 30, "task": "a task"}
+_VALUES: dict[str, Any] = {"fps": 30, "task": "a task"}
 
 
 @contextlib.contextmanager
