@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import functools
 import importlib
 from dataclasses import dataclass
 from types import ModuleType
+from typing import TYPE_CHECKING
 
 from physx_core.errors import PluginError, ReferenceFormError
 from physx_core.origin import install_hint
@@ -17,6 +19,9 @@ from physx_core.plugins.entries import (
     owner_of,
 )
 from physx_core.plugins.loading import loading
+
+if TYPE_CHECKING:
+    from importlib.metadata import EntryPoint
 
 
 @dataclass(frozen=True)
@@ -89,11 +94,18 @@ def hookspecs_of(hook: str) -> ModuleType:
         PluginError: If the package is broken, or several bring this hook.
     """
     entries = find_entries(HOOKSPECS)[hook]
-    who = f"The hook {hook} ({owner_of(entries[0])})"
     if len(entries) > 1:
         raise PluginError(hook, describe_conflict("hook", entries))
-    with loading(hook, who, f"cannot be read from {entries[0].value}"):
-        module = importlib.import_module(entries[0].value)
+    return _load(hook, entries[0])
+
+
+@functools.cache
+def _load(hook: str, entry: EntryPoint) -> ModuleType:
+    """Import the module once: `resolve` asks for a kind several times."""
+    with loading(
+        hook, f"The hook {hook} ({owner_of(entry)})", f"cannot be read from {entry.value}"
+    ):
+        module = importlib.import_module(entry.value)
         if kind_of(hook) not in _kinds_in(module):
             raise LookupError(f"it has no function {hook} marked with kind_hook")
     return module
