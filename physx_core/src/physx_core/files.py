@@ -12,8 +12,10 @@ import errno
 import fcntl
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from pathlib import Path
+
+import numpy as np
 
 from physx_core.closeable import Closeable
 from physx_core.errors import DatasetError, PhysxError
@@ -216,10 +218,17 @@ def read_head(descriptor: int, limit: int) -> bytes:
 
 def write_at(descriptor: int, content: bytes | memoryview, offset: int) -> None:
     """Write the whole content at an offset of an open file."""
-    view = memoryview(content)
-    while view:
-        written = os.pwrite(descriptor, view, offset)
-        view, offset = view[written:], offset + written
+    write_pieces(descriptor, ((content, offset),))
+
+
+def write_pieces(descriptor: int, pieces: Iterable[tuple[bytes | memoryview, int]]) -> None:
+    """Write several contents at their offsets of an open file, one after another."""
+    for content, offset in pieces:
+        written, nbytes = os.pwrite(descriptor, content, offset), memoryview(content).nbytes
+        if written < nbytes:  # the system writes at most 2 GB at once, and less to a full disk
+            view = np.frombuffer(content, "u1").data
+            while written < nbytes:
+                written += os.pwrite(descriptor, view[written:], offset + written)
 
 
 def read_at(descriptor: int, view: memoryview, offset: int) -> bool:

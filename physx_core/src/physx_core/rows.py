@@ -17,7 +17,7 @@ from physx_core.errors import (
     nearest,
 )
 from physx_core.fields import NO_ARRAY, Field, first_not_finite, is_finite
-from physx_core.typing import Batch, Sample
+from physx_core.typing import Array, Batch, Sample
 
 ROW_FIELDS = (
     Field("env_id", shape=(), dtype="int32", role="additional"),
@@ -60,10 +60,7 @@ class RowBuffer:
         self.capacity = capacity
         self.count = 0
         self._finite = 0  # number of rows known to be finite
-        self._arrays: Batch = {
-            field.name: np.empty((capacity, *(field.shape or ())), field.dtype)
-            for field in self.fields
-        }
+        self._arrays, self._blocks = _allocate(self.fields, capacity)
         self._names = {field.name for field in fields}
         known = [field if field.shape is not None else replace(field, shape=()) for field in fields]
         self._slots = [
@@ -136,24 +133,57 @@ class RowBuffer:
             NotFiniteError: If a row contains NaN or infinity; it names the first such row. The rows
                 before it can then still be taken.
         """
+        count = self.count
+        if count < self.capacity or self._finite:
+            self._check_finite()
+            self.clear()
+            return {name: array[:count] for name, array in self._arrays.items()}
+        for block in self._blocks:
+            if not is_finite(block):
+                self._check_finite()
+        self.count = 0
+        return self._arrays.copy()
+
+    def _check_finite(self) -> None:
+        """Check the rows that are not known to be finite."""
         count, wrong = self.count, None
-        if self._finite < count:
-            for field, array in self._floating:
-                bad = first_not_finite(array[self._finite : count])
-                if bad is not None:
-                    count, wrong = self._finite + bad, field
+        for field, array in self._floating if self._finite < count else ():
+            bad = first_not_finite(array[self._finite : count])
+            if bad is not None:
+                count, wrong = self._finite + bad, field
         if wrong is not None:
             instance_id, step = 0, -1
             if self._numbers:
                 instance_id, step = int(self._numbers[0][count]), int(self._numbers[2][count])
             self.count = self._finite = count
             raise wrong.not_finite(instance_id=instance_id, step=step)
-        self.clear()
-        return {name: array[:count] for name, array in self._arrays.items()}
 
     def clear(self) -> None:
         """Discard all rows."""
         self.count = self._finite = 0
+
+
+def _allocate(fields: Sequence[Field], capacity: int) -> tuple[Batch, list[Array]]:
+    """Allocate an array for each field; those of the same floating-point type share a block.
+
+    Args:
+        fields: Fields of the rows.
+        capacity: Maximum number of rows.
+
+    Returns:
+        Field name to array, and the blocks, which show in one pass whether all rows are finite.
+    """
+    shapes = {field.name: (capacity, *(field.shape or ())) for field in fields}
+    arrays = {field.name: np.empty(shapes[field.name], field.dtype) for field in fields}
+    blocks = []
+    for dtype in {array.dtype for array in arrays.values() if array.dtype.kind in "fc"}:
+        names = [name for name, array in arrays.items() if array.dtype == dtype]
+        ends = np.cumsum([arrays[name].size for name in names])
+        block = np.zeros(ends[-1], dtype)
+        blocks.append(block)
+        for name, part in zip(names, np.split(block, ends[:-1]), strict=True):
+            arrays[name] = part.reshape(shapes[name])
+    return arrays, blocks
 
 
 class RejectedSamples:

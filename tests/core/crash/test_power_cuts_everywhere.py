@@ -141,7 +141,7 @@ def test_a_failed_sync_is_an_error_and_never_retried_as_success(tmp_path, durabl
             except DatasetError as error:
                 errors += 1
                 assert "disk has failed" in str(error)
-            if not errors and (durable or not any(s._error for s in stage.syncers)):
+            if not errors and (durable or not any(s.error for s in stage.syncers)):
                 promised = stored
         assert errors >= 3  # it does not go on as if nothing had happened
         with pytest.raises(DatasetError, match="disk has failed"):

@@ -411,7 +411,10 @@ class Dataset(Closeable):
             DatasetError: If the disk is full or fails; says how many of the rows are stored.
             UsageError: If the dataset is closed or open for reading only.
         """
-        self._for_writing().append(mode, rows, checked=checked)
+        appender = self._appender
+        if appender is None or self._closed:
+            appender = self._for_writing()
+        appender.append(mode, rows, checked=checked)
 
     def stripes(self, mode: str, count: int) -> Stripes:
         """Let `count` other processes write the rows of a mode from now on, in turn.

@@ -62,6 +62,7 @@ class DataGeneration(NewSessionPipeline):
     batch: Batch = field(init=False, repr=False)
     batch_id: int = field(init=False, repr=False, default=0)
     _seed: int = field(init=False, repr=False, default=0)
+    _mode: str = field(init=False, repr=False, default="")
 
     def execute(self) -> None:
         """Generate all batches.
@@ -101,14 +102,16 @@ class DataGeneration(NewSessionPipeline):
         With ``record_wrong_samples``, the samples that `check_sample` rejected are stored too, in
         the mode "wrong".
         """
-        with record_beside_rows(self.source, self.dataset, self._mode):
-            self.batch = self.source.batch(self.batch_size)
-            store_sets(self.source, self.dataset, self._mode)
+        source, dataset, mode = self.source, self.dataset, self._mode
+        with record_beside_rows(source, dataset, mode):
+            self.batch = source.batch(self.batch_size)
+            if not source.is_plain:
+                store_sets(source, dataset, mode)
             if self.batch_id == 0:
-                self.dataset.define_fields(self._mode, self.source.fields)
+                dataset.define_fields(mode, source.fields)
                 self._describe()
             if self.batch:
-                self.dataset.append(self._mode, self.batch, checked=True)
+                dataset.append(mode, self.batch, checked=True)
 
     def _check_batch_produce(self) -> None:
         """Call a replacement of `batch_produce`, which must store samples."""
@@ -136,16 +139,13 @@ class DataGeneration(NewSessionPipeline):
     def data_generation_end(self) -> None:
         """Called after the last batch."""
 
-    @property
-    def _mode(self) -> str:
-        return self.mode or (self.dataset_config or DatasetConfig).mode
-
     def _begin(self) -> None:
         self.batch_id = 0
         end_generation(self.dataset)
 
     def _open(self, resources: contextlib.ExitStack) -> None:
         dataset_config = self.dataset_config or DatasetConfig()
+        self._mode = self.mode or dataset_config.mode
         if dataset_config.existing_dir is not None:
             raise ConfigError(
                 "DataGeneration writes to its own session's dataset, so existing_dir cannot be "

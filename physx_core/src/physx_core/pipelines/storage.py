@@ -244,10 +244,9 @@ def is_copy(directory: Path) -> bool:
     return False
 
 
-@contextlib.contextmanager
 def record_beside_rows(
     source: Source, dataset: Dataset | None, mode: str, earlier: Mapping[int, int] | None = None
-) -> Iterator[None]:
+) -> contextlib.AbstractContextManager[None]:
     """Store what a source produces in addition to the rows of a batch.
 
     These are the samples that `check_sample` rejects during the body, in the mode "wrong", and the
@@ -263,6 +262,15 @@ def record_beside_rows(
         earlier: Instance to the step of its last row before the batch, if a run was killed before
             it stored the samples rejected up to then: these are stored first. None: there are none.
     """
+    if source.is_plain:
+        return contextlib.nullcontext()
+    return _recording_beside_rows(source, dataset, mode, earlier)
+
+
+@contextlib.contextmanager
+def _recording_beside_rows(
+    source: Source, dataset: Dataset | None, mode: str, earlier: Mapping[int, int] | None
+) -> Iterator[None]:
     try:
         yield
     except PhysxError as error:

@@ -128,6 +128,7 @@ class ClientSource(Source):
                     "generated with, so it needs the rows. Use DatasetConfig.writers='server'."
                 )
             self.sets.begin(parameters)
+            self.is_plain = not (self.sets.parameters or self._rejections)
         except BaseException:
             self._failed = True
             raise

@@ -14,7 +14,7 @@ from physx_core.errors import ConfigError, PhysxError, UsageError
 from physx_core.fields import Field
 from physx_core.rows import ROW_FIELDS, RowBuffer, concatenate, copy_row, infer_shapes
 from physx_core.sources.source import Source, check_stored
-from physx_core.typing import Batch, Sample
+from physx_core.typing import Batch
 from physx_core.workers.instance import NOTHING, Instance, Skip, instance_arguments
 from physx_core.workers.parameter_sets import ParameterSets, next_step
 
@@ -81,6 +81,7 @@ class LocalSource(Source):
             self._open(instance)
         self.ignores_predictions = all(instance.ignores_predictions for instance in self._instances)
         self.sets.begin([instance.parameters for instance in self._instances])
+        self.is_plain = not (self.sets.parameters or self._config.record_wrong_samples)
 
     def batch(self, size: int, stored: Batch | None = None) -> Batch:
         """Return the next rows: see `Source.batch`.
@@ -91,30 +92,14 @@ class LocalSource(Source):
         """
         if stored is not None:
             check_stored(stored, size)
-        if self._config.record_wrong_samples:
+        if not self.is_plain:
             self.pop_rejected()
-        self._generate_again(size)
-        buffer = self._buffer
-        if buffer is not None:
-            buffer.clear()
-            if buffer.capacity < size:
-                buffer = self._buffer = RowBuffer(buffer.fields[: -len(ROW_FIELDS)], size)
-        first, count = self._next, self.instance_nb
-        self._last = range(first, first + size)
-        while self._next < first + size:
-            place = self._next % count
-            given = None if stored is None else copy_row(stored, self._next - first)
-            try:
-                self._make_row(place, given, size)
-            except PhysxError as error:
-                self._redraw(place, error)
-            else:
-                self._next += 1
-        buffer = self._buffer
-        if buffer is None:
-            raise UsageError(f"A batch must have at least one row, not {size}.")
-        rows = buffer.take()
-        self.sets.note(rows)
+        if self._next < self._skip.rows:
+            self._generate_again(size)
+        self._last = range(self._next, self._next + size)
+        rows = self._fill(size, stored).take()
+        if not self.is_plain:
+            self.sets.note(rows)
         return rows
 
     def _open(self, instance: Instance) -> None:
@@ -124,15 +109,31 @@ class LocalSource(Source):
     def _choose(self, instance_id: int, episode: int) -> dict[str, Any]:
         return self.sets.choose(instance_id, episode, self._next)
 
-    def _make_row(self, place: int, stored: Sample | None, size: int) -> None:
-        instance = self._instances[place]
-        sample = instance.step(stored)
-        buffer = self._buffer
+    def _fill(self, size: int, stored: Batch | None = None) -> RowBuffer:
+        """Generate the next rows; return the buffer with them."""
+        buffer, first, count = self._buffer, self._next, self.instance_nb
+        if buffer is not None and buffer.capacity < size:
+            buffer = self._buffer = RowBuffer(buffer.fields[: -len(ROW_FIELDS)], size)
+        elif buffer is not None and buffer.count:  # an error ended the last batch
+            buffer.clear()
+        while self._next < first + size:
+            place = self._next % count
+            instance = self._instances[place]
+            given = None if stored is None else copy_row(stored, self._next - first)
+            try:
+                sample = instance.step(given)
+                if buffer is None:
+                    buffer = self._buffer = RowBuffer(infer_shapes(instance.fields, sample), size)
+                episode, step = instance.last_episode, instance.last_step
+                buffer.put(sample, place + 1, episode, step, finite=self._redraws)
+            except PhysxError as error:
+                self._redraw(place, error)
+            else:
+                self._last_steps[place] = step
+                self._next += 1
         if buffer is None:
-            buffer = self._buffer = RowBuffer(infer_shapes(instance.fields, sample), size)
-        episode, step = instance.last_episode, instance.last_step
-        buffer.put(sample, place + 1, episode, step, finite=self._redraws)
-        self._last_steps[place] = step
+            raise UsageError(f"A batch must have at least one row, not {size}.")
+        return buffer
 
     def _redraw(self, place: int, error: PhysxError) -> None:
         """Continue with an instance's next parameters, or raise the error of its simulation."""
@@ -155,21 +156,11 @@ class LocalSource(Source):
 
     def _generate_again(self, size: int) -> None:
         """Generate the rows that an earlier run already got, and discard them."""
-        while self._next < self._skip.rows:
-            place = self._next % self.instance_nb
-            try:
-                self._make_row(place, None, size)
-            except PhysxError as error:
-                self._redraw(place, error)
-                continue
-            finally:
-                if self._buffer is not None:
-                    self._buffer.clear()
-            self._next += 1
-            if self._next == self._skip.rows:
-                for instance in self._instances:
-                    if instance.rejected is not None:
-                        instance.rejected.forget(self._skip.rejected_of(instance.instance_id))
+        while left := self._skip.rows - self._next:
+            self._fill(min(left, size)).clear()
+        for instance in self._instances:
+            if instance.rejected is not None:
+                instance.rejected.forget(self._skip.rejected_of(instance.instance_id))
 
     def pop_rejected(self) -> Batch:
         """Return the rejected samples: see `Source.pop_rejected`."""

@@ -29,11 +29,14 @@ class Source(ABC):
         sets: The sets of parameters that the instances get; those whose first rows are in the last
             batch can be taken from it.
         ignores_predictions: Whether `apply` is known to have no effect; unknown for clients.
+        is_plain: Whether all that an open source produces are rows: there are no parameters, and
+            rejected samples are not recorded.
     """
 
     instance_nb: int
     sets: ParameterSets
     ignores_predictions = False
+    is_plain = False
     _is_canceled = False
 
     @property

@@ -248,9 +248,8 @@ class Instance(Closeable):
             UnknownFieldError: If the step sets no data.
             EnvironmentFailedError: If the environment raises.
         """
-        environment = self._alive()
-        environment.sample = stored
-        if stored is not None or not environment._has_begun_episodes:
+        environment = self.environment or self._alive()
+        if stored is not environment._sample or not environment._has_begun_episodes:
             self._prepare(environment, stored)
         wrong = 0
         while True:
@@ -310,7 +309,8 @@ class Instance(Closeable):
                 self._runner = None
 
     def _prepare(self, environment: Environment, stored: Sample | None) -> None:
-        """Give the environment the parameters of a stored row, and begin its first episode."""
+        """Give the environment a stored row and its parameters, and begin its first episode."""
+        environment.sample = stored
         if stored is not None and SET in stored:
             self._replay(environment, stored)
         if not environment._has_begun_episodes:

@@ -69,35 +69,43 @@ def _unsynced(function: Callable[..., Any]) -> Callable[..., Any]:
     return without
 
 
-def _append_committing_late(self: Any, rows: Any, start: int, count: int) -> None:
-    first, last, durable = self.partition.rows, self.partition.rows + count, self._syncer is None
-    for name, file in self.files.items():
-        if file.room < last:
-            file.reserve(last)
-        file.write(first, rows[name][start : start + count])
-        if durable:
-            file.sync()
-    for file in self.files.values():
-        file.commit(last, durable=durable)
-    self.partition.rows = last
-    if self._syncer is not None:
-        self._syncer.note(self)
+def _pieces_of(file: Any, *given: Any, durable: bool) -> list[tuple[bytes, int]]:
+    """Return what a file would write, its commit last."""
+    found: list[tuple[bytes, int]] = []
+
+    def write(_: int, pieces: Any) -> None:
+        found.extend((bytes(content), offset) for content, offset in pieces)
+
+    with mock.patch.object(files, "write_pieces", write):
+        file.append(*given, durable=durable)
+    return found
 
 
-def _append_committing_early(self: Any, rows: Any, start: int, count: int) -> None:
-    first, last, durable = self.partition.rows, self.partition.rows + count, self._syncer is None
-    for name, file in self.files.items():
-        part = rows[name][start : start + count]
-        with mock.patch.object(files, "write_at", lambda *_: None):
-            file.write(first, part)
-        file.commit(last, durable=durable)
-        if durable:
-            file.sync()
-        place = file.data_offset + first * file.identity.field.nbytes
-        files.write_at(file.descriptor, files.as_bytes(part), place)
-    self.partition.rows = last
-    if self._syncer is not None:
-        self._syncer.note(self)
+def _append_syncing_between(*parts: slice) -> Callable[..., None]:
+    """Return an `OpenPartition.append` that writes rows and commit in another order."""
+
+    def append(self: Any, rows: Any, start: int, count: int) -> None:
+        first, last = self.partition.rows, self.partition.rows + count
+        durable = self._syncer is None
+        for name, file in self.files.items():
+            if file.room < last:
+                file.reserve(last)
+            part = rows[name][start : start + count]
+            pieces = _pieces_of(file, first, part, last, durable=durable)
+            files.write_pieces(file.descriptor, pieces[parts[0]])
+            if durable:
+                file.sync()
+            files.write_pieces(file.descriptor, pieces[parts[1]])
+        self.partition.rows = last
+        if self._syncer is not None:
+            self._syncer.note(self)
+
+    return append
+
+
+_COMMIT, _REST = slice(-1, None), slice(None, -1)
+_append_committing_late = _append_syncing_between(_REST, _COMMIT)
+_append_committing_early = _append_syncing_between(_COMMIT, _REST)
 
 
 def _no_mark(self: Any) -> int:

@@ -27,6 +27,9 @@ class Syncer:
 
     A power failure loses at most the rows of about the last second, yet the writer never waits for
     the disk.
+
+    Attributes:
+        error: The error of the first failed sync, if any.
     """
 
     def __init__(self, period: float = PERIOD) -> None:
@@ -36,7 +39,7 @@ class Syncer:
         self._lock = threading.Lock()
         self._wake, self._end = threading.Event(), threading.Event()
         self._thread: BackgroundThread | None = None
-        self._error: OSError | None = None
+        self.error: OSError | None = None
 
     def note(self, partition: Written) -> None:
         """Schedule an open partition; its rows are synced and marked."""
@@ -57,8 +60,8 @@ class Syncer:
 
         Once a sync has failed, nothing written before it can be considered stored.
         """
-        if self._error is not None:
-            raise self._error
+        if self.error is not None:
+            raise self.error
 
     def sync(self) -> None:
         """Sync everything that is scheduled now; a failure is reported by `check`."""
@@ -75,7 +78,7 @@ class Syncer:
             for folder in {path.parent for path in paths}:  # a sealed copy may have its name now
                 files.sync_folder(folder)
         except OSError as error:
-            self._error = self._error or error
+            self.error = self.error or error
 
     def close(self) -> None:
         """Sync everything that is left and stop the thread."""

@@ -8,7 +8,7 @@ from typing import Any
 from physx_core import files
 from physx_core.dataset.store.definitions import compare_fields, complete_shapes
 from physx_core.dataset.store.manifest import Mode
-from physx_core.dataset.write.row_validation import check_rows, infer_fields
+from physx_core.dataset.write.row_validation import check_rows, count_rows, infer_fields
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import ConfigError, listed
 from physx_core.fields import Field
@@ -57,6 +57,11 @@ class Appender:
     def append(self, mode: str, rows: Mapping[str, Any], *, checked: bool = False) -> None:
         """Store and commit rows: see `Dataset.append`."""
         known = self._manifest.modes.get(mode)
+        if checked and known and (count := count_rows(known.fields, rows)) is not None:
+            if self._buffers:
+                self._flush(mode)
+            self.writer.append(mode, dict(rows), count)
+            return
         fields = known.fields if known else {field.name: field for field in infer_fields(rows)}
         block, count = check_rows(fields, rows, checked=checked)
         self._flush(mode)

@@ -37,6 +37,33 @@ def infer_fields(values: Mapping[str, Any], axes: int = 1) -> list[Field]:
     return fields
 
 
+def count_rows(fields: Mapping[str, Field], rows: Mapping[str, Any]) -> int | None:
+    """Return the number of rows if they are contiguous arrays of exactly the fields' types.
+
+    Args:
+        fields: The fields of the mode.
+        rows: Field name to rows.
+
+    Returns:
+        The number; None if the rows must be converted, or are wrong.
+    """
+    count = None
+    for name, field in fields.items():
+        array = rows.get(name)
+        if (
+            type(array) is not np.ndarray
+            or array.dtype is not field.numpy_dtype
+            or array.shape[1:] != field.shape
+            or not array.flags.c_contiguous
+        ):
+            return None
+        if count is None:
+            count = len(array)
+        elif count != len(array):
+            return None
+    return count if len(rows) == len(fields) else None
+
+
 def check_rows(
     fields: Mapping[str, Field], rows: Mapping[str, Any], *, checked: bool = False
 ) -> tuple[Batch, int]:

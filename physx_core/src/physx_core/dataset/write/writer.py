@@ -7,6 +7,7 @@ from collections import deque
 from collections.abc import Iterable, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
+from operator import attrgetter
 from pathlib import Path
 
 from physx_core import files
@@ -28,6 +29,7 @@ from physx_core.fields import Field
 from physx_core.typing import Batch, Index
 
 _HEADER = 2**14
+_COMMITTED = attrgetter("committed")
 
 
 class OpenPartition:
@@ -64,12 +66,10 @@ class OpenPartition:
         for file in parts:
             if file.room < last:
                 file.reserve(last)
-        before = [file.committed for file in parts]
+        before = tuple(map(_COMMITTED, parts))
         try:
             for name, file in self.files.items():
-                file.write(first, rows[name][start : start + count])
-            for file in parts:
-                file.commit(last, durable=durable)
+                file.append(first, rows[name][start : start + count], last, durable=durable)
             if durable:
                 for file in parts:
                     file.sync()
@@ -165,19 +165,23 @@ class Writer:
             rows: Field name to checked rows.
             count: Number of rows.
         """
-        done = 0
-        self.check_alone([mode_name])
+        done, syncer = 0, self._syncer
+        if self._stripes:
+            self.check_alone([mode_name])
         try:
-            self._check()
+            if self.store.failure is not None or (syncer is not None and syncer.error is not None):
+                self._check()
             if self._sealing:
                 self._collect(wait=False)
             while done < count:
                 partition = self._open.get(mode_name)
-                if partition is None or not partition.free:
+                free = 0 if partition is None else partition.capacity - partition.partition.rows
+                if partition is None or not free:
                     if partition is not None:
                         self._retire(mode_name)
                     partition = self._open[mode_name] = self._begin(mode_name)
-                part = min(partition.free, count - done)
+                    free = partition.capacity
+                part = min(free, count - done)
                 partition.append(rows, done, part)
                 done += part
         except OSError as error:

@@ -104,6 +104,8 @@ class BlockDigests:
     Attributes:
         first: Number of the block of the first of the `finished` digests.
         finished: Digests of the blocks that have become full since they were last taken.
+        running: Digest of the rows after the last full block.
+        left: Number of bytes that their block lacks; fewer may be added to `running` directly.
     """
 
     def __init__(self, row_nbytes: int, ends: Sequence[int], row: int) -> None:
@@ -117,33 +119,25 @@ class BlockDigests:
         self._row_nbytes, self._ends = row_nbytes, ends
         self.first = self._block = bisect_right(ends, row)
         self.finished: list[int] = []
-        self._digest, self._left = xxh3_64(), self._nbytes_from(row)
+        self.running, self.left = xxh3_64(), self._nbytes_from(row)
 
     def update(self, content: bytes | memoryview) -> None:
         """Add the bytes of the next rows."""
-        if len(content) < self._left:
-            self._left -= len(content)
-            self._digest.update(content)
-            return
         view = memoryview(content)
-        while len(view) >= self._left:
-            self._digest.update(view[: self._left])
-            self.finished.append(self._digest.intdigest())
-            view = view[self._left :]
+        while len(view) >= self.left:
+            self.running.update(view[: self.left])
+            self.finished.append(self.running.intdigest())
+            view = view[self.left :]
             row, self._block = self._ends[self._block], self._block + 1
-            self._digest, self._left = xxh3_64(), self._nbytes_from(row)
-        self._left -= len(view)
-        self._digest.update(view)
+            self.running, self.left = xxh3_64(), self._nbytes_from(row)
+        self.left -= len(view)
+        self.running.update(view)
 
     def take(self) -> tuple[int, bytes]:
         """Return the number of the first block of `finished` and its digests, and begin anew."""
         first, content = self.first, b"".join(map(DIGEST.pack, self.finished))
         self.first, self.finished = self._block, []
         return first, content
-
-    def intdigest(self) -> int:
-        """Return the digest of the rows after the last full block."""
-        return self._digest.intdigest()
 
     def _nbytes_from(self, row: int) -> int:
         """Return the number of bytes from a row to the end of its block."""
@@ -206,7 +200,7 @@ class Rows:
                 different.append((max(start, commit.base), ends[number]))
         last = found.first + len(found.finished)
         start = max(ends[last - 1] if last else 0, commit.base)
-        if rows == commit.rows > start and found.intdigest() != commit.digest:
+        if rows == commit.rows > start and found.running.intdigest() != commit.digest:
             different.append((start, commit.rows))
         return different
 
@@ -259,7 +253,7 @@ def _spare(
     for other in others:
         if stop == commit.rows and start < other.rows < stop and other.base == commit.base:
             digests = rows.read(descriptor, start, other.rows)
-            if digests is not None and digests.intdigest() == other.digest:
+            if digests is not None and digests.running.intdigest() == other.digest:
                 different[-1] = other.rows, stop
                 return
 

@@ -153,41 +153,33 @@ class PartitionFile:
             else:
                 raise
 
-    def write(self, row: int, block: Array) -> None:
-        """Write rows without committing them.
+    def append(self, row: int, block: Array, rows: int, *, durable: bool) -> None:
+        """Write rows, and make the first `rows` rows of the file part of the dataset.
 
         Args:
             row: Number of the first one in the file.
             block: Contiguous rows of the field's own type, shape (count, *field shape).
-        """
-        if not self._row_nbytes:
-            return
-        content = files.as_bytes(block)
-        if len(content) < LARGE and not self._digester.pending:
-            self._digests.update(content)
-        else:
-            self._digester.update(self._digests, content)
-        files.write_at(self.descriptor, content, self.data_offset + row * self._row_nbytes)
-
-    def commit(self, rows: int, *, durable: bool) -> None:
-        """Make the first `rows` rows, including those just written, part of the dataset.
-
-        Args:
-            rows: Number of rows.
+            rows: Number of rows of the file, including these.
             durable: Whether the caller syncs the file before it continues.
         """
-        if self._digester.pending:
-            self._digester.wait()
-        if self._digests.finished:  # their digests must be there before rows that rely on them
-            self._store_digests()
+        digests, nbytes = self._digests, block.nbytes
+        pieces: list[tuple[bytes | memoryview, int]] = []
+        offset = self.data_offset + row * self._row_nbytes
+        if nbytes < digests.left and nbytes < LARGE:
+            digests.left -= nbytes
+            digests.running.update(block.data)
+            pieces.append((block.data, offset))
+        else:
+            self._write(block, offset)
         before = self.committed
-        commit = rows, before[1], self._digests.intdigest()
+        commit = rows, before[1], digests.running.intdigest()
         content = _NEWEST.pack(rows, *commit)
         if durable:
             first, second = (before, commit) if self._next_mark else (commit, before)
             content += RECORD.pack(*first) + RECORD.pack(*second)
             self._next_mark = 1 - self._next_mark
-        files.write_at(self.descriptor, content, self._rows_offset)
+        pieces.append((content, self._rows_offset))
+        files.write_pieces(self.descriptor, pieces)
         self.committed = commit
 
     def withdraw(self, commit: tuple[int, int, int]) -> None:
@@ -202,7 +194,7 @@ class PartitionFile:
             found = self._rows.read(self.descriptor, base, rows)
             self._digests = self._rows.begin(rows) if found is None else found
             self._store_digests()
-            self.committed = rows, base, self._digests.intdigest()
+            self.committed = rows, base, self._digests.running.intdigest()
             files.sync(self.descriptor)
             files.write_at(self.descriptor, encode(self.committed), self._rows_offset)
             files.sync(self.descriptor)
@@ -245,6 +237,15 @@ class PartitionFile:
             with self._lock:
                 descriptor, self.descriptor = self.descriptor, -1
             files.close(descriptor)
+
+    def _write(self, block: Array, offset: int) -> None:
+        """Write rows that complete a block of rows with a digest, or a large block."""
+        content = files.as_bytes(block)
+        self._digester.update(self._digests, content)
+        files.write_at(self.descriptor, content, offset)
+        self._digester.wait()
+        if self._digests.finished:  # they must be there before rows that rely on them
+            self._store_digests()
 
     def _store_digests(self) -> None:
         first, content = self._digests.take()
