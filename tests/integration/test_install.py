@@ -36,6 +36,29 @@ validation_split = 0.5
 [pipelines.linear.training.network]
 network = "toy/linear"
 """
+CRANE = """
+<robot name="crane">
+  <link name="base"/>
+  <link name="hook"><inertial><mass value="2"/>
+    <inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="lift" type="prismatic"><parent link="base"/><child link="hook"/>
+    <axis xyz="0 0 1"/><limit lower="0" upper="1" effort="9" velocity="1"/></joint>
+</robot>
+"""
+READ = """
+from pathlib import Path
+from physx_core.errors import PluginNotFoundError
+from physx_core.plugins import resolve
+from physx_sim import Box, Robot, UrdfTree, World, parse_urdf
+
+world = World([Robot("crane.urdf")], objects=[Box(name="a box", size=(1, 1, 1))])
+links = UrdfTree(parse_urdf(Path("crane.urdf"))).links
+print(links[-1], world.objects[0].name, sep=", ")
+try:
+    resolve("backend", "dart")
+except PluginNotFoundError as error:
+    print(error)
+"""
 ASK = """
 import socket, sys
 with socket.socket(type=socket.SOCK_DGRAM) as link:
@@ -162,6 +185,29 @@ def test_torch_adds_its_network(python, add, run):
 def test_each_plugin_works_with_the_core_alone(name, command, python, add, run):
     add(name)
     assert "20 training" in run(*PHYSX, *command.split(), python=python).stderr
+
+
+def test_sim_reads_a_robot_and_has_no_engine(python, add, run, tmp_path):
+    add("physx_sim")
+    (tmp_path / "crane.urdf").write_text(CRANE)
+    (tmp_path / "program.py").write_text(READ)
+    done = run("program.py", python=python).stdout
+    assert "hook, a box" in done
+    assert 'No plugin "dart" is installed' in done and "pip install" in done
+
+
+def test_formats_exports_and_imports(python, add, run, tmp_path):
+    add("physx_formats")
+    generate(run, python)
+    run(*PHYSX, "export", "sessions/data_generation", "rows.npz", "--to", "npz", python=python)
+    assert "20 training samples" in run(*PHYSX, "import", "rows.npz", "copy", python=python).stdout
+
+
+def test_testing_writes_a_plugin_and_checks_a_component(python, add, run, tmp_path):
+    add("physx_testing")
+    run(*PHYSX, "new", "environment", "mine", python=python)
+    assert (tmp_path / "physx-mine/pyproject.toml").exists()
+    assert "toy/spring" in run(*PHYSX, "check", "toy/spring", python=python).stdout
 
 
 def test_remote_works_with_the_core_alone(python, add, run, tmp_path):

@@ -208,8 +208,19 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
             UsageError: If results of `send` are pending.
             PhysxError: If an environment raises, or a process fails.
         """
-        self.send(actions)
-        self._take(self.num_envs)
+        if any(self._owed):
+            self.send(actions)  # which names one of them
+        workers = self._open()
+        for name, array in self._action_arrays(actions, self.num_envs).items():
+            self._batch.actions[name][:] = array
+        try:
+            for number, mine in enumerate(self._shares):
+                workers.ask(number, mine)
+            workers.wait(sum(workers.asked))
+        except BaseException:  # after an interrupt, `recv` and `reset` wait for them
+            self._owe_all()
+            raise
+        self._read_messages()
         return self._results(None)
 
     def async_reset(
@@ -299,9 +310,8 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         """Have environments step."""
         workers = self._open()
         if ids is self._all:
-            self._owes[:] = True
+            self._owe_all()
             for number, mine in enumerate(self._shares):
-                self._owed[number].extend(range(*self._starts[number : number + 2]))
                 workers.ask(number, mine)
             return
         self._owes[ids] = True
@@ -311,6 +321,18 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
                 mine = ids[first:last]
                 self._owed[number].extend(mine.tolist())
                 workers.ask(number, mine - self._starts[number])
+
+    def _owe_all(self) -> None:
+        """Note that the results of all environments are pending."""
+        self._owes[:] = True
+        for owed, bounds in zip(self._owed, pairwise(self._starts), strict=True):
+            owed.extend(range(*bounds))
+
+    def _read_messages(self) -> None:
+        messages = self._workers.messages
+        if messages:
+            self._infos.learn(messages)
+            messages.clear()
 
     def _take(self, count: int) -> Array:
         """Wait for `count` results, or all pending ones; return their environments, in order."""
@@ -332,9 +354,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
                 self._next = (self._next + 1) % len(ready)
             taken = np.array(sorted(found))
         self._owes[taken] = False
-        if workers.messages:
-            self._infos.learn(workers.messages)
-            workers.messages.clear()
+        self._read_messages()
         return taken
 
     def _chosen(self, env_ids: Any) -> Array:
@@ -379,10 +399,14 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
 
     def _results(self, ids: Array | None) -> tuple[Any, Array, Array, Array, dict[str, Any]]:
         """Return the results of environments; None: of all."""
-        batch, chosen = self._batch, slice(None) if ids is None else ids
-        ends = batch.rewards, batch.terminated, batch.truncated
-        rewards, terminated, truncated = (np.array(array[chosen]) for array in ends)
-        infos = self._infos_of(ids, batch.kinds[chosen], terminated | truncated)
+        batch = self._batch
+        results = batch.rewards, batch.terminated, batch.truncated, batch.kinds
+        if ids is None:
+            rewards, terminated, truncated, kinds = [array.copy() for array in results]
+        else:
+            rewards, terminated, truncated, kinds = [array[ids] for array in results]
+        over = terminated | truncated if batch.finals else None
+        infos = self._infos_of(ids, kinds, over)
         return self._observed(ids), rewards, terminated, truncated, infos
 
     def _observed(self, ids: Array | None) -> Any:
@@ -400,10 +424,12 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         Args:
             ids: The environments; None: all.
             kinds: The forms of their infos.
-            over: Whether their episodes are over; None: they have just begun.
+            over: Whether their episodes are over, if their last observations are kept; None: they
+                have just begun, or are not kept.
         """
-        batch, found = self._batch, set(kinds.tolist()) - {InfoKind.NONE}
-        has_finals = bool(batch.finals) and over is not None and bool(over.any())
+        batch, found = self._batch, set(kinds.tolist())
+        found.discard(InfoKind.NONE)
+        has_finals = over is not None and bool(over.any())
         if not found and not has_finals:
             return {}
         if len(found) == 1 and not has_finals:
