@@ -38,6 +38,7 @@ docs: .venv/tools
 	@echo docs/_build/docs/index.html
 
 bench: .venv/packages
+	$(BIN)/python benchmarks/calls.py
 	$(BIN)/python benchmarks/generation.py
 	$(BIN)/python benchmarks/training.py
 	$(BIN)/python benchmarks/prediction.py

@@ -8,7 +8,7 @@ pytestmark = [pytest.mark.faults, pytest.mark.processes]
 
 PROGRAM = Path(__file__).with_name("programs") / "one_round.py"
 QUICK = (
-    "backends", "checkpoint", "differentiable", "faults", "generation", "idle_threads",
+    "backends", "calls", "checkpoint", "differentiable", "faults", "generation", "idle_threads",
     "prediction", "remote", "training",
 )  # fmt: skip
 """Those that take seconds with a single round."""
