@@ -32,6 +32,7 @@ lint: .venv/tools
 	$(BIN)/ruff format --check .
 	$(BIN)/mypy
 	$(BIN)/lint-imports
+	$(BIN)/towncrier build --draft --version next >/dev/null
 
 docs: .venv/tools
 	$(BIN)/python -m sphinx -q -W --keep-going -b html -c docs . docs/_build
