@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import statistics
 import sys
 import time
@@ -92,6 +93,13 @@ def claim(
         met, target = at_most is not None and value <= at_most, f"at most {at_most:g}"
     print(f"  {what}: {value:.4g}, target {target}: {'met' if met else 'MISSED'}\n")
     return met
+
+
+def device() -> str:
+    """Return the device that ``--device`` names; else the processor."""
+    parser = argparse.ArgumentParser(add_help=False)
+    parser.add_argument("--device", default="cpu")
+    return str(parser.parse_known_args()[0].device)
 
 
 def finish(met: list[bool]) -> None:

@@ -6,6 +6,8 @@ with the checks of its sample, the prediction in physical units, and passing it 
 `Environment.get_prediction`, which a step may call, is measured as well. The environment itself
 does nothing.
 
+    python benchmarks/prediction.py --device cuda    # both on a GPU
+
 Claims: at most twice as long, at most 50 µs more.
 """
 
@@ -20,7 +22,7 @@ from typing import ClassVar
 
 import numpy as np
 import torch
-from measure import claim, finish
+from measure import claim, device, finish
 
 from physx_core import (
     Dataset,
@@ -105,7 +107,9 @@ def trained(root: Path, layers: list[int], ins: tuple[int, ...], outs: tuple[int
     with Dataset.create(root / "data") as dataset:
         rows = {"input": rng.random((16, *ins)), "ground_truth": rng.random((16, *outs))}
         dataset.append("training", rows)
-    network = NetworkConfig("torch/fc", {"layers": layers}, loss="MSELoss", optimizer="Adam")
+    network = NetworkConfig(
+        "torch/fc", {"layers": layers}, loss="MSELoss", optimizer="Adam", device=device()
+    )
     data = DatasetConfig(existing_dir=str(root / "data"), normalize=False)
     Training(network, data, session_dir=str(root), epoch_nb=1, batch_size=16).execute()
 
@@ -117,7 +121,8 @@ def compare(title: str, root: Path) -> list[bool]:
     environment = EnvironmentConfig(
         Still, {"inputs": list(ins), "outputs": list(outs)}, as_tcp_ip_client=False
     )
-    pipeline = Prediction(NetworkConfig(), environment, session_dir=str(root))
+    place = device()
+    pipeline = Prediction(NetworkConfig(device=place), environment, session_dir=str(root))
     with pipeline:
         pipeline.prediction_begin()
         stack = pipeline.learner.network.layers
@@ -125,8 +130,8 @@ def compare(title: str, root: Path) -> list[bool]:
 
         def alone() -> np.ndarray:
             with torch.no_grad():
-                tensor = torch.as_tensor(x[np.newaxis], dtype=torch.float32)
-                return stack(tensor.reshape(1, -1)).numpy()
+                tensor = torch.as_tensor(x[np.newaxis], dtype=torch.float32).to(place)
+                return stack(tensor.reshape(1, -1)).cpu().numpy()
 
         def step() -> None:
             pipeline.sample_begin()

@@ -4,6 +4,8 @@ Claim: physx, which reads its batches from the stored dataset, normalization asi
 0.9 times as many batches per second; and with statistics to CSV and TensorBoard, at least 0.9 times
 as many as without. Before each step, physx also checks that the gradients are finite, which the
 plain loop does not; a run without this check (`on_nan="continue"`) is printed for comparison.
+
+    python benchmarks/training.py --device cuda    # both on a GPU, to which each batch is copied
 """
 
 from __future__ import annotations
@@ -15,7 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from measure import finish, rates, report
+from measure import device, finish, rates, report
 
 from physx_core import Dataset, DatasetConfig, NetworkConfig, Training
 from physx_core.observers import Observers, ProgressBar
@@ -30,7 +32,8 @@ CASES = {
 
 def plain_loop(layers: list[int], x: np.ndarray, y: np.ndarray, batches: int) -> Callable[[], int]:
     """Return a round of training without physx."""
-    network = FC(layers, net_fields="input", opt_fields="ground_truth")
+    place = device()
+    network = FC(layers, net_fields="input", opt_fields="ground_truth").to(place)
     inputs = torch.from_numpy(x.astype(np.float32)).reshape(len(x), -1)
     targets = torch.from_numpy(y.astype(np.float32))
     stack, loss_function = network.layers, torch.nn.MSELoss()
@@ -41,7 +44,8 @@ def plain_loop(layers: list[int], x: np.ndarray, y: np.ndarray, batches: int) ->
         for number in range(batches):
             first = number * BATCH % (len(order) - BATCH + 1)
             chosen = order[first : first + BATCH]
-            loss = loss_function(stack(inputs[chosen]), targets[chosen])
+            taken = inputs[chosen].to(place), targets[chosen].to(place)
+            loss = loss_function(stack(taken[0]), taken[1])
             optimizer.zero_grad(set_to_none=True)
             loss.backward()
             optimizer.step()
@@ -105,6 +109,7 @@ def main() -> None:
                 loss="MSELoss",
                 optimizer="Adam",
                 lr=1e-3,
+                device=device(),
             )
             training = partial(
                 Training,
