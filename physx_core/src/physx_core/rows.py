@@ -70,7 +70,8 @@ class RowBuffer:
         self._floating = [
             (field, array) for _, array, _, dtype, field in self._slots if dtype.kind in "fc"
         ]
-        self._numbers = [self._arrays[field.name] for field in ROW_FIELDS] if numbered else []
+        # A memoryview writes a number in half the time an array takes.
+        self._numbers = [self._arrays[field.name].data for field in ROW_FIELDS if numbered]
 
     @property
     def full(self) -> bool:
@@ -154,7 +155,7 @@ class RowBuffer:
         if wrong is not None:
             instance_id, step = 0, -1
             if self._numbers:
-                instance_id, step = int(self._numbers[0][count]), int(self._numbers[2][count])
+                instance_id, step = self._numbers[0][count], self._numbers[2][count]
             self.count = self._finite = count
             raise wrong.not_finite(instance_id=instance_id, step=step)
 

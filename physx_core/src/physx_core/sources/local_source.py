@@ -116,16 +116,17 @@ class LocalSource(Source):
             buffer = self._buffer = RowBuffer(buffer.fields[: -len(ROW_FIELDS)], size)
         elif buffer is not None and buffer.count:  # an error ended the last batch
             buffer.clear()
+        instances, redraws = self._instances, self._redraws
         while self._next < first + size:
             place = self._next % count
-            instance = self._instances[place]
+            instance = instances[place]
             given = None if stored is None else copy_row(stored, self._next - first)
             try:
                 sample = instance.step(given)
                 if buffer is None:
                     buffer = self._buffer = RowBuffer(infer_shapes(instance.fields, sample), size)
                 episode, step = instance.last_episode, instance.last_step
-                buffer.put(sample, place + 1, episode, step, finite=self._redraws)
+                buffer.put(sample, place + 1, episode, step, finite=redraws)
             except PhysxError as error:
                 self._redraw(place, error)
             else:
