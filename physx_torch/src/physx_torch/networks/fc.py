@@ -128,14 +128,17 @@ class FC(TorchNetwork):
         Args:
             inputs: One tensor for each field, of shape (samples, *field shape).
         """
+        first = inputs[0]
         if len(inputs) == 1:
-            return self._flatten(inputs[0])
+            is_flat = first.dim() == 2 and first.is_floating_point()
+            return first if is_flat else self._flatten(first)
         return torch.cat([self._flatten(tensor) for tensor in inputs], dim=1)
 
     def split_outputs(self, output: torch.Tensor) -> torch.Tensor | list[torch.Tensor]:
         """Split outputs of shape (samples, number) into prediction fields with their shapes."""
         if len(self._shapes) == 1:
-            return _reshape(output, self._shapes[0])
+            shape = self._shapes[0]
+            return output if len(shape) == 1 else _reshape(output, shape)
         parts = output.split([math.prod(shape) for shape in self._shapes], dim=1)
         return [_reshape(part, shape) for part, shape in zip(parts, self._shapes, strict=True)]
 

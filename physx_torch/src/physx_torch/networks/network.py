@@ -94,7 +94,7 @@ class TorchNetwork(torch.nn.Module, Network):
             pred_fields = self.opt_fields
         self.pred_fields = _names("pred_fields", pred_fields, self.pred_fields)
         self.device = torch.device("cpu")
-        self.data_type = torch.float32
+        self.data_type, self._array_type = torch.float32, np.dtype(np.float32)
         self._training_forward: Callable[..., Any] | None = None
         self.differentiates = False
 
@@ -135,7 +135,7 @@ class TorchNetwork(torch.nn.Module, Network):
             FieldsMismatchError: If ``forward`` does not return `pred_fields`.
         """
         try:
-            inputs = [data[name] for name in self.net_fields]
+            inputs = list(map(data.__getitem__, self.net_fields))
         except KeyError as error:
             raise MissingFieldError(
                 f'{type(self).__name__} reads the field "{error.args[0]}", which is missing. '
@@ -152,12 +152,15 @@ class TorchNetwork(torch.nn.Module, Network):
             if tensor.requires_grad:
                 return self._by_field(self(*inputs))
         if not self.differentiates:
+            recorded = torch.is_grad_enabled()
+            torch.set_grad_enabled(False)  # in half the time of torch.no_grad()
             try:
-                with torch.no_grad():
-                    return self._by_field(self(*inputs))
+                return self._by_field(self(*inputs))
             except RuntimeError as error:
                 if _LACKS_GRADIENTS not in str(error):
                     raise
+            finally:
+                torch.set_grad_enabled(recorded)
             self.differentiates = True
         with torch.enable_grad():
             prediction = self._by_field(self(*inputs))
@@ -259,7 +262,7 @@ class TorchNetwork(torch.nn.Module, Network):
         if data_type not in DATA_TYPES:
             raise ConfigError(f'data_type is "{data_type}" but must be {listed(DATA_TYPES)}.')
         _check_type(DATA_TYPES[data_type], self.device)
-        self.data_type = DATA_TYPES[data_type]
+        self.data_type, self._array_type = DATA_TYPES[data_type], np.dtype(data_type)
         self._apply(lambda tensor: _to_precision(tensor, self.data_type))
 
     def get_parameters(self) -> dict[str, torch.Tensor]:
@@ -342,11 +345,22 @@ class TorchNetwork(torch.nn.Module, Network):
         Raises:
             FieldTypeError: If an integer does not fit into int64.
         """
-        return {name: self._tensor(name, array) for name, array in batch.items()}
+        on_cpu, own, tensors = self.device.type == "cpu", self._array_type, {}
+        for name, array in batch.items():
+            dtype = array.dtype
+            if not on_cpu or dtype.kind != "f":
+                tensors[name] = self._tensor(name, array)
+            elif dtype == own:
+                regular = array.flags.carray  # as are a training's batches
+                tensors[name] = torch.from_numpy(array if regular else _to_compatible(array))
+            else:
+                with np.errstate(over="ignore"):  # NumPy converts in half the time of torch
+                    tensors[name] = torch.from_numpy(array.astype(own))
+        return tensors
 
     def _tensor(self, name: str, array: Array) -> torch.Tensor:
         kind = array.dtype.kind
-        if kind == "f" and array.dtype.itemsize <= _WIDEST["f"]:  # nearly always: convert once
+        if kind == "f" and array.dtype.itemsize <= _WIDEST["f"]:
             return torch.from_numpy(_to_compatible(array)).to(self.device, self.data_type)
         if kind in "iu" and array.dtype != np.int64:
             array = _to_int64(name, array)
@@ -357,7 +371,10 @@ class TorchNetwork(torch.nn.Module, Network):
 
     def tensor_to_numpy(self, tensors: Tensors) -> Batch:
         """Return tensors as arrays; those on the CPU share memory."""
-        return {name: tensor.numpy(force=True) for name, tensor in tensors.items()}
+        arrays = {}
+        for name, tensor in tensors.items():
+            arrays[name] = tensor.numpy(force=True)
+        return arrays
 
 
 def _to_int64(name: str, array: Array) -> Array:
