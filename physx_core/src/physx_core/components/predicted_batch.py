@@ -87,7 +87,10 @@ class PredictedBatch:
 
 def pick(data: Mapping[str, Any], names: Sequence[str]) -> dict[str, Any]:
     """Return some of the fields."""
-    return dict(zip(names, map(data.__getitem__, names), strict=True))
+    picked = {}  # a loop, as a comprehension takes twice as long for few fields
+    for name in names:
+        picked[name] = data[name]
+    return picked
 
 
 def predict(network: Network, transformation: Transformation, data: Tensors) -> Tensors:

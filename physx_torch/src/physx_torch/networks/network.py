@@ -94,7 +94,7 @@ class TorchNetwork(torch.nn.Module, Network):
             pred_fields = self.opt_fields
         self.pred_fields = _names("pred_fields", pred_fields, self.pred_fields)
         self.device = torch.device("cpu")
-        self.data_type, self._array_type = torch.float32, np.dtype(np.float32)
+        self.data_type = torch.float32
         self._training_forward: Callable[..., Any] | None = None
         self.differentiates = False
 
@@ -262,7 +262,7 @@ class TorchNetwork(torch.nn.Module, Network):
         if data_type not in DATA_TYPES:
             raise ConfigError(f'data_type is "{data_type}" but must be {listed(DATA_TYPES)}.')
         _check_type(DATA_TYPES[data_type], self.device)
-        self.data_type, self._array_type = DATA_TYPES[data_type], np.dtype(data_type)
+        self.data_type = DATA_TYPES[data_type]
         self._apply(lambda tensor: _to_precision(tensor, self.data_type))
 
     def get_parameters(self) -> dict[str, torch.Tensor]:
@@ -345,23 +345,19 @@ class TorchNetwork(torch.nn.Module, Network):
         Raises:
             FieldTypeError: If an integer does not fit into int64.
         """
-        on_cpu, own, tensors = self.device.type == "cpu", self._array_type, {}
+        on_cpu, own, tensors = self.device.type == "cpu", self.data_type, {}
         for name, array in batch.items():
             dtype = array.dtype
-            if not on_cpu or dtype.kind != "f":
-                tensors[name] = self._tensor(name, array)
-            elif dtype == own:
-                regular = array.flags.carray  # as are a training's batches
-                tensors[name] = torch.from_numpy(array if regular else _to_compatible(array))
+            if dtype.char in "fd" and dtype.isnative and array.flags.carray:  # nearly always
+                tensor = torch.from_numpy(array)
+                is_own = on_cpu and tensor.dtype is own  # as of a training's batches
+                tensors[name] = tensor if is_own else tensor.to(self.device, own)
             else:
-                with np.errstate(over="ignore"):  # NumPy converts in half the time of torch
-                    tensors[name] = torch.from_numpy(array.astype(own))
+                tensors[name] = self._tensor(name, array)
         return tensors
 
     def _tensor(self, name: str, array: Array) -> torch.Tensor:
         kind = array.dtype.kind
-        if kind == "f" and array.dtype.itemsize <= _WIDEST["f"]:
-            return torch.from_numpy(_to_compatible(array)).to(self.device, self.data_type)
         if kind in "iu" and array.dtype != np.int64:
             array = _to_int64(name, array)
         elif array.dtype.itemsize > _WIDEST.get(kind, np.inf):  # unknown to torch
