@@ -127,6 +127,30 @@ def test_the_variance_is_that_of_the_last_fifty_batches_and_epochs(data):
         assert math.isclose(found["loss/training_variance"][count - 1], variance)
 
 
+def test_the_numbers_do_not_depend_on_when_they_are_reported(data, monkeypatch):
+    written = []
+    for seconds in (-1.0, 0.0003, 1e9):  # after each batch, some batches, each epoch
+        monkeypatch.setattr("physx_core.pipelines.training.REPORT_SECONDS", seconds)
+        config = NetworkConfig(Linear, optimization=LeastSquares)
+        pipeline = Training(config, DATA, epoch_nb=30, batch_size=3, seed=0)
+        pipeline.execute()
+        written.append((pipeline.session.path / "stats" / "scalars.csv").read_text())
+    assert written[0].count("loss/batch") == 120
+    assert written == [written[0]] * 3
+
+
+def test_observers_without_a_method_of_their_own_are_not_called(data):
+    told = []
+
+    class Silent(Observer):
+        def __getattribute__(self, name):
+            told.append(name)
+            return super().__getattribute__(name)
+
+    training([1.0], statistics=[Silent], batch_nb=50).execute()
+    assert told.count("scalars") == told.count("advance") == 1  # looked up once
+
+
 def test_validation_every_k_epochs(validated):
     pipeline = training([4.0, 3.0, 2.0, 1.0, 0.5], validation_every=2)
     with pipeline:

@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
+import re
 import warnings
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -11,6 +14,8 @@ import torch
 from physx_core import Dataset, DatasetConfig, NetworkConfig, Training, Transformation
 from physx_core.components import PredictedBatch
 from physx_core.errors import DivergedError
+from physx_core.observers import read_scalars
+from physx_core.pipelines import load_learner
 from physx_torch import FC, TorchNetwork, TorchOptimization
 
 
@@ -67,6 +72,58 @@ def test_a_gradient_that_is_nan_is_named_and_changes_nothing(options):
     assert not is_equal(network, before) and network.find_not_finite() == ""
 
 
+class Parts(TorchNetwork):
+    """Has parameters of one kind, small or large, and uses one row of the last."""
+
+    def __init__(self, size=3, count=4, dtype=torch.float32, sparse=False):
+        super().__init__()
+        values = [torch.ones(size, 2, dtype=dtype) for _ in range(count)]
+        self.parts = torch.nn.ParameterList(values)
+        self.sparse = torch.nn.Embedding(size, 2, sparse=True) if sparse else None
+
+    def forward(self, x):
+        products = [(part * x[0, 0]).sum() for part in self.parts]
+        if self.sparse is not None:
+            products.append(self.sparse(torch.tensor([0, 1])).sum())
+        return torch.stack(products).sum().reshape(1, 1)
+
+
+def real_sum(prediction, target):
+    """Has a gradient of 1 for each value."""
+    return torch.view_as_real(prediction).sum() if prediction.is_complex() else prediction.sum()
+
+
+KINDS = [{}, {"size": 5000}, {"dtype": torch.complex64}, {"dtype": torch.complex64, "size": 5000}]
+KINDS += [{"sparse": True}, {"sparse": True, "size": 5000}, {"dtype": torch.float64, "size": 5000}]
+
+
+@pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("kind", KINDS, ids=str)
+def test_one_gradient_of_any_kind_that_is_not_finite_is_found_in_the_step_that_makes_it(kind, bad):
+    network = Parts(**kind)
+    network.set_train()
+    optimization = TorchOptimization()
+    optimization.set_loss(real_sum)
+    optimization.set_optimizer("SGD", network, lr=0.1, momentum=0.9)
+    data = network.numpy_to_tensor({"input": np.ones((1, 1)), "ground_truth": np.ones((1, 1))})
+    learn(network, optimization, data)
+
+    def spoil(gradient):
+        gradient = gradient.clone()
+        (gradient._values() if gradient.is_sparse else gradient)[1, 0] = bad
+        return gradient
+
+    for name, parameter in network.named_parameters():
+        before = content(network)
+        with pytest.raises(DivergedError, match=f'gradient of the parameter "{re.escape(name)}"'):
+            hook = parameter.register_hook(spoil)
+            learn(network, optimization, data)
+        hook.remove()
+        assert is_equal(network, before)
+        learn(network, optimization, data)  # nothing is left of it
+        assert not is_equal(network, before) and network.find_not_finite() == ""
+
+
 @pytest.mark.parametrize("options", [{}, {"accumulate": 2}, {"mixed_precision": "float16"}])
 def test_a_loss_that_is_nan_changes_nothing(options):
     network, optimization = made(nan, **options)
@@ -83,12 +140,16 @@ def test_whoever_wants_to_continue_can():
     assert network.find_not_finite() == "layers.0.weight"
 
 
-def test_gradients_so_large_that_only_their_norm_overflows_are_fine():
-    network, optimization = made(lambda prediction, target: 1e30 * (prediction - target).sum())
-    optimization.set_optimizer("SGD", network, lr=1e-31)
+@pytest.mark.parametrize("hidden", [8, 5000])
+def test_gradients_so_large_that_only_their_norm_or_sum_overflows_are_fine(hidden):
+    network = FC([2, hidden, 1])
+    network.set_train()
+    optimization = TorchOptimization()
+    optimization.set_loss(lambda prediction, target: 1e36 * prediction.sum())
+    optimization.set_optimizer("SGD", network, lr=1e-37)
     before = content(network)
     learn(network, optimization, samples(network))
-    assert not is_equal(network, before)
+    assert not is_equal(network, before) and network.find_not_finite() == ""
 
 
 def test_a_step_that_the_scaler_of_float16_leaves_out_is_no_divergence():
@@ -153,6 +214,39 @@ def test_tensors_that_a_loss_returns_become_numbers_without_a_warning(data):
         training.execute()
     assert training.losses["twice"] == 2 * training.losses["loss"]
     assert all(type(value) is float for value in training.losses.values())
+
+
+class Spoiled(Training):
+    """Has a gradient that is NaN in the second batch of the second epoch."""
+
+    def batch_begin(self):
+        if (self.epoch_id, self.batch_id) == (1, 1):
+            network = self.learner.network
+            self.before = content(network)
+            network.layers[0].bias.register_hook(lambda gradient: gradient * torch.nan)
+
+
+@pytest.mark.parametrize("resumes", [False, True])
+@pytest.mark.parametrize("options", [{}, {"gradient_clip": 0.1}, {"accumulate": 2}], ids=str)
+@pytest.mark.parametrize("optimizer", ["Adam", "SGD"])
+def test_the_network_before_the_first_gradient_that_is_nan_is_kept(
+    data, optimizer, options, resumes
+):
+    network = dataclasses.replace(
+        config(loss="MSELoss", optimization_kwargs=options),
+        optimizer=optimizer,
+        optimizer_kwargs={"lr": 0.05} | ({"momentum": 0.9} if optimizer == "SGD" else {}),
+    )
+    train = {"batch_size": 10, "seed": 3, "quiet": True}
+    if resumes:
+        Training(network, data, epoch_nb=1, **train).execute()
+    spoiled = Spoiled(network, data, epoch_nb=3, resume=resumes, **train)
+    with pytest.raises(DivergedError, match="Epoch 2, batch 2: the gradient of the par"):
+        spoiled.execute()
+    kept = load_learner("sessions/training").network
+    assert is_equal(kept, spoiled.before)
+    losses = read_scalars(Path("sessions/training"))["batch", "loss/batch"]
+    assert list(losses) == [1, 2, 3, 4, 5]
 
 
 def test_a_training_says_where_the_gradient_became_nan(data):

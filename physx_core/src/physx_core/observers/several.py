@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -20,6 +20,7 @@ class Observers(Observer):
     def __init__(self, observers: Iterable[Observer]) -> None:
         self._observers = list(observers)
         self._muted: list[Observer] = []
+        self._calls: dict[str, list[tuple[Observer, Callable[..., Any]]]] = {}
 
     def open(self, run_name: str, session_dir: Path, instance_nb: int) -> None:
         """Announce a run. Here observers' errors are raised, because the user can fix them.
@@ -47,7 +48,8 @@ class Observers(Observer):
 
     def advance(self, count: int) -> None:
         """Report the progress of the loop."""
-        self._call("advance", count)
+        if self._calls.get("advance", True):  # after every sample of a run
+            self._call("advance", count)
 
     def end(self) -> None:
         """Announce the end of the loop."""
@@ -95,20 +97,27 @@ class Observers(Observer):
 
     def outputs(self) -> Sequence[str]:
         """Return the lines of all observers, including those that have failed."""
-        self._observers, self._muted = [*self._observers, *self._muted], []
+        self._observers, self._muted, self._calls = [*self._observers, *self._muted], [], {}
         return [line for lines in self._call("outputs") for line in lines]
 
     def _call(self, method: str, *arguments: Any) -> list[Any]:
-        """Call a method of each observer and return what they return."""
+        """Call a method of each observer that has its own, and return what they return."""
+        if method not in self._calls:
+            empty = getattr(Observer, method)
+            calls = [(each, getattr(each, method)) for each in self._observers]
+            self._calls[method] = [
+                call for call in calls if getattr(call[1], "__func__", None) is not empty
+            ]
         returned = []
-        for observer in self._observers:
+        for observer, call in self._calls[method]:
             try:
-                returned.append(getattr(observer, method)(*arguments))
+                returned.append(call(*arguments))
             except BaseException as error:
                 if not isinstance(error, Exception) and not is_ending(error):
                     raise
-                # A new list: this loop continues with the old one.
+                # New lists: this loop continues with the old one.
                 self._observers = [other for other in self._observers if other is not observer]
+                self._calls = {}
                 self._muted.append(observer)
                 warnings.warn(
                     f"{type(observer).__name__} failed and is disabled from here on: "

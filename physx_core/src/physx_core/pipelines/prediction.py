@@ -12,7 +12,7 @@ from typing import ClassVar
 from physx_core.components.environment import not_finite_prediction
 from physx_core.config import DatasetConfig, EnvironmentConfig, NetworkConfig, at_least, options
 from physx_core.dataset import Dataset
-from physx_core.fields import Field, first_not_finite
+from physx_core.fields import Field, first_not_finite, is_finite
 from physx_core.pipelines.learning.learner import Learner, load_learner
 from physx_core.pipelines.pipeline import Pipeline, choose_seed, derive_seed
 from physx_core.pipelines.run_description import (
@@ -33,6 +33,8 @@ from physx_core.processes import deferred_interrupt
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
+
+_NOTHING = contextlib.nullcontext()
 
 
 @options
@@ -127,15 +129,16 @@ class Prediction(Pipeline):
 
     def predict(self) -> None:
         """Step the environments, predict, and apply the predictions; then count the step."""
-        count = self.source.instance_nb
-        with record_beside_rows(self.source, self.dataset, "prediction"):
+        count, dataset = self.source.instance_nb, self.dataset
+        beside = record_beside_rows(self.source, dataset, "prediction") if dataset else _NOTHING
+        with beside:
             stored = None if self._stored is None else self._stored.take_cyclic(count)
             self.batch = self.source.batch(count, stored)
             self.prediction = self.learner.predict(self.batch)
             self._check(self.prediction)
             self.source.apply(self.prediction)
-            if self.dataset is not None:
-                self._store(self.dataset)
+            if dataset:
+                self._store(dataset)
         self._count_step()
 
     def _count_step(self) -> None:
@@ -159,8 +162,8 @@ class Prediction(Pipeline):
     def _check(self, prediction: Batch) -> None:
         """Check that the prediction is finite."""
         for name, values in prediction.items():
-            row = first_not_finite(values)
-            if row is not None:
+            if not is_finite(values):
+                row = first_not_finite(values)
                 instance_id, step = (int(self.batch[key][row]) for key in ("env_id", "step"))
                 raise not_finite_prediction(name).at(instance_id, step)
 

@@ -27,7 +27,7 @@ from physx_core.config import (
 )
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, DivergedError
-from physx_core.observers import statistics_observers
+from physx_core.observers import REPORT_SECONDS, statistics_observers
 from physx_core.pipelines.learning.bound_options import bound_options, check_bound
 from physx_core.pipelines.learning.components import create
 from physx_core.pipelines.learning.data_record import describe_changes, record_data
@@ -57,8 +57,6 @@ _ADVICE = (
     'on_nan="continue" ignores this.'
 )
 _KEPT_WITHIN_EPOCHS = 2
-_SESSION_INTERVAL = 1.0
-"""Time in s between checks that the session's folder still exists."""
 
 
 @options
@@ -164,7 +162,7 @@ class Training(NewSessionPipeline):
     validation_loss: float = field(init=False, repr=False, default=float("nan"))
     best: BestEpoch = field(init=False, repr=False)
     checkpoint_path: Path | None = field(init=False, repr=False, default=None)
-    _checked: float = field(init=False, repr=False, default=0.0)
+    _reported: float = field(init=False, repr=False, default=0.0)
     _within_epochs: list[Path] | None = field(init=False, repr=False, default=None)
     _epoch_batches: int | None = field(init=False, repr=False, default=None)
     _is_savable: bool = field(init=False, repr=False, default=False)
@@ -234,14 +232,15 @@ class Training(NewSessionPipeline):
             return
         names = self.learner.batch_fields
         self._epoch_batches = self.data.begin_epoch(self.epoch_id, names, self.batch_id)
-        if self.data.notice and not self._told_order and self._leads:
-            self.observers.note(self.data.notice)
-            self.session.note(self.data.notice)
+        if self.data.stored.notice and not self._told_order and self._leads:
+            self.observers.note(self.data.stored.notice)
+            self.session.note(self.data.stored.notice)
             self._told_order = True
-        if self.data.has_changed:
+        if self.data.stored.has_changed:
             self.learner.normalize(self.data.normalization())
         if self.epoch_id == self._resumed.epoch:
-            self.data.skip(self._resumed.batches_read)
+            for _ in range(self._resumed.batches_read):  # skipped
+                self.data.next_batch()
             left = (self.epoch_nb - self.epoch_id) * self._epoch_batches - self.batch_id
             self.observers.begin("training", max(0, left), "batches")
 
@@ -262,7 +261,7 @@ class Training(NewSessionPipeline):
         if self._epoch_batches is None:
             self._begin_epoch()
         self.batch = self.data.next_batch()
-        if self.data.produces:  # the normalization grows with the samples
+        if self.data.generated is not None:  # the normalization grows with the samples
             self.learner.bind(self.data.fields, self.data.normalization())
             self.learner.network.set_train()
 
@@ -272,13 +271,14 @@ class Training(NewSessionPipeline):
         Raises:
             DivergedError: If the loss or a gradient is not finite, with ``on_nan="stop"``.
         """
+        made = self.data.generated
+        weight, by_row = (None, False) if made is None else (made.weight, made.learns)
         try:
-            by_row = self.data.wants_row_losses
-            self.losses = self.learner.optimize(self.batch, self.data.weight, by_row=by_row)
+            self.losses = self.learner.optimize(self.batch, weight, by_row=by_row)
         except DivergedError as error:
             raise self._diverged(f"{error}", self.batch_id + 1) from None
-        if by_row:
-            self.data.tell(self.batch, self.learner.row_losses)
+        if made is not None and by_row:
+            made.tell(self.batch, self.learner.row_losses)
         if self.on_nan == "continue" and not math.isfinite(self.losses["loss"]):
             self._continue_after_nan()
         if self._leads and not self._is_savable:
@@ -293,18 +293,28 @@ class Training(NewSessionPipeline):
     def _record_batch(self) -> None:
         """Record the batch's losses."""
         self._recorded = self.losses
-        values = self._record.add(self.losses)
+        self._record.add(self.epoch_id * (self._epoch_batches or 0) + self.batch_id, self.losses)
+        now = time.monotonic()
+        if now > self._reported + REPORT_SECONDS or self.data.generated is not None:
+            self._reported = now
+            self._report()
+            if self._leads:
+                checkpoint.check_session(self.session.network_dir)
+
+    def _report(self) -> None:
+        """Pass the losses of the batches since the last report to the observers."""
+        batches, online = self._record.take_batches(), {}
+        if not batches:
+            return
         if not self._told_fields:
             self.observers.fields(list(self.learner.fields.values()))
             self._told_fields = True
-        if self.data.produces and self.data.online is not None:
+        if self.data.generated is not None and self.data.online is not None:
             self._blocks = self.data.online.number
-            values |= self.data.online.recent_statistics()
-        self.observers.scalars(values, self._number, "batch")
-        self.observers.advance(1)
-        if self._leads and time.monotonic() > self._checked + _SESSION_INTERVAL:
-            checkpoint.check_session(self.session.network_dir)
-            self._checked = time.monotonic()
+            online = self.data.online.recent_statistics()
+        for number, values in batches:
+            self.observers.scalars(values | online, number, "batch")
+        self.observers.advance(len(batches))
 
     @property
     def _number(self) -> int:
@@ -323,13 +333,14 @@ class Training(NewSessionPipeline):
         """Validate, record the epoch's losses, and note the best network, unless that is done."""
         if self._epoch_batches is None:
             return
+        self._report()
         self._epoch_batches, self.batch_id = None, 0
         values = self._record.take_epoch()
         self.training_loss = values.get("loss/training", float("nan"))
         if self.learner.learning_rate is not None:
             values["learning_rate"] = self.learner.learning_rate
         every, judged = self.validation_every, self.training_loss
-        validates = every > 0 and self.data.has_validation
+        validates = every > 0 and self.data.stored.has_validation
         is_due = not validates or self.epoch_id % every == 0
         if validates:
             judged = self._validate(values) if is_due else float("nan")
@@ -360,7 +371,7 @@ class Training(NewSessionPipeline):
         values |= {f"{name}/validation": value for name, value in losses.items()}
         self.validation_loss = losses["loss"]
         if self.observers.want_predictions:
-            samples = self.data.validation_samples(self.learner.batch_fields)
+            samples = self.data.stored.validation_samples(self.learner.batch_fields)
             compared = self.learner.compare(samples, self.validation_batch_size or self.batch_size)
             self.observers.predictions(*compared, self.epoch_id, "epoch")
         if self.on_nan == "stop" and not math.isfinite(self.validation_loss):
@@ -411,16 +422,17 @@ class Training(NewSessionPipeline):
         return Path(self.group.tell(written))
 
     def _write_own(self, *, best: bool = False) -> Path:
+        self._report()
         self.observers.flush()
         progress = Progress(
             self.epoch_id,
             self.batch_id,
-            self.data.batches_read,
+            self.data.stored.count,
             self._resumed.seed,
             self._blocks,
             self.best.state,
             self._record.state,
-            self.data.order,
+            self.data.stored.order,
             bound_options(self, self._resumed.seed, self.group.size),
             self._data_record(),
         )
@@ -433,7 +445,8 @@ class Training(NewSessionPipeline):
         every = self._epoch_batches if self.checkpoint_every == "epoch" else self.checkpoint_every
         if every and self._number % every == 0:
             self._save_within_epoch()
-        if self.group.any(bool(interrupt)) and self.batch_condition():
+        ends = self.group.any(bool(interrupt)) if self.group.size > 1 else interrupt
+        if ends and self.batch_condition():
             self._end_early(interrupt)
 
     def _save_within_epoch(self) -> None:
@@ -506,6 +519,7 @@ class Training(NewSessionPipeline):
     def _close(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         """Keep what was trained since the last checkpoint, by `execute` or by a user's own loop."""
         with deferred_interrupt():
+            self._report()
             if error is not None and not is_from_signal(error):
                 self._save_after(error)
             elif error is None and self._saved != (self.epoch_id, self.batch_id):
@@ -629,7 +643,7 @@ class Training(NewSessionPipeline):
         data, last = self.data, start.checkpoint
         fields = data.fields
         shapes = [fields[name].shape for name in self.learner.batch_fields if name in fields]
-        if not data.produces or None not in shapes:  # else bound with the first batch
+        if data.generated is None or None not in shapes:  # else bound with the first batch
             known = data.normalization()
             was_generated = start.config.existing_dir is None and data.dataset.info.get(GENERATION)
             if last is not None and was_generated:
@@ -670,8 +684,8 @@ class Training(NewSessionPipeline):
         if self.data.online is not None:
             yield from self.data.online.announce()
         size = self.batch_size * self.group.size
-        if not self.data.produces and size > self.data.num_samples:
-            yield f"batches of {self.data.num_samples:,} samples, because there are no more"
+        if self.data.generated is None and size > self.data.stored.num_samples:
+            yield f"batches of {self.data.stored.num_samples:,} samples, because there are no more"
         if self.group.size > 1:
             total, each, count = self.batch_size * self.group.size, self.batch_size, self.group.size
             yield f"batches of {total} samples, {each} in each of {count} processes"

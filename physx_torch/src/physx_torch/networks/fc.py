@@ -57,7 +57,7 @@ class FC(TorchNetwork):
         flags = _flags(type(self).__name__, biases, len(self.sizes) - 1)
         self.layers = _stack(self.sizes, activation, flags)
         self._shape = self._fixed_shape(output_shape)
-        self._shapes = [self._shape or (self.sizes[-1],)]
+        self._set_shapes([self._shape or (self.sizes[-1],)])
 
     def _fixed_shape(self, given: int | Sequence[int] | None) -> tuple[int, ...] | None:
         if given is None:
@@ -92,7 +92,11 @@ class FC(TorchNetwork):
             raise FieldsMismatchError(
                 f"{type(self).__name__} does not fit the fields", {name: text}
             )
+        self._set_shapes(shapes)
+
+    def _set_shapes(self, shapes: list[tuple[int, ...]]) -> None:
         self._shapes = shapes
+        self._is_flat = len(shapes) == 1 and len(shapes[0]) == 1
 
     def _check(self, which: str, size: int, fields: Mapping[str, Field]) -> None:
         unknown = {
@@ -120,7 +124,10 @@ class FC(TorchNetwork):
         Args:
             inputs: One tensor for each field, of shape (samples, *field shape).
         """
-        return self.split_outputs(self.layers(self.concatenate(inputs)))
+        first = inputs[0]  # a small network takes as long as a few calls of functions
+        is_flat = len(inputs) == 1 and first.dim() == 2 and first.is_floating_point()
+        output = self.layers(first if is_flat else self.concatenate(inputs))
+        return output if self._is_flat else self.split_outputs(output)
 
     def concatenate(self, inputs: Sequence[torch.Tensor]) -> torch.Tensor:
         """Return the concatenated values of all fields of each sample, shape (samples, number).

@@ -135,7 +135,7 @@ class TorchNetwork(torch.nn.Module, Network):
             FieldsMismatchError: If ``forward`` does not return `pred_fields`.
         """
         try:
-            inputs = [data[name] for name in self.net_fields]
+            inputs = list(map(data.__getitem__, self.net_fields))
         except KeyError as error:
             raise MissingFieldError(
                 f'{type(self).__name__} reads the field "{error.args[0]}", which is missing. '
@@ -152,12 +152,15 @@ class TorchNetwork(torch.nn.Module, Network):
             if tensor.requires_grad:
                 return self._by_field(self(*inputs))
         if not self.differentiates:
+            recorded = torch.is_grad_enabled()
+            torch.set_grad_enabled(False)  # in half the time of torch.no_grad()
             try:
-                with torch.no_grad():
-                    return self._by_field(self(*inputs))
+                return self._by_field(self(*inputs))
             except RuntimeError as error:
                 if _LACKS_GRADIENTS not in str(error):
                     raise
+            finally:
+                torch.set_grad_enabled(recorded)
             self.differentiates = True
         with torch.enable_grad():
             prediction = self._by_field(self(*inputs))
@@ -342,12 +345,19 @@ class TorchNetwork(torch.nn.Module, Network):
         Raises:
             FieldTypeError: If an integer does not fit into int64.
         """
-        return {name: self._tensor(name, array) for name, array in batch.items()}
+        on_cpu, own, tensors = self.device.type == "cpu", self.data_type, {}
+        for name, array in batch.items():
+            dtype = array.dtype
+            if dtype.char in "fd" and dtype.isnative and array.flags.carray:  # nearly always
+                tensor = torch.from_numpy(array)
+                is_own = on_cpu and tensor.dtype is own  # as of a training's batches
+                tensors[name] = tensor if is_own else tensor.to(self.device, own)
+            else:
+                tensors[name] = self._tensor(name, array)
+        return tensors
 
     def _tensor(self, name: str, array: Array) -> torch.Tensor:
         kind = array.dtype.kind
-        if kind == "f" and array.dtype.itemsize <= _WIDEST["f"]:  # nearly always: convert once
-            return torch.from_numpy(_to_compatible(array)).to(self.device, self.data_type)
         if kind in "iu" and array.dtype != np.int64:
             array = _to_int64(name, array)
         elif array.dtype.itemsize > _WIDEST.get(kind, np.inf):  # unknown to torch
@@ -357,7 +367,10 @@ class TorchNetwork(torch.nn.Module, Network):
 
     def tensor_to_numpy(self, tensors: Tensors) -> Batch:
         """Return tensors as arrays; those on the CPU share memory."""
-        return {name: tensor.numpy(force=True) for name, tensor in tensors.items()}
+        arrays = {}
+        for name, tensor in tensors.items():
+            arrays[name] = tensor.numpy(force=True)
+        return arrays
 
 
 def _to_int64(name: str, array: Array) -> Array:

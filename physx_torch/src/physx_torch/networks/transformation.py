@@ -64,24 +64,23 @@ class TorchTransformation(Transformation):
 
     def transform_before_prediction(self, data: Tensors) -> Tensors:
         """Return the data with `net_fields` normalized."""
-        return _normalize(data, self._inputs)
+        return _normalize(data, self._inputs) if self._inputs else data
 
     def transform_before_loss(
         self, prediction: Tensors, targets: Tensors
     ) -> tuple[Tensors, Tensors]:
         """Return the prediction unchanged, and the targets normalized."""
-        return prediction, _normalize(targets, self._targets)
+        return prediction, _normalize(targets, self._targets) if self._targets else targets
 
     def transform_before_apply(self, prediction: Tensors) -> Tensors:
         """Return the prediction in physical units."""
         if not self._predictions:
             return prediction
-        changed = {
-            name: torch.addcmul(scale.mean, prediction[name], scale.std)
-            for name, scale in self._predictions.items()
-            if name in prediction
-        }
-        return {**prediction, **changed}
+        changed = dict(prediction)
+        for name, scale in self._predictions.items():
+            if name in prediction:
+                changed[name] = torch.addcmul(scale.mean, prediction[name], scale.std)
+        return changed
 
 
 def _scale(item: Normalization, network: TorchNetwork) -> _Scale:
@@ -93,11 +92,8 @@ def _scale(item: Normalization, network: TorchNetwork) -> _Scale:
 
 
 def _normalize(data: Tensors, scales: Mapping[str, _Scale]) -> Tensors:
-    if not scales:
-        return data
-    changed = {
-        name: (data[name] - scale.mean) / scale.std
-        for name, scale in scales.items()
-        if name in data
-    }
-    return {**data, **changed}
+    changed = dict(data)
+    for name, scale in scales.items():
+        if name in data:
+            changed[name] = (data[name] - scale.mean) / scale.std
+    return changed

@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import copy
 import functools
 import inspect
 import math
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -27,7 +26,9 @@ from physx_torch.choices import choose, find_classes, make
 from physx_torch.networks.network import TorchNetwork
 from physx_torch.parallel import average_gradients, broadcast_parameters
 from physx_torch.storage.attributes import Attributes
-from physx_torch.storage.state import random_state, read_state, set_random_state, write_state
+from physx_torch.training.gradients import GradientCheck, clear, is_finite
+from physx_torch.training.losses import Loss, as_target, compared_fields, without_reduction
+from physx_torch.training.optimization_state import OptimizationState, describe, gradients_of
 from physx_torch.training.schedules import TrainingLength, choose_interval
 from physx_torch.training.training_forward import (
     PRECISIONS,
@@ -37,58 +38,6 @@ from physx_torch.training.training_forward import (
 )
 
 _LEAST_SCALE = 1e-9
-_ANOTHER = (
-    "Start another training from its network: NetworkConfig.network_dir (--network.network-dir)."
-)
-Loss = Callable[[torch.Tensor, torch.Tensor], torch.Tensor]
-
-
-def _clear_gradients(optimizer: torch.optim.Optimizer) -> None:
-    # Like optimizer.zero_grad(), without its hooks, which take as long as a small network.
-    for group in optimizer.param_groups:
-        for parameter in group["params"]:
-            parameter.grad = None
-
-
-def _without_reduction(loss: Loss) -> Loss | None:
-    """Return a loss that returns each element's own loss; None if that is not known to work."""
-    if not isinstance(loss, torch.nn.Module) or getattr(loss, "reduction", "") != "mean":
-        return None
-    if (
-        type(loss).__module__ != "torch.nn.modules.loss"
-        or getattr(loss, "weight", None) is not None
-    ):
-        return None
-    single: Any = copy.copy(loss)
-    single.reduction = "none"
-    return single
-
-
-def _pairs(network: TorchNetwork) -> Iterable[tuple[str, str]]:
-    """Return the names of each prediction and of the target that it is compared with."""
-    predicted, targets = network.pred_fields, network.opt_fields
-    if len(predicted) != len(targets):
-        raise ConfigError(
-            f"{type(network).__name__} predicts {listed(predicted)} but is compared with "
-            f"{listed(targets)}: each of pred_fields needs one of opt_fields. For a loss of all of "
-            "them together, derive from TorchOptimization and implement compute_loss(batch)."
-        )
-    return zip(predicted, targets, strict=True)
-
-
-def _as_target(target: torch.Tensor, prediction: torch.Tensor, loss: Loss) -> torch.Tensor:
-    """Return integers and booleans as numbers if they have the prediction's shape, else as labels.
-
-    Args:
-        target: The target.
-        prediction: What it is compared with.
-        loss: The loss function, which may need labels of the prediction's shape.
-    """
-    if target.is_floating_point() or target.is_complex():
-        return target
-    if target.shape != prediction.shape or isinstance(loss, torch.nn.MultiLabelMarginLoss):
-        return target.to(torch.int64)
-    return target.to(prediction.dtype)
 
 
 class TorchOptimization(Optimization):
@@ -172,6 +121,8 @@ class TorchOptimization(Optimization):
         self._total = (0, 0)  # epochs of the training, batches in each
         self._attributes: Attributes | None = None
         self._has_saved = False
+        self._compared: list[tuple[str, str]] | None = None
+        self._check = GradientCheck()
         self._known: tuple[torch.Tensor | None, float] = (None, 0.0)  # the loss that was last read
 
     def set_loss(self, loss: str | type[Any] | Loss | None) -> None:
@@ -240,6 +191,7 @@ class TorchOptimization(Optimization):
             raise ConfigError(f"{type(network).__name__} is not a TorchNetwork.")
         chosen = choose("optimizer", optimizer, find_classes(torch.optim, torch.optim.Optimizer))
         self._network = self.network = network
+        self._compared = None
         self._place_loss()
         trained = [p for p in network.parameters() if p.requires_grad]
         trained += self._learned_by_loss.values()
@@ -253,7 +205,7 @@ class TorchOptimization(Optimization):
                 "does not support. Choose another optimizer."
             )
         if type(self).compute_loss is TorchOptimization.compute_loss:
-            _pairs(network)
+            compared_fields(network)
         self.optimizer = made
         self._set_forward(network)
 
@@ -348,14 +300,17 @@ class TorchOptimization(Optimization):
         """
         if self.loss is None or self._network is None:
             raise UsageError("compute_loss() must be called after set_loss() and set_optimizer().")
+        if self._compared is None:
+            self._compared = compared_fields(self._network)
         losses = []
-        for pred_name, opt_name in _pairs(self._network):
+        for pred_name, opt_name in self._compared:
             pred, target = batch.prediction[pred_name], batch.targets[opt_name]
-            # Targets that are class indices, which are integers, have other shapes.
-            if pred.shape != target.shape and target.is_floating_point():
+            if not target.is_floating_point():  # class indices, for example, of another shape
+                target = as_target(target, pred, self.loss)
+            elif pred.shape != target.shape:
                 text = f'shape {tuple(pred.shape)}, but "{opt_name}" has {tuple(target.shape)}'
                 raise FieldsMismatchError("Prediction and target differ", {pred_name: text})
-            losses.append(self.loss(pred, _as_target(target, pred, self.loss)))
+            losses.append(self.loss(pred, target))
         return losses[0] if len(losses) == 1 else torch.stack(losses).mean()
 
     def compute_row_losses(self, batch: PredictedBatch) -> torch.Tensor:
@@ -368,16 +323,16 @@ class TorchOptimization(Optimization):
         """
         if self.loss is None or self._network is None:
             raise UsageError("compute_row_losses() needs set_loss() and set_optimizer() first.")
-        by_row = _without_reduction(self.loss)
+        by_row = without_reduction(self.loss)
         if by_row is None or type(self).compute_loss is not TorchOptimization.compute_loss:
             rows = range(len(next(iter(batch.prediction.values()))))
             # With gradients, which the loss of a subclass may need.
             return torch.stack([self.compute_loss(batch[row : row + 1]).detach() for row in rows])
         with torch.no_grad():
             losses = []
-            for pred_name, opt_name in _pairs(self._network):
+            for pred_name, opt_name in compared_fields(self._network):
                 pred, target = batch.prediction[pred_name], batch.targets[opt_name]
-                losses.append(by_row(pred, _as_target(target, pred, self.loss)))
+                losses.append(by_row(pred, as_target(target, pred, self.loss)))
             flat = [loss.reshape(len(loss), -1).mean(1) for loss in losses]
             return torch.stack(flat).mean(0)
 
@@ -396,8 +351,8 @@ class TorchOptimization(Optimization):
         """Update the parameters along the gradient of the loss, or of the mean of several batches.
 
         With `stops_at_nan`, the loss of each batch and the gradients of each step are checked
-        before the step, which costs one norm of all gradients. Gradients that overflow in float16
-        are left to the scaler, which skips the step.
+        before the step, in one pass over the gradients: see `GradientCheck`. Gradients that
+        overflow in float16 are left to the scaler, which skips the step.
 
         Raises:
             UsageError: If there is no optimizer yet.
@@ -411,7 +366,7 @@ class TorchOptimization(Optimization):
                 'reduces, for example with loss_kwargs={"reduction": "mean"}.'
             )
         if self._accumulated == 0:
-            _clear_gradients(optimizer)
+            clear(optimizer)
         scaled = loss / self._accumulate if self._accumulate > 1 else loss
         if self._scaler is not None:
             scaled = self._scaler.scale(scaled)
@@ -419,62 +374,58 @@ class TorchOptimization(Optimization):
         if self._shared is not None:
             average_gradients(self._shared)
         self._accumulated += 1
-        is_due = self._accumulated >= self._accumulate
-        norms: Sequence[torch.Tensor] = ()
-        if is_due:
+        if is_due := self._accumulated >= self._accumulate:
             self._accumulated = 0
-            norms = self._limit_gradients(optimizer, network)
+        norm = self._limit_gradients(optimizer, network) if is_due and self._gradient_clip else None
         if self.stops_at_nan:
-            self._check_finite(loss, norms, network)
+            self._check_finite(loss, norm, optimizer if is_due else None)
         if is_due:
             self._step(optimizer)
 
     def _limit_gradients(
         self, optimizer: torch.optim.Optimizer, network: TorchNetwork
-    ) -> Sequence[torch.Tensor]:
-        """Scale down large gradients, and return norms that are finite if all gradients are."""
-        if self._gradient_clip is not None:
-            if self._scaler is not None:
-                self._scaler.unscale_(optimizer)
-            learned = [*network.parameters(), *self._learned_by_loss.values()]
-            norm = torch.nn.utils.clip_grad_norm_(learned, self._gradient_clip)
-            return [norm] if self._scaler is None else ()
-        if self._scaler is not None or not self.stops_at_nan:
-            return ()
-        gradients = [
-            parameter.grad._values() if parameter.grad.is_sparse else parameter.grad
-            for group in optimizer.param_groups
-            for parameter in group["params"]
-            if parameter.grad is not None
-        ]
-        return torch._foreach_norm(gradients) if gradients else ()
+    ) -> torch.Tensor:
+        """Scale down large gradients, and return the norm that they had together."""
+        if self._scaler is not None:
+            self._scaler.unscale_(optimizer)
+        learned = [*network.parameters(), *self._learned_by_loss.values()]
+        return torch.nn.utils.clip_grad_norm_(learned, self._gradient_clip or 0.0)
 
     def _check_finite(
-        self, loss: torch.Tensor, norms: Sequence[torch.Tensor], network: TorchNetwork
+        self,
+        loss: torch.Tensor,
+        norm: torch.Tensor | None,
+        optimizer: torch.optim.Optimizer | None,
     ) -> None:
         """Raise an error if the loss or gradients are not finite.
 
         In a group of processes, only the gradients are checked, which all processes have in common.
+
+        Args:
+            loss: The loss of the batch.
+            norm: The norm of all gradients, if it is known.
+            optimizer: The optimizer, if it is about to step; None: the gradients are incomplete.
         """
         is_alone = self._shared is None
-        values = [loss.detach(), *norms] if is_alone else [*norms]
-        if loss.is_cuda and values:  # waits for the GPU once
-            alike = [value.to(loss.device, torch.float32) for value in values]
-            numbers = torch.stack(alike).tolist()
-        else:
-            numbers = [value.item() for value in values]
+        values = [loss] if is_alone else []
+        if self._scaler is not None:
+            optimizer = None
+        elif norm is not None:
+            values, optimizer = [*values, norm], None
+        numbers = self._check.read(values, optimizer)
         if is_alone:
             self._known = loss, numbers[0]
-        if all(map(math.isfinite, numbers)):
-            return
-        is_loss = is_alone and not math.isfinite(numbers[0])
-        what = f"the loss is {numbers[0]}" if is_loss else ""
-        for name, gradient in {**network.get_gradients(), **self._gradients_of_loss()}.items():
-            if what:
-                break
-            if not torch.isfinite(gradient).all():
+        if not all(map(math.isfinite, numbers)):
+            self._find_not_finite(numbers[0] if is_alone else 0.0)
+
+    def _find_not_finite(self, loss: float) -> None:
+        """Raise an error that names what is not finite; nothing: only a norm was too large."""
+        what = "" if math.isfinite(loss) else f"the loss is {loss}"
+        gradients = self.network.get_gradients() | gradients_of(self._learned_by_loss)
+        for name, gradient in gradients.items():
+            if not what and not is_finite(gradient):
                 what = f'the gradient of the parameter "{name}" contains NaN or infinity'
-        if what:  # otherwise, only the norm was too large for its type
+        if what:
             self._accumulated, self._known = 0, (None, 0.0)
             raise DivergedError(what)
 
@@ -542,28 +493,12 @@ class TorchOptimization(Optimization):
             UsageError: If there is no optimizer yet.
             CheckpointError: If a part of the state cannot be saved.
         """
-        optimizer, network = self._prepared("save_state")
-        attributes = self._attributes or self._find_attributes()
-        state: dict[str, Any] = {
-            "kinds": self._kinds(),
-            "optimizer": optimizer.state_dict(),
-            "random": random_state(network.device),
-            "attributes": attributes.save(),
-        }
+        state = self._state("save_state")
+        found = state.attributes.save()
         if not self._has_saved:
-            self._check_saved(attributes)
-        elif lost := self._unsavable(attributes):
-            state["lost"] = lost  # the parameters are worth saving nevertheless
-        for name, item in (("scheduler", self.scheduler), ("scaler", self._scaler)):
-            if item is not None:
-                state[name] = item.state_dict()
-        if self.scheduler is not None:
-            state["interval"] = self.scheduler_interval
-        if self._accumulated:
-            state["accumulated"] = self._accumulated
-            state["gradients"] = network.get_gradients()
-            state["gradients of the loss"] = self._gradients_of_loss()
-        write_state(path, state)
+            self._check_saved(state.attributes)
+        # Later, the parameters are worth saving nevertheless.
+        state.write(path, found, self._accumulated, self._unsavable(state.attributes))
         self._has_saved = True
 
     def load_state(self, path: Path) -> None:
@@ -574,45 +509,20 @@ class TorchOptimization(Optimization):
             CheckpointError: If the file is missing, damaged, or for another optimizer or scheduler,
                 or lacks some of the state.
         """
-        optimizer, network = self._prepared("load_state")
-        state = read_state(path)
-        self._check_fits(path, state)
-        try:
-            optimizer.load_state_dict(state["optimizer"])
-            self._accumulated = state.get("accumulated", 0)
-            network.set_gradients(state.get("gradients", {}))
-        except (KeyError, ValueError) as error:
-            raise CheckpointError(f"{path} is from another network: {error}.") from error
-        for name, parameter in self._learned_by_loss.items():
-            gradient = state.get("gradients of the loss", {}).get(name)
-            parameter.grad = None if gradient is None else gradient.to(parameter)
-        for name, item in (("scheduler", self.scheduler), ("scaler", self._scaler)):
-            if item is not None:
-                item.load_state_dict(state[name])
-        try:
-            attributes = self._attributes or self._find_attributes()
-            attributes.load(state.get("attributes", {}), network.device)
-        except CheckpointError as error:
-            raise CheckpointError(f"{path} does not fit: {error}. {_ANOTHER}") from error
-        set_random_state(state["random"], network.device)
+        self._accumulated = self._state("load_state").read(path)
         self._check_schedule()
 
-    def _check_fits(self, path: Path, state: Mapping[str, Any]) -> None:
-        if state.get("kinds") != self._kinds():
-            found, own = (" and ".join(kinds) for kinds in (state.get("kinds", []), self._kinds()))
-            raise CheckpointError(f"{path} is the state of {found or 'nothing'}, not of {own}.")
-        former = state.get("interval", "epoch")
-        if self.scheduler is not None and former != self.scheduler_interval:
-            raise CheckpointError(
-                f"The scheduler of {path} was stepped every {former}, not every "
-                f'{self.scheduler_interval}: set NetworkConfig.scheduler_interval="{former}" '
-                f"(--network.scheduler-interval {former}) to continue."
-            )
-        if lost := state.get("lost"):
-            raise CheckpointError(
-                f"{path} lacks a part of the state: {_reasons(lost)}. A resumed training would "
-                f"differ. {_ANOTHER}"
-            )
+    def _state(self, method: str) -> OptimizationState:
+        optimizer, network = self._prepared(method)
+        return OptimizationState(
+            network,
+            optimizer,
+            self.scheduler,
+            self._scaler,
+            self.scheduler_interval,
+            self._learned_by_loss,
+            self._attributes or self._find_attributes(),
+        )
 
     def _find_attributes(self) -> Attributes:
         network = self._network
@@ -638,23 +548,11 @@ class TorchOptimization(Optimization):
         kind, first = type(self).__name__, next(iter(lost))
         raise CheckpointError(
             f"The state of {kind} cannot be saved, so that a resumed training would differ: "
-            f"{_reasons(lost)}. Make it an attribute of its own that is a tensor, a "
+            f"{describe(lost)}. Make it an attribute of its own that is a tensor, a "
             "torch.nn.Module, an object with state_dict() and load_state_dict(), or a list or "
             "dictionary of these; or override save_state() and load_state(); or, if it is no "
             f'state, name it in the class: unsaved = ("{first}",).'
         )
-
-    def _gradients_of_loss(self) -> dict[str, torch.Tensor]:
-        named = self._learned_by_loss.items()
-        return {name: p.grad for name, p in named if p.grad is not None}
-
-    def _kinds(self) -> list[str]:
-        used = (self.optimizer, self.scheduler, self._scaler)
-        return [type(item).__name__ for item in used if item is not None]
-
-
-def _reasons(lost: Mapping[str, str]) -> str:
-    return "; ".join(f'"{path}" {reason}' for path, reason in lost.items())
 
 
 @functools.cache

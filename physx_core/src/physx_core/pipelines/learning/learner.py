@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Iterable, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -14,7 +15,7 @@ from physx_core import checkpoint
 from physx_core.components.group import Group
 from physx_core.components.network import Network
 from physx_core.components.optimization import Optimization
-from physx_core.components.predicted_batch import PredictedBatch, predict
+from physx_core.components.predicted_batch import PredictedBatch, pick, predict
 from physx_core.components.transformation import Transformation
 from physx_core.config import NetworkConfig, merge_arguments
 from physx_core.errors import (
@@ -35,7 +36,7 @@ from physx_core.plugins.networks import resolve_network
 from physx_core.plugins.references import check_recorded, is_of_plugin, is_recorded_as
 from physx_core.rows import concatenate
 from physx_core.statistics import Normalization
-from physx_core.typing import Array, Batch, Index, Tensors
+from physx_core.typing import Array, Batch, Index
 
 
 class Learner:
@@ -142,8 +143,8 @@ class Learner:
 
     def _predict_batch(self, batch: Batch) -> PredictedBatch:
         """Predict a batch in physical units that contains `batch_fields`."""
-        data = self.network.numpy_to_tensor(batch)
-        return PredictedBatch.of(self.network, self.transformation, data)
+        network = self.network
+        return PredictedBatch.of(network, self.transformation, network.numpy_to_tensor(batch))
 
     def _trainer(self) -> Optimization:
         if self.optimization is None:
@@ -171,7 +172,7 @@ class Learner:
         if self._is_between_steps:
             self._is_between_steps = False
             self.network.set_train()
-        optimization, group = self._trainer(), self.group
+        optimization, group = self.optimization or self._trainer(), self.group
         share = batch
         if weight is None:
             share, weight = (batch, 1.0) if group.size == 1 else group.share_of(batch)
@@ -321,7 +322,7 @@ class Learner:
         """
         network = self.network
         try:
-            read = {name: batch[name] for name in network.net_fields}
+            read = pick(batch, network.net_fields)
         except KeyError as error:
             raise MissingFieldError(
                 f'The network reads the field "{error.args[0]}", which is missing. '
@@ -329,7 +330,8 @@ class Learner:
                 field=str(error.args[0]),
             ) from None
         try:
-            return network.tensor_to_numpy(self._predict_tensors(network.numpy_to_tensor(read)))
+            inputs = network.numpy_to_tensor(read)
+            return network.tensor_to_numpy(predict(network, self.transformation, inputs))
         except PhysxError:
             raise
         except Exception:  # from a library; other shapes are fine as long as the network takes them
@@ -360,10 +362,6 @@ class Learner:
                     f"{field.shape}.",
                     field=name,
                 )
-
-    def _predict_tensors(self, inputs: Tensors) -> Tensors:
-        """Return the prediction for the network's inputs, both in physical units."""
-        return predict(self.network, self.transformation, inputs)
 
     def save(
         self,
@@ -428,7 +426,8 @@ class Learner:
                 f"Forms: {listed(network.export_forms)}."
             )
         write = import_component("exporter", network.exporter)
-        write(Path(path), form, network, self._predict_tensors, self.fields)
+        to_physical = partial(predict, network, self.transformation)
+        write(Path(path), form, network, to_physical, self.fields)
 
     def load_parameters(self, found: checkpoint.Checkpoint) -> None:
         """Read the network's parameters from a checkpoint.
@@ -553,16 +552,19 @@ def _check(
 def _numbers(optimization: Optimization, loss: Any, step: PredictedBatch) -> dict[str, float]:
     """Return the result of `Optimization.transform_loss` as plain numbers."""
     losses = optimization.transform_loss(loss, step)
-    method = f"{type(optimization).__name__}.transform_loss()"
     if not isinstance(losses, Mapping) or "loss" not in losses:
         given = listed(map(str, losses)) if isinstance(losses, Mapping) else type(losses).__name__
-        raise UsageError(f'{method} must return a dictionary with "loss", not {given}.')
+        raise UsageError(
+            f"{type(optimization).__name__}.transform_loss() must return a dictionary with "
+            f'"loss", not {given}.'
+        )
     numbers = {}
     for name, value in losses.items():
         try:
             numbers[name] = float(value.item() if hasattr(value, "item") else value)
         except (TypeError, ValueError, RuntimeError) as error:
             raise UsageError(
-                f'{method} returned "{name}", which is not a number: {error}.'
+                f'{type(optimization).__name__}.transform_loss() returned "{name}", which is not '
+                f"a number: {error}."
             ) from error
     return numbers

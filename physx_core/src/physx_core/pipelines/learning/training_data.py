@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from physx_core.dataset import Dataset
 from physx_core.fields import Field
@@ -13,7 +12,7 @@ from physx_core.pipelines.learning.batches.replayed import ReplayedBatches
 from physx_core.pipelines.learning.batches.stored import StoredBatches
 from physx_core.sources.source import Source
 from physx_core.statistics import Normalization
-from physx_core.typing import Array, Batch
+from physx_core.typing import Batch
 
 
 class TrainingData:
@@ -33,7 +32,17 @@ class TrainingData:
     "validation" are not replayed. An environment with parameters gets those that the sample was
     generated with, if the dataset has recorded them. The normalization is computed from the stored
     rows before the first epoch, and again before each epoch that follows a replay.
+
+    Attributes:
+        stored: The stored samples to train on and to validate with.
+        generated: The batches of the current epoch if environments generate them; else None.
+        next_batch: Returns the next batch of the epoch in physical units; generated batches are
+            already stored. In a group of processes, each gets its share of a generated batch, with
+            `GeneratedBatches.weight`.
     """
+
+    generated: GeneratedBatches | None
+    next_batch: Callable[[], Batch]
 
     def __init__(
         self,
@@ -53,10 +62,15 @@ class TrainingData:
             batch_nb: Batches in an epoch; None: one pass over the stored samples.
             always: Whether environments provide the samples of all epochs, not only of the first.
         """
-        self._stored, self._made, self._always = stored, made, always
+        self.stored, self._made, self._always = stored, made, always
         self._batch_size, self._batch_nb = batch_size, batch_nb
         self._generated = made if isinstance(made, GeneratedBatches) else None
-        self._current: GeneratedBatches | ReplayedBatches | StoredBatches = made or stored
+        self._choose(made or stored)
+
+    def _choose(self, batches: GeneratedBatches | ReplayedBatches | StoredBatches) -> None:
+        """Set where the batches come from, once for all of an epoch."""
+        self._current, self.next_batch = batches, batches.next
+        self.generated = batches if isinstance(batches, GeneratedBatches) else None
 
     def begin_epoch(self, epoch_id: int, names: Sequence[str], done: int = 0) -> int:
         """Prepare an epoch and return its number of batches.
@@ -66,51 +80,22 @@ class TrainingData:
             names: Fields of the batches that are read from the dataset.
             done: Number of its batches that the network has already learned from.
         """
-        made, stored = self._made, self._stored
+        made, stored = self._made, self.stored
         if made is not None and epoch_id and not self._always and self._current is made:
             made.finish()
-            self._current = stored
+            self._choose(stored)
         self._current.begin_epoch(names, max(0, (self._batch_nb or 0) - done))
         return self.batches_per_epoch
 
     @property
     def batches_per_epoch(self) -> int:
         """Number of batches in an epoch."""
-        return self._batch_nb or -(-self._stored.num_samples // self._batch_size)
-
-    def next_batch(self) -> Batch:
-        """Return the next batch in physical units; generated batches are already stored.
-
-        In a group of processes, each gets its share of a generated batch, with a `weight`.
-        """
-        return self._current.next()
-
-    def skip(self, batches: int) -> None:
-        """Skip batches that the training read before it was interrupted."""
-        for _ in range(batches):
-            self.next_batch()
-
-    def tell(self, batch: Batch, losses: Array) -> None:
-        """Pass the last batch's losses to the sampler, which learns from them.
-
-        See `wants_row_losses`.
-
-        Args:
-            batch: The batch.
-            losses: Loss of each row, shape (rows,).
-        """
-        if self._generated is not None:
-            self._generated.tell(batch, losses)
+        return self._batch_nb or -(-self.stored.num_samples // self._batch_size)
 
     @property
     def dataset(self) -> Dataset:
         """Dataset that batches are read from and generated ones are stored in."""
-        return self._stored.dataset
-
-    @property
-    def num_samples(self) -> int:
-        """Number of stored samples to train on."""
-        return self._stored.num_samples
+        return self.stored.dataset
 
     @property
     def source(self) -> Source | None:
@@ -123,62 +108,13 @@ class TrainingData:
         return None if self._generated is None else self._generated.online
 
     @property
-    def generated(self) -> GeneratedBatches | None:
-        """The batches of the current epoch if environments generate them; else None."""
-        return self._generated if self.produces else None
-
-    @property
-    def batches_read(self) -> int:
-        """Number of batches read from the dataset."""
-        return self._stored.count
-
-    @property
-    def order(self) -> dict[str, Any]:
-        """The reading order of the stored samples, as plain data; empty before it is chosen."""
-        return self._stored.order
-
-    @property
-    def notice(self) -> str:
-        """Why reading differs from that before the training was resumed; empty: it does not."""
-        return self._stored.notice
-
-    @property
-    def produces(self) -> bool:
-        """Whether environments generate new samples in the current epoch."""
-        return self._generated is not None and self._current is self._generated
-
-    @property
     def repeats(self) -> bool:
         """Whether environments would generate the same samples again."""
         return self._generated is not None and self._generated.repeats()
 
-    @property
-    def wants_row_losses(self) -> bool:
-        """Whether a sampler learns from the current epoch's row losses."""
-        return self.generated is not None and self.generated.learns
-
-    @property
-    def weight(self) -> float | None:
-        """Weight of the last batch if it is this process's share; None: it is a whole batch."""
-        return None if self.generated is None else self.generated.weight
-
-    @property
-    def has_changed(self) -> bool:
-        """Whether stored samples were replaced since the last call of `normalization`."""
-        return self._stored.has_changed
-
     def validation_batches(self, names: Sequence[str]) -> Iterator[Batch]:
         """Return the validation batches, in the order of writing."""
-        return self._stored.validation_batches(names)
-
-    def validation_samples(self, names: Sequence[str]) -> Batch:
-        """Return some of the validation samples, always the same ones."""
-        return self._stored.validation_samples(names)
-
-    @property
-    def has_validation(self) -> bool:
-        """Whether there are validation samples."""
-        return self._stored.has_validation
+        return self.stored.validation_batches(names)
 
     @property
     def fields(self) -> Mapping[str, Field]:

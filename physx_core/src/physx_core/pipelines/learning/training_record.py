@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import math
 from collections import deque
-from collections.abc import Collection, Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any
+
+import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
 RECENT = 50
 """Window of the running mean and variance, in batches or epochs."""
 
 
 class TrainingRecord:
-    """Sums over the current epoch, and the losses of the last batches and epochs."""
+    """Sums over the current epoch, and the losses of the last batches and epochs.
+
+    Batches are kept until `take_batches` accounts for all of them at once: a mean and a variance
+    for each would take longer than the step of a small network.
+    """
 
     def __init__(self, state: Mapping[str, Any]) -> None:
         """Start, or continue from a `state`; an empty state starts."""
@@ -20,10 +27,11 @@ class TrainingRecord:
         self._sums: dict[str, float] = dict(state.get("sums", {}))
         self._recent = deque[float](state.get("recent", ()), RECENT)
         self._epochs = deque[float](state.get("epochs", ()), RECENT)
+        self._batches: list[tuple[int, dict[str, float]]] = []
 
     @property
     def state(self) -> dict[str, Any]:
-        """The state that a resumed training needs, as plain data."""
+        """The state that a resumed training needs, as plain data, once all batches are taken."""
         return {
             "count": self._count,
             "sums": dict(self._sums),
@@ -31,26 +39,34 @@ class TrainingRecord:
             "epochs": list(self._epochs),
         }
 
-    def add(self, losses: Mapping[str, float]) -> dict[str, float]:
-        """Add a batch and return the values to record.
-
-        These are ``<name>/batch`` for each entry, and the loss's mean and sample variance over the
-        last `RECENT` batches, ``loss/mean`` and ``loss/variance``.
+    def add(self, number: int, losses: Mapping[str, float]) -> None:
+        """Add a batch.
 
         Args:
+            number: Number of the batch, counted over all epochs.
             losses: The batch's statistics, ``loss`` among them.
         """
-        values, sums = {}, self._sums
-        for name, value in losses.items():
-            values[f"{name}/batch"] = number = float(value)
-            sums[name] = sums.get(name, 0.0) + number
-        self._count += 1
-        self._recent.append(values["loss/batch"])
-        values["loss/mean"], values["loss/variance"] = _spread(self._recent)
-        return values
+        self._batches.append((number, {name: float(value) for name, value in losses.items()}))
+
+    def take_batches(self) -> list[tuple[int, dict[str, float]]]:
+        """Return number and values of each batch added since the last call, to record them.
+
+        The values are ``<name>/batch`` for each entry, and the loss's mean and sample variance over
+        the last `RECENT` batches, ``loss/mean`` and ``loss/variance``.
+        """
+        batches, self._batches = self._batches, []
+        spreads = _spreads(self._recent, [losses["loss"] for _, losses in batches])
+        sums, taken = self._sums, []
+        for (number, losses), (mean, variance) in zip(batches, spreads, strict=True):
+            for name, value in losses.items():
+                sums[name] = sums.get(name, 0.0) + value
+            values = {f"{name}/batch": value for name, value in losses.items()}
+            taken.append((number, {**values, "loss/mean": mean, "loss/variance": variance}))
+        self._count += len(batches)
+        return taken
 
     def take_epoch(self) -> dict[str, float]:
-        """Return the values to record for the epoch, and start a new one.
+        """Return the values to record for the epoch, once all batches are taken; start a new one.
 
         These are ``<name>/training``, the mean of each entry over the batches, and the loss's mean
         and sample variance over the last `RECENT` epochs, ``loss/training_mean`` and
@@ -60,17 +76,26 @@ class TrainingRecord:
             return {}
         values = {f"{name}/training": total / self._count for name, total in self._sums.items()}
         self._count, self._sums = 0, {}
-        self._epochs.append(values["loss/training"])
-        values["loss/training_mean"], values["loss/training_variance"] = _spread(self._epochs)
-        return values
+        ((mean, variance),) = _spreads(self._epochs, [values["loss/training"]])
+        return {**values, "loss/training_mean": mean, "loss/training_variance": variance}
 
 
-def _spread(recent: Collection[float]) -> tuple[float, float]:
-    """Return the mean and the sample variance; the variance of a single value is 0."""
-    size = len(recent)
-    mean = sum(recent) / size
-    squares = sum([(value - mean) * (value - mean) for value in recent])
-    return mean, squares / (size - 1) if size > 1 else 0.0
+def _spreads(recent: deque[float], added: Sequence[float]) -> list[list[float]]:
+    """Append values to the recent ones; return mean and sample variance after each of them.
+
+    The variance of a single value is 0. How many are added at once changes no bit.
+    """
+    count, values = len(recent), np.array([*[0.0] * RECENT, *recent, *added])
+    recent.extend(added)
+    rows = len(added)
+    sizes = np.arange(count + 1, count + rows + 1).clip(max=RECENT)[:, np.newaxis]
+    windows = sliding_window_view(values, RECENT)[len(values) - RECENT + 1 - rows :].copy()
+    with np.errstate(invalid="ignore", over="ignore"):  # of a training that goes on after NaN
+        means = windows.sum(axis=1, keepdims=True) / sizes
+        deviations = np.where(np.arange(RECENT) < RECENT - sizes, 0.0, windows - means)
+        variances = np.square(deviations).sum(axis=1, keepdims=True) / (sizes - 1).clip(min=1)
+    spreads: list[list[float]] = np.hstack([means, variances]).tolist()
+    return spreads
 
 
 class BestEpoch:
