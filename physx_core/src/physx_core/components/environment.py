@@ -152,6 +152,7 @@ class Environment(Closeable):
         self._has_read_sample = False
         self._sample: Sample | None = None
         self._fields: dict[str, Field] = {}
+        self._has_open_shapes = False
         self._training: dict[str, Any] | None = None
         self._additional: dict[str, Any] | None = None
         self._services: Services | None = None
@@ -292,7 +293,8 @@ class Environment(Closeable):
         """
         if not fields and self._training is None:
             raise UsageError("Call set_training_data() before get_prediction() without fields.")
-        self._infer_shapes()
+        if self._has_open_shapes:
+            self._infer_shapes()
         inputs = fields or dict(self._training or {})
         try:
             for name, value in inputs.items():
@@ -309,9 +311,9 @@ class Environment(Closeable):
 
     def _infer_shapes(self) -> None:
         """Infer undefined shapes of fields from this step's data."""
-        if any(field.shape is None for field in self._fields.values()):
-            given = {**(self._training or {}), **(self._additional or {})}
-            self._fields = {field.name: field for field in infer_shapes(self.fields, given)}
+        given = {**(self._training or {}), **(self._additional or {})}
+        self._fields = {field.name: field for field in infer_shapes(self.fields, given)}
+        self._has_open_shapes = any(field.shape is None for field in self._fields.values())
 
     def save_parameters(self, **values: Any) -> None:
         """Save numbers, strings, lists, dictionaries and arrays of this instance in the dataset."""
@@ -394,6 +396,7 @@ class Environment(Closeable):
             if field.name in self._fields:
                 raise ConfigError(f'The field "{field.name}" is defined twice.')
             self._fields[field.name] = field
+            self._has_open_shapes |= field.shape is None
 
     def _run(self) -> Services:
         if self._services is None:
