@@ -60,7 +60,7 @@ def test_a_training_batch_makes_at_most_40_calls(network, normalize):
             assert number < 2 or len(counter.calls) <= 40, counter.calls
 
 
-def test_a_prediction_step_makes_at_most_55_calls(network):
+def test_a_prediction_step_makes_at_most_45_calls(network):
     data = DatasetConfig(existing_dir="data")
     Training(network, data, epoch_nb=1, batch_size=10, quiet=True).execute()
     environment = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, seed=0)
@@ -70,4 +70,4 @@ def test_a_prediction_step_makes_at_most_55_calls(network):
                 pipeline.sample_begin()
                 pipeline.predict()
                 pipeline.sample_end()
-            assert number < 2 or len(counter.calls) <= 55, counter.calls
+            assert number < 2 or len(counter.calls) <= 45, counter.calls
