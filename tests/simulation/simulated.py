@@ -124,7 +124,7 @@ class Simulation(Network):
         if found:
             found.append(partial(self._pass_time, self._now + SHORT))
             return found[self.choose(len(found))]
-        until = min(task.until for task in self._tasks)
+        until = min(task.until for task in self._tasks if task.goes_on)
         if until == math.inf:
             raise Deadlock
         return partial(self._pass_time, until)
@@ -163,6 +163,17 @@ class Simulation(Network):
 
     # Clients --------------------------------------------------------------------------------
 
+    @property
+    def alive(self):
+        """The clients that have not ended, by the numbers of their instances."""
+        return {client.instance_id: client for client in self.clients if client.is_alive}
+
+    @property
+    def running(self):
+        """The client that runs now."""
+        (found,) = [client for client in self.clients if client.is_running]
+        return found
+
     def start_client(self, instance, address, token, **options):
         client = Client(self, instance, address, token, **options)
         self.clients.append(client)
@@ -199,8 +210,12 @@ class Task:
         self.until, self.ran, self.is_killed, self.is_stopped = math.inf, 0, False, False
 
     @property
+    def goes_on(self):
+        return not (self.greenlet.dead or self.is_killed or self.is_stopped)
+
+    @property
     def is_due(self):
-        if self.greenlet.dead or self.is_killed or self.is_stopped:
+        if not self.goes_on:
             return False
         return self.until <= self._simulation.monotonic() or bool(self._is_ready())
 
@@ -214,7 +229,7 @@ class Task:
         self.greenlet.switch()
 
     def kill(self):
-        self.is_killed, self.until = True, math.inf
+        self.is_killed = True
 
     def abandon(self):
         """Leave all its calls."""
@@ -248,6 +263,14 @@ class Client(ClientHandle):
         except Exception as error:
             self._status, self.error = 1, error
 
+    @property
+    def is_alive(self):
+        return self._status is None
+
+    @property
+    def is_running(self):
+        return self._task.greenlet is getcurrent()
+
     def exit_status(self):
         return self._status
 
@@ -259,15 +282,19 @@ class Client(ClientHandle):
 
     def end(self, number):
         """End as by a signal: the system closes its link."""
+        self.leave(-number)
+
+    def leave(self, status):
+        """End with an exit status, as by `os._exit`."""
         if self._status is None:
-            self._status = -number
+            self._status = status
             self._task.kill()
             if self.link is not None:
                 self.link.close()
 
     def stop(self):
         """Stop as by SIGSTOP."""
-        self._task.is_stopped, self._task.until = True, math.inf
+        self._task.is_stopped = True
 
     def vanish(self):
         """Be lost with the machine: nothing arrives any more, not even an end."""
