@@ -6,6 +6,7 @@ happen next is up to `Simulation.choose`: bytes arrive, another one goes on, or 
 
 from __future__ import annotations
 
+import asyncio
 import errno
 import math
 import select
@@ -101,7 +102,12 @@ class Simulation(Network):
         if self._hub.dead:
             self._hub = greenlet(self._run)
         self._hub.parent = self._tasks[0].greenlet
-        self._hub.switch()
+        loop = asyncio._get_running_loop()  # of this one; a thread has only one
+        asyncio._set_running_loop(None)
+        try:
+            self._hub.switch()
+        finally:
+            asyncio._set_running_loop(loop)
         if task.is_killed:
             raise GreenletExit
         return bool(is_ready())
