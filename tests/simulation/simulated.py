@@ -145,13 +145,14 @@ class Simulation(Network):
         self._listening[port] = listening = Listening(self, port)
         return listening
 
-    def connect(self, address, timeout):
+    def connect(self, address, timeout, *, unread=None):
         self.wait(lambda: True)
         listening = self._listening.get(address[1])
         if listening is None or listening.is_closed:
             raise ConnectionRefusedError(errno.ECONNREFUSED, "Connection refused")
         near, far = self.pair()
-        listening.waiting.append((far, (HOST, 50000 + len(self._links))))
+        near.address, far.address = (HOST, address[1]), (HOST, 50000 + len(self._links))
+        listening.waiting.append((far, far.address))
         near.settimeout(timeout)
         return near
 
@@ -313,8 +314,10 @@ class Link:
 
     Attributes:
         peer: The other end.
+        address: The address of the peer.
     """
 
+    address = ""
     family = socket.AF_UNIX
 
     def __init__(self, simulation):
@@ -408,7 +411,7 @@ class Link:
         return -1
 
     def getpeername(self):
-        return ""
+        return self.address
 
     def settimeout(self, seconds):
         self._timeout = seconds

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from simulated import Deadlock, Simulation, drawn
+from simulated import HOST, Deadlock, Simulation, drawn
 
 from physx_core import EnvironmentConfig
 from physx_core.errors import ClientError
@@ -124,6 +124,36 @@ def test_a_client_whose_machine_is_gone_is_replaced(program, caplog):
         assert run(source) == expected
         assert 12.0 < simulation.monotonic() - began < 20.0
     assert "its machine no longer answers" in caplog.text
+
+
+# Connections that are no clients -----------------------------------------------------------------
+
+
+def test_a_silent_connection_is_dropped_after_a_while(simulated, simulation, caplog):
+    with simulated(port=1) as source:
+        silent = simulation.connect((HOST, 1), 60)
+        silent.sendall(b"\0")
+        source.batch(1)
+        simulation.sleep(4.9)
+        source.batch(1)
+        assert not silent.has_ended
+        simulation.sleep(0.2)
+        source.batch(1)
+        assert silent.recv(10) == b""
+
+
+def test_many_silent_connections_do_not_keep_clients_out(simulated, simulation):
+    with simulated(port=1, num_clients=1, restarts=1, run_ahead=2) as source:
+        crowd = []
+        for _ in range(200):
+            crowd.append(simulation.connect((HOST, 1), 60))
+            source.batch(1)
+        assert sum(connection.has_ended for connection in crowd) > 50
+        simulation.alive[1].kill()
+        source.batch(5)
+
+
+# The simulation itself ---------------------------------------------------------------------------
 
 
 def test_whoever_waits_for_nobody_is_noticed():
