@@ -26,7 +26,7 @@ from physx_core.workers.client.joining import join
 from physx_core.workers.client.link import RunEnded
 from physx_core.workers.client.worker import run_instance
 
-ROOM = 1 << 22  # bytes that a link takes before they are read
+ROOM = 1 << 22
 SHORT = 1e-3  # s that pass if time is chosen to pass
 HOST = "127.0.0.1"
 
@@ -60,13 +60,14 @@ class Simulation(Network):
 
     current = None
 
-    def __init__(self, choose=lambda count: 0):
+    def __init__(self, choose=lambda count: 0, room=ROOM):
         """Start at an arbitrary time.
 
         Args:
             choose: Takes a number of possible events; returns the index of the next one.
+            room: How many bytes a link takes before they are read.
         """
-        self.clock, self.choose = self, choose
+        self.clock, self.choose, self.room = self, choose, room
         self.clients, self.plan, self.events = [], {}, 0
         self._now, self._links, self._listening = 1000.0, [], {}
         self._tasks = [Task(self, getcurrent())]
@@ -360,7 +361,7 @@ class Link:
 
     @property
     def _room(self):
-        return ROOM - len(self.peer._coming) - len(self.peer._arrived)
+        return self._simulation.room - len(self.peer._coming) - len(self.peer._arrived)
 
     def _block(self, is_ready):
         if self._timeout == 0:

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from simulated import HOST, Deadlock, Simulation, drawn
+from simulated import HOST, ROOM, Deadlock, Simulation, drawn
 
 from physx_core import EnvironmentConfig
 from physx_core.errors import ClientError
@@ -17,6 +17,8 @@ from physx_core.sources import ClientSource, LocalSource
 
 SEED = [5, 0, 7]
 SIZES = [3, 40, 1, 16]
+
+rooms = st.sampled_from([100, 3000, ROOM])
 
 
 class Services:
@@ -42,12 +44,14 @@ def program():
     return lambda name: f"{folder}/programs/worker_envs.py:{name}"
 
 
-def run(source, sizes=SIZES):
-    """Return the bytes of all rows by field."""
+def run(source, sizes=SIZES, begun=None):
+    """Return the bytes of all rows by field; `begun` is called after the first batch."""
     batches = []
     with source:
         for size in sizes:
             batches.append({name: rows.copy() for name, rows in source.batch(size).items()})
+            if begun is not None:
+                begun, _ = None, begun()
     return {name: b"".join(batch[name].tobytes() for batch in batches) for name in batches[0]}
 
 
@@ -63,11 +67,11 @@ def local(environment, **options):
 
 
 @settings(max_examples=30)
-@given(drawn)
-def test_rows_are_the_same_in_any_order_of_events(program, choose):
+@given(drawn, rooms)
+def test_rows_are_the_same_in_any_order_of_events(program, choose, room):
     kwargs = {"refuse": 5, "delay": 1e-3}
     expected = run(local(program("Walk"), env_kwargs=kwargs))
-    with Simulation(choose) as simulation:
+    with Simulation(choose, room) as simulation:
         assert run(simulate(simulation, program("Walk"), env_kwargs=kwargs)) == expected
         assert [client.exit_status() for client in simulation.clients] == [0, 0]
 
@@ -82,12 +86,19 @@ def test_predictions_are_the_same_in_any_order_of_events(program, choose):
 
 
 @settings(max_examples=30)
-@given(drawn, st.integers(1, 150), st.sampled_from([1, 2]))
-def test_rows_are_the_same_whenever_a_client_is_lost(program, choose, event, victim):
-    expected = run(local(program("Walk")))
-    with Simulation(choose) as simulation:
-        simulation.plan[event] = lambda: simulation.clients[victim - 1].kill()
-        assert run(simulate(simulation, program("Walk"), restarts=1)) == expected
+@given(drawn, rooms, st.integers(1, 100), st.booleans(), st.sampled_from([1, 2]))
+def test_rows_are_the_same_whenever_a_client_is_lost(program, choose, room, event, begun, victim):
+    kwargs = {"delay": 10e-3}  # so that there are some rows in each message
+    expected = run(local(program("Walk"), env_kwargs=kwargs))
+    with Simulation(choose, room) as simulation:
+        source = simulate(simulation, program("Walk"), restarts=1, env_kwargs=kwargs)
+
+        def lose():
+            simulation.plan[simulation.events + event] = simulation.clients[victim - 1].kill
+
+        if not begun:
+            simulation.plan[1] = lose
+        assert run(source, begun=lose if begun else None) == expected
         ended = [client.exit_status() for client in simulation.clients]
         assert ended.count(0) == 2 or ended.count(-signal.SIGKILL) == 1
 
