@@ -14,6 +14,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from safetensors.numpy import load_file
+from simulated import Simulation
 
 from physx_core import Dataset, EnvironmentConfig, Field
 from physx_core.sources import ClientSource, LocalSource
@@ -153,6 +154,25 @@ def clients(services, nothing_stays_behind):
     def make(environment="Plain", *, run_ahead=None, total=None, **options):
         settings = configured(environment, options)
         return ClientSource(settings, services, SEED, run_ahead=run_ahead, total=total)
+
+    return make
+
+
+@pytest.fixture
+def simulation():
+    """A network and a clock within this thread."""
+    with Simulation() as simulation:
+        yield simulation
+
+
+@pytest.fixture
+def simulated(services, simulation):
+    """Return the source of an environment in clients within this thread, named as for `local`."""
+
+    def make(environment="Plain", *, run_ahead=None, total=None, **options):
+        settings = configured(environment, {"launcher": "simulated:SimulatedLauncher", **options})
+        options = {"run_ahead": run_ahead, "total": total, "network": simulation}
+        return ClientSource(settings, services, SEED, **options)
 
     return make
 

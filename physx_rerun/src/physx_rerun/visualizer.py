@@ -168,7 +168,7 @@ class RerunVisualizer(Visualizer):
                 'picture, or mode "save" and open the file elsewhere with: rerun FILE.rrd'
             )
         options = ("--memory-limit", self.memory_limit, "--expect-data-soon")
-        self.viewer = Viewer(self.port, options, lives_on=True)
+        self.viewer = Viewer(self.port, options, detached=True)
         self.viewer.wait_until_ready()
         self.viewer.check(wait=1.0)  # it listens before its window opens
         self._addresses = [self.viewer.address]

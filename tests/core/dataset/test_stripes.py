@@ -450,13 +450,15 @@ class Machine(RuleBasedStateMachine):
 
 def abandon(writer):
     """Have a writer end as if its process were killed."""
-    writer._sealer.shutdown()
+    writer._sealer.close()
     opened, writer._opened = writer._opened, None
     if opened is not None:
         for file in opened.files.values():
             file.close()
     writer._digester.close()
-    writer._syncer._end.set()
+    writer._syncer._partitions.clear()  # it does not sync any more
+    writer._syncer._paths.clear()
+    writer._syncer._helper.close()
 
 
 def test_random_histories():

@@ -60,7 +60,7 @@ def receive_all(end):
     received = bytearray()
     deadline = time.monotonic() + PATIENCE
     while time.monotonic() < deadline:
-        if not end.hidden and not select.select([end], [], [], 1.0)[0]:
+        if not end.buffered and not select.select([end], [], [], 1.0)[0]:
             continue
         try:
             data = end.recv(5000)
@@ -121,7 +121,7 @@ class Stream(RuleBasedStateMachine):
     @invariant()
     def what_the_system_does_not_know_of_is_hidden(self):
         for end in getattr(self, "ends", ()):
-            assert end.hidden <= {end}
+            assert end.buffered <= {end}
 
     def teardown(self):
         if not hasattr(self, "ends"):
@@ -130,7 +130,7 @@ class Stream(RuleBasedStateMachine):
         while any(self.waiting) or any(self.travelling):
             self.flush()
             for side, end in enumerate(self.ends):
-                if end.hidden or select.select([end], [], [], 0)[0]:
+                if end.buffered or select.select([end], [], [], 0)[0]:
                     self.read(side, 3000)
             assert time.monotonic() < deadline
         for end, other in (self.ends, self.ends[::-1]):
@@ -238,7 +238,7 @@ def test_a_listener_finds_every_frame_though_the_system_sees_none_of_it(sizes):
     while not ended and time.monotonic() < deadline:
         for connection, _ in listener.select(1.0):
             try:  # as little as possible at a time
-                ended = not connection.reader.receive(connection.socket)
+                ended = not connection.reader.receive(connection.link)
             except BlockingIOError:
                 continue
             frame = connection.reader.take()
@@ -319,7 +319,7 @@ def test_a_first_byte_decides_and_nonsense_is_an_error_or_left_to_the_reader(dat
         else:
             assert receive_all(server) == (data, None)
             assert server.channel == b""
-            plain = server.settle()
+            plain = server.unwrap_if_plain()
             assert type(plain) is socket.socket
             plain.close()
 

@@ -209,7 +209,7 @@ def test_a_forked_process_of_multiprocessing_may_close_them_without_effect():
 
 
 def test_one_that_is_to_live_on_does(tmp_path):
-    line = "print(ChildProcess(['sleep', '60'], lives_on=True).pid, flush=True)"
+    line = "print(ChildProcess(['sleep', '60'], detached=True).pid, flush=True)"
     owner = start(tmp_path, line, "ChildProcess(['true']).wait()")
     pid = int(owner.stdout.readline())
     assert owner.wait(60) == 0

@@ -6,7 +6,9 @@ import os
 import signal
 import socket
 import subprocess
+import sys
 import time
+import uuid
 from pathlib import Path
 
 import numpy as np
@@ -41,8 +43,8 @@ class Wanderer(Environment):
         self.position, self.pull = np.zeros(2), 0.0
 
     def create(self):
-        Path(f"started-{self.instance_id}-{os.getpid()}").touch()
-        self.child = subprocess.Popen(["sleep", "600"]) if self.fault else None
+        Path(f"started-{self.instance_id}-{uuid.uuid4()}").touch()
+        self.start_child()
         self.drawn = self.load_parameters().get("drawn", 0)
         self.save_parameters(drawn=self.drawn + 1)
         self.reach("create")
@@ -54,8 +56,11 @@ class Wanderer(Environment):
     def init_visualization(self):
         self.factory.add_points("walker", np.zeros((1, 3)), color="red")
 
+    def start_child(self):
+        self.child = subprocess.Popen(["sleep", "600"]) if self.fault else None
+
     def step(self):
-        time.sleep(self.pace + self.delay * int.from_bytes(os.urandom(2), "little") / 65536)
+        self.sleep(self.pace + self.delay * int.from_bytes(os.urandom(2), "little") / 65536)
         if self.step_index == self.at:
             self.reach("step")
         start = 0.0 if self.sample is None else self.sample["position"]
@@ -93,8 +98,10 @@ class Wanderer(Environment):
 
     # Ways to break --------------------------------------------------------------------------
 
+    sleep = staticmethod(time.sleep)
+
     def dawdle(self):
-        time.sleep(0.5)
+        self.sleep(0.5)
 
     def fail(self):
         raise RuntimeError("no more beans")
@@ -112,12 +119,45 @@ class Wanderer(Environment):
         os.kill(os.getpid(), signal.SIGSTOP)
 
     def garble(self):
-        connection().sendall(b"\xff" * 100)
-        time.sleep(60)
+        self.connection().sendall(b"\xff" * 100)
+        self.sleep(60)
 
     def disconnect(self):
-        connection().shutdown(socket.SHUT_RDWR)
-        time.sleep(60)
+        self.connection().shutdown(socket.SHUT_RDWR)
+        self.sleep(60)
+
+    def connection(self):
+        return connection()
+
+
+class SimulatedWanderer(Wanderer):
+    """The same in a simulated client, which breaks in the same ways."""
+
+    def start_child(self):
+        """Start none."""
+
+    def sleep(self, seconds):
+        simulation().sleep(seconds)
+
+    def connection(self):
+        return simulation().running.link._connection
+
+    def leave(self):
+        self.end(lambda client: client.leave(3))
+
+    def kill(self):
+        self.end(lambda client: client.kill())
+
+    def stop(self):
+        self.end(lambda client: client.stop())
+
+    def end(self, how):
+        how(simulation().running)
+        self.sleep(0)
+
+
+def simulation():
+    return sys.modules["simulated"].Simulation.current
 
 
 def connection():

@@ -19,6 +19,12 @@ from physx_core import Environment, Field
 from physx_core.errors import FieldShapeError
 
 
+def sleep(seconds):
+    """Sleep, by the clock of the simulation if this client is in one."""
+    simulation = sys.modules["simulated"].Simulation.current if "simulated" in sys.modules else None
+    (simulation or time).sleep(seconds)
+
+
 class Walk(Environment):
     """A random walk: five numbers in, one out, in an open and a known shape; fields of any type."""
 
@@ -36,7 +42,7 @@ class Walk(Environment):
 
     def step(self):
         if self.delay:
-            time.sleep(self.delay * self.rng.random())
+            sleep(self.delay * self.rng.random())
         self.count += 1
         self.state = self.state + self.rng.normal(size=self.size)
         self.set_training_data(state=self.state, mean=self.state.mean())
@@ -67,7 +73,7 @@ class Unhurried(Plain):
     """Leaves the processor to others most of the time."""
 
     def act(self):
-        time.sleep(0.002)
+        sleep(0.002)
 
 
 class Trouble(Plain):
@@ -119,7 +125,10 @@ class Trouble(Plain):
             pass
 
     def sleep(self):
-        time.sleep(60)
+        sleep(60)
+
+    def hang(self):
+        sleep(1e9)
 
     def crash(self):
         ctypes.string_at(0)
@@ -177,7 +186,7 @@ class Asking(Plain):
 
     def step(self):
         x = np.array([self.instance_id, self.step_index], float)
-        time.sleep(self.delay * self.instance_id * self.rng.random())
+        sleep(self.delay * self.instance_id * self.rng.random())
         predicted = self.get_prediction(x=x, number=self.step_index)
         self.set_training_data(x=predicted["y"])
 
@@ -209,10 +218,15 @@ class Applied(Plain):
 class Drawing(Plain):
     """Draws points in each step."""
 
+    def __init__(self, *, pace: float = 0.0, **kwargs):
+        super().__init__(**kwargs)
+        self.pace = pace
+
     def init_visualization(self):
         self.factory.add_points("cloud", np.arange(6.0).reshape(2, 3), color="red")
 
     def act(self):
+        sleep(self.pace)
         self.factory.update_points("cloud", positions=np.full((2, 3), self.step_index / 3))
         self.update_visualization()
 
@@ -298,7 +312,7 @@ class Faulty(Plain):
             signal.signal(signal.SIGALRM, lambda *args: self.reach("prediction"))
             signal.setitimer(signal.ITIMER_REAL, 0.1)
         else:
-            time.sleep(0.5)  # requests are answered together: the other one waits for this one
+            sleep(0.5)  # requests are answered together: the other one waits for this one
         self.get_prediction(x=np.zeros(2))
 
     def close(self):
@@ -334,29 +348,29 @@ class Faulty(Plain):
 
     def do_garbage(self):
         own_connection().sendall(bytes(range(1, 256)) * 20)
-        time.sleep(60)
+        sleep(60)
 
     def do_half(self):
         own_connection().sendall(struct.pack("<IHHQ", 1000, 8, 0, 1) + bytes(500))
-        time.sleep(60)
+        sleep(60)
 
     def do_dribble(self):
         connection = own_connection()
         connection.sendall(struct.pack("<IHHQ", 1000, 8, 0, 1))
         for _ in range(600):
-            time.sleep(0.1)
+            sleep(0.1)
             connection.sendall(b"x")
 
     def do_trickle(self):
         connection = own_connection()
         connection.sendall(struct.pack("<IHHQ", 1_000_000, 8, 0, 1))
         for _ in range(600):
-            time.sleep(0.1)
+            sleep(0.1)
             connection.sendall(bytes(200))
 
     def do_disconnect(self):
         own_connection().shutdown(socket.SHUT_RDWR)
-        time.sleep(60)
+        sleep(60)
 
 
 def own_connection():

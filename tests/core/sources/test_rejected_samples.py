@@ -45,10 +45,10 @@ def same(a, b):
 
 
 @pytest.mark.parametrize(("instances", "ahead"), [(1, None), (3, None), (3, 0)])
-def test_rejected_rows_are_those_of_a_local_source(local, clients, instances, ahead):
+def test_rejected_rows_are_those_of_a_local_source(local, simulated, instances, ahead):
     settings = {"num_clients": instances, "record_wrong_samples": True}
     found = 0
-    with local(PICKY, **settings) as ours, clients(PICKY, run_ahead=ahead, **settings) as theirs:
+    with local(PICKY, **settings) as ours, simulated(PICKY, run_ahead=ahead, **settings) as theirs:
         for size in (1, 2, 50, 1, 7, 300):
             same(theirs.batch(size), ours.batch(size))
             wrong = ours.pop_rejected()
@@ -76,30 +76,30 @@ def test_rejected_rows_come_by_instance_then_step_before_their_accepted_ones(loc
             assert (rows["state"][:, 0] <= 0.6).all()
 
 
-def test_those_of_a_batch_are_forgotten_with_the_next(local, clients):
+def test_those_of_a_batch_are_forgotten_with_the_next(local, simulated):
     settings = {"num_clients": 2, "record_wrong_samples": True}
-    with local(PICKY, **settings) as ours, clients(PICKY, **settings) as theirs:
+    with local(PICKY, **settings) as ours, simulated(PICKY, **settings) as theirs:
         for source in (ours, theirs):
             source.batch(100)
             source.batch(4)
         same(theirs.pop_rejected(), ours.pop_rejected())
 
 
-def test_nothing_is_kept_unless_it_is_asked_for(local, clients):
-    with local(PICKY) as ours, clients(PICKY) as theirs:
+def test_nothing_is_kept_unless_it_is_asked_for(local, simulated):
+    with local(PICKY) as ours, simulated(PICKY) as theirs:
         for source in (ours, theirs):
             source.batch(50)
             assert source.pop_rejected() == {}
 
 
 @pytest.mark.parametrize("spoil", ["nan", "shape", "name", "ragged", "text"])
-def test_rejected_samples_that_are_invalid_are_left_out(local, clients, spoil):
+def test_rejected_samples_that_are_invalid_are_left_out(local, simulated, spoil):
     settings = {
         "num_clients": 2,
         "record_wrong_samples": True,
         "env_kwargs": {"spoil": spoil},
     }
-    with local(PICKY, **settings) as ours, clients(PICKY, **settings) as theirs:
+    with local(PICKY, **settings) as ours, simulated(PICKY, **settings) as theirs:
         same(ours.batch(60), theirs.batch(60))
         wrong = ours.pop_rejected()
         same(theirs.pop_rejected(), wrong)
@@ -181,9 +181,9 @@ def test_a_run_that_is_added_goes_on_recording():
     assert not np.isin(both["state"][count:], first["state"]).any()
 
 
-def test_stored_rows_must_be_as_many_as_the_batch(local, clients):
-    for make in (local, clients):
+def test_stored_rows_must_be_as_many_as_the_batch(local, simulated):
+    for make in (local, simulated):
         with make("Plain") as source, pytest.raises(UsageError, match="3 stored rows"):
             source.batch(4, {"x": np.zeros((3, 2))})
-    with clients("Plain") as source, pytest.raises(UsageError, match="run_ahead=0"):
+    with simulated("Plain") as source, pytest.raises(UsageError, match="run_ahead=0"):
         source.batch(3, {"x": np.zeros((3, 2))})

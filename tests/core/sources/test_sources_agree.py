@@ -9,8 +9,6 @@ import pytest
 
 from physx_core.errors import EnvironmentFailedError
 
-pytestmark = pytest.mark.processes
-
 ENVS = Path(__file__).parents[1] / "programs" / "source_envs.py"
 
 
@@ -62,12 +60,12 @@ def observed(make, services, *, apply, stored, **settings):
         ({"num_clients": 3, "visualizer": "any", "record_wrong_samples": True}, True, True),
     ],
 )
-def test_all_that_an_environment_does_is_the_same_over_tcp(
-    local, clients, services, settings, apply, stored
+def test_all_that_an_environment_does_is_the_same_in_clients(
+    local, simulated, services, settings, apply, stored
 ):
     given = {**settings, "apply": apply, "stored": stored}
     ours = observed(local, services, **given)
-    theirs = observed(lambda *a, **k: clients(*a, run_ahead=0, **k), services, **given)
+    theirs = observed(lambda *a, **k: simulated(*a, run_ahead=0, **k), services, **given)
     for mine, other in zip(ours, theirs, strict=True):
         same(mine, other)
     rows, rejected, _, kept, shown = ours
@@ -79,8 +77,8 @@ def test_all_that_an_environment_does_is_the_same_over_tcp(
 
 
 @pytest.mark.parametrize("sub_steps", [1, 2])
-def test_what_an_environment_leaves_drawn_is_shown(local, clients, services, sub_steps):
-    for make in (local, lambda *a, **k: clients(*a, run_ahead=0, **k)):
+def test_what_an_environment_leaves_drawn_is_shown(local, simulated, services, sub_steps):
+    for make in (local, lambda *a, **k: simulated(*a, run_ahead=0, **k)):
         services.shown = []
         settings = {"visualizer": "any", "simulations_per_step": sub_steps}
         with make(f"{ENVS}:LeavesDrawn", **settings) as source:
@@ -110,8 +108,8 @@ def test_what_an_environment_leaves_drawn_is_shown(local, clients, services, sub
 
 
 @pytest.mark.parametrize("method", ["create", "step"])
-def test_the_error_that_is_told_is_the_first_one(local, clients, method):
-    for make in (local, clients):
+def test_the_error_that_is_told_is_the_first_one(local, simulated, method):
+    for make in (local, simulated):
         with (
             pytest.raises(EnvironmentFailedError, match=rf"in {method}\(\).*first mistake"),
             make(f"{ENVS}:Broken", env_kwargs={"method": method}, num_clients=2) as source,

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 import numpy as np
 import pytest
 
@@ -18,11 +16,9 @@ from physx_core.errors import (
     WrongSamplesError,
 )
 
-pytestmark = pytest.mark.processes
-
 
 @pytest.fixture
-def errors_of(local, clients):
+def errors_of(local, simulated):
     """Return the errors of both sources, and how many rows each gave before."""
 
     def run(make, environment, sizes, options):
@@ -33,7 +29,7 @@ def errors_of(local, clients):
         return caught.value, rows
 
     def errors(environment, sizes, **options):
-        return [run(make, environment, sizes, options) for make in (local, clients)]
+        return [run(make, environment, sizes, options) for make in (local, simulated)]
 
     return errors
 
@@ -84,30 +80,28 @@ def test_invalid_data_is_rejected_as_in_process(errors_of, value, field, expecte
     assert rows == client_rows == 15
 
 
-def test_rows_before_a_bad_one_arrive_though_they_were_made_together(clients):
+def test_rows_before_a_bad_one_arrive_though_they_were_made_together(simulated):
     kwargs = {"value": np.full(2, np.nan), "at": 50}
-    with clients("Bad", run_ahead=1000, env_kwargs=kwargs) as source:
+    with simulated("Bad", run_ahead=1000, env_kwargs=kwargs) as source:
         assert source.batch(49)["step"][-1] == 48
         assert source.batch(1)["step"] == [49]
         with pytest.raises(NotFiniteError, match="Instance 1, step 50"):
             source.batch(1)
 
 
-def test_an_error_in_a_row_that_nobody_asked_for_is_no_error(clients):
+def test_an_error_in_a_row_that_nobody_asked_for_is_no_error(simulated, simulation):
     kwargs = {"value": np.full(2, np.nan), "at": 5}
-    with clients("Bad", run_ahead=1000, env_kwargs=kwargs) as source:
+    with simulated("Bad", run_ahead=1000, env_kwargs=kwargs) as source:
         assert len(source.batch(5)["x"]) == 5
-        time.sleep(0.1)
+        simulation.sleep(0.1)
 
 
 @pytest.mark.parametrize("goes_on", [True, False])
-def test_an_error_far_ahead_waits_until_the_server_hears_it(clients, process_ids, goes_on):
+def test_an_error_far_ahead_waits_until_the_server_hears_it(simulated, simulation, goes_on):
     kwargs = {"value": np.full(2, np.nan), "at": 30_000}
-    with clients("Bad", run_ahead=40_000, env_kwargs=kwargs) as source:
+    with simulated("Bad", run_ahead=40_000, env_kwargs=kwargs) as source:
         assert len(source.batch(5)["x"]) == 5
-        until = time.monotonic() + 1.0  # for more rows than a socket holds, and the error
-        while process_ids() and time.monotonic() < until:
-            time.sleep(0.01)
+        simulation.sleep(1.0)  # for all rows, and the error
         if goes_on:
             assert source.batch(29_995)["step"][-1] == 29_999
             with pytest.raises(NotFiniteError, match="Instance 1, step 30000"):
@@ -133,19 +127,19 @@ def test_open_shapes_must_be_the_same_in_all_instances(errors_of):
     assert vars(error) == vars(local)
 
 
-def test_instances_define_the_same_fields(clients):
+def test_instances_define_the_same_fields(simulated):
     with (
         pytest.raises(FieldsMismatchError, match="Instances 1 and 2") as caught,
-        clients("Names", num_clients=2),
+        simulated("Names", num_clients=2),
     ):
         pass
     assert set(caught.value.differences) == {"x1", "x2"}
 
 
-def test_an_environment_cannot_hide_a_row_that_is_not_finite(clients):
+def test_an_environment_cannot_hide_a_row_that_is_not_finite(simulated):
     with (
         pytest.raises(NotFiniteError, match="Instance 1, step 1"),
-        clients("Stubborn") as source,
+        simulated("Stubborn") as source,
     ):
         source.batch(1)
         source.batch(9)

@@ -1,25 +1,23 @@
 """ClientSource: misbehaving clients that know the token.
 
-The client is a thread that joins with the public handshake. It sends two good rows, or none, before
+The client joins with the public handshake, beside the test. It sends two good rows, or none, before
 it misbehaves.
 """
 
 from __future__ import annotations
 
 import contextlib
-import socket
-import threading
-import time
 
 import numpy as np
 import pytest
+from simulated import HOST
 
 from physx_core import Dataset, Field
 from physx_core.errors import ClientError, NotFiniteError
-from physx_core.net import HEADER, Kind, encode, introduce, pack
+from physx_core.net import HEADER, Kind, encode, introduce, pack, retry
 from physx_core.rows import ROW_FIELDS
 
-TOKEN = "a token for this test"
+TOKEN, PORT = "a token for this test", 1
 DEFINED = [Field("x", shape=(2,)), Field("flag", shape=(), dtype="bool")]
 
 
@@ -56,12 +54,17 @@ X = DEFINED[0].to_dict()
 
 
 @pytest.fixture
-def run_with(clients, monkeypatch, port, folder):
+def run_with(simulated, simulation, monkeypatch, folder):
     """Have a client send messages; return the error that ends the run, and the rows it stored."""
     monkeypatch.setenv("PHYSX_TOKEN", TOKEN)
 
-    def misbehave(messages, until):
-        with contextlib.suppress(OSError, EOFError), connected(port) as connection:
+    def misbehave(messages, deaf):
+        connection = retry(
+            lambda left: simulation.connect((HOST, PORT), left),
+            *(60, 0.1, ConnectionRefusedError),
+            clock=simulation,
+        )
+        with contextlib.suppress(OSError, EOFError), contextlib.closing(connection):
             reader = introduce(connection, TOKEN, 1)
             granted = 0
             for needed, message in messages:
@@ -69,46 +72,27 @@ def run_with(clients, monkeypatch, port, folder):
                     frame = reader.read(connection)
                     granted = frame.number if frame.kind is Kind.CREDIT else granted
                 connection.sendall(message)
-            until.wait(60)
+            if deaf:  # it reads nothing before
+                simulation.sleep(60)
             while connection.recv(1 << 16):
                 pass
 
     def run(*messages, deaf=False):
-        until = threading.Event()  # it reads nothing before
-        if not deaf:
-            until.set()
-        thread = threading.Thread(target=misbehave, args=(messages, until))
-        thread.start()
-        settings = {"launcher": "physx/manual", "port": port, "timeout": 20.0}
-        try:
-            with (
-                Dataset.create(folder) as dataset,
-                pytest.raises((ClientError, NotFiniteError)) as caught,
-                clients(run_ahead=0, **settings) as source,
-            ):
-                for size in (2, 1, 1):
-                    batch = source.batch(size)
-                    dataset.define_fields("training", source.fields)
-                    dataset.append("training", batch)
-        finally:
-            until.set()
-            thread.join()
+        simulation.start(lambda: misbehave(messages, deaf))
+        with (
+            Dataset.create(folder) as dataset,
+            pytest.raises((ClientError, NotFiniteError)) as caught,
+            simulated(run_ahead=0, launcher="physx/manual", port=PORT) as source,
+        ):
+            for size in (2, 1, 1):
+                batch = source.batch(size)
+                dataset.define_fields("training", source.fields)
+                dataset.append("training", batch)
         with Dataset.open(folder) as dataset:
             assert dataset.verify() == []
             return caught.value, dataset.num_samples("training")
 
     return run
-
-
-def connected(port):
-    """Connect to a server that will listen soon."""
-    until = time.monotonic() + 60
-    while True:
-        try:
-            return socket.create_connection(("127.0.0.1", port), timeout=60)
-        except OSError:
-            assert time.monotonic() < until
-            time.sleep(0.01)
 
 
 LATER = {

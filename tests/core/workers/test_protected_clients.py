@@ -178,7 +178,7 @@ def test_rows_of_another_machine_are_those_of_this_one_however_large(local, clie
         with clients(environment, ip_address=here, **settings) as source:
             batch = source.batch(rows)
             peers = source._group.server.peers.values()
-            assert all(isinstance(peer.socket, SecureSocket) for peer in peers)
+            assert all(isinstance(peer.link, SecureSocket) for peer in peers)
             for name, values in expected.items():
                 assert batch[name].tobytes() == values.tobytes(), name
 
@@ -187,7 +187,7 @@ def test_a_local_client_of_a_server_on_the_network_stays_plain(clients, another_
     with clients(num_clients=2, ip_address="0.0.0.0") as source:
         source.batch(4)
         peers = source._group.server.peers.values()
-        assert [type(peer.socket) for peer in peers] == [socket.socket] * 2
+        assert [type(peer.link) for peer in peers] == [socket.socket] * 2
 
 
 def test_connections_that_are_forwarded_are_encrypted_whichever_side_sees_it(
@@ -202,7 +202,7 @@ def test_connections_that_are_forwarded_are_encrypted_whichever_side_sees_it(
         with clients(ip_address="0.0.0.0", **settings) as source:
             source.batch(4)
             peers = source._group.server.peers.values()
-            assert all(isinstance(peer.socket, SecureSocket) for peer in peers)
+            assert all(isinstance(peer.link, SecureSocket) for peer in peers)
         assert [client.wait(PATIENCE) for client in ours] == [0, 0]
 
 

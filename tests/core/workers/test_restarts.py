@@ -2,30 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
 import errno
 import hashlib
 import io
 import os
 import random
-import signal
 import tempfile
-import threading
-import time
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.errors import ClientError, EnvironmentFailedError, SampleError
 from physx_core.net import Kind, pack
 from physx_core.workers.server.journal import Journal
 
-pytestmark = pytest.mark.processes
-
 ENVS = Path(__file__).parents[1] / "programs" / "restart_envs.py"
-WANDERER = f"{ENVS}:Wanderer"
+WANDERER = f"{ENVS}:SimulatedWanderer"
+ONCE = {"run_ahead": 0, "restarts": 1}
 
 
 @pytest.fixture
@@ -42,14 +36,15 @@ def batch_services(services):
 
 
 @pytest.fixture
-def kill_one(process_ids):
-    """Return a function that kills one of the clients that there are, by chance."""
+def kill_one(simulation):
+    """Return a function that has one of the clients killed soon, both by chance."""
 
     def kill():
-        with contextlib.suppress(IndexError, ProcessLookupError):  # all have ended
-            os.kill(random.choice(list(process_ids().values())), signal.SIGKILL)
+        simulation.sleep(random.random() * 0.5)
+        if alive := [*simulation.alive.values()]:
+            random.choice(alive).kill()
 
-    return kill
+    return lambda: simulation.start(kill)
 
 
 @pytest.fixture
@@ -79,15 +74,12 @@ def run(source, sizes, *, apply=False, kill=None):
     batches = []
     with source:
         if kill:
-            killer = threading.Timer(random.random() * 0.5, kill)
-            killer.start()
+            kill()
         for size in sizes:
             batch = source.batch(size)
             batches.append({name: values.copy() for name, values in batch.items()})
             if apply:
                 source.apply({"y": batch["position"][:, :1] / 10})
-        if kill:
-            killer.join()
     return batches
 
 
@@ -95,13 +87,13 @@ def run(source, sizes, *, apply=False, kill=None):
 
 
 @pytest.mark.parametrize("asks", [False, True])
-def test_rows_depend_on_the_seed_alone(clients, batch_services, kill_one, asks):
+def test_rows_depend_on_the_seed_alone(simulated, batch_services, kill_one, asks):
     """Three runs with delays by chance, and one in which a client is killed by chance."""
     ahead, sizes = (0, [1, 7, 9, 13]) if asks else (None, [1, 40, 50, 60])
     delay = 0.02 if asks else 0.01
     hashes = set()
     for attempt in range(4):
-        source = clients(
+        source = simulated(
             WANDERER,
             num_clients=3,
             env_kwargs={"asks": asks, "delay": delay, "refuse": 4},
@@ -114,13 +106,13 @@ def test_rows_depend_on_the_seed_alone(clients, batch_services, kill_one, asks):
 
 
 def test_the_run_ends_before_a_client_that_was_started_again_has_joined(
-    clients, batch_services, process_ids, caplog, nothing_stays_behind
+    simulated, batch_services, simulation, caplog
 ):
     arguments = {"fault": "dawdle", "place": "close", "pace": 0.1}
-    source = clients(WANDERER, num_clients=2, env_kwargs=arguments, run_ahead=0, restarts=1)
+    source = simulated(WANDERER, num_clients=2, env_kwargs=arguments, run_ahead=0, restarts=1)
     with source:
         source.batch(3)
-        os.kill(process_ids()[1], signal.SIGKILL)
+        simulation.alive[1].kill()
         source.batch(1)  # of instance 2
     assert "Restart 1 of 1" in caplog.text
 
@@ -142,15 +134,14 @@ def test_the_run_ends_before_a_client_that_was_started_again_has_joined(
     ],
 )
 def test_a_client_that_breaks_is_started_again(
-    local, clients, batch_services, fresh_notes, caplog, fault, place, unhurried
+    local, simulated, batch_services, fresh_notes, caplog, fault, place
 ):
     settings = {"num_clients": 2, "env_kwargs": {"asks": True, "refuse": 3}}
     sizes = [3, 9, 1, 6]
     expected = digest(run(local(WANDERER, **settings), sizes, apply=True))
     fresh_notes()
     settings["env_kwargs"] |= {"fault": fault, "place": place, "at": 7}
-    timeout = unhurried(2.0) if fault == "stop" else 60.0
-    source = clients(WANDERER, run_ahead=0, restarts=1, timeout=timeout, **settings)
+    source = simulated(WANDERER, run_ahead=0, restarts=1, **settings)
     assert digest(run(source, sizes, apply=True)) == expected
     (warning,) = [record for record in caplog.records if record.name == "physx"]
     assert warning.levelname == "WARNING"
@@ -162,19 +153,18 @@ def test_a_client_that_breaks_is_started_again(
     assert fresh_notes() == (2 if place == "close" else 3)
 
 
-def test_several_restarts_of_several_clients(local, clients, fresh_notes, caplog, process_ids):
+def test_several_restarts_of_several_clients(local, simulated, fresh_notes, caplog, simulation):
     settings = {"num_clients": 3, "env_kwargs": {"pace": 0.003}}
     with local(WANDERER, **settings) as source:
         expected = digest([source.batch(30)])
     fresh_notes()
     victims = [1, 3, 1]
     batches = []
-    with clients(WANDERER, restarts=2, run_ahead=2, **settings) as source:
+    with simulated(WANDERER, restarts=2, run_ahead=2, **settings) as source:
         while victims or len(batches) < 30:
             batches.append({name: values.copy() for name, values in source.batch(1).items()})
-            if victims and victims[0] in process_ids():
-                os.kill(process_ids()[victims.pop(0)], signal.SIGKILL)
-                time.sleep(0.05)
+            if victims and victims[0] in simulation.alive:
+                simulation.alive[victims.pop(0)].kill()
     assert digest(batches[:30]) == expected
     texts = [record.getMessage() for record in caplog.records if record.name == "physx"]
     assert [text.split(" was ")[0] for text in texts] == ["Client 1", "Client 3", "Client 1"]
@@ -182,13 +172,15 @@ def test_several_restarts_of_several_clients(local, clients, fresh_notes, caplog
 
 
 def test_requests_go_through_the_network_in_the_batches_of_a_run_without_failure(
-    clients, batch_services, fresh_notes
+    simulated, batch_services, fresh_notes
 ):
     asked = []
     for fault in ("", "kill", "fail"):
         batch_services.sizes.clear()
         kwargs = {"asks": True, "fault": fault, "place": "step", "at": 4}
-        with clients(WANDERER, num_clients=3, env_kwargs=kwargs, run_ahead=0, restarts=1) as source:
+        with simulated(
+            WANDERER, num_clients=3, env_kwargs=kwargs, run_ahead=0, restarts=1
+        ) as source:
             for _ in range(4):
                 source.batch(6)
         asked.append(batch_services.sizes.copy())
@@ -197,14 +189,14 @@ def test_requests_go_through_the_network_in_the_batches_of_a_run_without_failure
     assert asked[2] == asked[0]
 
 
-def test_what_was_drawn_and_kept_is_not_repeated(clients, services, fresh_notes):
+def test_what_was_drawn_and_kept_is_not_repeated(simulated, services, fresh_notes):
     seen = []
     for fault in ("", "kill"):
         services.shown.clear()
         services.kept.clear()
         kwargs = {"fault": fault, "place": "step", "at": 6}
         settings = {"num_clients": 2, "visualizer": "any", "restarts": 1}
-        with clients(WANDERER, env_kwargs=kwargs, total=20, **settings) as source:
+        with simulated(WANDERER, env_kwargs=kwargs, total=20, **settings) as source:
             source.batch(20)
         drawn = sorted((i, step, str(events)) for i, step, events in services.shown)
         seen.append((drawn, {number: kept["drawn"] for number, kept in services.kept.items()}))
@@ -214,13 +206,13 @@ def test_what_was_drawn_and_kept_is_not_repeated(clients, services, fresh_notes)
     assert seen[0][1] == {1: 1, 2: 1}
 
 
-def test_rejected_rows_are_those_of_a_run_without_failure(clients, fresh_notes):
+def test_rejected_rows_are_those_of_a_run_without_failure(simulated, fresh_notes):
     seen = []
     for fault in ("", "kill", "leave"):
         kwargs = {"refuse": 3, "fault": fault, "at": 11, "pace": 0.002}
         settings = {"num_clients": 2, "record_wrong_samples": True, "restarts": 1}
         rejected = []
-        with clients(WANDERER, env_kwargs=kwargs, **settings) as source:
+        with simulated(WANDERER, env_kwargs=kwargs, **settings) as source:
             for size in (5, 20, 11):
                 source.batch(size)
                 rejected.append(source.pop_rejected())
@@ -229,12 +221,14 @@ def test_rejected_rows_are_those_of_a_run_without_failure(clients, fresh_notes):
     assert len(set(seen)) == 1
 
 
-def test_stored_rows_are_sent_again(clients, fresh_notes):
+def test_stored_rows_are_sent_again(simulated, fresh_notes):
     stored = [{"position": np.arange(12.0).reshape(6, 2) * k} for k in (1, 2, 3)]
     seen = []
     for fault in ("", "kill"):
         kwargs = {"fault": fault, "at": 6}
-        with clients(WANDERER, num_clients=2, env_kwargs=kwargs, run_ahead=0, restarts=1) as source:
+        with simulated(
+            WANDERER, num_clients=2, env_kwargs=kwargs, run_ahead=0, restarts=1
+        ) as source:
             rows = []
             for part in stored:
                 rows.append({n: v.copy() for n, v in source.batch(6, part).items()})
@@ -244,35 +238,14 @@ def test_stored_rows_are_sent_again(clients, fresh_notes):
     assert seen[0] == seen[1]
 
 
-def test_making_rows_again_is_not_taken_for_silence(clients, caplog, unhurried):
+def test_making_rows_again_is_not_taken_for_silence(simulated, caplog):
     """Making twelve rows again takes longer than a client may be silent."""
-    timeout = unhurried(1.0)
+    timeout = 1.0
     kwargs = {"pace": timeout / 10, "fault": "kill", "at": 12, "who": 1}
-    with clients(WANDERER, env_kwargs=kwargs, run_ahead=0, restarts=1, timeout=timeout) as source:
+    with simulated(WANDERER, env_kwargs=kwargs, run_ahead=0, restarts=1, timeout=timeout) as source:
         for row in range(14):
             assert source.batch(1)["step"] == [row]
     assert len([record for record in caplog.records if record.name == "physx"]) == 1
-
-
-def test_a_pipeline_stores_the_same_rows_whatever_happens(fresh_notes):
-    """With three clients and delays by chance, one of them killed in the last run."""
-    sums = set()
-    for fault in ("", "", "kill"):
-        config = EnvironmentConfig(
-            WANDERER,
-            env_kwargs={"fault": fault, "at": 30, "delay": 0.004},
-            num_clients=3,
-            restarts=1,
-            seed=3,
-        )
-        generation = DataGeneration(config, batch_nb=10, batch_size=20)
-        generation.execute()
-        with Dataset.open(generation.session.path) as dataset:
-            assert dataset.num_samples("training") == 200
-            fields = dataset.fields("training")
-            sums.add(digest([{name: dataset["training"][name][:] for name in fields}]))
-        assert fresh_notes() == 3 + bool(fault)
-    assert len(sums) == 1
 
 
 # Limits -----------------------------------------------------------------------------------------
@@ -281,11 +254,11 @@ def test_a_pipeline_stores_the_same_rows_whatever_happens(fresh_notes):
 @pytest.mark.parametrize(
     ("fault", "error"), [("kill", ClientError), ("fail", EnvironmentFailedError)]
 )
-def test_a_client_that_fails_too_often_ends_the_run(clients, caplog, fresh_notes, fault, error):
+def test_a_client_that_fails_too_often_ends_the_run(simulated, caplog, fresh_notes, fault, error):
     kwargs = {"fault": fault, "at": 3, "times": 9}
     with (
         pytest.raises(error, match="SIGKILL|no more beans"),
-        clients(WANDERER, num_clients=2, env_kwargs=kwargs, restarts=2) as source,
+        simulated(WANDERER, num_clients=2, env_kwargs=kwargs, restarts=2) as source,
     ):
         source.batch(20)
     said = [record.getMessage() for record in caplog.records if record.name == "physx"]
@@ -295,11 +268,11 @@ def test_a_client_that_fails_too_often_ends_the_run(clients, caplog, fresh_notes
     assert fresh_notes() == 4
 
 
-def test_what_would_come_again_is_raised_at_once(clients, caplog, fresh_notes):
+def test_what_would_come_again_is_raised_at_once(simulated, caplog, fresh_notes):
     kwargs = {"fault": "refuse_rows", "at": 3, "times": 9}
     with (
         pytest.raises(SampleError, match="this would come again"),
-        clients(WANDERER, num_clients=2, env_kwargs=kwargs, restarts=2) as source,
+        simulated(WANDERER, num_clients=2, env_kwargs=kwargs, restarts=2) as source,
     ):
         source.batch(20)
     assert not [record for record in caplog.records if record.name == "physx"]
@@ -328,10 +301,10 @@ ASKS = {"num_clients": 2, "env_kwargs": {"asks": True}}
 
 
 def test_a_run_goes_on_at_the_limit_of_a_journal_and_says_so_once(
-    local, clients, batch_services, said
+    local, simulated, batch_services, said
 ):
     expected = digest(run(local(WANDERER, **ASKS), [30, 30], apply=True))
-    source = clients(WANDERER, run_ahead=0, restarts=1, journal_size=2e-6, **ASKS)
+    source = simulated(WANDERER, run_ahead=0, restarts=1, journal_size=2e-6, **ASKS)
     assert digest(run(source, [30, 30], apply=True)) == expected
     assert [text.partition(":")[0] for text in said()] == [
         f"Instance {number} can no longer be restarted" for number in (1, 2)
@@ -340,11 +313,11 @@ def test_a_run_goes_on_at_the_limit_of_a_journal_and_says_so_once(
 
 
 def test_a_client_that_ends_beyond_the_limit_of_its_journal_ends_the_run_with_the_reason(
-    clients, batch_services, process_ids
+    simulated, batch_services, simulation
 ):
-    with clients(WANDERER, run_ahead=0, restarts=3, journal_size=2e-6, **ASKS) as source:
+    with simulated(WANDERER, run_ahead=0, restarts=3, journal_size=2e-6, **ASKS) as source:
         source.batch(60)
-        os.kill(process_ids()[2], signal.SIGKILL)
+        simulation.alive[2].kill()
         with pytest.raises(ClientError, match="SIGKILL") as caught:
             source.batch(60)
     (note,) = caught.value.__notes__
@@ -353,13 +326,13 @@ def test_a_client_that_ends_beyond_the_limit_of_its_journal_ends_the_run_with_th
 
 
 def test_a_client_is_restarted_before_its_journal_reaches_the_limit(
-    local, clients, batch_services, process_ids, said
+    local, simulated, batch_services, simulation, said
 ):
     expected = digest(run(local(WANDERER, **ASKS), [10, 90], apply=False))
-    with clients(WANDERER, run_ahead=0, restarts=1, journal_size=4e-6, **ASKS) as source:
+    with simulated(WANDERER, run_ahead=0, restarts=1, journal_size=4e-6, **ASKS) as source:
         batches = [{name: rows.copy() for name, rows in source.batch(10).items()}]
         assert not said()
-        os.kill(process_ids()[1], signal.SIGKILL)
+        simulation.alive[1].kill()
         batches.append(source.batch(90))
     assert digest(batches) == expected
     assert len(said("Restart 1 of 1")) == 1
@@ -367,10 +340,10 @@ def test_a_client_is_restarted_before_its_journal_reaches_the_limit(
 
 
 def test_a_full_folder_for_temporary_files_is_named_and_the_run_goes_on(
-    local, clients, batch_services, full_disk, said
+    local, simulated, batch_services, full_disk, said
 ):
     expected = digest(run(local(WANDERER, **ASKS), [200], apply=True))
-    source = clients(WANDERER, run_ahead=0, restarts=1, **ASKS)
+    source = simulated(WANDERER, run_ahead=0, restarts=1, **ASKS)
     assert digest(run(source, [200], apply=True)) == expected
     assert len(said(f"cannot grow in {full_disk}: No space left")) == 2
 
@@ -383,7 +356,7 @@ def test_a_full_folder_is_named_to_whom_a_restarted_client_cannot_be_told(full_d
     assert journal.order(0)
 
 
-def test_redrawn_parameters_begin_a_journal_anew(clients, batch_services, said):
+def test_redrawn_parameters_begin_a_journal_anew(simulated, batch_services, said):
     journal = Journal(1, 10)
     journal.record(pack(Kind.APPLY, bytes(100), 1))
     assert journal.given_up
@@ -391,19 +364,6 @@ def test_redrawn_parameters_begin_a_journal_anew(clients, batch_services, said):
     assert not journal.given_up
     assert journal.record(pack(Kind.CREDIT, number=3))
     assert journal.credit
-
-
-def test_an_instance_of_an_elastic_run_does_not_move_beyond_the_limit_of_its_journal(
-    clients, batch_services, process_ids
-):
-    options = {"min_clients": 1, "max_clients": 2, "restarts": 2, "journal_size": 2e-6, **ASKS}
-    with clients(WANDERER, run_ahead=0, **options) as source:
-        source.batch(60)
-        os.kill(os.getpgid(process_ids()[2]), signal.SIGKILL)
-        with pytest.raises(ClientError) as caught:
-            for _ in range(20):
-                source.batch(60)
-    assert "journal_size" in caught.value.__notes__[0]
 
 
 # The journal ------------------------------------------------------------------------------------

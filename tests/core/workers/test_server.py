@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import contextlib
 import os
 import socket
 import threading
@@ -61,34 +60,6 @@ def test_strangers_do_not_disturb_a_run(clients, port):
         for thread in strangers:
             thread.join()
     assert len(talked) > 8
-
-
-def test_a_silent_stranger_is_dropped_after_a_while(clients, port, monkeypatch):
-    monkeypatch.setattr("physx_core.workers.server.server._HANDSHAKE_TIME", 0.2)
-    with clients(port=port) as source, socket.create_connection(("127.0.0.1", port)) as stranger:
-        stranger.settimeout(30)
-        stranger.sendall(b"\0")
-        for _ in range(30):
-            source.batch(1)
-            time.sleep(0.02)
-        assert stranger.recv(10) == b""
-
-
-def test_many_silent_strangers_do_not_keep_clients_out(clients, port):
-    with clients(port=port, num_clients=1) as source:
-        crowd = []
-        for _ in range(200):
-            crowd.append(socket.create_connection(("127.0.0.1", port), timeout=30))
-            source.batch(1)
-            time.sleep(0.011)
-        dropped = 0
-        for connection in crowd:
-            connection.setblocking(False)
-            with contextlib.suppress(BlockingIOError):
-                dropped += connection.recv(10) == b""
-            connection.close()
-        assert dropped > 50
-        source.batch(1)
 
 
 def test_a_client_with_another_token_is_told_so(clients, port):

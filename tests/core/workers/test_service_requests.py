@@ -2,17 +2,10 @@
 
 from __future__ import annotations
 
-import os
-import signal
-import time
-from pathlib import Path
-
 import numpy as np
 import pytest
 
 from physx_core.errors import ClientError, EnvironmentFailedError, UsageError
-
-pytestmark = pytest.mark.processes
 
 
 @pytest.fixture
@@ -35,39 +28,39 @@ def batch_services(services):
 
 
 @pytest.mark.parametrize("kind", ["services", "batch_services"])
-def test_predictions_are_answered(clients, kind, request):
+def test_predictions_are_answered(simulated, kind, request):
     services = request.getfixturevalue(kind)
-    with clients("Asking", num_clients=3, run_ahead=0) as source:
+    with simulated("Asking", num_clients=3, run_ahead=0) as source:
         rows = source.batch(30)["x"]
     expected = [[2 * (row % 3 + 1), 2 * (row // 3)] for row in range(30)]
     assert rows.tolist() == expected
     assert "".join(map(str, services.asked)).count("1") >= 10
 
 
-def test_requests_of_all_instances_are_one_batch_whatever_their_speed(clients, batch_services):
-    with clients("Asking", num_clients=3, env_kwargs={"delay": 0.01}, run_ahead=0) as source:
+def test_requests_of_all_instances_are_one_batch_whatever_their_speed(simulated, batch_services):
+    with simulated("Asking", num_clients=3, env_kwargs={"delay": 0.01}, run_ahead=0) as source:
         for size in (1, 30, 2):
             source.batch(size)
     assert batch_services.asked == ["1"] + 10 * ["1 2 3"] + ["2 3"]
 
 
-def test_who_keeps_a_batch_of_requests_waiting_is_named(clients, batch_services):
+def test_who_keeps_a_batch_of_requests_waiting_is_named(simulated, batch_services):
     kwargs = {"what": "sleep", "who": 2, "at": 1}
     settings = {"num_clients": 2, "env_kwargs": kwargs, "timeout": 2.5}
     with (
         pytest.raises(ClientError, match="Client 2 sent nothing"),
-        clients("AskingTrouble", run_ahead=10, **settings) as source,
+        simulated("AskingTrouble", run_ahead=10, **settings) as source,
     ):
         source.batch(1)
         source.batch(2)
 
 
-def test_a_refused_prediction_is_the_error_of_the_services(local, clients, services):
+def test_a_refused_prediction_is_the_error_of_the_services(local, simulated, services):
     def predict(fields):
         raise UsageError("there is no network")
 
     services.predict = predict
-    for make in (local, clients):
+    for make in (local, simulated):
         with (
             pytest.raises(UsageError, match="there is no network") as caught,
             make("Asking", num_clients=2) as source,
@@ -77,33 +70,33 @@ def test_a_refused_prediction_is_the_error_of_the_services(local, clients, servi
         assert note in ("in step() of instance 1", "in step() of instance 2")  # whoever was first
 
 
-def test_a_long_prediction_is_not_taken_for_silence(clients, services, unhurried):
-    quick, timeout = services.predict, unhurried(1.0)
+def test_a_long_prediction_is_not_taken_for_silence(simulated, services, simulation):
+    quick = services.predict
 
     def predict(fields):
-        time.sleep(0.4 * timeout)
+        simulation.sleep(0.4)
         return quick(fields)
 
     services.predict = predict
-    with clients("Asking", num_clients=3, timeout=timeout, run_ahead=0) as source:
+    with simulated("Asking", num_clients=3, timeout=1.0, run_ahead=0) as source:
         assert len(source.batch(3)["x"]) == 3
 
 
-def test_an_exception_of_the_network_is_raised_as_it_is(clients, services):
+def test_an_exception_of_the_network_is_raised_as_it_is(simulated, services):
     def predict(fields):
         raise ZeroDivisionError("in the network")
 
     services.predict = predict
     with (
         pytest.raises(ZeroDivisionError, match="in the network"),
-        clients("Asking", num_clients=2) as source,
+        simulated("Asking", num_clients=2) as source,
     ):
         source.batch(4)
 
 
-def test_parameters_are_kept_and_given_back(clients, services):
+def test_parameters_are_kept_and_given_back(simulated, services):
     for _ in range(2):
-        with clients("Asking", num_clients=2):
+        with simulated("Asking", num_clients=2):
             pass
     assert set(services.kept) == {1, 2}
     for number in (1, 2):
@@ -113,9 +106,9 @@ def test_parameters_are_kept_and_given_back(clients, services):
         assert kept["kept"]["kept"] == {}
 
 
-def test_drawing_events_arrive_exactly(local, clients, services):
+def test_drawing_events_arrive_exactly(local, simulated, services):
     shown = []
-    for make in (local, clients):
+    for make in (local, simulated):
         services.shown.clear()
         with make("Drawing", num_clients=2, visualizer="any") as source:
             source.batch(6)
@@ -131,66 +124,54 @@ def test_drawing_events_arrive_exactly(local, clients, services):
             same_arrays(a.values, b.values)
 
 
+DRAWING = {"visualizer": "any", "env_kwargs": {"pace": 1e-4}}
+
+
 def test_a_client_at_its_end_stays_until_the_server_has_read_what_it_sent(
-    clients, services, process_ids
+    simulated, services, simulation
 ):
     """The server is slow, and the client comes to its end while thousands of messages wait."""
     shown, closing, ended = [], [], []
 
     def show(instance_id, step, events):
         if len(shown) == 1:  # the first is what is drawn at the beginning
-            time.sleep(1.0)  # meanwhile the client gets ahead
+            simulation.sleep(1.0)  # meanwhile the client gets ahead
         if closing and not ended:
-            time.sleep(1.0)  # meanwhile it closes its environment
-            ended.append(has_ended(closing[0]))
-        if len(shown) % 500 == 0:
-            time.sleep(0.3)
+            simulation.sleep(1.0)  # meanwhile it closes its environment
+            ended.append(closing[0].exit_status())
         shown.append(step)
 
     services.show = show
-    with clients("Drawing", run_ahead=5000, total=5000, visualizer="any") as source:
+    with simulated("Drawing", run_ahead=5000, total=5000, **DRAWING) as source:
         source.batch(1)
-        closing.append(process_ids()[1])
+        closing += simulation.clients
     assert shown[1:] == list(range(len(shown) - 1))
     assert len(shown) > 1000
-    assert ended == [False]
-    assert has_ended(closing[0])
+    assert ended == [None]
+    assert closing[0].exit_status() == 0
 
 
-def test_what_a_client_sent_before_it_was_killed_is_read(clients, services, process_ids):
-    """The server is slow, and thousands of messages of a process that is no more wait."""
+def test_what_a_client_sent_before_it_was_killed_is_read(simulated, services, simulation):
+    """The server is slow, and thousands of messages of a client that is no more wait."""
     shown, killing = [], []
 
     def show(instance_id, step, events):
         if killing:
-            time.sleep(1.0)  # meanwhile the client gets ahead
-            os.kill(killing[0], signal.SIGKILL)
-            while not has_ended(killing[0]):
-                time.sleep(0.01)
-            killing.clear()
-        if len(shown) % 500 == 0:
-            time.sleep(0.3)
+            simulation.sleep(1.0)  # meanwhile the client gets ahead
+            killing.pop().kill()
         shown.append(step)
 
     services.show = show
     with (
         pytest.raises(ClientError, match="killed by signal 9"),
-        clients("Drawing", run_ahead=3000, visualizer="any") as source,
+        simulated("Drawing", run_ahead=3000, **DRAWING) as source,
     ):
         source.batch(1)
-        killing.append(process_ids()[1])
+        killing += simulation.clients
         assert source.batch(2000)["step"].tolist() == list(range(1, 2001))
         assert not killing
         shown.append("all")
     assert "all" in shown
-
-
-def has_ended(number):
-    """Return whether a process has ended, waited for or not."""
-    try:
-        return Path(f"/proc/{number}/stat").read_text().rpartition(")")[2].split()[0] == "Z"
-    except OSError:
-        return True
 
 
 def same_arrays(a, b):
@@ -202,7 +183,7 @@ def same_arrays(a, b):
             assert value == b[name]
 
 
-def test_options_arrive_exactly(clients, services):
+def test_options_arrive_exactly(simulated, services):
     options = {
         "numbers": [0.1, 1e300, 2**70, -1, True, None],
         "pair": (1, (2.5, "x")),
@@ -210,7 +191,7 @@ def test_options_arrive_exactly(clients, services):
         "scalar": np.int16(7),
         "bytes": bytes(range(256)),
     }
-    with clients("Echo", env_kwargs={"options": options}):
+    with simulated("Echo", env_kwargs={"options": options}):
         pass
     back = services.kept[1]["options"]
     assert back[3]["array"].dtype == np.float32
@@ -221,10 +202,10 @@ def test_options_arrive_exactly(clients, services):
     assert type(back["scalar"]) is np.int16
 
 
-def test_options_that_cannot_travel_are_named_before_anything_starts(clients):
+def test_options_that_cannot_travel_are_named_before_anything_starts(simulated):
     message = r"env_kwargs'\]\['options'\]\['deep'\].*cannot be sent"
     kwargs = {"options": {"deep": object()}}
-    with pytest.raises(UsageError, match=message), clients("Echo", env_kwargs=kwargs):
+    with pytest.raises(UsageError, match=message), simulated("Echo", env_kwargs=kwargs):
         pass
 
 
@@ -232,9 +213,11 @@ def test_options_that_cannot_travel_are_named_before_anything_starts(clients):
 
 
 @pytest.mark.parametrize("instances", [1, 2, 3])
-def test_predictions_are_applied_to_the_instance_and_row_they_belong_to(local, clients, instances):
+def test_predictions_are_applied_to_the_instance_and_row_they_belong_to(
+    local, simulated, instances
+):
     results = []
-    for make, options in ((local, {}), (clients, {"run_ahead": 0})):
+    for make, options in ((local, {}), (simulated, {"run_ahead": 0})):
         rows, count = [], 0
         with make("Applied", num_clients=instances, **options) as source:
             for size in (1, 2, 1, 5, 4):
@@ -246,12 +229,12 @@ def test_predictions_are_applied_to_the_instance_and_row_they_belong_to(local, c
     assert np.array_equal(*results)
 
 
-def test_an_error_while_a_prediction_is_applied_comes_back(clients):
+def test_an_error_while_a_prediction_is_applied_comes_back(simulated):
     kwargs = {"what": "fail", "method": "apply_prediction"}
     for go_on in (True, False):
         with (
             pytest.raises(EnvironmentFailedError, match=r"apply_prediction\(\) at step 1"),
-            clients("Trouble", env_kwargs=kwargs, run_ahead=0) as source,
+            simulated("Trouble", env_kwargs=kwargs, run_ahead=0) as source,
         ):
             source.batch(1)
             source.apply({"y": np.zeros(1)})
@@ -259,7 +242,7 @@ def test_an_error_while_a_prediction_is_applied_comes_back(clients):
                 source.batch(1)
 
 
-def test_predictions_cannot_be_applied_to_clients_that_run_ahead(clients):
-    with clients("Applied") as source, pytest.raises(UsageError, match="run_ahead=0"):
+def test_predictions_cannot_be_applied_to_clients_that_run_ahead(simulated):
+    with simulated("Applied") as source, pytest.raises(UsageError, match="run_ahead=0"):
         source.batch(1)
         source.apply({"y": np.zeros(1)})

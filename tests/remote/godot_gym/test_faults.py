@@ -331,7 +331,7 @@ def test_clients_that_never_ask_keep_nobody_out(start, scene, peer_class, caplog
     peer = peer_class(service.address, service)
     assert peer.ask(LIVES) == ALIVE
     assert len(service.environment.communication.connections) <= 32 + 1
-    assert "too many strangers are connected" in caplog.text
+    assert "too many connections are pending" in caplog.text
     for one in (*idle, peer):
         one.leave()
 

@@ -150,7 +150,7 @@ def test_silent_strangers_are_closed(serving, env):
         half.sendall(HELLO)
         slow.sendall(HELLO[:5])
         assert all(_is_closed(stranger) for stranger in (silent, half, slow))
-    service._strangers.patience = PATIENCE  # the next one may be slow, but is no stranger
+    service._pending.patience = PATIENCE  # the next one may be slow, but is no stranger
     assert lives(service)
 
 

@@ -74,7 +74,7 @@ def test_large_observations_infos_and_observers_over_an_encrypted_connection(ser
             assert infos["note"].tolist() == ["seen by nobody else"] * 2
         last = observer.last()
         assert np.array_equal(last.observation, seen)
-        assert all(isinstance(one.socket, SecureSocket) for one in service.connections)
+        assert all(isinstance(one.link, SecureSocket) for one in service.connections)
 
 
 def test_on_the_loopback_interface_it_stays_plain(serving, another_machine):
@@ -82,7 +82,7 @@ def test_on_the_loopback_interface_it_stays_plain(serving, another_machine):
     port = service.address[1]
     with contextlib.closing(connect(f"127.0.0.1:{port}", token=TOKEN)) as near:
         near.reset()
-        assert [type(one.socket) for one in service.connections] == [socket.socket]
+        assert [type(one.link) for one in service.connections] == [socket.socket]
 
 
 def test_a_client_that_does_not_encrypt_is_refused_and_a_wrong_token_too(serving, here):
@@ -145,7 +145,7 @@ def test_a_connection_that_is_forwarded_to_another_machine_is_encrypted(serving,
         port = listener.getsockname()[1]
         with contextlib.closing(connect(f"127.0.0.1:{port}", token=TOKEN)) as env:
             assert env.reset()[0].tolist() == [0.123456789] * 3
-            assert [type(one.socket) for one in service.connections] == [SecureSocket]
+            assert [type(one.link) for one in service.connections] == [SecureSocket]
         over.set()
 
 

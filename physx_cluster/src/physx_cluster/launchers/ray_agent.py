@@ -34,7 +34,7 @@ class Agent:
             address: ``HOST:PORT`` of the run's server.
             token: The run's secret; the client gets it in its environment.
         """
-        client = ClientProcess(instance, address, token, lives_on=True)
+        client = ClientProcess(instance, address, token, detached=True)
         client.start()
         self._clients[instance] = client
 

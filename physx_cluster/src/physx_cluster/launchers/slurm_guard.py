@@ -42,7 +42,7 @@ def start_guard(folder: Path, name: str) -> tuple[ChildProcess, int]:
     module = "physx_cluster.launchers.slurm_guard"
     words = [sys.executable, "-P", "-m", module, str(reading), str(folder), name]
     try:
-        return ChildProcess(words, pass_fds=[reading], lives_on=True), pipe
+        return ChildProcess(words, pass_fds=[reading], detached=True), pipe
     finally:
         os.close(reading)
 

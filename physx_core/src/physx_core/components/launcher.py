@@ -2,10 +2,10 @@
 
 from __future__ import annotations
 
-import time
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
 
+from physx_core.clock import SYSTEM_CLOCK, Clock
 from physx_core.closeable import Closeable
 
 _POLL_SECONDS = 0.005
@@ -16,9 +16,11 @@ class ClientHandle(ABC):
 
     Attributes:
         instance_id: Number of its instance, from 1.
+        clock: The clock that `wait` follows.
     """
 
     instance_id: int
+    clock: Clock = SYSTEM_CLOCK
 
     @abstractmethod
     def exit_status(self) -> int | None:
@@ -47,9 +49,9 @@ class ClientHandle(ABC):
     def wait(self, until: float) -> bool:
         """Wait for the client to end; return whether it did before `until`, in monotonic s."""
         while self.exit_status() is None:
-            if time.monotonic() >= until:
+            if self.clock.monotonic() >= until:
                 return False
-            time.sleep(_POLL_SECONDS)
+            self.clock.sleep(_POLL_SECONDS)
         return True
 
 

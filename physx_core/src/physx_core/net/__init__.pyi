@@ -21,11 +21,16 @@ from .handshake import PlainRefusedError as PlainRefusedError
 from .handshake import ServerHandshake as ServerHandshake
 from .handshake import encrypt as encrypt
 from .handshake import introduce as introduce
+from .link import SOCKETS as SOCKETS
+from .link import Link as Link
+from .link import Network as Network
 from .listener import Listener as Listener
 from .liveness import VANISHED as VANISHED
 from .liveness import is_loss as is_loss
 from .liveness import poll_peer as poll_peer
 from .liveness import prepare_connection as prepare_connection
+from .pending import Handshakes as Handshakes
+from .pending import PendingConnections as PendingConnections
 from .remote_errors import decode_error as decode_error
 from .remote_errors import encode_error as encode_error
 from .spin_wait import count_cores as count_cores
@@ -33,8 +38,6 @@ from .spin_wait import fence as fence
 from .spin_wait import has_core_for_each as has_core_for_each
 from .spin_wait import order as order
 from .spin_wait import yield_core as yield_core
-from .strangers import Handshakes as Handshakes
-from .strangers import Strangers as Strangers
 from .tls import SecureSocket as SecureSocket
 from .tokens import find_token as find_token
 from .values import decode as decode

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import ipaddress
 import socket
-import time
 from collections.abc import Callable
 from typing import Any, TypeVar
 
+from physx_core.clock import SYSTEM_CLOCK, Clock
 from physx_core.errors import ConfigError
+from physx_core.net.link import Link
 
 Reached = TypeVar("Reached")
 
@@ -56,7 +57,7 @@ def is_loopback(host: str) -> bool:
     return all((getattr(one, "ipv4_mapped", None) or one).is_loopback for one in places)
 
 
-def stays_here(connection: socket.socket) -> bool:
+def is_same_host(connection: Link) -> bool:
     """Return whether the peer is on this machine, judging by its address."""
     if connection.family not in (socket.AF_INET, socket.AF_INET6):
         return True
@@ -71,6 +72,7 @@ def retry(
     patience: float,
     pause: float,
     *errors: type[Exception],
+    clock: Clock = SYSTEM_CLOCK,
 ) -> Reached:
     """Repeat an attempt until it succeeds, and return its result.
 
@@ -79,12 +81,13 @@ def retry(
         patience: How long to keep trying, in s.
         pause: Time between two attempts, in s.
         errors: Errors after which to try again; when time is up, the last one is raised.
+        clock: The clock that it follows.
     """
-    until = time.monotonic() + patience
+    until = clock.monotonic() + patience
     while True:
         try:
-            return attempt(max(until - time.monotonic(), pause))
+            return attempt(max(until - clock.monotonic(), pause))
         except errors:
-            if time.monotonic() + pause > until:
+            if clock.monotonic() + pause > until:
                 raise
-        time.sleep(pause)
+        clock.sleep(pause)

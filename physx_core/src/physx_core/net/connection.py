@@ -4,22 +4,22 @@ from __future__ import annotations
 
 import contextlib
 import selectors
-import socket
-import time
 from abc import ABC, abstractmethod
 from typing import Any
 
+from physx_core.clock import SYSTEM_CLOCK, Clock
 from physx_core.closeable import Closeable
+from physx_core.net.link import Link
 from physx_core.net.liveness import prepare_connection
 
-_MOST_AT_ONCE = 1 << 20
+_SEND_LIMIT = 1 << 20
 
 
 class Reader(ABC):
-    """Splits the byte stream of a socket into messages."""
+    """Splits the byte stream of a link into messages."""
 
     @abstractmethod
-    def receive(self, connection: socket.socket) -> int:
+    def receive(self, connection: Link) -> int:
         """Receive available bytes and return their number; 0 at the end of the stream.
 
         Raises:
@@ -48,30 +48,34 @@ class Reader(ABC):
 
 
 class Connection(Closeable):
-    """One non-blocking socket of a server.
+    """One non-blocking link of a server.
 
     Attributes:
-        socket: The socket.
+        link: The link.
         reader: Splits the incoming bytes into messages.
         name: The peer as ``host:port``, for log and error messages.
         heard: When something was last received from the peer or sent to it, in monotonic s.
-        closed: Whether the socket is closed.
+        closed: Whether the link is closed.
         outgoing: Bytes waiting to be sent.
         events: The events that the selector watches for.
     """
 
-    def __init__(self, connected: socket.socket, reader: Reader, name: str = "") -> None:
-        """Take a connected socket.
+    def __init__(
+        self, link: Link, reader: Reader, name: str = "", clock: Clock = SYSTEM_CLOCK
+    ) -> None:
+        """Take a connected link.
 
         Args:
-            connected: The socket.
+            link: The link.
             reader: Splits the incoming bytes into messages.
             name: The peer, for log and error messages.
+            clock: Tells when something was received or sent.
         """
-        connected.setblocking(False)
-        prepare_connection(connected)
-        self.socket, self.reader, self.name = connected, reader, name
-        self.heard = time.monotonic()
+        link.setblocking(False)
+        prepare_connection(link)
+        self.link, self.reader, self.name = link, reader, name
+        self._clock = clock
+        self.heard = clock.monotonic()
         self.closed = False
         self.outgoing = bytearray()
         self.events = 0
@@ -91,7 +95,7 @@ class Connection(Closeable):
         sent = 0
         if not self.outgoing:
             try:
-                sent = self.socket.send(parts[0]) if len(parts) == 1 else self.socket.sendmsg(parts)
+                sent = self.link.send(parts[0]) if len(parts) == 1 else self.link.sendmsg(parts)
             except BlockingIOError:
                 sent = 0
             if len(parts) == 1 and sent == len(parts[0]):
@@ -114,7 +118,7 @@ class Connection(Closeable):
         """
         sent = 0
         with contextlib.suppress(BlockingIOError), memoryview(self.outgoing) as waiting:
-            sent = self.socket.send(waiting[:_MOST_AT_ONCE])
+            sent = self.link.send(waiting[:_SEND_LIMIT])
         del self.outgoing[:sent]
         self.watch()
         return sent
@@ -132,17 +136,17 @@ class Connection(Closeable):
         if events == self.events or selector is None:
             return
         if not events:
-            selector.unregister(self.socket)
+            selector.unregister(self.link)
         elif not self.events:
-            selector.register(self.socket, events, self)
+            selector.register(self.link, events, self)
         else:
-            selector.modify(self.socket, events, self)
+            selector.modify(self.link, events, self)
         self.events = events
 
     def close(self) -> None:
-        """Unregister and close the socket."""
+        """Unregister and close the link."""
         self.closed = True
         if self.events and self._selector is not None:
-            self._selector.unregister(self.socket)
+            self._selector.unregister(self.link)
         self.events, self._selector = 0, None
-        self.socket.close()
+        self.link.close()

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import enum
-import socket
 import struct
 from typing import NamedTuple
 
 from physx_core.errors import ConnectionRefusedByPeerError, UsageError
 from physx_core.net.connection import Reader
+from physx_core.net.link import Link
 
 HEADER = struct.Struct("<IHHQ")
 """Length of the payload in bytes, kind, reserved (0), number."""
@@ -195,7 +195,7 @@ class FrameReader(Reader):
         """Whether another `read` may find data immediately; False: it certainly does not."""
         return self._socket_may_have_more or self.has_buffered
 
-    def read(self, connection: socket.socket) -> Frame | None:
+    def read(self, connection: Link) -> Frame | None:
         """Return the next frame, or None if a non-blocking socket has no complete one yet.
 
         Raises:
@@ -230,7 +230,7 @@ class FrameReader(Reader):
             return frame
         return self._buffered() if self._start < self._end else None
 
-    def receive(self, connection: socket.socket) -> int:
+    def receive(self, connection: Link) -> int:
         """Receive available bytes and return their number; 0 at the end of the stream.
 
         Raises:

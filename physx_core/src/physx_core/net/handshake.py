@@ -11,11 +11,12 @@ import hmac
 import secrets
 import socket
 import struct
-import time
 
+from physx_core.clock import SYSTEM_CLOCK, Clock
 from physx_core.errors import ConnectionRefusedByPeerError, SilentPeerError, UnansweredError
-from physx_core.net.addresses import stays_here
+from physx_core.net.addresses import is_same_host
 from physx_core.net.frames import MAX_PAYLOAD, Frame, FrameReader, Kind, pack
+from physx_core.net.link import Link
 
 TOKEN_VARIABLE = "PHYSX_TOKEN"
 """Environment variable that holds the token of a run."""
@@ -24,7 +25,7 @@ VERSION = 2
 """Version of the protocol between client and server."""
 
 HANDSHAKE_LIMIT = 256
-"""Longest payload in bytes accepted from a stranger."""
+"""Longest payload in bytes accepted from a pending connection."""
 
 _OPENING = struct.Struct("<8sI32s")
 _MAGIC = b"physxtcp"
@@ -55,14 +56,15 @@ class ServerHandshake:
         since: When the server began to wait for the client, in monotonic s.
     """
 
-    def __init__(self, token: str) -> None:
+    def __init__(self, token: str, clock: Clock = SYSTEM_CLOCK) -> None:
         """Draw a challenge.
 
         Args:
             token: The token that the client must know.
+            clock: Tells `since`.
         """
         self.instance_id: int | None = None
-        self.since = time.monotonic()
+        self._clock, self.since = clock, clock.monotonic()
         self._token = token
         self._own = secrets.token_bytes(32)
         self._other: bytes | None = None
@@ -76,11 +78,12 @@ class ServerHandshake:
             channel: See `SecureSocket.channel`.
 
         Raises:
-            ConnectionRefusedByPeerError: If the client sent nonsense or does not know the token.
+            ConnectionRefusedByPeerError: If the client violated the protocol, or does not know the
+                token.
         """
         if frame.kind is Kind.HELLO and not self._is_greeted:
             magic, version, other = _parse_opening(frame.payload)
-            self.since, self._is_greeted = time.monotonic(), True
+            self.since, self._is_greeted = self._clock.monotonic(), True
             if magic != _MAGIC:
                 raise ConnectionRefusedByPeerError("The peer is not a physx client.")
             opening = _OPENING.pack(_MAGIC, VERSION, self._own)
@@ -99,11 +102,11 @@ class ServerHandshake:
         raise ConnectionRefusedByPeerError("The client does not know the token.")
 
 
-def encrypt(connection: socket.socket, *, always: bool = False) -> socket.socket:
+def encrypt(connection: Link, *, always: bool = False) -> Link:
     """Return a client's connection ready for use: encrypted if it leaves this machine.
 
     Args:
-        connection: Connected, blocking socket, which is taken over if it is encrypted; its timeout
+        connection: Connected, blocking link, which is taken over if it is encrypted; its timeout
             covers the whole exchange.
         always: Whether to encrypt in any case because the server requires it.
 
@@ -112,8 +115,9 @@ def encrypt(connection: socket.socket, *, always: bool = False) -> socket.socket
         UnansweredError: If the server ended the connection.
         ConnectionRefusedByPeerError: If the server does not encrypt.
     """
-    if not always and stays_here(connection):
+    if not always and is_same_host(connection):
         return connection
+    assert isinstance(connection, socket.socket)
     from physx_core.net.tls import SecureSocket  # takes a while to import
 
     older = (
@@ -132,13 +136,16 @@ def encrypt(connection: socket.socket, *, always: bool = False) -> socket.socket
         raise UnansweredError(f"The server ended the connection ({error}). {older}") from error
 
 
-def introduce(connection: socket.socket, token: str, instance: int) -> FrameReader:
+def introduce(
+    connection: Link, token: str, instance: int, clock: Clock = SYSTEM_CLOCK
+) -> FrameReader:
     """Prove to a server that this client knows the token, and verify that the server does.
 
     Args:
-        connection: Blocking socket returned by `encrypt`; its timeout covers the whole handshake.
+        connection: Blocking link returned by `encrypt`; its timeout covers the whole handshake.
         token: The run's token.
         instance: Number of the instance to run, 0 for any that is free.
+        clock: The clock that the timeout follows.
 
     Returns:
         The reader of the connection.
@@ -155,7 +162,7 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
     own = secrets.token_bytes(32)
     try:
         connection.sendall(pack(Kind.HELLO, _OPENING.pack(_MAGIC, VERSION, own)))
-        frame = _read_in_time(connection, reader)
+        frame = _read_in_time(connection, reader, clock)
     except TimeoutError as error:
         raise SilentPeerError("The server did not answer in time.") from error
     except (EOFError, OSError) as error:
@@ -188,13 +195,13 @@ def introduce(connection: socket.socket, token: str, instance: int) -> FrameRead
     return reader
 
 
-def _read_in_time(connection: socket.socket, reader: FrameReader) -> Frame:
+def _read_in_time(connection: Link, reader: FrameReader, clock: Clock) -> Frame:
     """Return the next frame within the timeout, even if it arrives in pieces."""
     patience = connection.gettimeout()
-    until = None if patience is None else time.monotonic() + patience
+    until = None if patience is None else clock.monotonic() + patience
     while (frame := reader.take()) is None:
         if until is not None:
-            connection.settimeout(max(until - time.monotonic(), 1e-3))
+            connection.settimeout(max(until - clock.monotonic(), 1e-3))
         if not reader.receive(connection):
             raise EOFError("end of stream")
     connection.settimeout(patience)
@@ -205,5 +212,5 @@ def _parse_opening(payload: bytearray) -> tuple[bytes, int, bytes]:
     try:
         magic, version, challenge = _OPENING.unpack(payload)
     except struct.error:
-        raise ConnectionRefusedByPeerError("A stranger sent a malformed greeting.") from None
+        raise ConnectionRefusedByPeerError("The peer sent a malformed greeting.") from None
     return magic, version, challenge

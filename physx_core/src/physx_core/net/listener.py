@@ -13,13 +13,12 @@ from weakref import WeakSet
 from physx_core.closeable import Closeable
 from physx_core.net.addresses import is_loopback
 from physx_core.net.connection import Connection
-from physx_core.net.liveness import LOOK_EVERY, has_vanished
-from physx_core.net.spin_wait import spin_until
+from physx_core.net.link import SOCKETS, Link, ListeningLink, Network
+from physx_core.net.liveness import CHECK_INTERVAL, has_vanished
 from physx_core.net.timers import Timers
 from physx_core.net.tls import Identity, SecureSocket
 
 _ACCEPTED_AT_ONCE = 16
-_BACKLOG = 128
 _PAUSE = 0.5
 _LOG = logging.getLogger("physx")
 
@@ -27,7 +26,7 @@ AnyConnection = TypeVar("AnyConnection", bound=Connection)
 
 
 class Listener(Closeable, Generic[AnyConnection]):
-    """The sockets of one server: a listening one and any number of connected ones.
+    """The links of one server: a listening one and any number of connected ones.
 
     Attributes:
         address: Host and port where it listens; an empty host: it does not listen.
@@ -36,10 +35,11 @@ class Listener(Closeable, Generic[AnyConnection]):
 
     def __init__(
         self,
-        accepted: Callable[[socket.socket, str], Any],
+        accepted: Callable[[Link, str], Any],
         vanished: Callable[[AnyConnection], Any],
         *,
         encrypts: bool = False,
+        network: Network = SOCKETS,
     ) -> None:
         """Start without listening.
 
@@ -47,17 +47,19 @@ class Listener(Closeable, Generic[AnyConnection]):
             accepted: Called with each new connection and its peer as ``host:port``.
             vanished: Called with a connection if the peer's machine no longer answers.
             encrypts: Whether clients may encrypt; `accepted` then gets a `SecureSocket`.
+            network: What it listens on.
         """
         self.address = ("", 0)
-        self.timers = Timers()
+        self.timers = Timers(network.clock)
+        self._network = network
         self._accepted, self._vanished = accepted, vanished
         self._connections: WeakSet[AnyConnection] = WeakSet()
         self._is_watching = self._has_guests = False
         self._identity = Identity() if encrypts else None
-        self._hidden: set[SecureSocket] = set()
-        self._socket: socket.socket | None = None
-        self._selector = selectors.DefaultSelector()
-        self._waker, self._wakes = socket.socketpair()
+        self._buffered: set[SecureSocket] = set()
+        self._link: ListeningLink | None = None
+        self._selector = network.selector()
+        self._waker, self._wakes = network.pair()
         for one in (self._waker, self._wakes):
             one.setblocking(False)
         self._selector.register(self._waker, selectors.EVENT_READ)
@@ -65,7 +67,7 @@ class Listener(Closeable, Generic[AnyConnection]):
     @property
     def is_listening(self) -> bool:
         """Whether connections are accepted."""
-        return self._socket is not None
+        return self._link is not None
 
     def listen(self, address: str, port: int) -> None:
         """Start accepting connections.
@@ -77,17 +79,12 @@ class Listener(Closeable, Generic[AnyConnection]):
         Raises:
             OSError: If the address is not one of this machine, or the port is in use.
         """
-        try:
-            found = socket.getaddrinfo(address, port, type=socket.SOCK_STREAM)
-            family, place = found[0][0], found[0][4]
-            self._socket = socket.create_server(place, family=family, backlog=_BACKLOG)
-        except (OverflowError, UnicodeError, TypeError) as error:
-            raise OSError(str(error)) from error
+        self._link = self._network.listen(address, port)
         if self._identity is not None and not is_loopback(address):
             self._identity.prepare()
-        self._socket.setblocking(False)
-        self.address = self._socket.getsockname()[:2]
-        self._selector.register(self._socket, selectors.EVENT_READ)
+        self._link.setblocking(False)
+        self.address = self._link.getsockname()[:2]
+        self._selector.register(self._link, selectors.EVENT_READ)
 
     def add(self, connection: AnyConnection) -> None:
         """Watch a connection until it is closed."""
@@ -95,7 +92,7 @@ class Listener(Closeable, Generic[AnyConnection]):
         self._connections.add(connection)
         if not self._is_watching:
             self._is_watching = True
-            self.timers.add(LOOK_EVERY, self._look_for_vanished)
+            self.timers.add(CHECK_INTERVAL, self._check_liveness)
 
     def select(self, timeout: float | None, spin: float = 0.0) -> list[tuple[AnyConnection, int]]:
         """Return the connections with pending events, and these events.
@@ -105,25 +102,25 @@ class Listener(Closeable, Generic[AnyConnection]):
             spin: How long to poll for it without sleeping before that, in s.
         """
         select = self._selector.select
-        hidden = self._find_hidden() if self._hidden else {}
-        if hidden:
+        buffered = self._find_buffered() if self._buffered else {}
+        if buffered:
             timeout, spin = 0.0, 0.0
-        found = (spin and spin_until(lambda: select(0), spin)) or select(timeout)
+        found = (spin and self._network.spin_until(lambda: select(0), spin)) or select(timeout)
         ready = []
         for key, events in found:
             if key.data is not None:
-                ready.append((key.data, events | hidden.pop(key.data, 0)))
+                ready.append((key.data, events | buffered.pop(key.data, 0)))
             elif key.fileobj is self._waker:
                 self._waker.recv(1024)
             else:
                 self._has_guests = True
-        ready += hidden.items()
+        ready += buffered.items()
         return ready
 
-    def _find_hidden(self) -> dict[AnyConnection, int]:
+    def _find_buffered(self) -> dict[AnyConnection, int]:
         """Return connections that may have received data that the selector does not see."""
         watched = self._selector.get_map()
-        keys = [watched[one] for one in self._hidden if one in watched]
+        keys = [watched[one] for one in self._buffered if one in watched]
         return {key.data: selectors.EVENT_READ for key in keys if key.events & selectors.EVENT_READ}
 
     def accept(self) -> bool:
@@ -136,21 +133,21 @@ class Listener(Closeable, Generic[AnyConnection]):
             return False
         self._has_guests = False
         for _ in range(_ACCEPTED_AT_ONCE):
-            if self._socket is None:
+            if self._link is None:
                 break
             try:
-                connected, place = self._socket.accept()
+                connected, place = self._link.accept()
             except BlockingIOError:
                 break
             except ConnectionError:  # it was gone before it was accepted
                 continue
             except OSError as error:  # the process has too many open files
                 _LOG.warning("Connections cannot be accepted for now: %s", error)
-                self._selector.unregister(self._socket)
+                self._selector.unregister(self._link)
                 self.timers.add(_PAUSE, self._accept_again)
                 break
-            if self._identity is not None:
-                connected = SecureSocket.of_server(connected, self._identity, self._hidden)
+            if self._identity is not None and isinstance(connected, socket.socket):
+                connected = SecureSocket.of_server(connected, self._identity, self._buffered)
             with contextlib.suppress(OSError):  # gone already
                 self._accepted(connected, "{}:{}".format(*place[:2]))
         return True
@@ -162,22 +159,22 @@ class Listener(Closeable, Generic[AnyConnection]):
 
     def close(self) -> None:
         """Stop listening; the owner closes the connections."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
+        if self._link is not None:
+            self._link.close()
+            self._link = None
         self._waker.close()
         self._wakes.close()
         self._selector.close()
 
-    def _look_for_vanished(self) -> None:
+    def _check_liveness(self) -> None:
         alive = [one for one in self._connections if not one.closed]
         for connection in alive:
-            if has_vanished(connection.socket):
+            if has_vanished(connection.link):
                 self._vanished(connection)
         self._is_watching = bool(alive)
         if self._is_watching:
-            self.timers.add(LOOK_EVERY, self._look_for_vanished)
+            self.timers.add(CHECK_INTERVAL, self._check_liveness)
 
     def _accept_again(self) -> None:
-        if self._socket is not None:
-            self._selector.register(self._socket, selectors.EVENT_READ)
+        if self._link is not None:
+            self._selector.register(self._link, selectors.EVENT_READ)

@@ -12,13 +12,14 @@ from __future__ import annotations
 import contextlib
 import errno
 import math
-import select
 import socket
 import struct
 import sys
-import time
 
-LOOK_EVERY = 2.0
+from physx_core.clock import SYSTEM_CLOCK, Clock
+from physx_core.net.link import Link, Poll
+
+CHECK_INTERVAL = 2.0
 """Interval at which code that waits for a peer calls `has_vanished`, in s."""
 
 VANISHED = "its machine no longer answers"
@@ -32,7 +33,7 @@ _INFO = struct.Struct("=8B13I")  # beginning of Linux's tcp_info
 _LOSSES = {errno.ETIMEDOUT, errno.EHOSTUNREACH, errno.ENETUNREACH, errno.ENETDOWN, errno.EHOSTDOWN}
 
 
-def prepare_connection(connected: socket.socket) -> None:
+def prepare_connection(connected: Link) -> None:
     """Make the system send small messages immediately and probe the peer when idle."""
     options = [(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)]
     idle = getattr(socket, "TCP_KEEPIDLE", getattr(socket, "TCP_KEEPALIVE", None))
@@ -49,7 +50,7 @@ def prepare_connection(connected: socket.socket) -> None:
             connected.setsockopt(level, option, value)
 
 
-def has_vanished(connected: socket.socket) -> bool:
+def has_vanished(connected: Link) -> bool:
     """Return whether a peer has acknowledged nothing for 12 s despite repeated probes.
 
     Only Linux provides this information; other systems give up after their own timeouts.
@@ -71,23 +72,26 @@ def is_loss(error: BaseException | None) -> bool:
     return isinstance(error, OSError) and error.errno in _LOSSES
 
 
-def poll_peer(poll: select.poll, connected: socket.socket, seconds: float | None) -> bool:
+def poll_peer(
+    poll: Poll, connected: Link, seconds: float | None, clock: Clock = SYSTEM_CLOCK
+) -> bool:
     """Wait for the events of `poll` on a connection; return whether one occurred.
 
     Args:
         poll: Watches the connection.
         connected: The connection.
         seconds: How long to wait, in s; None: as long as the peer's machine answers.
+        clock: The clock that it follows.
 
     Raises:
         TimeoutError: If the peer's machine no longer answers; `is_loss` recognizes the error.
     """
-    until = math.inf if seconds is None else time.monotonic() + seconds
+    until = math.inf if seconds is None else clock.monotonic() + seconds
     while True:
-        left = max(0.0, until - time.monotonic())
-        if poll.poll(1000 * min(left, LOOK_EVERY)):
+        left = max(0.0, until - clock.monotonic())
+        if poll.poll(1000 * min(left, CHECK_INTERVAL)):
             return True
         if has_vanished(connected):
             raise TimeoutError(errno.ETIMEDOUT, VANISHED)
-        if left <= LOOK_EVERY:
+        if left <= CHECK_INTERVAL:
             return False

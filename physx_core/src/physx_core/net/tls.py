@@ -17,12 +17,12 @@ import time
 from collections.abc import Iterable, Iterator
 from typing import Any
 
-from physx_core.net.addresses import stays_here
+from physx_core.net.addresses import is_same_host
 from physx_core.processes import anonymous_file
 
-_HANDSHAKE = b"\x16"  # first byte of a client that starts TLS; no stranger's frame starts with it
-_PIECE = 1 << 16
-_CHUNK = 1 << 17
+_HANDSHAKE = b"\x16"  # first byte of a client that starts TLS; no frame of a handshake does
+CHUNK_SIZE = 1 << 16
+_SEND_SIZE = 1 << 17
 _SMALL = 1 << 14
 _AT_ONCE = getattr(socket, "MSG_DONTWAIT", 0)
 _VALID = datetime.timedelta(days=3650)  # not checked by anyone
@@ -89,16 +89,16 @@ class SecureSocket(socket.socket):
         channel: What the token proofs are bound to: the fingerprint of the server's certificate;
             empty if the connection is plain and stays on this machine; None if it is plain and
             comes from elsewhere, or before anything has arrived.
-        hidden: Sockets, possibly including this one, that may hold received data that the system
+        buffered: Sockets, possibly including this one, that may hold received data that the system
             does not report, because it has already been read for decryption.
     """
 
-    def __init__(self, connected: socket.socket, hidden: set[SecureSocket] | None = None) -> None:
+    def __init__(self, connected: socket.socket, buffered: set[SecureSocket] | None = None) -> None:
         """Take over a connected socket; see `of_server` and `of_client`.
 
         Args:
             connected: The socket.
-            hidden: The set to use as `hidden`.
+            buffered: The set to use as `buffered`.
         """
         timeout = connected.gettimeout()
         super().__init__(
@@ -106,26 +106,26 @@ class SecureSocket(socket.socket):
         )
         self.settimeout(timeout)
         self.channel: bytes | None = None
-        self.hidden = set[SecureSocket]() if hidden is None else hidden
+        self.buffered = set[SecureSocket]() if buffered is None else buffered
         self._identity: Identity | None = None
         self._is_plain = self._is_broken = False
         self._tls: ssl.SSLObject | None = None
         self._incoming, self._outgoing = ssl.MemoryBIO(), ssl.MemoryBIO()
         self._unsent = memoryview(b"")  # encrypted
-        self._owed = 0  # bytes that are encrypted but not reported as sent
+        self._unreported = 0  # bytes that are encrypted but not reported as sent
 
     @classmethod
     def of_server(
-        cls, connected: socket.socket, identity: Identity, hidden: set[SecureSocket]
+        cls, connected: socket.socket, identity: Identity, buffered: set[SecureSocket]
     ) -> SecureSocket:
         """Return a server's end of a new connection; its first byte decides whether it encrypts.
 
         Args:
             connected: The connected socket, which is taken over.
             identity: The server's certificate.
-            hidden: See the attribute.
+            buffered: See the attribute.
         """
-        made = cls(connected, hidden)
+        made = cls(connected, buffered)
         made._identity = identity
         return made
 
@@ -156,7 +156,7 @@ class SecureSocket(socket.socket):
         made.channel = hashlib.sha256(certificate).digest()
         return made
 
-    def settle(self) -> socket.socket:
+    def unwrap_if_plain(self) -> socket.socket:
         """Return the socket to use once the peer is trusted: a plain one if not encrypted.
 
         In that case, this one is detached.
@@ -176,10 +176,10 @@ class SecureSocket(socket.socket):
         Raises:
             OSError: If nothing has arrived, or the connection is broken or was cut.
         """
-        tls = self._tls or self._choose()
+        tls = self._tls or self._detect_mode()
         if tls is None:
             return super().recv_into(buffer, nbytes, flags)
-        if self not in self.hidden:
+        if self not in self.buffered:
             self._fetch()
         view = memoryview(buffer).cast("B")
         return self._decrypt(tls, view[: nbytes or len(view)])
@@ -202,13 +202,13 @@ class SecureSocket(socket.socket):
         done = 0
         try:
             self._push()
-            done, self._owed = self._owed, 0
+            done, self._unreported = self._unreported, 0
             while done < len(view):
-                end = min(done + _CHUNK, len(view))
-                while done + self._owed < end:
-                    self._owed += tls.write(view[done + self._owed : end])
+                end = min(done + _SEND_SIZE, len(view))
+                while done + self._unreported < end:
+                    self._unreported += tls.write(view[done + self._unreported : end])
                 self._push()
-                done, self._owed = end, 0
+                done, self._unreported = end, 0
         except BlockingIOError:
             if not done:
                 raise
@@ -245,19 +245,19 @@ class SecureSocket(socket.socket):
         Hence, any thread may shut down both directions.
         """
         if how == socket.SHUT_WR:
-            self._say_goodbye(0)
+            self._send_close_notify(0)
         super().shutdown(how)
 
     def close(self) -> None:
         """Send a TLS goodbye, if that does not block, and close the socket."""
-        self.hidden.discard(self)
+        self.buffered.discard(self)
         if self.fileno() >= 0:
-            self._say_goodbye(_AT_ONCE)
+            self._send_close_notify(_AT_ONCE)
         super().close()
 
     # Encryption -------------------------------------------------------------------------------
 
-    def _choose(self) -> ssl.SSLObject | None:
+    def _detect_mode(self) -> ssl.SSLObject | None:
         """Determine from a client's first byte whether it encrypts."""
         if self._is_plain or self._identity is None:
             return None
@@ -268,7 +268,7 @@ class SecureSocket(socket.socket):
             self.channel = self._identity.fingerprint
             return self._tls
         self._is_plain = True
-        self.channel = b"" if stays_here(self) else None
+        self.channel = b"" if is_same_host(self) else None
         return None
 
     def _shake_hands(self, tls: ssl.SSLObject) -> None:
@@ -288,13 +288,13 @@ class SecureSocket(socket.socket):
                 raise self._failed(error) from error
             self._push()
             self.settimeout(patience)
-            self.hidden.add(self)
+            self.buffered.add(self)
             return
 
     def _decrypt(self, tls: ssl.SSLObject, view: memoryview) -> int:
         """Fill a buffer as far as possible; return the number of bytes, 0 at the end.
 
-        If the buffer is full or the end is near, the socket is added to `hidden`.
+        If the buffer is full or the end is near, the socket is added to `buffered`.
         """
         filled, size = 0, len(view)
         while filled < size:
@@ -304,7 +304,7 @@ class SecureSocket(socket.socket):
                     break
                 filled += count
             except ssl.SSLWantReadError:
-                self.hidden.discard(self)
+                self.buffered.discard(self)
                 self._answer()
                 if filled:
                     return filled
@@ -316,9 +316,9 @@ class SecureSocket(socket.socket):
                     break
                 raise self._failed(error) from error
         if filled:
-            self.hidden.add(self)
+            self.buffered.add(self)
         else:
-            self.hidden.discard(self)
+            self.buffered.discard(self)
         return filled
 
     def _answer(self) -> None:
@@ -335,7 +335,7 @@ class SecureSocket(socket.socket):
         """
         if self._is_broken:
             raise ConnectionAbortedError("its encryption has already failed")
-        data = super().recv(_PIECE)
+        data = super().recv(CHUNK_SIZE)
         if data:
             self._incoming.write(data)
         else:
@@ -361,9 +361,9 @@ class SecureSocket(socket.socket):
         reason = (error.reason or str(error)).replace("_", " ").lower()
         return ConnectionAbortedError(f"its encryption failed: {reason}")
 
-    def _say_goodbye(self, flags: int) -> None:
+    def _send_close_notify(self, flags: int) -> None:
         """Tell the peer that nothing follows, unless earlier data has not been sent completely."""
-        tls, is_complete = self._tls, not (self._unsent or self._owed or self._is_broken)
+        tls, is_complete = self._tls, not (self._unsent or self._unreported or self._is_broken)
         if tls is None or not is_complete:
             return
         with contextlib.suppress(OSError, ValueError):

@@ -1,4 +1,4 @@
-"""Child processes and temporary folders that end with this process, and signals that end it."""
+"""Child processes, threads and temporary folders that end with this process, and its signals."""
 
 from .child import ChildProcess as ChildProcess
 from .descendants import children as children
@@ -9,6 +9,7 @@ from .endings import ends_in as ends_in
 from .endings import is_ending as is_ending
 from .endings import passes_through as passes_through
 from .folder import TemporaryFolder as TemporaryFolder
+from .helper import Helper as Helper
 from .interrupt import Interrupt as Interrupt
 from .interrupt import Terminated as Terminated
 from .interrupt import deferred_interrupt as deferred_interrupt

@@ -38,7 +38,7 @@ class ChildProcess(Closeable):
         stdout: int | None = None,
         stderr: int | None = None,
         pass_fds: Sequence[int] = (),
-        lives_on: bool = False,
+        detached: bool = False,
     ) -> None:
         """Start the process.
 
@@ -48,7 +48,7 @@ class ChildProcess(Closeable):
             stdout: As in `subprocess.Popen`.
             stderr: As in `subprocess.Popen`.
             pass_fds: As in `subprocess.Popen`.
-            lives_on: Whether it outlives this process and this object unless it is closed.
+            detached: Whether it outlives this process and this object unless it is closed.
 
         Raises:
             OSError: If the process cannot be started.
@@ -70,7 +70,7 @@ class ChildProcess(Closeable):
             self.pid, self.stderr = self._process.pid, self._process.stderr
             assert self._process.stdin is not None
             with self._process.stdin as line:  # if it closes without a line, nothing is started
-                if not lives_on:
+                if not detached:
                     WATCHDOG.add(self.pid)
                     # When the interpreter exits, the watchdog acts after all exit functions.
                     weakref.finalize(self, _abandon, self._process, self._owner).atexit = False

@@ -39,4 +39,4 @@ class TemporaryFolder(Closeable):
 def _remove(path: Path, owner: int) -> None:
     if os.getpid() == owner:
         shutil.rmtree(path, ignore_errors=True)
-        WATCHDOG.settle()
+        WATCHDOG.stop_if_idle()

@@ -52,16 +52,16 @@ class Watchdog:
             if group in self._groups:
                 self._groups.discard(group)
                 self._write(self._names())
-                self.settle()
+                self.stop_if_idle()
 
     def make_folder(self, prefix: str) -> Path:
-        """Create a folder for temporary files; call `settle` after removing it."""
+        """Create a folder for temporary files; call `stop_if_idle` after removing it."""
         with self.lock:
             self._start()
             self._folder.mkdir(0o700, exist_ok=True)  # a cleanup of /tmp may have removed it
             return Path(tempfile.mkdtemp(prefix=prefix, dir=self._folder))
 
-    def settle(self) -> None:
+    def stop_if_idle(self) -> None:
         """Stop the shell if there is nothing left to watch over."""
         with self.lock:
             if self._groups or self._shell is None:

@@ -7,7 +7,6 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections import Counter
 from collections.abc import Iterable, Sequence
 
@@ -36,7 +35,7 @@ class ClientProcess(ClientHandle):
         token: str,
         core: int | None = None,
         ticket: int | None = None,
-        lives_on: bool = False,
+        detached: bool = False,
     ) -> None:
         """Store the arguments of the process.
 
@@ -46,7 +45,7 @@ class ClientProcess(ClientHandle):
             token: Token of the run.
             core: The only processor core that it may use; None: all that this process may use.
             ticket: Ticket that it presents to run the instance, in an elastic run.
-            lives_on: Whether it outlives this process; it ends with its connection to the server.
+            detached: Whether it outlives this process; it ends with its connection to the server.
         """
         self.instance_id = instance_id
         self._core = core
@@ -59,7 +58,7 @@ class ClientProcess(ClientHandle):
         self._process: ChildProcess | None = None
         self._tail: OutputTail | None = None
         self._file: OutputFile | None = None
-        self._lives_on = lives_on
+        self._detached = detached
 
     def start(self) -> None:
         """Start the process.
@@ -69,12 +68,12 @@ class ClientProcess(ClientHandle):
         """
         try:
             # If this process ended, a pipe would make each line that the client writes an error.
-            self._file = OutputFile() if self._lives_on else None
+            self._file = OutputFile() if self._detached else None
             self._process = ChildProcess(
                 self._command,
                 variables=self._variables,
                 stderr=subprocess.PIPE if self._file is None else self._file.descriptor,
-                lives_on=self._lives_on,
+                detached=self._detached,
             )
         except OSError as error:
             raise ClientError(self.instance_id, f"could not be started: {error}.") from error
@@ -192,5 +191,5 @@ def stop(clients: Iterable[ClientHandle], patience: float) -> None:
 
 
 def _wait_for(clients: list[ClientHandle], patience: float) -> list[ClientHandle]:
-    until = time.monotonic() + patience
-    return [client for client in clients if not client.wait(until)]
+    limits = [client.clock.monotonic() + patience for client in clients]
+    return [c for c, until in zip(clients, limits, strict=True) if not c.wait(until)]

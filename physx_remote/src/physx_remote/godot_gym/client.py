@@ -18,7 +18,7 @@ from physx_remote.godot_gym.wire import OUTCOME, observation_fields
 from physx_remote.serving.client_link import RequestLink
 from physx_remote.serving.connect_options import ConnectOptions
 from physx_remote.serving.spaces import (
-    NONSENSE,
+    MALFORMED_INPUT_ERRORS,
     Space,
     SpaceTree,
     build_space,
@@ -262,7 +262,7 @@ class GodotGymEnv(gymnasium.Env[Any, Any]):
         """Return the reward from an answer."""
         try:
             return float((data["world"] or {}).get("reward", 0.0))
-        except NONSENSE as error:
+        except MALFORMED_INPUT_ERRORS as error:
             raise _unexpected("reward_of", error) from error
 
     def ended_of(self, data: Parts) -> tuple[bool, bool]:
@@ -271,7 +271,7 @@ class GodotGymEnv(gymnasium.Env[Any, Any]):
         ended = world.get("terminated", world.get("done", False))
         try:
             return bool(ended), bool(world.get("truncated", False))
-        except NONSENSE as error:
+        except MALFORMED_INPUT_ERRORS as error:
             raise _unexpected("ended_of", error) from error
 
     def info_of(self, data: Parts) -> dict[str, Any]:
@@ -281,7 +281,7 @@ class GodotGymEnv(gymnasium.Env[Any, Any]):
         text = world.get("info")
         try:
             return {**others, **json.loads(text)} if text else others
-        except NONSENSE as error:
+        except MALFORMED_INPUT_ERRORS as error:
             raise _unexpected("info_of", error) from error
 
     # ----------------------------------------------------------------------------------------
@@ -356,7 +356,7 @@ def _to_leaf(name: str, leaf: Space, value: Any) -> Any:
         source = np.frombuffer(value, np.uint8) if isinstance(value, bytes) else value
         array = np.asarray(source, leaf.dtype)
         return array if array.shape == leaf.shape else array.reshape(leaf.shape)
-    except NONSENSE as error:
+    except MALFORMED_INPUT_ERRORS as error:
         raise RemoteProtocolError(
             f'The field "{name}" of the observation does not fit {leaf}: {error}. Override '
             "observation_of, or pass observation_space."

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Literal, get_args
 
 from physx_core.errors import ConfigError, UsageError
-from physx_core.net import Reader, check_address
+from physx_core.net import SOCKETS, Network, Reader, check_address
 from physx_remote.errors import RequestError
 from physx_remote.godot_gym.frames_timer import Signal
 from physx_remote.godot_gym.messages import ERROR, encode_extension
@@ -43,6 +43,7 @@ class Communication(SocketService):
         max_request: int = MAX_REQUEST,
         patience: float | None = None,
         max_clients: int = 256,
+        network: Network = SOCKETS,
     ) -> None:
         """Store the options.
 
@@ -61,11 +62,12 @@ class Communication(SocketService):
             max_clients: Maximum number of clients; further ones are disconnected at their first
                 request. In addition, as many connections that have not sent a whole request are
                 kept, but at least 32; if another arrives, one of them is closed.
+            network: What connects the clients, and the clock that `patience` follows.
 
         Raises:
             ConfigError: If a value is out of range.
         """
-        super().__init__(max_clients=max_clients)
+        super().__init__(max_clients=max_clients, network=network)
         choices = (
             ("clients", clients, Clients),
             ("reply", reply, Reply),
@@ -127,7 +129,7 @@ class Communication(SocketService):
         self.listen(address, port)
         LOG.info("Listening at %s:%s", *self.address)
         if self._patience is not None:
-            self.after(self._patience / 4, self._look_for_silence)
+            self.after(self._patience / 4, self._drop_silent)
 
     def server_poll(self, timeout: float | None = 0.0) -> bool:
         """Handle what has arrived; see `Service.poll`."""
@@ -221,10 +223,10 @@ class Communication(SocketService):
         elif self._reply == "always":
             self.put_message(encode_extension(ERROR, text))
 
-    def _look_for_silence(self) -> None:
+    def _drop_silent(self) -> None:
         """Disconnect a silent client that keeps others waiting."""
         patience, served = self._patience or 0.0, self._served
-        self.after(patience / 4, self._look_for_silence)
+        self.after(patience / 4, self._drop_silent)
         others = any(c is not served for c in self.connections)
         idle = served is not None and self._asking is None and served.body is None
         if served is not None and idle and others and served.silence > patience:

@@ -22,7 +22,7 @@ from physx_core.errors import ConfigError, MissingLibraryError
 from physx_core.fields import FieldLike, as_fields
 from physx_core.typing import Array
 from physx_remote.errors import RemoteError, RemoteProtocolError
-from physx_remote.serving.spaces import NONSENSE
+from physx_remote.serving.spaces import MALFORMED_INPUT_ERRORS
 
 AGENT, WORLD = "agent_data", "world_data"
 ERROR, DESCRIPTION = 1000, 1001
@@ -33,7 +33,7 @@ MessageField: TypeAlias = FieldLike
 _NamedReaders: TypeAlias = "list[tuple[str, Callable[[Any], Any]]]"
 _Readers: TypeAlias = tuple[_NamedReaders, _NamedReaders]
 
-_INVALID: tuple[type[Exception], ...] = (ConfigError, *NONSENSE)
+_INVALID: tuple[type[Exception], ...] = (ConfigError, *MALFORMED_INPUT_ERRORS)
 _LENGTH_DELIMITED = 2
 _MANY = 32
 
@@ -169,7 +169,7 @@ class Messages:
                 "agent": _values(message.agent_data, agent) if has_agent else None,
                 "world": _values(message.world_data, world) if has_world else None,
             }
-        except NONSENSE as error:
+        except MALFORMED_INPUT_ERRORS as error:
             raise RemoteProtocolError(
                 f"An answer of {len(body)} bytes does not fit the fields of the messages: {error}."
             ) from error

@@ -27,7 +27,7 @@ from physx_remote.godot_rl.json_spaces import (
 )
 from physx_remote.serving.client_link import RequestLink
 from physx_remote.serving.connect_options import ConnectOptions
-from physx_remote.serving.spaces import NONSENSE, Space, check_shape
+from physx_remote.serving.spaces import MALFORMED_INPUT_ERRORS, Space, check_shape
 
 VERSION = {"major_version": "0", "minor_version": "7"}
 """Version of the protocol sent in the handshake."""
@@ -223,7 +223,7 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         try:
             for agent, info in enumerate(each):
                 infos = self._add_info(infos, info, agent)
-        except NONSENSE as error:
+        except MALFORMED_INPUT_ERRORS as error:
             raise RemoteProtocolError(
                 f"The infos of the agents are incompatible: {error}."
             ) from error
@@ -238,7 +238,7 @@ class GodotRLVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         """Return one agent's observation."""
         try:
             values = {n: read_observation(n, part, told[n]) for n, part in self._observed.items()}
-        except NONSENSE as error:
+        except MALFORMED_INPUT_ERRORS as error:
             raise RemoteProtocolError(
                 f"The application sent the observation {reprlib.repr(told)}, which does not fit "
                 f"its description {self._observed}: {error!r}."
@@ -337,7 +337,7 @@ def _spaces(told: Mapping[str, Any], key: str, count: int, make: Any) -> dict[st
         parts = {name: make(name, entry) for name, entry in each[0].items()}
         for space in parts.values():
             check_shape(space.shape or (), count)
-    except NONSENSE as error:
+    except MALFORMED_INPUT_ERRORS as error:
         raise RemoteProtocolError(
             f"The {key} {reprlib.repr(each)} is invalid: {error!r}."
         ) from error

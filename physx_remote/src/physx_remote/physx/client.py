@@ -25,11 +25,11 @@ from physx_remote.physx.wire import (
     split_infos,
 )
 from physx_remote.serving.connect_options import TokenOptions
-from physx_remote.serving.spaces import NONSENSE, build_space, check_shape
+from physx_remote.serving.spaces import MALFORMED_INPUT_ERRORS, build_space, check_shape
 
 LOG = logging.getLogger("physx.remote")
 
-_INVALID: tuple[type[Exception], ...] = (RemoteProtocolError, *NONSENSE)
+_INVALID: tuple[type[Exception], ...] = (RemoteProtocolError, *MALFORMED_INPUT_ERRORS)
 _FLOAT, _BOOL = np.dtype(np.float64), np.dtype(np.bool_)
 
 
@@ -133,7 +133,7 @@ class PhysxClient(Closeable):
         """
         number = self.ask({"do": "snapshot", "world": world})
         if type(number) is not int:
-            raise self._link.nonsense("a snapshot without a number")
+            raise self._link.protocol_error("a snapshot without a number")
         return number
 
     def restore(self, snapshot: int, world: int = 0) -> Outcomes:
@@ -201,9 +201,9 @@ class PhysxClient(Closeable):
         """
         notes, arrays = self._answer(self._number - back)
         if not isinstance(arrays, dict) or arrays.keys() != self._names:
-            raise self._link.nonsense("an answer without the arrays of worlds")
+            raise self._link.protocol_error("an answer without the arrays of worlds")
         if not (fit_outcome(arrays, count) and self.observations.fit(arrays, count)):
-            raise self._link.nonsense("an answer that does not fit the worlds and their spaces")
+            raise self._link.protocol_error("an answer that does not fit the worlds' spaces")
         if notes is None:
             return Outcomes(arrays, [{} for _ in range(count)])
         infos, left_out = split_infos(notes, count)
@@ -232,13 +232,13 @@ class PhysxClient(Closeable):
         while True:
             frame = self._link.receive()
             if frame.number != number:
-                raise self._link.nonsense(
+                raise self._link.protocol_error(
                     f"an answer to request {frame.number} instead of {number}"
                 )
             if frame.kind in (Kind.ANSWER, Kind.REFUSAL):
                 return notes, self._link.decode(frame)
             if frame.kind is not Kind.NOTES:
-                raise self._link.nonsense(f"a message {frame.kind.name}")
+                raise self._link.protocol_error(f"a message {frame.kind.name}")
             notes = self._link.decode(frame)
 
 
@@ -371,7 +371,7 @@ def read_introduction(link: PhysxLink) -> Introduction:
             metadata,
         )
     except _INVALID as error:
-        raise link.nonsense(f"an invalid introduction: {error}") from error
+        raise link.protocol_error(f"an invalid introduction: {error}") from error
     except BaseException:
         link.close()
         raise

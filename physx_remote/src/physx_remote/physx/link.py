@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import socket
-import time
 from typing import Any, ClassVar
 
 from physx_core.errors import (
@@ -14,10 +12,12 @@ from physx_core.errors import (
     UnansweredError,
 )
 from physx_core.net import (
+    SOCKETS,
     TOKEN_VARIABLE,
     Frame,
     FrameReader,
     Kind,
+    Network,
     PlainRefusedError,
     decode,
     decode_error,
@@ -62,6 +62,7 @@ class PhysxLink(ClientConnection):
         timeout: float | None = 60.0,
         connect_timeout: float = 10.0,
         max_answer: int = MAX_ANSWER,
+        network: Network = SOCKETS,
     ) -> None:
         """Connect; retry while nothing listens.
 
@@ -73,8 +74,9 @@ class PhysxLink(ClientConnection):
             timeout: Time limit for an answer in s; None: no limit.
             connect_timeout: Time in s to keep trying to connect.
             max_answer: Size of the longest accepted answer in bytes.
+            network: What connects, and the clock that the time limits follow.
         """
-        super().__init__(address)
+        super().__init__(address, network)
         self.timeout = timeout
         found = find_token(token_file, token)
         if found is None:
@@ -104,11 +106,14 @@ class PhysxLink(ClientConnection):
         encrypted: bool = False,
     ) -> FrameReader:
         """Connect, and authenticate both sides with the token."""
-        until = time.monotonic() + patience
-        self._socket = self._reach(lambda left: _open_socket(address, role, left), patience)
+        until = self._clock.monotonic() + patience
+        unread = _BACKLOG if role == OBSERVE else None
+        self._socket = self._reach(
+            lambda left: self._network.connect(address, left, unread=unread), patience
+        )
         try:
             return self._authenticate(
-                token, role, max(until - time.monotonic(), 1.0), encrypted=encrypted
+                token, role, max(until - self._clock.monotonic(), 1.0), encrypted=encrypted
             )
         except BaseException:
             self._socket.close()
@@ -120,7 +125,7 @@ class PhysxLink(ClientConnection):
         self._socket.settimeout(patience)
         try:
             self._socket = encrypt(self._socket, always=encrypted)
-            return introduce(self._socket, token, role)
+            return introduce(self._socket, token, role, self._clock)
         except PlainRefusedError:
             raise
         except SilentPeerError as error:
@@ -202,8 +207,8 @@ class PhysxLink(ClientConnection):
                 if frame is not None:
                     return frame
                 if patience is not None:
-                    until = time.monotonic() + patience if until is None else until
-                    left = until - time.monotonic()
+                    until = self._clock.monotonic() + patience if until is None else until
+                    left = until - self._clock.monotonic()
                     if left <= 0:
                         return None
         except (EOFError, OSError) as error:
@@ -226,24 +231,7 @@ class PhysxLink(ClientConnection):
             raise RemoteProtocolError(f"{self.name}: {error}") from error
         raise refusal
 
-    def nonsense(self, what: str) -> RemoteProtocolError:
+    def protocol_error(self, what: str) -> RemoteProtocolError:
         """Close the connection; return the error for a service that sent something invalid."""
         self.close(f"it sent {what}")
         return RemoteProtocolError(f"{self.name} sent {what}. The connection is closed.")
-
-
-def _open_socket(address: tuple[str, int], role: int, patience: float) -> socket.socket:
-    """Return a connected socket; an observer's socket buffers little unread data."""
-    error: OSError = OSError("the host has no address")
-    for family, kind, proto, _, place in socket.getaddrinfo(*address, type=socket.SOCK_STREAM):
-        connected = socket.socket(family, kind, proto)
-        try:
-            if role == OBSERVE:
-                connected.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, _BACKLOG)
-            connected.settimeout(patience)
-            connected.connect(place)
-            return connected
-        except OSError as failed:
-            connected.close()
-            error = failed
-    raise error

@@ -26,7 +26,7 @@ from physx_remote.physx.wire import (
     split_infos,
 )
 from physx_remote.serving.connect_options import TokenOptions
-from physx_remote.serving.spaces import NONSENSE
+from physx_remote.serving.spaces import MALFORMED_INPUT_ERRORS
 
 
 @dataclass(frozen=True)
@@ -108,7 +108,7 @@ class PhysxObserver(Closeable):
             if frame.kind is Kind.SEEN:
                 return self._seen(frame)
             if frame.kind is not Kind.NOTES:
-                raise self._nonsense(frame)
+                raise self._protocol_error(frame)
             self._notes = frame
 
     def last(self) -> Seen:
@@ -157,10 +157,10 @@ class PhysxObserver(Closeable):
                 truncated=np.asarray(arrays[TRUNCATED]),
                 infos=infos,
             )
-        except NONSENSE as error:
-            raise self._nonsense(frame) from error
+        except MALFORMED_INPUT_ERRORS as error:
+            raise self._protocol_error(frame) from error
 
-    def _nonsense(self, frame: Frame) -> RemoteProtocolError:
+    def _protocol_error(self, frame: Frame) -> RemoteProtocolError:
         self.close()
         return RemoteProtocolError(
             f"{self._link.name} sent a message {frame.kind.name} that is not valid for observers."

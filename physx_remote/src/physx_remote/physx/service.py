@@ -12,10 +12,12 @@ from physx_core import PhysxError
 from physx_core.errors import ConnectionRefusedByPeerError
 from physx_core.net import (
     HANDSHAKE_LIMIT,
+    SOCKETS,
     Frame,
     FrameReader,
     Handshakes,
     Kind,
+    Network,
     Reader,
     decode,
     describe_flat,
@@ -65,12 +67,13 @@ class PhysxService(SocketService):
         max_request: int,
         max_clients: int,
         max_snapshots: int,
+        network: Network = SOCKETS,
     ) -> None:
         """Store the worlds; the options are those of `Physx`."""
-        super().__init__(max_clients=max_clients)
+        super().__init__(max_clients=max_clients, network=network)
         self.token = token
         self._worlds = worlds
-        self._requests = WorldRequests(worlds, max_snapshots)
+        self._requests = WorldRequests(worlds, max_snapshots, self._clock)
         self._introduction = self._introduce()
         self._max_request = max_request
         self._handshake_timeout = handshake_timeout
@@ -107,12 +110,12 @@ class PhysxService(SocketService):
         """Return a reader of frames."""
         return FrameReader(HANDSHAKE_LIMIT)
 
-    def new_strangers(self) -> Handshakes[RequestConnection]:
+    def new_pending(self) -> Handshakes[RequestConnection]:
         """Return the handshakes, in which new clients prove that they know the token."""
         self._handshakes = Handshakes[RequestConnection](
             self.token,
             self._handshake_timeout,
-            self.max_strangers,
+            self.max_pending,
             self.drop,
             self._listener.timers,
         )

@@ -15,7 +15,7 @@ from physx_core.typing import Array
 from physx_remote.errors import RemoteProtocolError
 from physx_remote.physx.client import PhysxClient
 from physx_remote.physx.wire import REWARD, TERMINATED, TRUNCATED
-from physx_remote.serving.spaces import NONSENSE
+from physx_remote.serving.spaces import MALFORMED_INPUT_ERRORS
 
 
 class PhysxVectorEnv(VectorEnv[Any, Any, Any], Closeable):
@@ -190,7 +190,7 @@ class PhysxVectorEnv(VectorEnv[Any, Any, Any], Closeable):
     def _joined(self, infos: dict[str, Any], info: dict[str, Any], world: int) -> dict[str, Any]:
         try:
             return self._add_info(infos, info, world)
-        except NONSENSE as error:
+        except MALFORMED_INPUT_ERRORS as error:
             raise RemoteProtocolError(
                 f"The infos of the worlds are incompatible, for example that of world {world}: "
                 f"{error}."

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import itertools
-import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from types import TracebackType
@@ -12,6 +11,7 @@ from typing import Any, Self
 import numpy as np
 
 from physx_core import PhysxError
+from physx_core.clock import Clock
 from physx_core.typing import Array
 from physx_remote.errors import RequestError
 from physx_remote.physx.latest_state import LatestState
@@ -46,8 +46,9 @@ class WorldRequests:
         latest: The last transition of each world.
     """
 
-    def __init__(self, worlds: Worlds, max_snapshots: int) -> None:
+    def __init__(self, worlds: Worlds, max_snapshots: int, clock: Clock) -> None:
         """Store the worlds."""
+        self._clock = clock
         self._worlds = worlds
         self._actions = SpaceArrays(worlds.action_space, "action")
         observations = SpaceArrays(worlds.observation_space, "observation")
@@ -76,14 +77,14 @@ class WorldRequests:
         return Change(worlds, False, self._step(worlds, rows), arrays)
 
     def _step(self, worlds: Sequence[int], actions: Iterable[Any]) -> Iterator[float]:
-        step, put, begin = self._worlds.step, self.latest.put, time.monotonic()
+        step, put, begin = self._worlds.step, self.latest.put, self._clock.monotonic()
         with _Place("step") as place:
             for world, action in zip(worlds, actions, strict=True):
                 place.world = world
                 put(world, step(world, action))
-                if time.monotonic() - begin > _SLICE:
+                if self._clock.monotonic() - begin > _SLICE:
                     yield 0.0
-                    begin = time.monotonic()
+                    begin = self._clock.monotonic()
 
     def resets(self, request: Mapping[str, Any]) -> Change:
         """Prepare a new episode of some worlds.
@@ -111,15 +112,15 @@ class WorldRequests:
     def _reset(
         self, worlds: Sequence[int], seeds: Sequence[int | None], options: dict[str, Any] | None
     ) -> Iterator[float]:
-        begin = time.monotonic()
+        begin = self._clock.monotonic()
         with _Place("reset") as place:
             for world, seed in zip(worlds, seeds, strict=True):
                 place.world = world
                 observation, info = self._worlds.reset(world, seed, options)
                 self.latest.put(world, (observation, 0.0, False, False, info))
-                if time.monotonic() - begin > _SLICE:
+                if self._clock.monotonic() - begin > _SLICE:
                     yield 0.0
-                    begin = time.monotonic()
+                    begin = self._clock.monotonic()
 
     # Snapshots --------------------------------------------------------------------------------
 

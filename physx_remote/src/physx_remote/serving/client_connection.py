@@ -4,11 +4,19 @@ from __future__ import annotations
 
 import contextlib
 import select
-import socket
 from collections.abc import Callable, Collection
 from typing import Any, ClassVar
 
-from physx_core.net import VANISHED, is_loss, poll_peer, prepare_connection, retry
+from physx_core.net import (
+    SOCKETS,
+    VANISHED,
+    Link,
+    Network,
+    is_loss,
+    poll_peer,
+    prepare_connection,
+    retry,
+)
 from physx_remote.errors import RemoteClosedError, RemoteError, RemoteTimeoutError
 
 _RETRY = 0.1
@@ -27,24 +35,25 @@ class ClientConnection:
     """Name for the other side in messages."""
     _advice: ClassVar[str] = "It may be busy with another client, or waiting for one."
     """What to do if it does not answer in time, or a possible reason."""
-    _socket: socket.socket
+    _socket: Link
 
-    def __init__(self, address: tuple[str, int]) -> None:
-        """Store the address."""
+    def __init__(self, address: tuple[str, int], network: Network = SOCKETS) -> None:
+        """Store the address, and what connects to it."""
+        self._network, self._clock = network, network.clock
         self.name = "{}:{}".format(*address)
         self._why_closed = ""
-        self._readable, self._writable = select.poll(), select.poll()
-        self._hidden: Collection[Any] = ()
+        self._buffered: Collection[Any] = ()
 
-    def _reach(self, connect: Callable[[float], socket.socket], patience: float) -> socket.socket:
-        """Return a connected socket; retry while nothing listens.
+    def _reach(self, connect: Callable[[float], Link], patience: float) -> Link:
+        """Return a connected link; retry while nothing listens.
 
         Args:
             connect: Connects within a time in s.
             patience: Time in s to keep trying.
         """
         try:
-            return retry(connect, patience, _RETRY, ConnectionRefusedError, TimeoutError)
+            errors = ConnectionRefusedError, TimeoutError
+            return retry(connect, patience, _RETRY, *errors, clock=self._clock)
         except (ConnectionRefusedError, TimeoutError) as error:
             raise RemoteTimeoutError(
                 f"Nothing answered at {self.name} within {patience:g} s: {error}. Start the "
@@ -54,12 +63,12 @@ class ClientConnection:
             raise RemoteError(f"{self.name} cannot be reached: {error}.") from error
 
     def _begin(self) -> None:
-        """Prepare the connected socket for `_send` and `_wait`."""
+        """Prepare the connected link for `_send` and `_wait`."""
         prepare_connection(self._socket)
         self._socket.setblocking(False)
-        self._hidden = getattr(self._socket, "hidden", ())  # data held by an encrypting socket
-        self._readable.register(self._socket, select.POLLIN)
-        self._writable.register(self._socket, select.POLLOUT)
+        self._buffered = getattr(self._socket, "buffered", ())  # see SecureSocket
+        self._readable = self._network.poll(self._socket)
+        self._writable = self._network.poll(self._socket, select.POLLOUT)
 
     def _send(self, message: bytes, patience: float | None) -> None:
         """Send a message.
@@ -76,7 +85,7 @@ class ClientConnection:
                     rest = rest[self._socket.send(rest) :]
                 if not rest:
                     return
-                if not poll_peer(self._writable, self._socket, patience):
+                if not poll_peer(self._writable, self._socket, patience, self._clock):
                     raise self._late(patience)
         except OSError as error:
             raise self._broken(error) from error
@@ -90,7 +99,9 @@ class ClientConnection:
         Raises:
             OSError: If the server's machine no longer answers.
         """
-        return bool(self._hidden) or poll_peer(self._readable, self._socket, patience)
+        return bool(self._buffered) or poll_peer(
+            self._readable, self._socket, patience, self._clock
+        )
 
     def _late(self, patience: float | None) -> RemoteTimeoutError:
         """Close the connection; return the error for an answer that did not arrive in time."""

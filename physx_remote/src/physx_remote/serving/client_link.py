@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import socket
-import time
 from typing import Any
 
 from physx_core.errors import ConfigError
+from physx_core.net import SOCKETS, Link, Network
 from physx_remote.errors import RemoteClosedError
 from physx_remote.serving.client_connection import ClientConnection
 from physx_remote.serving.framing import MAX_ANSWER, PrefixReader, add_prefix
@@ -27,6 +26,7 @@ class RequestLink(ClientConnection):
         timeout: float | None = 60.0,
         connect_timeout: float = 10.0,
         max_answer: int = MAX_ANSWER,
+        network: Network = SOCKETS,
     ) -> None:
         """Connect; retry while nothing listens.
 
@@ -35,6 +35,7 @@ class RequestLink(ClientConnection):
             timeout: Time limit for an answer in s; None: no limit.
             connect_timeout: Time in s to keep trying to connect.
             max_answer: Longest accepted answer in bytes.
+            network: What connects, and the clock that the time limits follow.
         """
         if timeout is not None:
             _check_time("timeout", timeout)
@@ -43,14 +44,14 @@ class RequestLink(ClientConnection):
             raise ConfigError(
                 f"max_answer is {max_answer!r} but must be a positive integer (bytes)."
             )
-        super().__init__(address)
+        super().__init__(address, network)
         self._timeout = timeout
         self._reader = PrefixReader(max_answer)
         self._socket = self._connected(address, connect_timeout)
         self._begin()
 
-    def _connected(self, address: tuple[str, int], patience: float) -> socket.socket:
-        return self._reach(lambda left: socket.create_connection(address, left), patience)
+    def _connected(self, address: tuple[str, int], patience: float) -> Link:
+        return self._reach(lambda left: self._network.connect(address, left), patience)
 
     def tell(self, body: bytes) -> None:
         """Send a message that has no answer."""
@@ -69,7 +70,7 @@ class RequestLink(ClientConnection):
 
     def _answer(self) -> bytes:
         left = self._timeout
-        until = None if left is None else time.monotonic() + left
+        until = None if left is None else self._clock.monotonic() + left
         while True:
             if not self._wait(left):
                 raise self._late(self._timeout)
@@ -79,7 +80,7 @@ class RequestLink(ClientConnection):
             body = self._reader.take()
             if body is not None:
                 return body
-            left = None if until is None else max(0.0, until - time.monotonic())
+            left = None if until is None else max(0.0, until - self._clock.monotonic())
 
 
 def _check_time(name: str, seconds: Any) -> None:

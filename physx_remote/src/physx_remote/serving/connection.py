@@ -3,15 +3,14 @@
 from __future__ import annotations
 
 import socket
-import time
 from typing import Any
 
-from physx_core.net import Connection, Reader, yield_core
+from physx_core.net import Connection
 
-MOMENT = 100e-6
+SPIN_LIMIT = 100e-6
 """How long to poll for the next message of a quick client without sleeping, in s."""
 
-_QUICK = 2 * MOMENT
+_QUICK = 2 * SPIN_LIMIT
 
 
 class RequestConnection(Connection):
@@ -23,11 +22,8 @@ class RequestConnection(Connection):
         ended: Whether the client has stopped sending.
     """
 
-    def __init__(self, connected: socket.socket, reader: Reader, name: str) -> None:
-        """Use a connected socket; see `Connection`."""
-        super().__init__(connected, reader, name)
-        self.body: Any = None
-        self.ended = self.is_quick = False
+    body: Any = None
+    ended = is_quick = False
 
     @property
     def is_quiet(self) -> bool:
@@ -37,7 +33,7 @@ class RequestConnection(Connection):
     @property
     def silence(self) -> float:
         """Time in s since the client last sent something."""
-        return time.monotonic() - self.heard
+        return self._clock.monotonic() - self.heard
 
     @property
     def wants_more(self) -> bool:
@@ -46,11 +42,11 @@ class RequestConnection(Connection):
 
     def limit_backlog(self, size: int) -> None:
         """Limit the unread data that the system keeps for the client to about `size` bytes."""
-        self.socket.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, size)
+        self.link.setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, size)
 
     def touch(self) -> None:
         """Restart the time of silence, because the client had to wait until now."""
-        self.heard = time.monotonic()
+        self.heard = self._clock.monotonic()
 
     def receive(self) -> bool:
         """Take what has arrived; return whether there was anything, even the end of the stream.
@@ -59,28 +55,13 @@ class RequestConnection(Connection):
             OSError: If the connection is broken.
         """
         try:
-            count = self.reader.receive(self.socket)
+            count = self.reader.receive(self.link)
         except BlockingIOError:
             return False
         self.ended = not count
         if count:
-            now = time.monotonic()
+            now = self._clock.monotonic()
             self.is_quick, self.heard = now - self.heard < _QUICK, now
-        return True
-
-    def receive_soon(self) -> bool:
-        """Take what arrives within a moment; return whether there was anything.
-
-        For such a short time, polling is faster than being woken by the system.
-
-        Raises:
-            OSError: If the connection is broken.
-        """
-        until = time.monotonic() + MOMENT
-        while not self.receive():
-            if time.monotonic() > until:
-                return False
-            yield_core()
         return True
 
     def next_body(self) -> bool:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import socket
 import struct
 
-from physx_core.net import Reader
+from physx_core.net import Link, Reader
 from physx_remote.errors import RemoteProtocolError
 
 PREFIX = struct.Struct("<I")
@@ -17,7 +16,7 @@ MAX_REQUEST = 1 << 24
 MAX_ANSWER = 1 << 28
 """Default for the longest body that a client accepts, in bytes."""
 
-_PIECE = 1 << 16
+CHUNK_SIZE = 1 << 16
 _MOST_UNREAD = 1 << 20
 
 
@@ -42,9 +41,9 @@ class BufferReader(Reader):
         """Start with an empty buffer."""
         self.buffer = bytearray()
 
-    def receive(self, connection: socket.socket) -> int:
+    def receive(self, connection: Link) -> int:
         """Take what has arrived; see `Reader.receive`."""
-        data = connection.recv(_PIECE)
+        data = connection.recv(CHUNK_SIZE)
         self.buffer += data
         return len(data)
 

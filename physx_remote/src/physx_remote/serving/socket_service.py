@@ -4,25 +4,33 @@ from __future__ import annotations
 
 import math
 import selectors
-import socket
 import threading
-import time
 from abc import abstractmethod
 from collections import deque
 from collections.abc import Callable, Iterator
 from typing import Any, ClassVar
 
 from physx_core.errors import PhysxError
-from physx_core.net import VANISHED, Listener, Reader, Strangers, is_loopback, is_loss
+from physx_core.net import (
+    SOCKETS,
+    VANISHED,
+    Link,
+    Listener,
+    Network,
+    PendingConnections,
+    Reader,
+    is_loopback,
+    is_loss,
+)
 from physx_remote.errors import RemoteClosedError, RemoteError
 from physx_remote.serving.client_log import ClientLog
-from physx_remote.serving.connection import MOMENT, RequestConnection
+from physx_remote.serving.connection import SPIN_LIMIT, RequestConnection
 from physx_remote.serving.framing import PrefixReader
 from physx_remote.serving.service import LOG, Service
 
 _READ = selectors.EVENT_READ
 _SLICE = 0.02
-_FEW = 32
+_MIN_PENDING = 32
 
 Work = Iterator[float]
 """A request in progress: yields the time in s until it resumes."""
@@ -34,7 +42,7 @@ class SocketService(Service):
     `handle` is called with one message at a time, from any connection. While the work that it
     returns is in progress, no other message is handled, but connections are accepted, read and
     closed, and timers run. A client that sends faster than it is served, or does not read its
-    answers, has to wait. A connection is a stranger at first, and a client after `welcome`.
+    answers, has to wait. A connection is pending at first, and a client after `welcome`.
 
     Attributes:
         connections: All open connections.
@@ -44,19 +52,22 @@ class SocketService(Service):
     encrypts: ClassVar[bool] = False
     """Whether the protocol encrypts what leaves this machine, and authenticates."""
 
-    def __init__(self, *, max_clients: int = 256) -> None:
+    def __init__(self, *, max_clients: int = 256, network: Network = SOCKETS) -> None:
         """Start without connections.
 
         Args:
             max_clients: Maximum number of clients; further ones are turned away. In addition, as
-                many strangers are kept, but at least 32; if another arrives, one of them is closed.
+                many pending connections are kept, but at least 32; if another arrives, one of them
+                is closed.
+            network: What connects the clients, and the clock that the service follows.
         """
         self.address = ("", 0)
         self.connections: list[RequestConnection] = []
         self._max_clients = max_clients
+        self._network, self._clock = network, network.clock
         self.log = ClientLog(self.after)
         self._listener: Listener[RequestConnection]
-        self._strangers: Strangers[RequestConnection]
+        self._pending: PendingConnections[RequestConnection]
         self._ready: deque[RequestConnection] = deque()
         self._work: tuple[RequestConnection, Work] | None = None
         self._recent: RequestConnection | None = None
@@ -74,7 +85,7 @@ class SocketService(Service):
         """Handle a new connection."""
 
     def on_first_message(self, connection: RequestConnection) -> None:
-        """Handle a stranger's first complete message; by default the stranger becomes a client."""
+        """Handle the first complete message of a connection; by default it becomes a client."""
         self.welcome(connection)
 
     def on_fault(self, connection: RequestConnection, error: PhysxError) -> None:
@@ -98,14 +109,14 @@ class SocketService(Service):
         """Return the reader of a new connection."""
         return PrefixReader()
 
-    def new_strangers(self) -> Strangers[RequestConnection]:
+    def new_pending(self) -> PendingConnections[RequestConnection]:
         """Return what manages the connections that are not clients yet; called once."""
-        return Strangers(self.max_strangers, self.drop)
+        return PendingConnections(self.max_pending, self.drop)
 
     @property
-    def max_strangers(self) -> int:
+    def max_pending(self) -> int:
         """Maximum number of connections that are not clients yet."""
-        return max(self._max_clients, _FEW)
+        return max(self._max_clients, _MIN_PENDING)
 
     @property
     def is_listening(self) -> bool:
@@ -135,14 +146,14 @@ class SocketService(Service):
             ) from error
         self.address = self._listener.address
 
-    def adopt(self, connected: socket.socket) -> RequestConnection:
-        """Serve a socket that is already connected."""
+    def adopt(self, link: Link) -> RequestConnection:
+        """Serve a link that is already connected."""
         self._open()
-        host, port = connected.getpeername()[:2]
+        host, port = link.getpeername()[:2]
         if not self.is_listening:
             self._warn_of(host)
-        connection = RequestConnection(connected, self.new_reader(), f"{host}:{port}")
-        self._strangers.add(connection)
+        connection = RequestConnection(link, self.new_reader(), f"{host}:{port}", self._clock)
+        self._pending.add(connection)
         self.connections.append(connection)
         self._listener.add(connection)
         self.on_open(connection)
@@ -164,8 +175,8 @@ class SocketService(Service):
         Raises:
             RemoteError: If there are too many clients.
         """
-        self._strangers.forget(connection)
-        if len(self.connections) - len(self._strangers) > self._max_clients:
+        self._pending.forget(connection)
+        if len(self.connections) - len(self._pending) > self._max_clients:
             raise RemoteError(
                 f"Too many clients are connected: max_clients is {self._max_clients}. Try again "
                 "when one has left."
@@ -193,7 +204,7 @@ class SocketService(Service):
             self.log.warning(connection.name, "Connection to %s ended: %s", connection.name, reason)
         connection.close()
         self.connections.remove(connection)
-        self._strangers.forget(connection)
+        self._pending.forget(connection)
         if connection in self._ready:
             self._ready.remove(connection)
         self.on_close(connection)
@@ -231,15 +242,15 @@ class SocketService(Service):
     def _cycle(self, timeout: float | None) -> None:
         if not self._is_open:
             self._open()
-        if not self._came_soon(timeout):
-            self._look(timeout)
-        is_due = self._listener.timers.next <= time.monotonic()
+        if not self._poll_last_client(timeout):
+            self._run_once(timeout)
+        is_due = self._listener.timers.next <= self._clock.monotonic()
         if self._work is not None or self._ready or is_due:
             self._turn()
         else:
             self._has_more = False
 
-    def _came_soon(self, timeout: float | None) -> bool:
+    def _poll_last_client(self, timeout: float | None) -> bool:
         """Handle the next message of a quick client that is alone, if it comes within a moment."""
         connection, self._recent = self._recent, None
         if connection is None or not connection.is_quick or connection.closed:
@@ -247,22 +258,25 @@ class SocketService(Service):
         if len(self.connections) > 1 or self._work is not None:
             return False
         wait = self._wait(timeout)
-        if (wait is not None and wait < MOMENT) or time.monotonic() - self._looked > _SLICE:
+        if wait is not None and wait < SPIN_LIMIT:
+            return False
+        if self._clock.monotonic() - self._looked > _SLICE:
             return False
         try:
-            if not connection.receive_soon():
+            # For such a short time, polling is faster than being woken by the system.
+            if not self._network.spin_until(connection.receive, SPIN_LIMIT):
                 return False
         except OSError as error:
-            self._broken(connection, error)
+            self._on_io_error(connection, error)
             return True
         self._answer(connection)
         return True
 
-    def _look(self, timeout: float | None) -> None:
+    def _run_once(self, timeout: float | None) -> None:
         """Handle the events reported by the selector."""
         for connection, events in self._listener.select(self._wait(timeout)):
             self._serve(connection, events)
-        self._looked = time.monotonic()
+        self._looked = self._clock.monotonic()
         self._listener.accept()
 
     def _open(self) -> None:
@@ -270,8 +284,10 @@ class SocketService(Service):
         with self._lock:
             if not (self._is_open or self._released):
                 self._is_open = True
-                self._listener = Listener(self._meet, self._give_up, encrypts=self.encrypts)
-                self._strangers = self.new_strangers()
+                self._listener = Listener(
+                    self._meet, self._give_up, encrypts=self.encrypts, network=self._network
+                )
+                self._pending = self.new_pending()
 
     def _release(self) -> None:
         with self._lock:
@@ -295,17 +311,17 @@ class SocketService(Service):
             moment = min(moment, self._resume_at)
         if moment == math.inf:
             return timeout
-        wait = max(0.0, moment - time.monotonic())
+        wait = max(0.0, moment - self._clock.monotonic())
         return wait if timeout is None else min(wait, timeout)
 
     def _turn(self) -> None:
         """Run timers, and work until there is none left or others have waited long enough."""
-        begin = time.monotonic()
+        begin = self._clock.monotonic()
         self._listener.timers.call_due()
         self._has_more = True
         while not self._over:
             if self._work is not None:
-                if self._resume_at > time.monotonic():
+                if self._resume_at > self._clock.monotonic():
                     self._has_more = False
                     return
                 self._go_on()
@@ -315,7 +331,7 @@ class SocketService(Service):
                     self._has_more = False
                     return
                 self._begin(connection)
-            if time.monotonic() - begin > _SLICE:
+            if self._clock.monotonic() - begin > _SLICE:
                 return
 
     def _next(self) -> RequestConnection | None:
@@ -346,7 +362,7 @@ class SocketService(Service):
             return
         connection, work = self._work
         try:
-            self._resume_at = time.monotonic() + next(work)
+            self._resume_at = self._clock.monotonic() + next(work)
         except StopIteration:
             self._work = None
             self._after(connection)
@@ -395,7 +411,7 @@ class SocketService(Service):
             if events & selectors.EVENT_READ:
                 connection.receive()
         except OSError as error:
-            self._broken(connection, error)
+            self._on_io_error(connection, error)
             return
         if had_body and connection.ended and not self.admits(connection):
             self.drop(connection, "it left before its turn")
@@ -421,14 +437,14 @@ class SocketService(Service):
         """Put the next complete message into `body`; return whether there is one."""
         if not connection.next_body():
             return False
-        if connection in self._strangers:
+        if connection in self._pending:
             self.on_first_message(connection)
         return True
 
-    def _meet(self, connected: socket.socket, name: str) -> None:
-        self.adopt(connected)
+    def _meet(self, link: Link, name: str) -> None:
+        self.adopt(link)
 
-    def _broken(self, connection: RequestConnection, error: OSError) -> None:
+    def _on_io_error(self, connection: RequestConnection, error: OSError) -> None:
         if is_loss(error):
             self._give_up(connection)
         else:

@@ -20,7 +20,7 @@ Space: TypeAlias = spaces.Space[Any]
 Leaf: TypeAlias = spaces.Box | spaces.Discrete | spaces.MultiBinary | spaces.MultiDiscrete
 Path: TypeAlias = tuple[Any, ...]
 
-NONSENSE: tuple[type[Exception], ...] = (
+MALFORMED_INPUT_ERRORS: tuple[type[Exception], ...] = (
     *(ValueError, TypeError, LookupError, AttributeError, ArithmeticError, AssertionError),
     *(RecursionError, MemoryError),
 )
@@ -178,7 +178,7 @@ def build_space(plain: Mapping[str, Any]) -> Space:
     """Return the space described by the result of `describe_space`."""
     try:
         return _build(plain)
-    except NONSENSE as error:
+    except MALFORMED_INPUT_ERRORS as error:
         raise RemoteProtocolError(
             "The other side sent an invalid description of a space, "
             f"{reprlib.repr(plain):.200}: {error!r}."

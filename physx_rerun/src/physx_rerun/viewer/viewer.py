@@ -98,7 +98,7 @@ class Viewer:
         options: Sequence[str],
         *,
         environment: Mapping[str, str] | None = None,
-        lives_on: bool = False,
+        detached: bool = False,
     ) -> None:
         """Start the process.
 
@@ -106,7 +106,7 @@ class Viewer:
             port: Port of the viewer; 0: any free one.
             options: Further command-line options.
             environment: Environment variables in addition to those of this process.
-            lives_on: Whether the viewer outlives this process.
+            detached: Whether the viewer outlives this process.
 
         Raises:
             VisualizerError: If the port is taken.
@@ -121,8 +121,8 @@ class Viewer:
             ],
             variables={"RERUN_APP_ONLY": "true", **(environment or {})},
             stdout=subprocess.DEVNULL,
-            stderr=subprocess.DEVNULL if lives_on else subprocess.PIPE,
-            lives_on=lives_on,
+            stderr=subprocess.DEVNULL if detached else subprocess.PIPE,
+            detached=detached,
         )
         stream = self.process.stderr
         self._tail = None if stream is None else OutputTail(stream, _LINES)

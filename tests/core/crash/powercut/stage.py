@@ -7,7 +7,6 @@ import functools
 import sys
 import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import Future
 from typing import Any
 from unittest import mock
 
@@ -17,66 +16,52 @@ from physx_core import files
 from physx_core.dataset.store import syncing
 from physx_core.dataset.store.partition import file as partition_file
 from physx_core.dataset.store.partition import format as partition_format
+from physx_core.dataset.write import opening
+from physx_core.dataset.write.writer import Writer
+from physx_core.processes import Helper
 from powercut.disk import Recorder
 
 
-class Later(Future[Any]):
-    """Work that is done when it is waited for, or before."""
+class LaterHelper(Helper[Any]):
+    """A helper without a thread: a job waits until it is told to work, or its result is taken."""
 
-    def __init__(self, work: Callable[[], Any]) -> None:
-        super().__init__()
-        self._work: Callable[[], Any] | None = work
-
-    def do(self) -> None:
-        """Do the work, if it was not done yet."""
-        work, self._work = self._work, None
-        if work is not None:
-            try:
-                self.set_result(work())
-            except Exception as error:
-                self.set_exception(error)
-
-    def result(self, timeout: float | None = None) -> Any:
-        """Return the result of the work."""
-        self.do()
-        return super().result(timeout)
-
-
-class Executor:
-    """Stands in for a writer's background thread: its work waits until `Stage.work`."""
-
-    def __init__(self, *_: object) -> None:
-        self.waiting: list[Later] = []
+    def __init__(self, name: str) -> None:
+        super().__init__(name, inline=True)
+        self.waiting: list[Callable[[], Any]] = []
         self.actor = Stage.now.actor
-        Stage.now.executors.append(self)
+        if name == "physx-seal":
+            Stage.now.executors.append(self)
 
-    def submit(self, function: Callable[..., Any], *given: Any) -> Later:
-        """Note some work."""
-        later = Later(lambda: function(*given))
-        self.waiting.append(later)
-        return later
+    def give(self, job: Callable[[], Any]) -> None:
+        """Note a job."""
+        self.waiting.append(job)
+        self.pending += 1
 
-    def shutdown(self, **_: object) -> None:
+    def take(self) -> Any:
+        """Return the result of the next job."""
+        if not self.is_ready:
+            self.work()
+        return super().take()
+
+    def close(self) -> None:
         """Do what is left."""
         while self.work():
             pass
 
     def work(self) -> bool:
-        """Do the first piece of work that waits; return whether there was one."""
-        while self.waiting:
-            later = self.waiting.pop(0)
-            if not later.done():
-                later.do()
-                return True
-        return False
+        """Do the first job that waits; return whether there was one."""
+        if not self.waiting:
+            return False
+        super().give(self.waiting.pop(0))
+        self.pending -= 1  # it was counted when it was given
+        return True
 
 
 class Syncer(syncing.Syncer):
-    """A syncer without a thread: it syncs when it is told to."""
+    """A syncer that syncs when it is told to."""
 
-    def __init__(self, *given: Any, **named: Any) -> None:
-        super().__init__(*given, **named)
-        self._thread = _NoThread()  # type: ignore[assignment]
+    def __init__(self, helper: Helper[Any]) -> None:
+        super().__init__(helper)
         self.actor = Stage.now.actor
         self._at_work = False
         Stage.now.syncers.append(self)
@@ -96,15 +81,6 @@ class Syncer(syncing.Syncer):
             self._at_work = False
 
 
-class _NoThread:
-    def join(self, *_: object) -> None:
-        """Be at an end."""
-
-    def is_alive(self) -> bool:
-        """Be at work."""
-        return True
-
-
 class Stage:
     """What is at work on the stage.
 
@@ -121,7 +97,7 @@ class Stage:
     def __init__(self) -> None:
         self.boot = "boot 0"
         self.actor = 0
-        self.executors: list[Executor] = []
+        self.executors: list[LaterHelper] = []
         self.syncers: list[Syncer] = []
 
     def bury(self, actor: int | None = None) -> None:
@@ -136,7 +112,8 @@ class Stage:
         Stage.now = self
         with contextlib.ExitStack() as stack:
             patch = mock.patch.object
-            stack.enter_context(patch(writer_module, "ThreadPoolExecutor", Executor))
+            writer = functools.partial(Writer, helper=LaterHelper)
+            stack.enter_context(patch(opening, "Writer", writer))
             stack.enter_context(patch(writer_module, "Syncer", Syncer))
             stack.enter_context(patch(partition_format, "boot_id", lambda: Stage.now.boot))
             stack.enter_context(patch(partition_file, "make_header", _make_header))

@@ -1,4 +1,4 @@
-"""Syncs written files to disk about once a second, in a background thread."""
+"""Syncs written files to disk about once a second, beside the thread that writes them."""
 
 from __future__ import annotations
 
@@ -6,11 +6,13 @@ import contextlib
 import threading
 from itertools import chain
 from pathlib import Path
-from typing import Protocol
+from typing import Protocol, TypeVar
 
 from physx_core import files
 from physx_core.dataset.store.partition.file import PartitionFile, sync_named
-from physx_core.processes import BackgroundThread
+from physx_core.processes import Helper
+
+T = TypeVar("T")
 
 PERIOD = 1.0
 """Seconds between two syncs of the same file."""
@@ -23,7 +25,7 @@ class Written(Protocol):
 
 
 class Syncer:
-    """Syncs written files in a thread that starts with the first of them.
+    """Syncs written files a second after the first of them was noted.
 
     A power failure loses at most the rows of about the last second, yet the writer never waits for
     the disk.
@@ -32,28 +34,22 @@ class Syncer:
         error: The error of the first failed sync, if any.
     """
 
-    def __init__(self, period: float = PERIOD) -> None:
-        self._period = period
+    def __init__(self, helper: Helper[None]) -> None:
+        self._helper = helper
         self._partitions: dict[Written, None] = {}
         self._paths: dict[Path, None] = {}
         self._lock = threading.Lock()
-        self._wake, self._end = threading.Event(), threading.Event()
-        self._thread: BackgroundThread | None = None
         self.error: OSError | None = None
 
     def note(self, partition: Written) -> None:
         """Schedule an open partition; its rows are synced and marked."""
         if partition not in self._partitions:
-            with self._lock:
-                self._partitions[partition] = None
-            self._start()
+            self._schedule(self._partitions, partition)
 
     def note_path(self, path: Path) -> None:
         """Schedule a file by its path."""
         if path not in self._paths:
-            with self._lock:
-                self._paths[path] = None
-            self._start()
+            self._schedule(self._paths, path)
 
     def check(self) -> None:
         """Raise the error of the first failed sync, if any.
@@ -81,27 +77,23 @@ class Syncer:
             self.error = self.error or error
 
     def close(self) -> None:
-        """Sync everything that is left and stop the thread."""
-        self._end.set()
-        self._wake.set()
-        if self._thread is not None:
-            self._thread.join()
-            self._thread = None
+        """Sync everything that is left, and close the helper."""
+        self._helper.close()
         self.sync()
         self.check()
 
-    def _start(self) -> None:
-        self._wake.set()
-        if self._thread is None:
-            self._thread = BackgroundThread(self._run, "physx-sync")
-            self._thread.start()
+    def _schedule(self, noted: dict[T, None], one: T) -> None:
+        with self._lock:
+            is_first = not (self._partitions or self._paths)
+            noted[one] = None
+        if is_first:
+            while self._helper.is_ready:
+                self._helper.take()
+            self._helper.give(self._sync_later)
 
-    def _run(self) -> None:
-        while not self._end.is_set():
-            self._wake.wait()
-            self._wake.clear()
-            if not self._end.wait(self._period):
-                self.sync()
+    def _sync_later(self) -> None:
+        self._helper.pause(PERIOD)
+        self.sync()
 
 
 def _sync_marked(file: PartitionFile) -> None:

@@ -2,22 +2,20 @@
 
 from __future__ import annotations
 
-from collections import deque
 from collections.abc import Sequence
-from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 
 from physx_core import files
 from physx_core.closeable import Closeable
 from physx_core.dataset.store.manifest import Partition
-from physx_core.dataset.store.partition.digesting import Digester
 from physx_core.dataset.store.partition.file import PartitionFile
 from physx_core.dataset.store.sealing import seal
 from physx_core.dataset.store.syncing import Syncer
 from physx_core.dataset.write.writer import OpenPartition
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
+from physx_core.processes import Helper
 from physx_core.typing import Batch
 
 
@@ -47,9 +45,9 @@ class StripeWriter(Closeable):
         self._fields = {field.name: field for field in fields}
         self._entries: dict[int, Partition] = {}
         self._opened: OpenPartition | None = None
-        self._syncer, self._digester = Syncer(), Digester()
-        self._sealer = ThreadPoolExecutor(1, "physx-seal")
-        self._sealing: deque[tuple[int, Future[Partition]]] = deque()
+        self._syncer = Syncer(Helper("physx-sync"))
+        self._digester = Helper[None]("physx-digest")
+        self._sealer = Helper[tuple[int, Partition]]("physx-seal")
 
     def add(self, number: int, entry: Partition) -> None:
         """Register the partition for the rows from ``number * capacity`` on."""
@@ -107,10 +105,9 @@ class StripeWriter(Closeable):
         """Return the partitions that have been sealed since the last call, with their numbers."""
         found = []
         with files.storing("A partition of this client"):
-            while self._sealing and (wait or self._sealing[0][1].done()):
-                number, work = self._sealing.popleft()
+            while self._sealer.pending and (wait or self._sealer.is_ready):
                 try:
-                    found.append((number, work.result()))
+                    found.append(self._sealer.take())
                 except OSError as error:
                     if error.errno not in files.FULL:  # else it is sealed once there is space
                         raise
@@ -131,7 +128,7 @@ class StripeWriter(Closeable):
 
     def close(self) -> None:
         """Sync and close the files without sealing them."""
-        self._sealer.shutdown()
+        self._sealer.close()
         self._digester.close()
         opened, self._opened = self._opened, None
         if opened is not None:
@@ -172,5 +169,4 @@ class StripeWriter(Closeable):
         number = (self.rows - entry.rows) // self.capacity
         opened.close()
         entry = replace(entry, rows=entry.rows if rows is None else rows)
-        work = self._sealer.submit(seal, self._directory, self._fields, entry)
-        self._sealing.append((number, work))
+        self._sealer.give(lambda: (number, seal(self._directory, self._fields, entry)))

@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 import contextlib
-from collections import deque
-from collections.abc import Iterable, Mapping
-from concurrent.futures import Future, ThreadPoolExecutor
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
+from functools import partial
 from operator import attrgetter
 from pathlib import Path
+from typing import Any
 
 from physx_core import files
 from physx_core.dataset.read.mode_statistics import compute_statistics, count_sealed
@@ -17,7 +17,6 @@ from physx_core.dataset.repair import recovery
 from physx_core.dataset.store import locks, manifest_file
 from physx_core.dataset.store.manifest import Mode, Partition
 from physx_core.dataset.store.manifest_store import ManifestStore
-from physx_core.dataset.store.partition.digesting import Digester
 from physx_core.dataset.store.partition.file import PartitionFile
 from physx_core.dataset.store.sealing import remove_files, seal
 from physx_core.dataset.store.syncing import Syncer
@@ -26,6 +25,7 @@ from physx_core.dataset.write.stripes import Stripes
 from physx_core.dataset.write.updating import update_rows
 from physx_core.errors import DatasetError, UsageError
 from physx_core.fields import Field
+from physx_core.processes import Helper
 from physx_core.typing import Batch, Index
 
 _HEADER = 2**14
@@ -111,6 +111,7 @@ class Writer:
         max_file_size: float,
         durable: bool,
         lock: files.FileLock,
+        helper: Callable[[str], Helper[Any]] = Helper,
     ) -> None:
         """Start without an open partition.
 
@@ -121,20 +122,20 @@ class Writer:
             durable: Whether each commit waits for the disk; otherwise files are synced about once
                 a second.
             lock: The dataset's lock, which `close` releases.
+            helper: Makes what works beside the caller, given a name.
         """
         self.store = store
         self.session = session
         self._lock = lock
         self._directory = store.directory
         self._max_nbytes = int(max_file_size * 1e9) - _HEADER
-        self._syncer = None if durable else Syncer()
-        self._digester = Digester()
+        self._syncer = None if durable else Syncer(helper("physx-sync"))
+        self._digester: Helper[None] = helper("physx-digest")
         self._reader = Reader(store.directory, store.manifest)
         self._open: dict[str, OpenPartition] = {}
         self._filled: dict[str, Partition] = {}
-        self._sealing: deque[Future[Partition]] = deque()
         self._sealed: list[Partition] = []
-        self._sealer = ThreadPoolExecutor(1, "physx-seal")
+        self._sealer: Helper[Partition] = helper("physx-seal")
         self._stripes: dict[str, Stripes] = {}
 
     @property
@@ -171,7 +172,7 @@ class Writer:
         try:
             if self.store.failure is not None or (syncer is not None and syncer.error is not None):
                 self._check()
-            if self._sealing:
+            if self._sealer.pending:
                 self._collect(wait=False)
             while done < count:
                 partition = self._open.get(mode_name)
@@ -249,7 +250,7 @@ class Writer:
         finally:
             for stripes in self._stripes.values():
                 stripes.forget()
-            self._sealer.shutdown()
+            self._sealer.close()
             self._digester.close()
             for opened in self._open.values():
                 opened.close()
@@ -281,14 +282,13 @@ class Writer:
         opened.close()
         self._filled[mode_name] = entry
         fields = self.store.manifest.modes[mode_name].fields
-        work = self._sealer.submit(_seal, self._directory, fields, replace(entry))
-        self._sealing.append(work)
+        self._sealer.give(partial(_seal, self._directory, fields, replace(entry)))
 
     def _collect(self, *, wait: bool) -> None:
         """Record in the manifest which partitions have been sealed."""
-        while self._sealing and (wait or self._sealing[0].done()):
+        while self._sealer.pending and (wait or self._sealer.is_ready):
             try:
-                self._sealed.append(self._sealing.popleft().result())
+                self._sealed.append(self._sealer.take())
             except OSError as error:
                 self._note(error)
                 if wait or error.errno not in files.FULL:

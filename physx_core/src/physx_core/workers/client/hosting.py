@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import socket
-import time
 from collections.abc import Callable
 
 from physx_core.errors import ClientError, ConnectionRefusedByPeerError
@@ -53,7 +52,7 @@ class _Hosting:
         self._link.send(pack(Kind.HOST, encode(socket.gethostname())))
         while (patience := self._obey()) is None:
             self._report()
-        until = time.monotonic() + patience
+        until = self._link.clock.monotonic() + patience
         for worker in self._workers.values():
             worker.wait(until)
         self._report()

@@ -13,9 +13,9 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 from physx_core.net.frames import Frame, FrameReader, Kind
+from physx_core.net.link import SOCKETS, Link, Network
 from physx_core.net.liveness import poll_peer
 from physx_core.net.remote_errors import decode_error
-from physx_core.net.spin_wait import spin_until
 from physx_core.net.values import decode, pack_value
 from physx_core.processes import BackgroundThread, kill_descendants
 
@@ -37,29 +37,35 @@ class ServerGone(RunEnded):
 class WorkerLink:
     """Authenticated, blocking connection to the server.
 
-    A thread watches the connection: a process whose server is gone exits within about a second,
-    even during a long step, and within about 15 s if the server's machine no longer answers.
-
     Attributes:
+        clock: The clock that the client follows.
         spins: Whether to spin-wait for an answer for up to 0.2 ms.
     """
 
-    def __init__(self, connection: socket.socket, reader: FrameReader) -> None:
+    def __init__(self, connection: Link, reader: FrameReader, network: Network = SOCKETS) -> None:
         """Take over a connection whose handshake is done.
 
         Args:
-            connection: The socket.
+            connection: The link.
             reader: The reader that the handshake returned.
+            network: What the link belongs to.
         """
-        self.spins = False
+        self.clock, self.spins = network.clock, False
+        self._network = network
         self._connection = connection
         self._reader = reader
-        self._hidden: Collection[Any] = getattr(connection, "hidden", ())  # see SecureSocket
+        self._buffered: Collection[Any] = getattr(connection, "buffered", ())  # see SecureSocket
         self._postponed: deque[Frame] = deque()
         self._requests = 0
-        self._poll = select.poll()
-        self._poll.register(connection, select.POLLIN)
+        self._poll = network.poll(connection)
         self._over = threading.Event()
+
+    def exit_if_lost(self) -> None:
+        """Watch the connection in a thread that ends this process if the server is gone.
+
+        It does within about a second, even during a long step, and within about 15 s if the
+        server's machine no longer answers.
+        """
         BackgroundThread(self._watch, "physx-orders").start()
 
     def send(self, message: bytes) -> None:
@@ -101,7 +107,7 @@ class WorkerLink:
         Args:
             seconds: How long to wait for one, in s.
         """
-        if self._postponed or self._reader.has_buffered or self._hidden:
+        if self._postponed or self._reader.has_buffered or self._buffered:
             return True
         return bool(self._poll.poll(1000 * seconds))
 
@@ -150,7 +156,7 @@ class WorkerLink:
 
     def _spin(self) -> None:
         if self.spins:
-            spin_until(self.has_message, _SPIN_TIME)
+            self._network.spin_until(self.has_message, _SPIN_TIME)
 
     def _next(self) -> Frame:
         try:
@@ -162,10 +168,8 @@ class WorkerLink:
         return frame
 
     def _watch(self) -> None:
-        poll = select.poll()
-        poll.register(self._connection, _HANGUP)
         try:
-            poll_peer(poll, self._connection, None)
+            poll_peer(self._network.poll(self._connection, _HANGUP), self._connection, None)
         except TimeoutError:
             with contextlib.suppress(OSError):  # unblock a call that sends or receives
                 self._connection.shutdown(socket.SHUT_RDWR)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from collections import deque
 
 from physx_core.errors import ConnectionRefusedByPeerError, NotFiniteError, PhysxError
@@ -52,6 +51,7 @@ class Producer:
         self.made = made
         self.failure: PhysxError | None = None
         self._link, self._instance, self._sink = link, instance, sink
+        self._clock = link.clock
         self._skip, self._skip_rejected = rows, rejected
         self._slow_until = slow_until
         self._buffer: RowBuffer | None = None
@@ -70,7 +70,7 @@ class Producer:
             if self.made >= self._credit:
                 while self.made >= self._credit:
                     self._obey(self._link.receive())
-                self._sent_at = time.monotonic()
+                self._sent_at = self._clock.monotonic()
             try:
                 self._make_row()
             except PhysxError:
@@ -102,7 +102,7 @@ class Producer:
             self.made += count
         if self._announced:
             self._sink.tell()
-        self._sent_at = time.monotonic()
+        self._sent_at = self._clock.monotonic()
         if self.failure is not None:
             raise RunEnded
 
@@ -163,7 +163,7 @@ class Producer:
             self.made >= self._credit
             or (buffer is not None and buffer.full)
             or self._instance.last_episode < self._slow_until
-            or time.monotonic() - self._sent_at >= _BLOCK_TIME
+            or self._clock.monotonic() - self._sent_at >= _BLOCK_TIME
         )
 
     def _listen(self) -> None:

@@ -51,11 +51,14 @@ def run_client(
     """
     say(f"connecting to the server at {address}")
     link, setup = join(address, token, instance or 0, patience)
+    link.exit_if_lost()
     try:
         if setup is None:
             host_workers(link, address, token, say)
             return 0
-        return _serve(link, setup, say)
+        os.environ[CLIENT_VARIABLE] = "1"
+        _take_place(setup.pop("path"), setup.pop("directory"))
+        return run_instance(link, setup, say)
     except RunEnded:
         say("the server is gone")
         return 1
@@ -63,8 +66,22 @@ def run_client(
         link.close()
 
 
-def _serve(link: WorkerLink, setup: dict[str, Any], say: Callable[[str], None]) -> int:
-    os.environ[CLIENT_VARIABLE] = "1"
+def run_instance(
+    link: WorkerLink, setup: dict[str, Any], say: Callable[[str], None] = lambda text: None
+) -> int:
+    """Run one instance in this process, wherever it is, until the server ends the run.
+
+    Args:
+        link: Connection to the server.
+        setup: What `join` returned, without the module path and the working directory.
+        say: Called with a description of what happens.
+
+    Returns:
+        See `run_client`.
+
+    Raises:
+        ServerGone: If the server is gone without having ended the run.
+    """
     draw, skip, stripes = setup.pop("draw"), setup.pop("skip"), setup.pop("stripes", None)
     sink: RowSink = SentRows(link)
     if stripes is not None:
@@ -72,7 +89,6 @@ def _serve(link: WorkerLink, setup: dict[str, Any], say: Callable[[str], None]) 
         from physx_core.workers.client.striped_rows import StripedRows
 
         sink = StripedRows(link, stripes)
-    _take_place(setup.pop("path"), setup.pop("directory"))
     again = skip["rows"] - skip["made"]
     say(
         f"running {setup['environment']}, instance {setup['instance_id']} of {setup['instance_nb']}"

@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import time
-
 from physx_core.components.launcher import ClientHandle
 from physx_core.errors import ClientError
 from physx_core.net.liveness import VANISHED
@@ -28,7 +26,7 @@ def exit_error(
     """
     if peer is not None and peer.offense:
         if handle is not None:
-            handle.wait(time.monotonic() + _LINES_TIME)
+            handle.wait(handle.clock.monotonic() + _LINES_TIME)
         stderr = "" if handle is None else handle.stderr()
         what = f"was cut off after {peer.received} rows. {peer.offense}"
         return ClientError(number, what, stderr=stderr, client=place)
@@ -38,7 +36,7 @@ def exit_error(
         return ClientError(number, f"was lost {when}: {VANISHED}.")
     if handle is None:
         return ClientError(number, f"closed the connection {when}. Its own terminal may say why.")
-    handle.wait(time.monotonic() + _LEAVE_TIME)
+    handle.wait(handle.clock.monotonic() + _LEAVE_TIME)
     status = handle.exit_status()
     how = "closed the connection" if status is None else describe_exit(status)
     return ClientError(
@@ -78,7 +76,7 @@ def timeout_error(
         how = f"sent nothing {waited}. If its steps take"
     if handle is not None:
         handle.terminate()  # it writes where it hung
-        handle.wait(time.monotonic() + _LAST_WORDS_TIME)
+        handle.wait(handle.clock.monotonic() + _LAST_WORDS_TIME)
     return ClientError(
         number,
         f"{how} that long, raise EnvironmentConfig.timeout.",

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import socket
 import sys
-import time
 from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
@@ -23,6 +22,7 @@ from physx_core.errors import (
 )
 from physx_core.net.addresses import format_address, is_loopback, parse_address
 from physx_core.net.handshake import TOKEN_VARIABLE
+from physx_core.net.link import SOCKETS, Network
 from physx_core.net.tokens import choose_token, find_token
 from physx_core.net.values import encode
 from physx_core.plugins import reference_of, resolve
@@ -65,6 +65,7 @@ class ClientGroup:
         skip: Skip = NOTHING,
         total: int | None = None,
         written: WrittenRows | None = None,
+        network: Network = SOCKETS,
     ) -> None:
         """Store the arguments; `open` starts the clients.
 
@@ -77,7 +78,9 @@ class ClientGroup:
             skip: What an earlier run already got: clients generate it again, but do not send it.
             total: Number of rows of the whole run, including those to skip; None: unknown.
             written: Counts the rows that the clients write themselves; None: they send them.
+            network: What connects the clients, and the clock that the run follows.
         """
+        self._clock = network.clock
         self._written = written
         self.config = config
         self._seed, self._sets = list(seed), sets
@@ -88,10 +91,10 @@ class ClientGroup:
         self._pool: ClientPool | None = None
         if config.is_elastic:
             is_known = find_token(config.token_file) is not None
-            self._pool = ClientPool(config, launcher, is_open=is_known)
+            self._pool = ClientPool(config, launcher, is_open=is_known, clock=self._clock)
         self._is_by_hand = launcher.by_hand
         self._launcher: Launcher = self._pool or launcher
-        self._laggards, self._named = Laggards(), set[str]()
+        self._laggards, self._named = Laggards(self._clock), set[str]()
         self._handles: dict[int, ClientHandle] = {}
         self._launched: dict[int, float] = {}
         self._queued: dict[int, float] = {}
@@ -113,6 +116,7 @@ class ClientGroup:
             skip,
             self._pool,
             written,
+            network,
         )
 
     def open(self) -> None:
@@ -148,7 +152,7 @@ class ClientGroup:
         Args:
             missing: Returns the instances to wait for; called after each round.
         """
-        began = self._began = time.monotonic()
+        began = self._began = self._clock.monotonic()
         if began - self._served > _TICK / 10:
             self._serve(0.0)
         while waited := missing():
@@ -202,7 +206,7 @@ class ClientGroup:
         return range(1, self.config.num_clients + 1)
 
     def _launch(self, numbers: Sequence[int]) -> None:
-        now = time.monotonic()
+        now = self._clock.monotonic()
         started = self._launcher.launch(numbers, self._address(), self.server.token)
         handles = {handle.instance_id: handle for handle in started}
         self._handles.update(handles)
@@ -228,17 +232,17 @@ class ClientGroup:
         return f"{socket.gethostname()}:{self.server.address.rpartition(':')[2]}"
 
     def _serve(self, timeout: float) -> None:
-        began = time.monotonic()
+        began = self._clock.monotonic()
         self.server.pump(timeout)
-        self._served = time.monotonic()
+        self._served = self._clock.monotonic()
         lost = any(peer.is_lost and not peer.vacant for peer in self.server.peers.values())
         if lost or self._served - self._checked > _TICK:
             self._checked = self._served
             self._check_ended(self._served, began)
 
     def _wait_a_moment(self) -> None:
-        until = time.monotonic() + _GRACE
-        while self._unfinished() and time.monotonic() < until:
+        until = self._clock.monotonic() + _GRACE
+        while self._unfinished() and self._clock.monotonic() < until:
             try:
                 self.server.pump(_TICK)
             except Exception:  # the run has already failed, with its own error
@@ -458,7 +462,7 @@ class ClientGroup:
 
     def _report_missing(self, waited: Sequence[int], began: float) -> None:
         """Report from time to time which clients are missing."""
-        now = time.monotonic()
+        now = self._clock.monotonic()
         if now - max(began, self._said) < _SAY_EVERY:
             return
         numbers = self._with_client(self.server.holding_up(waited))
@@ -493,7 +497,7 @@ class ClientGroup:
 
     def _find_silent(self, waited: Sequence[int], began: float) -> list[int]:
         """Return the instances that have kept the server waiting too long."""
-        now = time.monotonic()
+        now = self._clock.monotonic()
         numbers = self._with_client(self.server.holding_up(waited))
         self._queued |= {number: now for number in numbers if self._is_queued(number)}
         since = {n: max(began, self._heard(n), self._queued.get(n, 0.0)) for n in numbers}

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import logging
-import time
 from collections import Counter
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from physx_core.clock import SYSTEM_CLOCK, Clock
 from physx_core.components.launcher import ClientHandle, Launcher
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError, TooFewClientsError
@@ -52,7 +52,12 @@ class ClientPool(Launcher):
     """
 
     def __init__(
-        self, config: EnvironmentConfig, launcher: Launcher, *, is_open: bool = False
+        self,
+        config: EnvironmentConfig,
+        launcher: Launcher,
+        *,
+        is_open: bool = False,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         """Store the arguments.
 
@@ -60,6 +65,7 @@ class ClientPool(Launcher):
             config: How many clients there may be, and how long they may be silent.
             launcher: Starts the clients.
             is_open: Whether others who know the token may start clients, besides the launcher.
+            clock: Tells how long clients are silent.
 
         Raises:
             ConfigError: If more clients are needed than may join.
@@ -73,6 +79,7 @@ class ClientPool(Launcher):
             )
         self._config, self._launcher, self.elsewhere = config, launcher, launcher.elsewhere
         launcher.elastic = True
+        self._clock = clock
         self._is_open = is_open or launcher.by_hand
         self._address, self._public = "", ""
         self._server: Serving | None = None
@@ -139,7 +146,7 @@ class ClientPool(Launcher):
         foreign = [number for number in free if number not in self._handles]
         peer.client = wanted or (foreign or free)[0]
         peer.reader.limit = _LONGEST_MESSAGE
-        self._clients[peer.client] = PooledClient(peer.client, peer)
+        self._clients[peer.client] = PooledClient(peer.client, peer, self._clock)
         peer.send(pack(Kind.HOST))
 
     def redeem(self, ticket: int) -> int:
@@ -212,7 +219,7 @@ class ClientPool(Launcher):
         client = None if worker is None else worker.client
         if client is None or client.unanswered is None:
             return False
-        silent = time.monotonic() - max(client.unanswered, served_since)
+        silent = self._clock.monotonic() - max(client.unanswered, served_since)
         if silent < self._config.timeout / 4:
             return False
         self._give_up(client)
@@ -233,11 +240,11 @@ class ClientPool(Launcher):
         """
         if self._server is None:
             return
-        clients, until = [*self._clients.values()], time.monotonic() + patience + 1.0
+        clients, until = [*self._clients.values()], self._clock.monotonic() + patience + 1.0
         try:
             for client in clients:
                 client.peer.send(pack(Kind.CLOSE, number=int(1000 * patience)))
-            while any(not client.peer.closed for client in clients) and time.monotonic() < until:
+            while self._clock.monotonic() < until and not all(c.peer.closed for c in clients):
                 try:
                     self._server.pump(_TICK)
                 except Exception:  # of a run that has already failed
@@ -258,7 +265,7 @@ class ClientPool(Launcher):
             self._handles[handle.instance_id] = handle
 
     def _give_up(self, client: PooledClient) -> None:
-        seconds = time.monotonic() - client.pinged
+        seconds = self._clock.monotonic() - client.pinged
         client.peer.offense = f"It has not answered for {seconds:.0f} s: it is stopped, or hangs."
         client.peer.close()
 
@@ -280,7 +287,7 @@ class ClientPool(Launcher):
             how = f"was lost: {VANISHED}"
         else:
             how = "left"
-            if handle is not None and handle.wait(time.monotonic() + _LEAVE_TIME):
+            if handle is not None and handle.wait(handle.clock.monotonic() + _LEAVE_TIME):
                 how = describe_exit(handle.exit_status() or 0)
                 stderr = handle.stderr()
         self._mourn(_capital(str(client)), how, handle, client.number, numbers, stderr)
@@ -366,7 +373,8 @@ class ClientPool(Launcher):
         handles: list[ClientHandle] = []
         for number in instances:
             self._starts[number] += 1
-            worker = PooledWorker(number, make_ticket(number, self._starts[number]), self._listen)
+            ticket = make_ticket(number, self._starts[number])
+            worker = PooledWorker(number, ticket, self._listen, self._clock)
             former = self._workers.get(number)
             if former is not None and former.client is not None:
                 self._last_host[number] = former.client
@@ -443,7 +451,7 @@ class ClientPool(Launcher):
             former = self._last_host.get(number)
             client = min(ready, key=lambda c: (c.load + (c is former), c.number))
             del self._waiting[number]
-            worker.client, worker.started = client, time.monotonic()
+            worker.client, worker.started = client, self._clock.monotonic()
             client.workers[worker.ticket] = worker
             client.peer.send(pack(Kind.START, number=worker.ticket))
 

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import statistics
-import time
 from collections import defaultdict
 from collections.abc import Iterable, Mapping
 from typing import NamedTuple
+
+from physx_core.clock import SYSTEM_CLOCK, Clock
 
 _HELD = 5.0  # s that the run waits for an instance before it is reported
 _SLOW = 2.0
@@ -19,8 +20,9 @@ class Pace:
     Counting starts when the first rows arrive: earlier rows may have been generated again.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock = SYSTEM_CLOCK) -> None:
         """Start before the first row."""
+        self._clock = clock
         self._rows, self._seconds = 0, 0.0
         self._has_begun = False
         self._since: float | None = None
@@ -47,13 +49,13 @@ class Pace:
     def rest(self) -> None:
         """Note that the client waits for the server."""
         if self._since is not None:
-            self._seconds += time.monotonic() - self._since
+            self._seconds += self._clock.monotonic() - self._since
             self._since = None
 
     def go_on(self) -> None:
         """Note that the client no longer waits for the server."""
         if self._has_begun and self._since is None:
-            self._since = time.monotonic()
+            self._since = self._clock.monotonic()
 
 
 class Laggard(NamedTuple):
@@ -73,10 +75,10 @@ class Laggard(NamedTuple):
 class Laggards:
     """Finds instances that are much slower than the others and hold up the run."""
 
-    def __init__(self) -> None:
+    def __init__(self, clock: Clock = SYSTEM_CLOCK) -> None:
         """Start with none."""
         self._held: defaultdict[int, float] = defaultdict(float)
-        self._looked = time.monotonic()
+        self._looked = clock.monotonic()
 
     def note(self, waited: Iterable[int], now: float) -> None:
         """Note which instances the run waits for now; none if it waits for most of them."""

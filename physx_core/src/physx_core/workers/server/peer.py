@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import contextlib
-import socket
-import time
 from typing import NamedTuple
 
+from physx_core.clock import SYSTEM_CLOCK, Clock
 from physx_core.components.parameter import Parameter
 from physx_core.errors import PhysxError
 from physx_core.fields import Field
 from physx_core.net.connection import Connection
 from physx_core.net.frames import FrameReader, Kind, pack
 from physx_core.net.handshake import HANDSHAKE_LIMIT
+from physx_core.net.link import Link
 from physx_core.workers.row_codec import RejectedRows, RowQueue
 from physx_core.workers.server.journal import Journal
 from physx_core.workers.server.pace import Pace
@@ -73,14 +73,15 @@ class Peer(Connection):
 
     reader: FrameReader
 
-    def __init__(self, connected: socket.socket, name: str) -> None:
+    def __init__(self, link: Link, name: str, clock: Clock = SYSTEM_CLOCK) -> None:
         """Take a new connection.
 
         Args:
-            connected: The socket.
+            link: The link to its client.
             name: The other side as ``host:port``.
+            clock: Tells how long the client takes.
         """
-        super().__init__(connected, FrameReader(HANDSHAKE_LIMIT), name)
+        super().__init__(link, FrameReader(HANDSHAKE_LIMIT), name, clock)
         self.instance_id = self.client = 0
         self.fields: list[Field] = []
         self.row_fields: list[Field] = []
@@ -99,7 +100,7 @@ class Peer(Connection):
         self.episode = -1
         self.origin = Origin()
         self.slow_until = 0
-        self.pace = Pace()
+        self.pace = Pace(clock)
         self._arrived = 0  # of a long frame, when the peer was last heard from
         self._next_order: int | None = None  # of the journal's, for this client; None: it got all
 
@@ -154,7 +155,7 @@ class Peer(Connection):
         """
         arrived = 0 if whole else self.reader.arrived
         if whole or arrived - self._arrived >= _PIECE:
-            self.heard, self._arrived = time.monotonic(), arrived
+            self.heard, self._arrived = self._clock.monotonic(), arrived
 
     def send(self, message: bytes) -> None:
         """Send as much as the connection takes now; `flush` sends the rest.
@@ -187,7 +188,7 @@ class Peer(Connection):
                 self.write(message)
             except OSError:  # reading notices its end
                 self.outgoing.clear()
-        self.heard = time.monotonic()  # its time to react starts now
+        self.heard = self._clock.monotonic()  # its time to react starts now
 
     def flush(self) -> int:
         """Send what is pending, then the journal's orders, as far as the connection takes them."""

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import math
 import signal
-import time
 from collections.abc import Callable
 
+from physx_core.clock import SYSTEM_CLOCK, Clock
 from physx_core.components.launcher import ClientHandle
 from physx_core.net.frames import Kind, pack
 from physx_core.workers.server.peer import Peer
@@ -24,10 +24,10 @@ class PooledClient:
         pinged: When it was last pinged, in monotonic s.
     """
 
-    def __init__(self, number: int, peer: Peer) -> None:
+    def __init__(self, number: int, peer: Peer, clock: Clock = SYSTEM_CLOCK) -> None:
         self.number, self.peer, self.host = number, peer, ""
         self.workers: dict[int, PooledWorker] = {}
-        self.pinged = time.monotonic()
+        self.pinged = clock.monotonic()
         self.unanswered: float | None = self.pinged
 
     @property
@@ -51,12 +51,17 @@ class PooledWorker(ClientHandle):
     """
 
     def __init__(
-        self, instance_id: int, ticket: int, listen: Callable[[Peer, float], None]
+        self,
+        instance_id: int,
+        ticket: int,
+        listen: Callable[[Peer, float], None],
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         self.instance_id, self.ticket = instance_id, ticket
         self.client: PooledClient | None = None
         self.started = math.inf
         self._listen = listen
+        self.clock = clock
         self._status: int | None = None
         self._stderr = ""
 
@@ -92,7 +97,7 @@ class PooledWorker(ClientHandle):
     def wait(self, until: float) -> bool:
         """Listen to its client until that reports its end: see `ClientHandle.wait`."""
         while self.client is not None and not self.is_orphan and self._status is None:
-            left = until - time.monotonic()
+            left = until - self.clock.monotonic()
             if left <= 0:
                 return False
             self._listen(self.client.peer, left)

@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import select
 import selectors
-import socket
-import time
 from collections.abc import Callable, Iterable
 
 from physx_core.components.environment import Services
@@ -17,11 +14,12 @@ from physx_core.errors import (
 )
 from physx_core.net.addresses import format_address
 from physx_core.net.frames import MAX_PAYLOAD, Frame, Kind, pack
+from physx_core.net.link import SOCKETS, Link, Network
 from physx_core.net.listener import Listener
 from physx_core.net.liveness import is_loss
+from physx_core.net.pending import Handshakes
 from physx_core.net.remote_errors import decode_error, encode_error
 from physx_core.net.spin_wait import has_core_for_each
-from physx_core.net.strangers import Handshakes
 from physx_core.workers.instance import NOTHING, Skip
 from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.row_codec import unpack_rows
@@ -69,6 +67,7 @@ class Server:
         skip: Skip = NOTHING,
         pool: ClientPool | None = None,
         written: WrittenRows | None = None,
+        network: Network = SOCKETS,
     ) -> None:
         """Store the arguments; `open` starts listening.
 
@@ -86,9 +85,11 @@ class Server:
             skip: What an earlier run already got from the instances.
             pool: The clients, if they run workers for several instances; None: each runs one.
             written: Counts the rows that the clients write themselves; None: they send them.
+            network: What connects the clients, and the clock that the server follows.
         """
         self.peers: dict[int, Peer] = {}
         self.token = token
+        self._network, self._clock = network, network.clock
         self._ip_address, self._port, self._instance_nb = ip_address, port, instance_nb
         self._spin_time = _SPIN_TIME if has_core_for_each(instance_nb) else 0.0
         self._requests = ServiceRequests(services, sets)
@@ -96,7 +97,7 @@ class Server:
         self._journal_size = journal_size
         self._pool = pool
         self._ending = self._has_news = False
-        self._listener = Listener[Peer](self._meet, self._give_up, encrypts=True)
+        self._listener = Listener[Peer](self._meet, self._give_up, encrypts=True, network=network)
         self._strangers = Handshakes[Peer](
             token, _HANDSHAKE_TIME, _MAX_STRANGERS, self._drop, self._listener.timers
         )
@@ -139,17 +140,15 @@ class Server:
         Continues as long as predictions are requested and answered and nothing else happens, but
         no longer than `timeout`.
         """
-        until = time.monotonic() + timeout
+        until = self._clock.monotonic() + timeout
         spin = 0.0
-        while self._answer_at_once(timeout, spin) and time.monotonic() < until:
+        while self._answer_at_once(timeout, spin) and self._clock.monotonic() < until:
             spin = self._spin_time
         self._listener.timers.call_due()
 
     def listen_to(self, peer: Peer, seconds: float) -> None:
         """Handle what one client has sent, and nothing else; wait up to `seconds` for it."""
-        poll = select.poll()
-        poll.register(peer.socket, select.POLLIN)
-        if poll.poll(1000 * seconds):
+        if self._network.poll(peer.link).poll(1000 * seconds):
             self._read(peer)
 
     def _answer_at_once(self, timeout: float, spin: float) -> bool:
@@ -193,7 +192,7 @@ class Server:
         if peer is not None:
             self._drop(peer)
             self._requests.forget(peer)
-            peer.vacant, peer.failure, peer.heard = True, None, time.monotonic()
+            peer.vacant, peer.failure, peer.heard = True, None, self._clock.monotonic()
 
     def close(self) -> None:
         """Close all connections; calling it again does nothing."""
@@ -241,8 +240,8 @@ class Server:
             return peer is None
         return peer.vacant or not peer.is_lost or self._replaces(number, peer.failure)
 
-    def _meet(self, connected: socket.socket, name: str) -> None:
-        peer = Peer(connected, name)
+    def _meet(self, link: Link, name: str) -> None:
+        peer = Peer(link, name, self._clock)
         self._strangers.add(peer)
         self._listener.add(peer)
 
@@ -251,7 +250,7 @@ class Server:
         try:
             while not peer.closed:
                 turns += 1
-                frame = peer.reader.read(peer.socket)
+                frame = peer.reader.read(peer.link)
                 if peer.instance_id or peer.client:
                     peer.hear(whole=frame is not None)
                 if frame is not None:

@@ -7,6 +7,7 @@ import os
 import struct
 import threading
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 
 from zlib_ng.zlib_ng import crc32
@@ -21,11 +22,12 @@ from physx_core.dataset.store.partition.commits import (
     Rows,
     encode,
 )
-from physx_core.dataset.store.partition.digesting import LARGE, Digester
 from physx_core.dataset.store.partition.format import Header, Identity, inspect, make_header
 from physx_core.errors import DatasetError
+from physx_core.processes import Helper
 from physx_core.typing import Array
 
+_LARGE = 2**17  # bytes from which hashing beside the copying into the cache takes no extra time
 _SMALLEST_STEP = 2**20
 _LARGEST_STEP = 2**26
 _COPY = 2**23
@@ -52,7 +54,7 @@ class PartitionFile:
         identity: Identity,
         header: Header,
         descriptor: int,
-        digester: Digester,
+        digester: Helper[None],
     ) -> None:
         self.identity = identity
         self.data_offset = header.data_offset
@@ -71,7 +73,7 @@ class PartitionFile:
 
     @classmethod
     def create(
-        cls, directory: Path, identity: Identity, capacity: int, digester: Digester
+        cls, directory: Path, identity: Identity, capacity: int, digester: Helper[None]
     ) -> PartitionFile:
         """Write an empty partition file under a temporary name and wait until it is on disk.
 
@@ -79,7 +81,7 @@ class PartitionFile:
             directory: The dataset's folder.
             identity: Identity of the file.
             capacity: Number of rows that fit in.
-            digester: Computes the digests.
+            digester: Computes the digests of large blocks.
         """
         header = make_header(identity, capacity)
         path = directory / identity.file_name
@@ -94,7 +96,7 @@ class PartitionFile:
 
     @classmethod
     def reopen(
-        cls, directory: Path, identity: Identity, rows: int, digester: Digester
+        cls, directory: Path, identity: Identity, rows: int, digester: Helper[None]
     ) -> PartitionFile:
         """Open an existing partition file to write rows after its first ones.
 
@@ -102,7 +104,7 @@ class PartitionFile:
             directory: The dataset's folder.
             identity: Expected identity of the file.
             rows: Number of its committed rows to keep.
-            digester: Computes the digests.
+            digester: Computes the digests of large blocks.
 
         Raises:
             DatasetError: If the file has a different identity or fewer rows.
@@ -165,7 +167,7 @@ class PartitionFile:
         digests, nbytes = self._digests, block.nbytes
         pieces: list[tuple[bytes | memoryview, int]] = []
         offset = self.data_offset + row * self._row_nbytes
-        if nbytes < digests.left and nbytes < LARGE:
+        if nbytes < digests.left and nbytes < _LARGE:
             digests.left -= nbytes
             digests.running.update(block.data)
             pieces.append((block.data, offset))
@@ -188,7 +190,7 @@ class PartitionFile:
         Args:
             commit: The commit; its digest is recomputed.
         """
-        self._digester.wait()
+        self._digester.drain()
         rows, base, _ = commit
         with self._lock:
             found = self._rows.read(self.descriptor, base, rows)
@@ -241,9 +243,12 @@ class PartitionFile:
     def _write(self, block: Array, offset: int) -> None:
         """Write rows that complete a block of rows with a digest, or a large block."""
         content = files.as_bytes(block)
-        self._digester.update(self._digests, content)
+        if len(content) < _LARGE:
+            self._digests.update(content)
+        else:
+            self._digester.give(partial(self._digests.update, content))
         files.write_at(self.descriptor, content, offset)
-        self._digester.wait()
+        self._digester.drain()
         if self._digests.finished:  # they must be there before rows that rely on them
             self._store_digests()
 

@@ -1,0 +1,88 @@
+"""Restarts of client processes; what restarted clients do is in `test_restarts`."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import signal
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from physx_core import DataGeneration, Dataset, EnvironmentConfig
+from physx_core.errors import ClientError
+
+pytestmark = pytest.mark.processes
+
+WANDERER = f"{Path(__file__).parents[1] / 'programs' / 'restart_envs.py'}:Wanderer"
+ASKS = {"num_clients": 2, "env_kwargs": {"asks": True}}
+
+
+@pytest.fixture
+def batch_services(services):
+    """The services, predicting several samples at once."""
+    services.predict_batch = lambda batch: {"y": 2 * batch["x"]}
+    return services
+
+
+@pytest.mark.parametrize(
+    ("fault", "place"), [("kill", "step"), ("stop", "step"), ("disconnect", "prediction")]
+)
+def test_a_process_that_breaks_is_started_again(
+    local, clients, batch_services, fault, place, unhurried
+):
+    settings = {"num_clients": 2, "env_kwargs": {"asks": True}}
+    with local(WANDERER, **settings) as source:
+        expected = digest([source.batch(19)])
+    settings["env_kwargs"] |= {"fault": fault, "place": place, "at": 7}
+    timeout = unhurried(2.0) if fault == "stop" else 60.0
+    with clients(WANDERER, run_ahead=0, restarts=1, timeout=timeout, **settings) as source:
+        assert digest([source.batch(19)]) == expected
+    assert len([*Path().glob("started-*")]) == 2 + 3
+
+
+def test_a_pipeline_stores_the_same_rows_whatever_happens(nothing_stays_behind):
+    """With three clients and delays by chance, one of them killed in the last run."""
+    sums = set()
+    for fault in ("", "", "kill"):
+        config = EnvironmentConfig(
+            WANDERER,
+            env_kwargs={"fault": fault, "at": 30, "delay": 0.004},
+            num_clients=3,
+            restarts=1,
+            seed=3,
+        )
+        generation = DataGeneration(config, batch_nb=10, batch_size=20)
+        generation.execute()
+        with Dataset.open(generation.session.path) as dataset:
+            assert dataset.num_samples("training") == 200
+            fields = dataset.fields("training")
+            sums.add(digest([{name: dataset["training"][name][:] for name in fields}]))
+        notes = [*Path().glob("started-*")]
+        assert len(notes) == 3 + bool(fault)
+        for note in notes:
+            note.unlink()
+    assert len(sums) == 1
+
+
+def test_an_instance_of_an_elastic_run_does_not_move_beyond_the_limit_of_its_journal(
+    clients, batch_services, process_ids
+):
+    options = {"min_clients": 1, "max_clients": 2, "restarts": 2, "journal_size": 2e-6, **ASKS}
+    with clients(WANDERER, run_ahead=0, **options) as source:
+        source.batch(60)
+        os.kill(os.getpgid(process_ids()[2]), signal.SIGKILL)
+        with pytest.raises(ClientError) as caught:
+            for _ in range(20):
+                source.batch(60)
+    assert "journal_size" in caught.value.__notes__[0]
+
+
+def digest(batches):
+    """Return a hash of rows by field, whatever the sizes of the batches."""
+    found = hashlib.sha256()
+    for name in sorted(batches[0]):
+        for batch in batches:
+            found.update(np.ascontiguousarray(batch[name]).tobytes())
+    return found.hexdigest()
