@@ -127,6 +127,7 @@ def holds_token(path):
         return False
 
 
+@pytest.mark.faults
 def test_a_preempted_job_is_queued_again_and_the_rows_stay_the_same(
     runs, local_rows, slurm, eventually
 ):
@@ -231,6 +232,7 @@ def test_a_job_that_slurm_forgot_has_completed(slurm, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.faults
 def test_the_queue_is_asked_for_all_jobs_at_once_and_rarely(runs, slurm, tmp_path):
     asked = tmp_path / "bin"
     asked.mkdir()
@@ -269,6 +271,7 @@ def test_options_are_checked_before_anything_is_started(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.faults
 def test_clients_of_an_elastic_run_are_jobs_too(runs, local_rows, eventually):
     expected = local_rows(clients=4)
     assert runs.same(runs.rows(*LOCAL, "--environment.max-clients", "2", clients=4), expected)

@@ -122,6 +122,7 @@ def test_a_sweep_that_is_asked_to_end_leaves_no_trial_behind(write, training, ex
         assert list(Path("studies/there").glob("trial_0001/network/*/checkpoint.toml"))
 
 
+@pytest.mark.faults
 def test_slurm_runs_trials_and_keeps_none_when_the_sweep_is_killed(
     write, slow, same_as_whole, idle_slurm
 ):
@@ -156,6 +157,7 @@ def test_a_job_that_slurm_preempts_continues_its_trial(write, training, same_as_
     assert output.count("session: ") == 2  # the same trial began twice
 
 
+@pytest.mark.faults
 def test_a_worker_that_ray_loses_is_replaced(write, slow, same_as_whole, ray_cluster):
     write(run={"executor": "ray", "options": {"address": ray_cluster.variables["RAY_ADDRESS"]}})
     sweep = start("sweep.toml", "studies/there")

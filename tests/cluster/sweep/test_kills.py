@@ -91,6 +91,7 @@ def test_a_trial_that_never_gets_further_is_given_up(write, slow, physx):
     assert len(Path("studies/sweep/trials.csv").read_text().splitlines()) == 1
 
 
+@pytest.mark.faults
 def test_data_that_were_cut_short_are_generated_anew(write, slow, physx, parameters_of):
     del slow["dataset"]["existing_dir"]
     spring = {"environment": "toy/spring", "as_tcp_ip_client": False}
