@@ -48,6 +48,8 @@ APART = "pytest.mark.processes"  # in a file whose tests start processes
 STARTS = ("subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.system")
 DAYS = 4
 """After so many days each case was in a sample."""
+QUICK_DAYS = 8
+"""The same, of samples of quick tests."""
 
 
 def pytest_addoption(parser):
@@ -110,8 +112,9 @@ def sampled(items):
     others = (item for item in items if item not in known)
     for _, group in itertools.groupby(others, key=lambda item: item.nodeid.partition("[")[0]):
         cases = list(group)
-        few = sizes.is_quick() or cases[0].get_closest_marker("processes")
-        chosen.update(sizes.share(cases, min(DAYS, len(cases))) if few else cases)
+        few = DAYS if cases[0].get_closest_marker("processes") else 1
+        parts = QUICK_DAYS if sizes.is_quick() else few
+        chosen.update(sizes.share(cases, min(parts, len(cases))))
     return chosen
 
 

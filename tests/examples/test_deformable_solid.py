@@ -68,6 +68,7 @@ def test_large_loads_bend_it_less_than_in_proportion(beam):
     assert np.all(solver.solve(0 * tip_load(beam, 0)) == 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("force", [-80, 100])
 def test_the_equilibrium_is_that_of_felupes_own_solver_in_small_parts(force, beam):
     import felupe

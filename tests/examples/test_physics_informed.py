@@ -37,6 +37,7 @@ def test_true_friction_inside_the_model_is_exact(module, pendulum, engines):
     assert pendulum.error(model, samples) > 0.05
 
 
+@pytest.mark.slow
 def test_equations_of_motion_help_a_network(module, pendulum, engines):
     example = module("18_physics_informed")
     model = example.ForwardDynamics(engines[1])

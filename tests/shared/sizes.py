@@ -15,17 +15,14 @@ def campaign():
     return os.environ["PHYSX_CAMPAIGN"]
 
 
-def size(full, usual, quick=None):
-    """Return how many examples, trials, steps or rows a test has.
+def size(full, quick):
+    """Return how many examples, steps or rows a test has."""
+    return quick if is_quick() else full
 
-    Args:
-        full: The number in a full campaign.
-        usual: The number in other runs.
-        quick: The number with --quick, if it is another one.
-    """
-    if campaign() == "full":
-        return full
-    return quick if quick is not None and is_quick() else usual
+
+def trials(full, few):
+    """Return how many trials a test makes: all only in a full campaign."""
+    return full if campaign() == "full" else few
 
 
 def seed():

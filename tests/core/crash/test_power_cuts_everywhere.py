@@ -15,6 +15,7 @@ from powercut.disk import Disk, Folder, Killed, Recorder
 from powercut.planted import BUGS
 from powercut.promises import encode, look
 from powercut.stage import Stage
+from sizes import size
 
 from physx_core import Dataset, Field
 from physx_core.errors import DatasetError
@@ -24,7 +25,7 @@ HISTORIES = 25  # of which one at least finds a planted bug
 
 @given(seed=st.integers(0, 2**32))
 @settings(
-    max_examples=4,
+    max_examples=size(4, 1),
     deadline=None,
     derandomize=True,
     suppress_health_check=[HealthCheck.function_scoped_fixture],

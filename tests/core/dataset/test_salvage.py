@@ -254,6 +254,7 @@ class Killed(BaseException):
     """The process is gone."""
 
 
+@pytest.mark.slow
 def test_whenever_the_process_ends_no_row_is_shifted_against_another(folder, tmp_path, monkeypatch):
     left_open(folder)
     flip(folder, "x", 20)

@@ -18,6 +18,7 @@ from hypothesis.stateful import (
     invariant,
     rule,
 )
+from sizes import size
 
 from physx_core.errors import ConnectionRefusedByPeerError, SilentPeerError, UnansweredError
 from physx_core.net import FrameReader, Kind, Listener, SecureSocket, encrypt, pack
@@ -143,10 +144,10 @@ class Stream(RuleBasedStateMachine):
 
 
 TestStream = Stream.TestCase
-TestStream.settings = settings(max_examples=25, stateful_step_count=25, deadline=None)
+TestStream.settings = settings(max_examples=size(25, 4), stateful_step_count=25, deadline=None)
 
 
-@settings(max_examples=40)
+@settings(max_examples=size(40, 5))
 @given(data=st.data())
 def test_what_is_cut_or_changed_on_its_way_is_a_beginning_of_what_was_sent_and_an_error(data):
     near, relay_near = pair()

@@ -14,6 +14,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
+from sizes import size
 
 from physx_core.errors import ConnectionRefusedByPeerError, UsageError
 from physx_core.net import Kind, decode, encode, pack, pack_value
@@ -82,13 +83,13 @@ def same(a, b):
     return a == b
 
 
-@settings(max_examples=150)
+@settings(max_examples=size(150, 18))
 @given(VALUES)
 def test_values_come_back_with_type_and_bits(value):
     assert same(decode(encode(value)), value)
 
 
-@settings(max_examples=150)
+@settings(max_examples=size(150, 18))
 @given(FLAT, st.sampled_from(Kind), st.integers(0, 2**64 - 1))
 def test_flat_dictionaries_come_back_however_often_they_travel(value, kind, number):
     for _ in range(2):
@@ -198,13 +199,13 @@ def refused_or_taken(data):
         decode(data)
 
 
-@settings(max_examples=200)
+@settings(max_examples=size(200, 25))
 @given(st.binary(max_size=60) | damaged())
 def test_damaged_bytes_never_raise_anything_else(data):
     refused_or_taken(data)
 
 
-@settings(max_examples=300)
+@settings(max_examples=size(300, 37))
 @given(TREES, st.binary(max_size=20))
 def test_trees_of_any_tags_never_raise_anything_else(tree, data):
     text = json.dumps(tree, separators=(",", ":")).encode()

@@ -131,6 +131,7 @@ def test_wrong_precision(precision, data_type, told):
 # torch.compile ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_compiled_network_learns_the_same():
     plain, optimization = made()
     learn(plain, optimization, samples(plain))
