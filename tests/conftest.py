@@ -4,6 +4,7 @@ import contextlib
 import datetime
 import itertools
 import os
+import platform
 import random
 import shutil
 import signal
@@ -63,6 +64,7 @@ def pytest_configure(config):
         os.environ["PHYSX_TEST_SAMPLE"] = "1"
     if config.getoption("quick"):
         os.environ["PHYSX_TEST_QUICK"] = "1"
+        platform.processor()  # h5py asks for it, and the first time it starts a process
         sys.addaudithook(refuse_processes)
     settings.load_profile("quick" if sizes.is_quick() else "physx")
 
