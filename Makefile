@@ -11,7 +11,7 @@ DEMO_ARGS ?=
 PYTEST_ARGS ?= -n 3
 BIN := .venv/bin
 DIST := --dist loadgroup --no-loadscope-reorder
-ROOM = $(if $(P),$(wildcard tests/$(P) tests/*/$(P) tests/*/*/$(P)),-n 2 $(DIST))
+ROOM = $(wildcard tests/$(P) tests/*/$(P) tests/*/*/$(P))
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check
 COMPILE := $(BIN)/python -m compileall -q -j 0 .venv/lib >/dev/null 2>&1 || true  # pip uses one core
 PACKAGES := -e ./physx_core -e ./physx_testing -e "./physx_sim[robots,meshes]" -e ./physx_formats -e "./physx_dart[robots]" -e "./physx_torch[export]" -e ./physx_rerun -e ./physx_gym -e ./physx_remote -e ./physx_cluster
@@ -26,7 +26,7 @@ test: .venv/tools
 	$(BIN)/python -m pytest $(DIST) $(PYTEST_ARGS)
 
 quick: .venv/tools
-	$(BIN)/python -m pytest -q --quick -m "not faults and not slow" $(or $(ROOM),$(error there is no room $(P)))
+	$(BIN)/python -m pytest -q --quick -m "not faults and not slow" -n 2 $(DIST) $(if $(P),$(or $(ROOM),$(error there is no room $(P))))
 
 lint: .venv/tools
 	$(BIN)/ruff check .

@@ -7,12 +7,11 @@ from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.components import Factory
 from physx_core.errors import WrongSamplesError
 
-pytest.importorskip("felupe", reason="needs felupe, which solves the beam")
-
 
 @pytest.fixture
 def beam(root, monkeypatch):
     """The module of the solver."""
+    pytest.importorskip("felupe", reason="needs felupe, which solves the beam")
     monkeypatch.syspath_prepend(str(root / "examples"))
     from environments import beam_solver
 

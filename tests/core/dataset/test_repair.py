@@ -303,7 +303,7 @@ def test_numbers_are_on_one_line_of_the_manifest(tmp_path):
 
 
 def test_repairing_keeps_the_rows_before_those_that_did_not_reach_the_disk(tmp_path):
-    writer = Dataset.create(tmp_path / "data", durable=True)
+    writer = Dataset.create(tmp_path / "data", durable=True, max_file_size=1e-3)
     for rows in (4, 3):
         writer.append("training", {"x": np.arange(1.0, rows + 1)})
     shutil.copytree(tmp_path / "data", tmp_path / "cut")

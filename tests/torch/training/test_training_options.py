@@ -141,6 +141,7 @@ def test_compiled_network_learns_the_same():
     assert list(fast.state_dict()) == list(plain.state_dict())
 
 
+@pytest.mark.slow
 def test_compiled_in_mixed_precision():
     network, optimization = made({"compile": "eager", "mixed_precision": "bfloat16"})
     data = samples(network)
