@@ -104,6 +104,7 @@ def test_the_skin_is_closed_and_faces_outwards(beam):
     assert volumes.sum() == pytest.approx(np.prod(beam.SIZE))
 
 
+@pytest.mark.slow
 def test_samples_are_pushes_and_their_equilibria(beam, pushed, tmp_path):
     config = EnvironmentConfig(pushed.Beam, as_tcp_ip_client=False, seed=0)
     DataGeneration(config, session_dir=str(tmp_path), batch_nb=1, batch_size=3).execute()

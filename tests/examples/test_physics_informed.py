@@ -23,6 +23,7 @@ def engines(pendulum):
         yield real, model
 
 
+@pytest.mark.slow
 def test_the_model_lacks_the_friction(module, pendulum, engines):
     samples = pendulum.measure(engines[0], 20, seed=3)
     friction = module("environments.double_pendulum_picture").friction

@@ -31,7 +31,7 @@ HISTORIES = 25  # of which one at least finds a planted bug
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 def test_nothing_wrong_is_read_back_after_a_power_cut(tmp_path, seed):
-    problems = Checker(tmp_path, states=200).check(seed).problems
+    problems = Checker(tmp_path, states=size(200, 40)).check(seed).problems
     assert not problems, "\n".join(map(describe, problems))
 
 

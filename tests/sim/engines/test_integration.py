@@ -48,6 +48,7 @@ def test_the_energy_error_of_a_pendulum_is_proportional_to_the_period(backend, b
     np.testing.assert_allclose(errors[0] / errors[1], 2.0, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_rk4_keeps_the_energy_of_a_pendulum(backend, bar):
     assert energy_error(backend, bar(), 1e-3, "rk4") < 1e-11
 

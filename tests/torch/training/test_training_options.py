@@ -151,6 +151,7 @@ def test_compiled_in_mixed_precision():
     assert last < first
 
 
+@pytest.mark.slow
 def test_a_machine_without_a_compiler_is_told_so():
     def broken(graph, inputs):
         raise RuntimeError("no compiler found")
@@ -164,6 +165,7 @@ def test_a_machine_without_a_compiler_is_told_so():
         learn(network, optimization, samples(network))
 
 
+@pytest.mark.slow
 def test_unknown_backend():
     with pytest.raises(ConfigError, match="inductor"):
         made({"compile": "indcutor"})
