@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from sizes import seed, trials
 
 from physx_core import Dataset
 from physx_core.errors import DatasetError, DatasetNotFoundError
@@ -52,8 +53,8 @@ def test_kill_9_loses_no_committed_row(tmp_path, work):
 @pytest.mark.parametrize("work", WORKS)
 def test_kill_9_loses_no_committed_row_in_many_trials(
     tmp_path, record_property, work, durability
-):  # 204 kills in all
-    record_property("counts", kill(tmp_path, work, durability, 2, 17))
+):  # 204 kills in a full campaign
+    record_property("counts", kill(tmp_path, work, durability, seed(), trials(17, 6)))
 
 
 # Readers beside a writer ------------------------------------------------------------------------
@@ -297,7 +298,7 @@ def test_a_disk_that_is_full_at_some_moment(small_disk):
 
 @pytest.mark.faults
 def test_a_disk_that_is_full_at_any_moment(small_disk):
-    for free in range(0, 1_200_000, 4096 * 9):
+    for free in range(0, 1_200_000, 4096 * trials(9, 27)):
         fill_up(small_disk / "data", free)
 
 

@@ -9,6 +9,7 @@ import warnings
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from sizes import trials
 
 from physx_core import Dataset, Field
 from physx_core.errors import DatasetError
@@ -179,7 +180,7 @@ def test_a_flipped_bit_is_noticed(places, tmp_path):
 
 @pytest.mark.faults
 def test_flipped_bits_all_over_are_noticed(places, tmp_path, record_property):
-    record_property("tried, noticed", flip_bits(places, tmp_path, 100))
+    record_property("tried, noticed", flip_bits(places, tmp_path, trials(100, 300)))
 
 
 def test_every_flipped_bit_of_the_rows_is_noticed_when_they_are_read(places, tmp_path):

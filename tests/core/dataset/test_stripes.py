@@ -30,6 +30,7 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
+from sizes import trials
 
 from physx_core import Dataset, Field
 from physx_core.dataset.read import reader as reading
@@ -47,8 +48,8 @@ from physx_core.errors import DatasetError
 pytestmark = pytest.mark.processes
 
 FIELDS = [Field("n", (), "int64"), Field("x", (3,), unit="m"), Field("f", (), "bool")]
-QUICK = settings(database=None, deadline=None, max_examples=4, stateful_step_count=30)
-LONG = settings(QUICK, max_examples=5, stateful_step_count=50)
+QUICK = settings(database=None, deadline=None, max_examples=trials(4, 2), stateful_step_count=30)
+LONG = settings(QUICK, max_examples=trials(5, 2), stateful_step_count=50)
 SYNCED = {}  # by a file's inode: see `sync`
 
 

@@ -14,6 +14,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from sizes import seed, trials
 
 from physx_core import (
     DataGeneration,
@@ -182,7 +183,7 @@ def test_a_client_that_was_killed_continues_its_partitions(step, nothing_stays_b
 @pytest.mark.faults
 def test_clients_that_are_killed_at_any_moments(nothing_stays_behind, process_ids):
     wanted = rows(generate("server", "server", batches=30))
-    chance, ended = random.Random(5), threading.Event()
+    chance, ended = random.Random(seed()), threading.Event()
 
     def kill():
         while not ended.wait(0.2 + 0.3 * chance.random()):
@@ -283,15 +284,11 @@ def test_a_run_that_is_killed_leaves_rows_before_which_none_is_missing(
 
 @pytest.mark.faults
 def test_runs_that_are_killed_at_any_moments(run_killed, nothing_stays_behind):
-    (wanted, duration), chance = server_rows(run_killed), random.Random(7)
+    (wanted, duration), chance = server_rows(run_killed), random.Random(seed())
+    shares = [0.9, *(chance.uniform(0.3, 1.0) for _ in range(trials(4, 2)))]
     left = [
-        check_killed_run(
-            run_killed,
-            Path(f"killed-{number}").resolve(),
-            duration * chance.uniform(0.3, 1.0),
-            wanted,
-        )
-        for number in range(5)
+        check_killed_run(run_killed, Path(f"killed-{place}").resolve(), duration * share, wanted)
+        for place, share in enumerate(shares)
     ]
     assert max(left) > 0
 

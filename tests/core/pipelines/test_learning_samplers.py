@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sizes import seed, trials
 
 from physx_core import (
     DataGeneration,
@@ -184,7 +185,7 @@ def test_a_training_whose_sampler_learns_is_killed_and_resumed_bit_for_bit(
 @pytest.mark.faults
 @pytest.mark.parametrize("words", [("clients", "stream"), ("clients", "reservoir")], ids=str)
 def test_such_a_training_survives_being_killed_at_any_moments(tmp_path, words, run_killed):
-    assert survives(run_killed, tmp_path, 0, 10, words)
+    assert survives(run_killed, tmp_path, seed(), trials(10, 4), words)
 
 
 def test_after_failed_sets_resuming_is_refused_if_rejected_samples_are_recorded(tmp_path):

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sizes import seed, trials
 
 from physx_core import (
     DataGeneration,
@@ -409,7 +410,7 @@ def survives(run_killed, random, kills, words):
 def test_a_training_that_is_killed_while_environments_generate_is_resumed_bit_for_bit(
     words, run_killed
 ):
-    survives(run_killed, random.Random(1), 2, words)
+    survives(run_killed, random.Random(1), trials(2, 1), words)
 
 
 @pytest.mark.faults
@@ -419,7 +420,7 @@ def test_a_training_that_is_killed_while_environments_generate_is_resumed_bit_fo
     ids=["clients once fifo", "clients always stream"],
 )
 def test_a_training_survives_being_killed_at_many_moments(words, kills, run_killed):
-    survives(run_killed, random.Random(2), kills, words)
+    survives(run_killed, random.Random(seed()), trials(kills, 3), words)
 
 
 def test_the_command_resumes_with_the_environments_of_the_session(capfd, nothing_stays_behind):

@@ -117,6 +117,7 @@ def test_clean_rl_sees_the_episodes_of_an_environment_in_this_process(train):
     assert len({tuple(observation) for observation in first}) == 3, "agents differ"
 
 
+@pytest.mark.faults
 def test_stable_baselines_learns_in_environments_that_its_wrapper_starts(train, tmp_path):
     launcher = write_launcher(tmp_path / "cart.x86_64", "gym/CartPole-v1", num_worlds=2)
     told = train("stable_baselines", launcher)
