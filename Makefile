@@ -1,5 +1,5 @@
 # make demo    install into .venv and run the main job: examples/09_robot_arm.py
-# make test    install into .venv and run the tests; PYTEST_ARGS are handed on
+# make test    install into .venv and run the tests; PYTEST_ARGS are handed on, PHYSX_CAMPAIGN=full has all cases
 # make quick   run the tests that start no process, of one room with P=dataset: a minute at most
 # make lint    ruff, mypy and import-linter
 # make docs    build the site: docs/_build/docs/index.html

@@ -230,5 +230,5 @@ class Sweeps(RuleBasedStateMachine):
         self.root.cleanup()
 
 
-Sweeps.TestCase.settings = settings(max_examples=size(trials(20, 6), 2), stateful_step_count=8)
+Sweeps.TestCase.settings = settings(max_examples=size(trials(20, 12), 2), stateful_step_count=8)
 test_sweeps = Sweeps.TestCase
