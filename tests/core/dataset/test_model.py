@@ -1111,12 +1111,12 @@ class SharedMachine(RuleBasedStateMachine):
 
 
 @pytest.mark.parametrize("number", range(trials(13, 6)))
-def test_a_dataset_is_what_lists_are(number):
+def test_dataset_behaves_like_lists(number):
     run_state_machine_as_test(seed(number)(Machine), settings=QUICK)
 
 
 @pytest.mark.parametrize("number", range(trials(4, 2)))
-def test_a_dataset_of_several_writers_is_what_lists_are(number):
+def test_dataset_of_concurrent_writers_behaves_like_lists(number):
     few = settings(QUICK, stateful_step_count=15)
     run_state_machine_as_test(seed(number)(SharedMachine), settings=few)
 
@@ -1129,6 +1129,6 @@ def test_longer_histories(number):
 
 @pytest.mark.faults
 @pytest.mark.parametrize("number", range(100, 110))
-def test_longer_histories_of_several_writers(number):
+def test_longer_histories_of_concurrent_writers(number):
     few = settings(QUICK, stateful_step_count=20)
     run_state_machine_as_test(seed(number)(SharedMachine), settings=few)

@@ -63,7 +63,7 @@ def test_a_wrong_edit_is_undone(folder, old, new, thousand):
 
 
 @pytest.mark.parametrize("text", [None, b"", b"{", b"[]", b"\xff", b"null", b"[" * 100_000])
-def test_a_lost_or_damaged_manifest_is_rebuilt(folder, text, thousand):
+def test_repair_rebuilds_lost_or_corrupt_manifest(folder, text, thousand):
     thousand.write(folder)
     (folder / "dataset.json").unlink()
     if text is not None:
@@ -227,7 +227,7 @@ def killed_at(monkeypatch, changes, call):
 
 
 @pytest.mark.parametrize("call", ["rebuild", "repair"])
-def test_a_manifest_is_there_whenever_rebuilding_is_killed(folder, call, thousand, monkeypatch):
+def test_killed_rebuild_always_leaves_a_manifest(folder, call, thousand, monkeypatch):
     left = folder.with_name("left")
     thousand.write(left, thousand.part(0, 340), info={"a": 1})
     with Dataset.open(left, writable=True, max_file_size=thousand.size) as dataset:

@@ -110,7 +110,7 @@ def test_concurrent_writers_lose_no_rows(tmp_path, folder, sessions):
 
 
 @pytest.mark.parametrize("victims", [1, 3])
-def test_a_killed_writer_does_not_block_the_others(tmp_path, folder, victims):
+def test_killed_writer_does_not_block_concurrent_writers(tmp_path, folder, victims):
     Dataset.create(folder).close()
     writers = [start(tmp_path, folder, number, 10**9) for number in range(3)]
     totals = [0, 0, 0]
@@ -200,7 +200,7 @@ def test_shared_and_exclusive_writers_exclude_each_other(folder):
     Dataset.open(folder, writable=True).close()
 
 
-def test_a_shared_writer_seals_what_a_killed_one_left(folder, tmp_path):
+def test_shared_writer_seals_partitions_of_killed_writer(folder, tmp_path):
     with Dataset.create(folder, shared=True) as one:
         one.append("training", rows(1, 3))
         shutil.copytree(folder, tmp_path / "killed")

@@ -460,16 +460,16 @@ def abandon(writer):
     writer._syncer._end.set()
 
 
-def test_random_histories():
+def test_stripes_behave_like_lists():
     run_state_machine_as_test(Machine, settings=QUICK)
 
 
 @pytest.mark.faults
-def test_many_random_histories():
+def test_stripes_behave_like_lists_in_long_histories():
     run_state_machine_as_test(Machine, settings=LONG)
 
 
-def test_rows_that_a_restarted_writer_found_survive_a_power_cut():
+def test_rows_found_by_restarted_stripe_writer_survive_power_cut():
     """A restart syncs them; only what was written since is not on the disk yet."""
     machine = Machine()
     try:
@@ -522,7 +522,7 @@ def test_the_flat_index_finds_what_the_spans_say():
             assert rows == [wanted[row] for row in range(start, stop)]
 
 
-def test_a_stripe_has_one_writer_at_a_time(folder, monkeypatch):
+def test_stripe_lock_allows_one_writer(folder, monkeypatch):
     """A process that is alive keeps its stripe; at its end the next one gets it at once."""
     monkeypatch.setattr(locks, "_PATIENCE", 0.1)
     with Dataset.create(folder) as dataset:

@@ -96,7 +96,7 @@ class InPieces:
         return len(piece)
 
 
-def test_who_announces_much_and_sends_little_takes_little_memory():
+def test_announced_frame_length_allocates_no_memory():
     head = HEADER.pack(1 << 30, Kind.ROWS, 0, 1)
     tracemalloc.start()
     try:

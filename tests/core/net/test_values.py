@@ -148,7 +148,7 @@ class Text(str):
     [object(), {1, 2}, Text("x"), np.array([None]), np.zeros(2, "i4,f8"), np.ma.array([1]), print],
     ids=["object", "set", "subclass", "objects", "structured", "masked", "function"],
 )
-def test_what_cannot_travel_is_named(value):
+def test_unserializable_values_are_named(value):
     with pytest.raises(UsageError, match=r"(?s)options\['deep'\]\[1\] is .*cannot be sent"):
         encode({"deep": [0, value]}, "options")
 
@@ -201,13 +201,13 @@ def refused_or_taken(data):
 
 @settings(max_examples=size(200, 25))
 @given(st.binary(max_size=60) | damaged())
-def test_damaged_bytes_never_raise_anything_else(data):
+def test_corrupt_bytes_raise_only_decoding_errors(data):
     refused_or_taken(data)
 
 
 @settings(max_examples=size(300, 37))
 @given(TREES, st.binary(max_size=20))
-def test_trees_of_any_tags_never_raise_anything_else(tree, data):
+def test_random_tags_raise_only_decoding_errors(tree, data):
     text = json.dumps(tree, separators=(",", ":")).encode()
     refused_or_taken(struct.pack("<I", len(text)) + text + data)
 

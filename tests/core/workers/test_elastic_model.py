@@ -99,7 +99,7 @@ OPTIONS = {
 
 @settings(max_examples=trials(3, 2), **OPTIONS)
 @given(st.lists(ACTION, min_size=2, max_size=6), st.booleans())
-def test_any_history_gives_the_same_rows(
+def test_any_elastic_history_gives_same_rows(
     local, by_hand, join, process_ids, taking, said, caplog, history, asks
 ):
     caplog.set_level("INFO", "physx")
@@ -110,7 +110,7 @@ def test_any_history_gives_the_same_rows(
 @pytest.mark.faults
 @settings(max_examples=trials(5, 2), **OPTIONS)
 @given(st.lists(ACTION, min_size=5, max_size=12), st.booleans())
-def test_any_long_history_gives_the_same_rows(
+def test_any_long_elastic_history_gives_same_rows(
     local, by_hand, join, process_ids, taking, said, caplog, history, asks
 ):
     caplog.set_level("INFO", "physx")

@@ -17,7 +17,7 @@ from physx_core.workers.client.worker import run_client
 pytestmark = pytest.mark.processes
 
 
-def test_strangers_do_not_disturb_a_run(clients, port):
+def test_unauthenticated_connections_do_not_disturb_run(clients, port):
     stop_it = threading.Event()
     talked = []
 
@@ -63,7 +63,7 @@ def test_strangers_do_not_disturb_a_run(clients, port):
     assert len(talked) > 8
 
 
-def test_a_silent_stranger_is_dropped_after_a_while(clients, port, monkeypatch):
+def test_silent_connection_is_closed_after_timeout(clients, port, monkeypatch):
     monkeypatch.setattr("physx_core.workers.server.server._HANDSHAKE_TIME", 0.2)
     with clients(port=port) as source, socket.create_connection(("127.0.0.1", port)) as stranger:
         stranger.settimeout(30)
@@ -74,7 +74,7 @@ def test_a_silent_stranger_is_dropped_after_a_while(clients, port, monkeypatch):
         assert stranger.recv(10) == b""
 
 
-def test_many_silent_strangers_do_not_keep_clients_out(clients, port):
+def test_many_silent_connections_do_not_block_clients(clients, port):
     with clients(port=port, num_clients=1) as source:
         crowd = []
         for _ in range(200):
@@ -91,7 +91,7 @@ def test_many_silent_strangers_do_not_keep_clients_out(clients, port):
         source.batch(1)
 
 
-def test_a_client_with_another_token_is_told_so(clients, port):
+def test_client_with_wrong_token_is_refused(clients, port):
     errors = []
 
     def join():
@@ -129,7 +129,7 @@ def test_a_client_does_not_trust_a_server_without_the_token():
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nonsense", "127.0.0.1:port", "a.invalid:80"])
-def test_nothing_at_the_address_is_an_error_that_names_it(address):
+def test_connection_refused_names_address(address):
     with pytest.raises(ConnectionRefusedByPeerError, match=address):
         run_client(address, "token" * 5, patience=1.0)
 

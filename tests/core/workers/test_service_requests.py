@@ -51,7 +51,7 @@ def test_requests_of_all_instances_are_one_batch_whatever_their_speed(clients, b
     assert batch_services.asked == ["1"] + 10 * ["1 2 3"] + ["2 3"]
 
 
-def test_who_keeps_a_batch_of_requests_waiting_is_named(clients, batch_services):
+def test_instance_that_delays_batch_of_requests_is_reported(clients, batch_services):
     kwargs = {"what": "sleep", "who": 2, "at": 1}
     settings = {"num_clients": 2, "env_kwargs": kwargs, "timeout": 2.5}
     with (
@@ -77,7 +77,7 @@ def test_a_refused_prediction_is_the_error_of_the_services(local, clients, servi
         assert note in ("in step() of instance 1", "in step() of instance 2")  # whoever was first
 
 
-def test_a_long_prediction_is_not_taken_for_silence(clients, services, unhurried):
+def test_long_prediction_is_no_timeout(clients, services, unhurried):
     quick, timeout = services.predict, unhurried(1.0)
 
     def predict(fields):
@@ -131,9 +131,7 @@ def test_drawing_events_arrive_exactly(local, clients, services):
             same_arrays(a.values, b.values)
 
 
-def test_a_client_at_its_end_stays_until_the_server_has_read_what_it_sent(
-    clients, services, process_ids
-):
+def test_ending_client_waits_until_server_has_read_everything(clients, services, process_ids):
     """The server is slow, and the client comes to its end while thousands of messages wait."""
     shown, closing, ended = [], [], []
 
@@ -157,7 +155,7 @@ def test_a_client_at_its_end_stays_until_the_server_has_read_what_it_sent(
     assert has_ended(closing[0])
 
 
-def test_what_a_client_sent_before_it_was_killed_is_read(clients, services, process_ids):
+def test_rows_sent_before_kill_are_read(clients, services, process_ids):
     """The server is slow, and thousands of messages of a process that is no more wait."""
     shown, killing = [], []
 
@@ -221,7 +219,7 @@ def test_options_arrive_exactly(clients, services):
     assert type(back["scalar"]) is np.int16
 
 
-def test_options_that_cannot_travel_are_named_before_anything_starts(clients):
+def test_unserializable_options_are_refused_before_start(clients):
     message = r"env_kwargs'\]\['options'\]\['deep'\].*cannot be sent"
     kwargs = {"options": {"deep": object()}}
     with pytest.raises(UsageError, match=message), clients("Echo", env_kwargs=kwargs):
