@@ -30,6 +30,7 @@ def test_the_model_lacks_the_friction(module, pendulum, engines):
     torch.testing.assert_close(pendulum.missing(engines[1], samples), friction(samples[1]))
 
 
+@pytest.mark.slow
 def test_true_friction_inside_the_model_is_exact(module, pendulum, engines):
     example = module("18_physics_informed")
     samples, model = pendulum.measure(engines[0], 20, seed=3), example.ForwardDynamics(engines[1])

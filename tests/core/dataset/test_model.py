@@ -1115,6 +1115,7 @@ def test_dataset_behaves_like_lists(number):
     run_state_machine_as_test(seed(number)(Machine), settings=QUICK)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(trials(4, 2)))
 def test_dataset_of_concurrent_writers_behaves_like_lists(number):
     few = settings(QUICK, stateful_step_count=15)
