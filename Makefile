@@ -1,5 +1,5 @@
 # make demo    install into .venv and run the main job: examples/09_robot_arm.py
-# make test    install into .venv and run the tests; PYTEST_ARGS are handed on
+# make test    install into .venv and run the tests; PYTEST_ARGS are handed on, PHYSX_CAMPAIGN=full has all cases
 # make quick   run the tests that start no process, of one room with P=dataset: a minute at most
 # make lint    ruff, mypy and import-linter
 # make docs    build the site: docs/_build/docs/index.html
@@ -8,9 +8,10 @@
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
 DEMO_ARGS ?=
-PYTEST_ARGS ?= -n 3 --dist worksteal
+PYTEST_ARGS ?= -n 3
 BIN := .venv/bin
-ROOM = $(if $(P),$(wildcard tests/$(P) tests/*/$(P) tests/*/*/$(P)),-n 2 tests)
+DIST := --dist loadgroup --no-loadscope-reorder
+ROOM = $(wildcard tests/$(P) tests/*/$(P) tests/*/*/$(P))
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check
 COMPILE := $(BIN)/python -m compileall -q -j 0 .venv/lib >/dev/null 2>&1 || true  # pip uses one core
 PACKAGES := -e ./physx_core -e ./physx_testing -e "./physx_sim[robots,meshes]" -e ./physx_formats -e "./physx_dart[robots]" -e "./physx_torch[export]" -e ./physx_rerun -e ./physx_gym -e ./physx_remote -e ./physx_cluster
@@ -22,10 +23,10 @@ demo: .venv/packages
 	$(BIN)/python examples/09_robot_arm.py $(DEMO_ARGS)
 
 test: .venv/tools
-	$(BIN)/python -m pytest $(PYTEST_ARGS)
+	$(BIN)/python -m pytest $(DIST) $(PYTEST_ARGS)
 
 quick: .venv/tools
-	$(BIN)/python -m pytest -q --quick -m "not faults and not slow" $(or $(ROOM),$(error there is no room $(P)))
+	$(BIN)/python -m pytest -q --quick -m "not faults and not slow" -n 2 $(DIST) $(if $(P),$(or $(ROOM),$(error there is no room $(P))))
 
 lint: .venv/tools
 	$(BIN)/ruff check .

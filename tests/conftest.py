@@ -1,8 +1,10 @@
 """What all tests share."""
 
 import contextlib
-import importlib
+import datetime
+import itertools
 import os
+import platform
 import random
 import shutil
 import signal
@@ -15,6 +17,7 @@ from multiprocessing import resource_tracker
 from pathlib import Path
 
 import pytest
+import sizes
 from hypothesis import HealthCheck, settings
 
 # Else each of the thousands of interpreters that tests start compiles all of physx again.
@@ -35,7 +38,7 @@ if (
 
 # How long an example takes says nothing on a busy machine.
 settings.register_profile("physx", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.load_profile("physx")
+settings.register_profile("quick", settings.get_profile("physx"), max_examples=25)
 
 # A shell that starts the tests in the background has them ignore Ctrl-C, and every process that
 # they start inherits that; some tests press it.
@@ -44,6 +47,11 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 APART = "pytest.mark.processes"  # in a file whose tests start processes
 STARTS = ("subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.system")
+RUNNING = {"quick": False}  # what kind of test
+DAYS = 4
+"""After so many days each case was in a sample."""
+QUICK_DAYS = 8
+"""The same, of samples of quick tests."""
 
 
 def pytest_addoption(parser):
@@ -51,14 +59,29 @@ def pytest_addoption(parser):
 
 
 def pytest_configure(config):
+    """Choose sizes; processes of pytest-xdist inherit the choice as environment variables."""
+    os.environ.setdefault("PHYSX_CAMPAIGN", str(datetime.date.today().toordinal()))
+    if config.args_source is config.ArgsSource.TESTPATHS and not hasattr(config, "workerinput"):
+        os.environ["PHYSX_TEST_SAMPLE"] = "1"
     if config.getoption("quick"):
-        importlib.import_module("h5py")  # which starts a process
-        sys.addaudithook(refuse_processes)
+        os.environ["PHYSX_TEST_QUICK"] = "1"
+    platform.processor()  # h5py asks for it, and the first time it starts a process
+    sys.addaudithook(refuse_processes)
+    settings.load_profile("quick" if sizes.is_quick() else "physx")
+
+
+def pytest_report_header():
+    return f"PHYSX_CAMPAIGN={sizes.campaign()} chose the cases; PHYSX_CAMPAIGN=full has them all"
+
+
+def pytest_runtest_setup(item):
+    RUNNING["quick"] = not any(map(item.get_closest_marker, ("processes", "slow", "faults")))
 
 
 def refuse_processes(event, _):
-    """Fail a test that starts a process, in a run of those that start none."""
-    if event in STARTS and "PYTEST_CURRENT_TEST" in os.environ:
+    """Fail a test that starts a process although --quick runs it, in any run."""
+    phase = os.environ.get("PYTEST_CURRENT_TEST", "").rpartition(" ")[2]
+    if event in STARTS and RUNNING["quick"] and phase == "(call)":
         pytest.fail(f"this test starts a process: its file needs pytestmark = {APART}")
 
 
@@ -68,23 +91,39 @@ def pytest_ignore_collect(collection_path, config):
     return True if is_test and APART in collection_path.read_text() else None
 
 
-def pytest_collection_modifyitems(config, items):
-    """Begin with long tests: one that begins last would prolong the whole run.
+def pytest_itemcollected(item):
+    """Let pytest-xdist run a file, or all that need a cluster, in one process, one by one."""
+    clusters = [name for name in ("ray_cluster", "slurm") if name in item.fixturenames]
+    item.add_marker(pytest.mark.xdist_group([*clusters, str(item.path)][0]))
 
-    Of several processes each begins with its part of the long tests, as each has a part of the
-    items in a row.
+
+@pytest.hookimpl(trylast=True)  # of what -m and -k have left
+def pytest_collection_modifyitems(config, items):
+    """Take a sample if the whole suite runs, and begin with files that have long tests."""
+    if "PHYSX_TEST_SAMPLE" in os.environ or sizes.is_quick():
+        chosen = sampled(items)
+        config.hook.pytest_deselected(items=[item for item in items if item not in chosen])
+        items[:] = [item for item in items if item in chosen]
+    long = {item.path for item in items if any(map(item.get_closest_marker, ("faults", "slow")))}
+    items.sort(key=lambda item: item.path not in long)
+
+
+def sampled(items):
+    """Return a sample, another one each day: after some days, all cases had their turn.
+
+    Of tests marked `faults` it is a part, and of the cases of each other parametrized test that
+    starts processes, or of any in a run of quick tests, another part, or one.
     """
-    long = [item for item in items if any(map(item.get_closest_marker, ("faults", "slow")))]
-    known = set(long)
-    short = [item for item in items if item not in known]
-    count = getattr(config, "workerinput", {}).get("workercount", 1)
-    ends = [len(items) * number // count for number in range(count + 1)]
-    items.clear()
-    for number in range(count):
-        items += long[number::count]
-        rest = ends[number + 1] - len(items)
-        items += short[:rest]
-        del short[:rest]
+    faults = [item for item in items if item.get_closest_marker("faults")]
+    known = set(faults)
+    chosen = set(sizes.share(faults, DAYS))
+    others = (item for item in items if item not in known)
+    for _, group in itertools.groupby(others, key=lambda item: item.nodeid.partition("[")[0]):
+        cases = list(group)
+        few = DAYS if cases[0].get_closest_marker("processes") else 1
+        parts = QUICK_DAYS if sizes.is_quick() else few
+        chosen.update(sizes.share(cases, min(parts, len(cases))))
+    return chosen
 
 
 @pytest.fixture

@@ -10,6 +10,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as arrays
+from sizes import size
 
 from physx_core import DataGeneration, Dataset, Environment, EnvironmentConfig, Field
 from physx_core.errors import (
@@ -187,7 +188,7 @@ def store(tmp_path_factory):
             assert np.isfinite(dataset[mode]["x"][:]).all()
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=size(200, 25), deadline=None)
 @given(dtype=st.sampled_from(DTYPES), value=values, other=st.booleans())
 @example("int32", 3_000_000_000, False)
 @example("uint8", -1, False)
@@ -222,7 +223,7 @@ def test_every_way_in_has_the_same_rule(store, dtype, value, other):
             agrees(dtype, wanted, after[-1])
 
 
-@settings(max_examples=30, deadline=None)
+@settings(max_examples=size(30, 4), deadline=None)
 @given(dtype=st.sampled_from(DTYPES), value=given_arrays())
 @example("int32", np.array(3_000_000_000))
 @example("uint16", np.array([-1], "int8"))

@@ -3,6 +3,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 from numpy.testing import assert_allclose
+from sizes import size
 
 from physx_core import Dataset, Normalization
 from physx_core.array_file import pack, unpack
@@ -114,7 +115,7 @@ def test_rounding_errors_count_as_constant():
     assert statistics_of(rows).normalization().std == 1
 
 
-@settings(max_examples=50)
+@settings(max_examples=size(50, 6))
 @given(
     first=st.lists(st.floats(-1e6, 1e6), max_size=20),
     second=st.lists(st.floats(-1e6, 1e6), max_size=20),
@@ -161,7 +162,7 @@ def test_any_history_gives_what_all_rows_give(shape, history, offset):
 HUGE = np.finfo(np.float64).max
 
 
-@settings(max_examples=200)
+@settings(max_examples=size(200, 25))
 @given(st.lists(st.lists(st.floats(-HUGE, HUGE), min_size=1, max_size=5), min_size=1, max_size=5))
 @example([[HUGE, -HUGE], [HUGE]])
 @example([[1e200], [-1e200, 0.0]])

@@ -7,12 +7,11 @@ from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.components import Factory
 from physx_core.errors import WrongSamplesError
 
-pytest.importorskip("felupe", reason="needs felupe, which solves the beam")
-
 
 @pytest.fixture
 def beam(root, monkeypatch):
     """The module of the solver."""
+    pytest.importorskip("felupe", reason="needs felupe, which solves the beam")
     monkeypatch.syspath_prepend(str(root / "examples"))
     from environments import beam_solver
 
@@ -68,6 +67,7 @@ def test_large_loads_bend_it_less_than_in_proportion(beam):
     assert np.all(solver.solve(0 * tip_load(beam, 0)) == 0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("force", [-80, 100])
 def test_the_equilibrium_is_that_of_felupes_own_solver_in_small_parts(force, beam):
     import felupe
@@ -104,6 +104,7 @@ def test_the_skin_is_closed_and_faces_outwards(beam):
     assert volumes.sum() == pytest.approx(np.prod(beam.SIZE))
 
 
+@pytest.mark.slow
 def test_samples_are_pushes_and_their_equilibria(beam, pushed, tmp_path):
     config = EnvironmentConfig(pushed.Beam, as_tcp_ip_client=False, seed=0)
     DataGeneration(config, session_dir=str(tmp_path), batch_nb=1, batch_size=3).execute()

@@ -113,6 +113,7 @@ def network(plate, module):
     return made
 
 
+@pytest.mark.slow
 def test_a_node_hears_of_others_as_far_as_there_are_steps(network, plate):
     """With two steps, warmth comes from nodes at most two edges away; conductivity from three."""
     nodes, triangles = plate.mesh()
@@ -127,6 +128,7 @@ def test_a_node_hears_of_others_as_far_as_there_are_steps(network, plate):
     assert not np.any(conductivity & ~reach[2]) and np.any(conductivity & ~reach[0])
 
 
+@pytest.mark.slow
 def test_a_plate_of_one_temperature_stays_as_it_is(network):
     values = torch.randn(2, len(network.places), 2, dtype=torch.double)
     values[..., 0] = 1.5

@@ -23,12 +23,14 @@ def engines(pendulum):
         yield real, model
 
 
+@pytest.mark.slow
 def test_the_model_lacks_the_friction(module, pendulum, engines):
     samples = pendulum.measure(engines[0], 20, seed=3)
     friction = module("environments.double_pendulum_picture").friction
     torch.testing.assert_close(pendulum.missing(engines[1], samples), friction(samples[1]))
 
 
+@pytest.mark.slow
 def test_true_friction_inside_the_model_is_exact(module, pendulum, engines):
     example = module("18_physics_informed")
     samples, model = pendulum.measure(engines[0], 20, seed=3), example.ForwardDynamics(engines[1])
@@ -37,6 +39,7 @@ def test_true_friction_inside_the_model_is_exact(module, pendulum, engines):
     assert pendulum.error(model, samples) > 0.05
 
 
+@pytest.mark.slow
 def test_equations_of_motion_help_a_network(module, pendulum, engines):
     example = module("18_physics_informed")
     model = example.ForwardDynamics(engines[1])

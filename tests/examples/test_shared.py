@@ -34,6 +34,7 @@ def test_the_spread_is_that_of_the_covariance_and_depends_on_neither_place_nor_o
         np.testing.assert_allclose(spread, np.sqrt(variances[::-1]), rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_the_deep_set_depends_on_neither_place_nor_order():
     from networks.deep_set import DeepSet
 

@@ -17,6 +17,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sizes import size
 
 import physx_core
 import physx_sim
@@ -200,7 +201,7 @@ def test_every_public_description_is_covered_with_a_number_in_each_option() -> N
         assert list(numbers_in(number_at(cls, option))), f"{cls.__name__}.{option}"
 
 
-@settings(max_examples=400, deadline=None)
+@settings(max_examples=size(400, 50), deadline=None)
 @given(
     st.sampled_from(CASES),
     st.sampled_from(sorted(FLOATS)),
@@ -227,7 +228,7 @@ def test_numbers_of_any_type_are_stored_as_declared(
     assert outcome(cls, foreign) == outcome(cls, plain)
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=size(200, 25), deadline=None)
 @given(st.sampled_from(CASES), st.integers(0, 6))
 def test_what_is_not_of_the_declared_kind_is_refused_by_name(
     case: tuple[type[Any], str], choice: int

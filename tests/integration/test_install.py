@@ -210,12 +210,14 @@ def test_testing_writes_a_plugin_and_checks_a_component(python, add, run, tmp_pa
     assert "toy/spring" in run(*PHYSX, "check", "toy/spring", python=python).stdout
 
 
+@pytest.mark.faults
 def test_remote_works_with_the_core_alone(python, add, run, tmp_path):
     add("physx_remote")
     (tmp_path / "program.py").write_text(SERVE)
     assert "1.0 reward" in run("program.py", python=python).stdout
 
 
+@pytest.mark.faults
 def test_the_plugin_of_clusters_works_with_the_core_alone(python, add, run):
     add("physx_cluster")
     words = ("generate", "toy/spring", *GENERATE.split(), "--environment.launcher")
@@ -237,6 +239,7 @@ def workshop(python, add, wheels, tmp_path):
     pip(python, "install", *OPTIONS, "--no-deps", next(tmp_path.glob("*.whl")))
 
 
+@pytest.mark.faults
 @pytest.mark.usefixtures("workshop")
 def test_a_package_adds_components_of_every_kind_and_a_kind_of_its_own(python, run, tmp_path):
     def physx(*words, ok=True):

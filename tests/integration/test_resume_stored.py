@@ -41,6 +41,7 @@ def train(session, epochs, **options):
     ).execute()  # fmt: skip
 
 
+@pytest.mark.slow
 def test_two_halves_equal_the_whole(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     spring = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, seed=0)

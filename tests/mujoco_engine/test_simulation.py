@@ -7,6 +7,7 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
+from sizes import size
 
 from physx_core.errors import UnknownOptionError
 from physx_core.rotations import to_matrix
@@ -421,7 +422,7 @@ class Snapshots(RuleBasedStateMachine):
 
 
 TestSnapshots = Snapshots.TestCase
-TestSnapshots.settings = settings(max_examples=10, stateful_step_count=10, deadline=None)
+TestSnapshots.settings = settings(max_examples=size(10, 4), stateful_step_count=10, deadline=None)
 
 
 @pytest.mark.parametrize("contacts", ["all", "static"])

@@ -121,6 +121,7 @@ def test_jitter_is_uniform_in_its_range():
     np.testing.assert_allclose([lag.mean(), lag.std()], [4.5e-3, 5e-3 / 12**0.5], rtol=0.05)
 
 
+@pytest.mark.slow
 def test_noise_and_bias_have_their_statistics():
     simulation = Signal(lambda t: np.zeros(2))
     noisy = Encoder(

@@ -53,5 +53,6 @@ def end_sleepers():
             continue
 
 
+@pytest.mark.faults
 def test_nothing_is_found_in_a_right_one(place, expect_right):
     expect_right(check_launcher(place("wrong_launchers", "Right")))

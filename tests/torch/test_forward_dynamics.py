@@ -30,6 +30,7 @@ def test_gradients_are_those_of_the_values(build, name, draw):
     assert torch.autograd.gradcheck(ForwardDynamics(simulation), states, eps=1e-5, atol=1e-5)
 
 
+@pytest.mark.slow
 def test_gradients_of_an_arm(build, draw):
     backend = plugins.resolve("backend", "pinocchio")
     if "ur/ur5_robot" not in [info.name for info in backend.robots()]:

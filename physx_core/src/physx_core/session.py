@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import datetime
+import functools
 import platform
 import re
 import sys
@@ -11,6 +12,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 from importlib.metadata import distributions
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 from physx_core import files
@@ -179,7 +181,8 @@ def _last_number(path: Path) -> int:
     return int(numbered[-1].name.rpartition("_")[2]) if numbered else 0
 
 
-def installed_versions() -> dict[str, str]:
+@functools.cache
+def installed_versions() -> Mapping[str, str]:
     """Return the versions of Python, the platform, the physx distributions, and their libraries."""
     versions = {"python": platform.python_version(), "platform": sys.platform}
     for distribution in distributions():
@@ -188,4 +191,4 @@ def installed_versions() -> dict[str, str]:
         name = (name or "").replace("_", "-")
         if name.startswith("physx-") or name in ("numpy", "h5py", "torch", "dartpy", "pin"):
             versions[name] = distribution.version
-    return dict(sorted(versions.items()))
+    return MappingProxyType(dict(sorted(versions.items())))

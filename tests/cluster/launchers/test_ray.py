@@ -46,9 +46,7 @@ def test_the_rows_are_those_of_a_local_run(runs, local_rows, ray_cluster, eventu
 
 
 @pytest.mark.faults
-def test_a_killed_node_is_replaced_and_the_rows_stay_the_same(
-    runs, local_rows, ray_cluster, eventually
-):
+def test_killed_ray_node_restarts_client_with_same_rows(runs, local_rows, ray_cluster, eventually):
     expected = local_rows(batches=20)
     lost = ray_cluster.nodes.pop()
     process = runs.start(
@@ -71,9 +69,7 @@ def test_a_killed_node_is_replaced_and_the_rows_stay_the_same(
 
 
 @pytest.mark.faults
-def test_an_elastic_run_goes_on_without_some_of_its_clients(
-    runs, local_rows, ray_cluster, eventually
-):
+def test_elastic_ray_run_survives_lost_node(runs, local_rows, ray_cluster, eventually):
     """Of four clients two find a place, of which one is lost with its node."""
     expected = local_rows(batches=30)
     lost = ray_cluster.nodes.pop()
@@ -96,9 +92,7 @@ def test_an_elastic_run_goes_on_without_some_of_its_clients(
 
 
 @pytest.mark.faults
-def test_a_run_goes_on_with_its_clients_without_the_head_of_the_cluster(
-    runs, local_rows, mortal_ray, eventually
-):
+def test_run_survives_crash_of_ray_head(runs, local_rows, mortal_ray, eventually):
     expected = local_rows(batches=30)
     process = runs.start(*on(mortal_ray), batches=30, pace=0.1, **mortal_ray.variables)
     runs.wait_for_clients(2, process)
@@ -115,7 +109,7 @@ def test_a_run_goes_on_with_its_clients_without_the_head_of_the_cluster(
 
 
 @pytest.mark.faults
-def test_a_client_is_not_restarted_without_the_head_of_the_cluster(runs, mortal_ray, eventually):
+def test_no_restart_without_ray_head(runs, mortal_ray, eventually):
     process = runs.start(
         *on(mortal_ray),
         "--environment.restarts",
@@ -149,7 +143,7 @@ sys.exit("ray" in sys.modules)
 @pytest.mark.parametrize(
     "way", ["error", pytest.param("SIGINT", marks=pytest.mark.faults), "SIGTERM", "SIGKILL"]
 )
-def test_nothing_is_left_on_any_node(way, runs, ray_cluster, eventually):
+def test_signals_and_errors_leave_no_process_on_ray_nodes(way, runs, ray_cluster, eventually):
     fail_at = 5 if way == "error" else -1
     process = runs.start(
         *on(ray_cluster), batches=10_000, pace=0.01, fail_at=fail_at, **ray_cluster.variables
@@ -166,7 +160,7 @@ def test_nothing_is_left_on_any_node(way, runs, ray_cluster, eventually):
 
 
 @pytest.mark.faults
-def test_a_cluster_is_started_for_the_run_and_ends_with_it(runs, eventually):
+def test_local_ray_cluster_ends_with_run(runs, eventually):
     folder = tempfile.mkdtemp(prefix="ray", dir="/tmp")
     try:
         for way in ("return", "SIGKILL"):
@@ -201,7 +195,7 @@ def test_what_cannot_be_had_is_said_within_seconds(runs, ray_cluster):
         ({"strategy": "STRICT_PACK"}, "2 clients, each with 1 CPU, do not fit the 2 nodes"),
     ],
 )
-def test_what_has_no_place_is_refused(kwargs, text, ray_cluster):
+def test_resources_beyond_ray_cluster_are_refused(kwargs, text, ray_cluster):
     launcher = RayLauncher(address=ray_cluster.variables["RAY_ADDRESS"], **kwargs)
     launcher.open()
     try:
@@ -226,7 +220,7 @@ def test_options_are_checked_before_anything_is_started(kwargs, text):
 
 
 @pytest.mark.faults
-def test_the_run_says_what_its_clients_wait_for(runs, ray_cluster, eventually):
+def test_run_reports_queued_ray_clients(runs, ray_cluster, eventually):
     first = runs.start(*on(ray_cluster), batches=10_000, pace=0.01, **ray_cluster.variables)
     runs.wait_for_clients(2, first)
     log, runs.log = runs.log, runs.folder / "second"

@@ -58,7 +58,7 @@ def test_local_jobs_make_the_rows_of_a_local_run(runs, local_rows, eventually):
 
 
 @pytest.mark.faults
-def test_a_preempted_local_job_runs_again_and_the_rows_stay_the_same(runs, local_rows, eventually):
+def test_preempted_local_job_is_requeued_with_same_rows(runs, local_rows, eventually):
     expected = local_rows(batches=20)
     words = (*LOCAL, "--environment.restarts", "1")
     process = runs.start(*words, batches=20, pace=0.05)
@@ -75,7 +75,7 @@ def test_a_preempted_local_job_runs_again_and_the_rows_stay_the_same(runs, local
 
 
 @pytest.mark.parametrize("way", ["error", "SIGINT", "SIGKILL"])
-def test_no_local_job_is_left(way, runs, eventually):
+def test_signals_and_errors_leave_no_local_job(way, runs, eventually):
     process = runs.start(*LOCAL, batches=10_000, pace=0.01, fail_at=5 if way == "error" else -1)
     runs.wait_for_clients(2, process)
     if way != "error":
@@ -98,7 +98,7 @@ def test_jobs_make_the_rows_of_a_local_run(runs, local_rows, slurm, eventually):
     assert not slurm.ask("squeue", "--noheader")
 
 
-def test_the_token_is_where_only_its_user_reads_it(runs, slurm):
+def test_token_of_slurm_jobs_has_owner_only_permissions(runs, slurm):
     variables = {**slurm.variables, "PHYSX_TOKEN": TOKEN}
     process = runs.start(*slurm_words(), batches=10_000, pace=0.01, **variables)
     try:
@@ -127,9 +127,8 @@ def holds_token(path):
         return False
 
 
-def test_a_preempted_job_is_queued_again_and_the_rows_stay_the_same(
-    runs, local_rows, slurm, eventually
-):
+@pytest.mark.faults
+def test_preempted_slurm_job_is_requeued_with_same_rows(runs, local_rows, slurm, eventually):
     expected = local_rows(batches=20)
     words = slurm_words("slurm_partition='low'")
     process = runs.start(
@@ -153,7 +152,7 @@ def test_a_preempted_job_is_queued_again_and_the_rows_stay_the_same(
 
 
 @pytest.mark.parametrize("way", ["error", "SIGINT", "SIGTERM", "SIGKILL"])
-def test_no_job_is_left(way, runs, slurm, eventually):
+def test_signals_and_errors_cancel_slurm_jobs(way, runs, slurm, eventually):
     fail_at = 5 if way == "error" else -1
     process = runs.start(
         *slurm_words(), batches=10_000, pace=0.01, fail_at=fail_at, **slurm.variables
@@ -180,7 +179,7 @@ def busy(slurm):
     assert wait_for(lambda: not slurm.ask("squeue", "--noheader"))
 
 
-def test_a_run_whose_jobs_are_queued_says_so_and_leaves_none(runs, busy, eventually):
+def test_killed_run_cancels_queued_slurm_jobs(runs, busy, eventually):
     process = runs.start(*slurm_words(), **busy.variables)
     eventually(lambda: "PENDING (Resources)" in " ".join(runs.log.read_text().split()))
     process.kill()
@@ -190,7 +189,7 @@ def test_a_run_whose_jobs_are_queued_says_so_and_leaves_none(runs, busy, eventua
 
 
 @pytest.mark.faults
-def test_a_job_is_not_queued_for_longer_than_it_may(runs, busy):
+def test_queue_time_limit_of_slurm_job(runs, busy):
     status, said = runs.finish(runs.start(*slurm_words("queue_time=2"), **busy.variables))
     assert status == 1
     assert "for longer than queue_time, 2 s" in " ".join(said.split())
@@ -219,7 +218,7 @@ def test_where_there_is_no_slurm_the_run_says_what_to_do(runs):
     assert 'launcher_kwargs={"cluster": "local"}' in " ".join(said.split())
 
 
-def test_a_job_that_slurm_forgot_has_completed(slurm, tmp_path, monkeypatch):
+def test_job_unknown_to_slurm_counts_as_completed(slurm, tmp_path, monkeypatch):
     monkeypatch.setenv("SLURM_CONF", slurm.variables["SLURM_CONF"])
     launcher = SlurmLauncher(folder=str(tmp_path))
     launcher.open()
@@ -231,7 +230,8 @@ def test_a_job_that_slurm_forgot_has_completed(slurm, tmp_path, monkeypatch):
     assert not list(tmp_path.iterdir())
 
 
-def test_the_queue_is_asked_for_all_jobs_at_once_and_rarely(runs, slurm, tmp_path):
+@pytest.mark.faults
+def test_squeue_is_polled_rarely_for_all_jobs(runs, slurm, tmp_path):
     asked = tmp_path / "bin"
     asked.mkdir()
     program = asked / "squeue"
@@ -269,6 +269,7 @@ def test_options_are_checked_before_anything_is_started(
     assert not list(tmp_path.iterdir())
 
 
+@pytest.mark.faults
 def test_clients_of_an_elastic_run_are_jobs_too(runs, local_rows, eventually):
     expected = local_rows(clients=4)
     assert runs.same(runs.rows(*LOCAL, "--environment.max-clients", "2", clients=4), expected)

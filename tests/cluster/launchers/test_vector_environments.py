@@ -44,7 +44,8 @@ def test_steps_are_those_of_processes_that_share_memory(launcher, request, tmp_p
         assert_same(vector, local, 30)
 
 
-def test_a_killed_node_is_replaced_and_the_episodes_go_on(ray_cluster):
+@pytest.mark.faults
+def test_killed_ray_node_restarts_vector_environment(ray_cluster):
     lost = ray_cluster.nodes.pop()
     kwargs = {"address": ray_cluster.variables["RAY_ADDRESS"], "num_cpus": 0.5}
     options = {"launcher": "cluster/ray", "launcher_kwargs": kwargs, "restarts": 1}

@@ -103,7 +103,7 @@ def test_options_that_an_executor_does_not_know(
         pytest.param("slurm", {"cluster": "local"}, id="slurm"),
     ],
 )
-def test_a_sweep_that_is_asked_to_end_leaves_no_trial_behind(write, training, executor, options):
+def test_signal_to_sweep_terminates_trials(write, training, executor, options):
     pytest.importorskip({"ray": "ray", "slurm": "submitit"}[executor])
     training["network"]["optimization_kwargs"] = {"pause": 0.2}
     write(run={"executor": executor, "options": options})
@@ -122,9 +122,8 @@ def test_a_sweep_that_is_asked_to_end_leaves_no_trial_behind(write, training, ex
         assert list(Path("studies/there").glob("trial_0001/network/*/checkpoint.toml"))
 
 
-def test_slurm_runs_trials_and_keeps_none_when_the_sweep_is_killed(
-    write, slow, same_as_whole, idle_slurm
-):
+@pytest.mark.faults
+def test_killed_sweep_cancels_slurm_trials(write, slow, same_as_whole, idle_slurm):
     pytest.importorskip("submitit")
     write(run={"parallel": 2, "executor": "slurm"})
     sweep = start("sweep.toml", "studies/there")
@@ -140,7 +139,7 @@ def test_slurm_runs_trials_and_keeps_none_when_the_sweep_is_killed(
 
 
 @pytest.mark.faults
-def test_a_job_that_slurm_preempts_continues_its_trial(write, training, same_as_whole, idle_slurm):
+def test_preempted_slurm_trial_resumes(write, training, same_as_whole, idle_slurm):
     pytest.importorskip("submitit")
     training["network"]["optimization_kwargs"] = {"pause": 0.15}
     write(run={"parallel": 1, "executor": "slurm", "options": {"slurm_partition": "low"}})
@@ -156,7 +155,8 @@ def test_a_job_that_slurm_preempts_continues_its_trial(write, training, same_as_
     assert output.count("session: ") == 2  # the same trial began twice
 
 
-def test_a_worker_that_ray_loses_is_replaced(write, slow, same_as_whole, ray_cluster):
+@pytest.mark.faults
+def test_lost_ray_worker_of_sweep_is_restarted(write, slow, same_as_whole, ray_cluster):
     write(run={"executor": "ray", "options": {"address": ray_cluster.variables["RAY_ADDRESS"]}})
     sweep = start("sweep.toml", "studies/there")
     kill_one("studies/there", parent=True)

@@ -34,7 +34,7 @@ def check(parameters_of, whole="studies/whole", killed="studies/killed"):
         assert read_scalars(Path(killed) / trial) == read_scalars(Path(whole) / trial)
 
 
-def test_killed_trials_are_continued_bit_for_bit(write, slow, whole, parameters_of):
+def test_killed_trials_resume_bit_identically(write, slow, whole, parameters_of):
     whole()
     write(run={"parallel": 2})
     chance = random.Random(1)
@@ -50,7 +50,7 @@ def test_killed_trials_are_continued_bit_for_bit(write, slow, whole, parameters_
 
 
 @pytest.mark.faults
-def test_a_killed_sweep_is_continued_by_the_same_command(write, slow, whole, parameters_of):
+def test_killed_sweep_resumes_by_same_command(write, slow, whole, parameters_of):
     whole(seeds=[0, 1])
     write(run={"parallel": 2}, seeds=[0, 1])
     _, kills = sweep_with_kills("sweep.toml", "studies/killed", {}, BATCHES, whole=[20, 70])
@@ -59,9 +59,7 @@ def test_a_killed_sweep_is_continued_by_the_same_command(write, slow, whole, par
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
-def test_a_sweep_that_is_asked_to_end_writes_checkpoints(
-    write, slow, whole, physx, parameters_of, number
-):
+def test_signal_to_sweep_writes_checkpoints(write, slow, whole, physx, parameters_of, number):
     slow["network"]["optimization_kwargs"] = {"pause": 0.05}
     one = {"training.network.lr": [0.1]}
     whole(parameters=one)
@@ -80,7 +78,7 @@ def test_a_sweep_that_is_asked_to_end_writes_checkpoints(
     check(parameters_of)
 
 
-def test_a_trial_that_never_gets_further_is_given_up(write, slow, physx):
+def test_trial_beyond_restart_limit_is_given_up(write, slow, physx):
     slow["network"]["optimization"] = f"{Path(__file__).parents[1]}/programs/descent.py:Doomed"
     write(run={"restarts": 1})
     said = physx("sweep", "sweep.toml", status=1)
@@ -91,7 +89,8 @@ def test_a_trial_that_never_gets_further_is_given_up(write, slow, physx):
     assert len(Path("studies/sweep/trials.csv").read_text().splitlines()) == 1
 
 
-def test_data_that_were_cut_short_are_generated_anew(write, slow, physx, parameters_of):
+@pytest.mark.faults
+def test_incomplete_data_of_killed_trial_are_regenerated(write, slow, physx, parameters_of):
     del slow["dataset"]["existing_dir"]
     spring = {"environment": "toy/spring", "as_tcp_ip_client": False}
     generation = {"batch_nb": 5, "batch_size": 20, "environment": spring}
@@ -118,7 +117,7 @@ def test_data_that_were_cut_short_are_generated_anew(write, slow, physx, paramet
 
 
 @pytest.mark.faults
-def test_trainings_that_generate_their_samples_are_continued(write, slow, physx, parameters_of):
+def test_killed_online_trials_resume(write, slow, physx, parameters_of):
     slow["dataset"] = {}
     slow["batch_nb"] = BATCHES
     slow["environment"] = {"environment": "toy/spring", "num_clients": 2}
@@ -135,7 +134,7 @@ def test_trainings_that_generate_their_samples_are_continued(write, slow, physx,
 
 @pytest.mark.faults
 @pytest.mark.parametrize("seed", range(2))
-def test_kills_at_random_moments_change_nothing(write, slow, physx, parameters_of, seed):
+def test_sweep_killed_at_random_moments_gives_same_table(write, slow, physx, parameters_of, seed):
     chance = random.Random(seed)
     write(
         sampler="optuna/tpe",

@@ -20,6 +20,7 @@ from hypothesis.stateful import (
     precondition,
     rule,
 )
+from sizes import size, trials
 
 from physx_cluster.errors import StudyError
 from physx_cluster.sweep import Definition, Result, Study, run_study
@@ -229,5 +230,5 @@ class Sweeps(RuleBasedStateMachine):
         self.root.cleanup()
 
 
-Sweeps.TestCase.settings = settings(max_examples=20, stateful_step_count=8)
+Sweeps.TestCase.settings = settings(max_examples=size(trials(20, 12), 2), stateful_step_count=8)
 test_sweeps = Sweeps.TestCase

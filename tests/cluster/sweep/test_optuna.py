@@ -119,7 +119,7 @@ def decisions(pruner, kwargs, numbers, earlier, at_once=False, goal="minimize"):
 
 
 @pytest.mark.parametrize("name", ["median", "percentile", "successive_halving", "hyperband"])
-def test_a_resumed_trial_meets_the_same_decision(name):
+def test_pruner_decides_the_same_after_resume(name):
     kwargs = {
         "median": {"n_startup_trials": 2},
         "percentile": {"percentile": 50.0, "n_startup_trials": 2},

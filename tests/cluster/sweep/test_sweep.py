@@ -157,7 +157,7 @@ def test_a_folder_that_is_no_study_is_named(physx):
     assert "There is no configuration file" in physx("sweep", "missing.toml", status=1)
 
 
-def test_damaged_files_of_trials_are_named(write):
+def test_corrupt_trial_files_are_reported(write):
     definition = Definition.read(write(parameters={"training.network.lr": [0.1]}))
     folder = Path("study")
     run_study(definition, folder, lambda line: None)

@@ -22,6 +22,7 @@ from physx_core.errors import DatasetError
 HISTORIES = 25  # of which one at least finds a planted bug
 
 
+@pytest.mark.slow
 @given(seed=st.integers(0, 2**32))
 @settings(
     max_examples=4,

@@ -13,6 +13,7 @@ import h5py
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from sizes import seed, trials
 
 from physx_core import Dataset
 from physx_core.errors import DatasetError, DatasetNotFoundError
@@ -50,10 +51,10 @@ def test_kill_9_loses_no_committed_row(tmp_path, work):
 @pytest.mark.faults
 @pytest.mark.parametrize("durability", ["fast", "durable"])
 @pytest.mark.parametrize("work", WORKS)
-def test_kill_9_loses_no_committed_row_in_many_trials(
+def test_kill_9_campaign_loses_no_committed_row(
     tmp_path, record_property, work, durability
-):  # 204 kills in all
-    record_property("counts", kill(tmp_path, work, durability, 2, 17))
+):  # 204 kills in a full campaign
+    record_property("counts", kill(tmp_path, work, durability, seed(), trials(17, 6)))
 
 
 # Readers beside a writer ------------------------------------------------------------------------
@@ -135,12 +136,12 @@ def open_in_h5py(folder):
     return len(paths)
 
 
-def test_a_reader_beside_a_writer_sees_only_committed_rows(tmp_path):
+def test_concurrent_reader_sees_only_committed_rows(tmp_path):
     assert read_beside_a_writer(tmp_path, 2) > 10
 
 
 @pytest.mark.faults
-def test_a_reader_beside_a_writer_for_a_while(tmp_path, record_property):
+def test_concurrent_reader_campaign_sees_only_committed_rows(tmp_path, record_property):
     record_property("opened", read_beside_a_writer(tmp_path, 8))
 
 
@@ -291,13 +292,13 @@ def check_all(dataset, least):
     return total
 
 
-def test_a_disk_that_is_full_at_some_moment(small_disk):
+def test_disk_full_at_some_moments_loses_no_committed_row(small_disk):
     assert sum(fill_up(small_disk / "data", free) for free in (0, 30_000, 90_000, 400_000))
 
 
 @pytest.mark.faults
-def test_a_disk_that_is_full_at_any_moment(small_disk):
-    for free in range(0, 1_200_000, 4096 * 9):
+def test_disk_full_at_every_moment_loses_no_committed_row(small_disk):
+    for free in range(0, 1_200_000, 4096 * trials(9, 27)):
         fill_up(small_disk / "data", free)
 
 
@@ -329,7 +330,7 @@ def test_many_partitions_need_few_descriptors(tmp_path, durability):
 
 
 @pytest.mark.parametrize("durable", [False, True])
-def test_a_folder_that_is_removed_is_noticed(tmp_path, durable):
+def test_removed_dataset_folder_is_an_error(tmp_path, durable):
     folder = tmp_path / "session" / "dataset"
     dataset = Dataset.create(folder, durable=durable)
     dataset.append("training", expected(10))

@@ -206,7 +206,7 @@ def test_normalization_of_floating_fields(folder):
         assert_allclose(again.std, before.std, rtol=1e-12)
 
 
-def test_normalization_continues_in_another_session(folder):
+def test_normalization_continues_in_next_session(folder):
     first, second = rows(300, 1), rows(200, 2)
     with Dataset.create(folder, "one") as dataset:
         dataset.append("training", first)

@@ -208,7 +208,7 @@ def test_an_open_partition_is_read_and_then_sealed(folder, tmp_path):
         assert [p["index"] for p in partitions(killed)] == [0, 1, 2, 3, 4, 5]
 
 
-def test_a_stale_manifest_hides_no_row(folder, tmp_path):
+def test_stale_manifest_hides_no_row(folder, tmp_path):
     live = write(folder, close=False)
     early = (folder / "dataset.json").read_bytes()
     live.append("training", ROWS)
@@ -323,7 +323,7 @@ def test_garbage_instead_of_a_partition(folder):
         Dataset.open(folder)
 
 
-def test_a_changed_byte_is_found_by_verify(folder):
+def test_verify_finds_changed_byte(folder):
     write(folder)
     path = folder / "run_training_n_1.h5"
     damaged = bytearray(path.read_bytes())

@@ -24,6 +24,7 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
+from sizes import trials
 
 from physx_core import Dataset, Field
 from physx_core.dataset.read import reader as reading
@@ -1109,13 +1110,14 @@ class SharedMachine(RuleBasedStateMachine):
 # Each history has its own seed: from one seed, Hypothesis would make variations of few histories.
 
 
-@pytest.mark.parametrize("number", range(13))
-def test_a_dataset_is_what_lists_are(number):
+@pytest.mark.parametrize("number", range(trials(13, 6)))
+def test_dataset_behaves_like_lists(number):
     run_state_machine_as_test(seed(number)(Machine), settings=QUICK)
 
 
-@pytest.mark.parametrize("number", range(4))
-def test_a_dataset_of_several_writers_is_what_lists_are(number):
+@pytest.mark.slow
+@pytest.mark.parametrize("number", range(trials(4, 2)))
+def test_dataset_of_concurrent_writers_behaves_like_lists(number):
     few = settings(QUICK, stateful_step_count=15)
     run_state_machine_as_test(seed(number)(SharedMachine), settings=few)
 
@@ -1128,6 +1130,6 @@ def test_longer_histories(number):
 
 @pytest.mark.faults
 @pytest.mark.parametrize("number", range(100, 110))
-def test_longer_histories_of_several_writers(number):
+def test_longer_histories_of_concurrent_writers(number):
     few = settings(QUICK, stateful_step_count=20)
     run_state_machine_as_test(seed(number)(SharedMachine), settings=few)

@@ -118,7 +118,7 @@ def test_damage_before_reading(large_rows, strategy, damage):
 
 @pytest.mark.parametrize("strategy", STRATEGIES[1:])
 @pytest.mark.parametrize("shuffle", [False, True])
-def test_a_file_that_is_cut_while_it_is_read(large_rows, strategy, shuffle):
+def test_truncation_during_read_is_an_error(large_rows, strategy, shuffle):
     batches = large_rows.batches("training", 10, shuffle=shuffle, epochs=None, strategy=strategy)
     next(batches)
     for number in range(20):
@@ -162,7 +162,7 @@ def test_new_rows_are_seen_after_refresh(tmp_path):
 
 @pytest.mark.parametrize("large", [False, True])
 @pytest.mark.parametrize("seconds", [2, pytest.param(8, marks=pytest.mark.faults)])
-def test_reading_while_another_process_writes(tmp_path, seconds, large):
+def test_read_during_concurrent_write(tmp_path, seconds, large):
     folder, enough = tmp_path / "dataset", tmp_path / "enough"
     words = [sys.executable, "-c", WRITER, str(folder), str(enough), *(["large"] * large)]
     with subprocess.Popen(words, stdout=subprocess.PIPE, text=True) as writer:

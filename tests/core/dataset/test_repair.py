@@ -63,7 +63,7 @@ def test_a_wrong_edit_is_undone(folder, old, new, thousand):
 
 
 @pytest.mark.parametrize("text", [None, b"", b"{", b"[]", b"\xff", b"null", b"[" * 100_000])
-def test_a_lost_or_damaged_manifest_is_rebuilt(folder, text, thousand):
+def test_repair_rebuilds_lost_or_corrupt_manifest(folder, text, thousand):
     thousand.write(folder)
     (folder / "dataset.json").unlink()
     if text is not None:
@@ -227,7 +227,7 @@ def killed_at(monkeypatch, changes, call):
 
 
 @pytest.mark.parametrize("call", ["rebuild", "repair"])
-def test_a_manifest_is_there_whenever_rebuilding_is_killed(folder, call, thousand, monkeypatch):
+def test_killed_rebuild_always_leaves_a_manifest(folder, call, thousand, monkeypatch):
     left = folder.with_name("left")
     thousand.write(left, thousand.part(0, 340), info={"a": 1})
     with Dataset.open(left, writable=True, max_file_size=thousand.size) as dataset:
@@ -303,7 +303,7 @@ def test_numbers_are_on_one_line_of_the_manifest(tmp_path):
 
 
 def test_repairing_keeps_the_rows_before_those_that_did_not_reach_the_disk(tmp_path):
-    writer = Dataset.create(tmp_path / "data", durable=True)
+    writer = Dataset.create(tmp_path / "data", durable=True, max_file_size=1e-3)
     for rows in (4, 3):
         writer.append("training", {"x": np.arange(1.0, rows + 1)})
     shutil.copytree(tmp_path / "data", tmp_path / "cut")

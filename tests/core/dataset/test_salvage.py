@@ -90,7 +90,7 @@ def check(folder, lost, rows=ROWS):
 
 @pytest.mark.parametrize("how", ["writer", "repair", "rebuild"])
 @pytest.mark.parametrize(("name", "row"), [("x", 0), ("x", 20), ("x", 199), ("n", 0), ("n", 90)])
-def test_a_flipped_bit_costs_its_block_and_is_called_damage(folder, how, name, row):
+def test_salvage_drops_only_the_block_of_a_bit_flip(folder, how, name, row):
     left_open(folder, synced=150)
     flip(folder, name, row)
     lost = block_of(name, row)
@@ -102,7 +102,7 @@ def test_a_flipped_bit_costs_its_block_and_is_called_damage(folder, how, name, r
     assert {path.name for path in (folder / "damaged").iterdir()} == set(FILES.values())
 
 
-def test_damage_in_several_fields_costs_all_of_their_blocks(folder):
+def test_salvage_drops_corrupt_blocks_of_all_fields(folder):
     left_open(folder)
     for name, row in (("x", 3), ("x", 150), ("n", 130), ("n", 131)):
         flip(folder, name, row)
@@ -138,7 +138,7 @@ def test_a_reader_gets_other_rows_and_an_error_that_names_the_damaged_ones(folde
 
 
 @pytest.mark.parametrize("seed", range(2))
-def test_any_flipped_bit_costs_no_more_than_a_block_and_gives_no_wrong_row(folder, tmp_path, seed):
+def test_salvage_after_any_bit_flip_drops_at_most_one_block(folder, tmp_path, seed):
     """Records and digests may be hit too; a damaged header makes the partition unreadable."""
     rng = random.Random(seed)
     left_open(folder, synced=150)
@@ -254,7 +254,8 @@ class Killed(BaseException):
     """The process is gone."""
 
 
-def test_whenever_the_process_ends_no_row_is_shifted_against_another(folder, tmp_path, monkeypatch):
+@pytest.mark.slow
+def test_killed_salvage_shifts_no_rows(folder, tmp_path, monkeypatch):
     left_open(folder)
     flip(folder, "x", 20)
     flip(folder, "n", 150)

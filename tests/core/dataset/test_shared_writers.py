@@ -10,6 +10,7 @@ import h5py
 import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
+from sizes import trials
 
 from physx_core import Dataset, Field
 from physx_core.errors import DatasetLockedError, FieldsMismatchError, UsageError
@@ -69,11 +70,14 @@ def partitions(folder):
     return plain["modes"]["training"]["partitions"]
 
 
+COUNT = trials(100_000, 20_000)
+
+
 @pytest.mark.parametrize("sessions", [(), ("a", "b")])
-def test_two_writers_of_100_000_rows_lose_nothing(tmp_path, folder, sessions):
+def test_concurrent_writers_lose_no_rows(tmp_path, folder, sessions):
     Dataset.create(folder).close()
     writers = [
-        start(tmp_path, folder, number, 100_000, 5e-4, *sessions[number : number + 1])
+        start(tmp_path, folder, number, COUNT, 5e-4, *sessions[number : number + 1])
         for number in range(2)
     ]
     seen = 0
@@ -89,7 +93,7 @@ def test_two_writers_of_100_000_rows_lose_nothing(tmp_path, folder, sessions):
     for writer in writers:
         writer.communicate()
         assert writer.returncode == 0
-    assert check(folder, [100_000, 100_000]) == [100_000, 100_000]
+    assert check(folder, [COUNT, COUNT]) == [COUNT, COUNT]
     found = partitions(folder)
     assert all(partition["sealed"] and partition["counted"] for partition in found)
     assert len({(partition["session"], partition["index"]) for partition in found}) == len(found)
@@ -106,7 +110,7 @@ def test_two_writers_of_100_000_rows_lose_nothing(tmp_path, folder, sessions):
 
 
 @pytest.mark.parametrize("victims", [1, 3])
-def test_a_killed_writer_does_not_block_the_others(tmp_path, folder, victims):
+def test_killed_writer_does_not_block_concurrent_writers(tmp_path, folder, victims):
     Dataset.create(folder).close()
     writers = [start(tmp_path, folder, number, 10**9) for number in range(3)]
     totals = [0, 0, 0]
@@ -196,7 +200,7 @@ def test_shared_and_exclusive_writers_exclude_each_other(folder):
     Dataset.open(folder, writable=True).close()
 
 
-def test_a_shared_writer_seals_what_a_killed_one_left(folder, tmp_path):
+def test_shared_writer_seals_partitions_of_killed_writer(folder, tmp_path):
     with Dataset.create(folder, shared=True) as one:
         one.append("training", rows(1, 3))
         shutil.copytree(folder, tmp_path / "killed")

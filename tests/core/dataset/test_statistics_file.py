@@ -171,7 +171,7 @@ def test_only_sealing_and_closing_write_it(folder):
         assert_right(dataset.normalization, np.concatenate(rows))
 
 
-def test_a_full_disk_leaves_the_statistics_of_before(small_disk):
+def test_full_disk_keeps_previous_statistics(small_disk):
     folder = small_disk / "data"
     rows, size = np.ones((2, 20_000)), 336_400e-9  # two rows fill a partition
     with Dataset.create(folder, max_file_size=size) as dataset:
@@ -349,7 +349,7 @@ def test_a_reader_keeps_on_reading_while_a_writer_replaces_it(folder):
     reader.close()
 
 
-def test_what_a_killed_writer_left_is_removed_and_nothing_else(folder):
+def test_leftovers_of_killed_writer_are_removed(folder):
     write(folder, rows_of(50))
     kept = statistics_file(folder)
     for name in ("statistics_00000000.safetensors", "statistics_12345678.safetensors.tmp"):
@@ -361,7 +361,7 @@ def test_what_a_killed_writer_left_is_removed_and_nothing_else(folder):
     assert files_of(folder) == sorted([kept.name, *own])
 
 
-def test_a_folder_can_be_read_only(folder):
+def test_read_only_folder_permissions(folder):
     rows = rows_of(50)
     write(folder, rows)
     statistics_file(folder).unlink()

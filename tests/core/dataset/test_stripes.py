@@ -30,6 +30,7 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
+from sizes import trials
 
 from physx_core import Dataset, Field
 from physx_core.dataset.read import reader as reading
@@ -47,8 +48,8 @@ from physx_core.errors import DatasetError
 pytestmark = pytest.mark.processes
 
 FIELDS = [Field("n", (), "int64"), Field("x", (3,), unit="m"), Field("f", (), "bool")]
-QUICK = settings(database=None, deadline=None, max_examples=4, stateful_step_count=30)
-LONG = settings(QUICK, max_examples=5, stateful_step_count=50)
+QUICK = settings(database=None, deadline=None, max_examples=trials(4, 2), stateful_step_count=30)
+LONG = settings(QUICK, max_examples=trials(5, 2), stateful_step_count=50)
 SYNCED = {}  # by a file's inode: see `sync`
 
 
@@ -461,16 +462,16 @@ def abandon(writer):
     writer._syncer._helper.close()
 
 
-def test_random_histories():
+def test_stripes_behave_like_lists():
     run_state_machine_as_test(Machine, settings=QUICK)
 
 
 @pytest.mark.faults
-def test_many_random_histories():
+def test_stripes_behave_like_lists_in_long_histories():
     run_state_machine_as_test(Machine, settings=LONG)
 
 
-def test_rows_that_a_restarted_writer_found_survive_a_power_cut():
+def test_rows_found_by_restarted_stripe_writer_survive_power_cut():
     """A restart syncs them; only what was written since is not on the disk yet."""
     machine = Machine()
     try:
@@ -523,7 +524,7 @@ def test_the_flat_index_finds_what_the_spans_say():
             assert rows == [wanted[row] for row in range(start, stop)]
 
 
-def test_a_stripe_has_one_writer_at_a_time(folder, monkeypatch):
+def test_stripe_lock_allows_one_writer(folder, monkeypatch):
     """A process that is alive keeps its stripe; at its end the next one gets it at once."""
     monkeypatch.setattr(locks, "_PATIENCE", 0.1)
     with Dataset.create(folder) as dataset:

@@ -94,7 +94,7 @@ def test_an_invalid_update_changes_nothing(folder, thousand):
         dataset.update("training", 0, {"x": np.full(5, np.inf)})
 
 
-def test_an_interrupted_update_is_completed(folder, tmp_path, thousand):
+def test_interrupted_update_is_completed_on_open(folder, tmp_path, thousand):
     thousand.write(folder)
     rows = thousand.stacked(thousand.rows)
     rows["x"][:400] = 1
@@ -302,7 +302,7 @@ def test_a_missing_partition_cannot_be_removed(folder, thousand):
     thousand.check(folder, thousand.stacked(thousand.rows, (0, 20)))
 
 
-def test_an_interrupted_removal_is_completed(folder, thousand):
+def test_interrupted_removal_is_completed_on_open(folder, thousand):
     thousand.write(folder)
     plain = json.loads((folder / "dataset.json").read_text())
     mode = plain["modes"]["training"]

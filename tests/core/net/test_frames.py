@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sizes import size
 
 from physx_core.errors import (
     ConfigError,
@@ -23,7 +24,7 @@ from physx_core.workers.client.link import WorkerLink
 # Frames -----------------------------------------------------------------------------------------
 
 
-@settings(max_examples=100)
+@settings(max_examples=size(100, 12))
 @given(
     st.lists(st.tuples(st.sampled_from(Kind), st.binary(max_size=300), st.integers(0, 2**64 - 1))),
     st.lists(st.integers(1, 200), min_size=1),
@@ -62,7 +63,7 @@ def test_large_frames_arrive_between_small_ones():
         assert not reader.may_have_more
 
 
-@settings(max_examples=40)
+@settings(max_examples=size(40, 5))
 @given(
     st.lists(st.sampled_from([0, 5, 16_000, 16_384, 16_385, 70_000, 200_000, 2_500_000])),
     st.sampled_from([7, 1000, 16_000, 100_000, 1_000_000]),
@@ -95,7 +96,7 @@ class InPieces:
         return len(piece)
 
 
-def test_who_announces_much_and_sends_little_takes_little_memory():
+def test_announced_frame_length_allocates_no_memory():
     head = HEADER.pack(1 << 30, Kind.ROWS, 0, 1)
     tracemalloc.start()
     try:

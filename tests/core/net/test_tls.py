@@ -18,6 +18,7 @@ from hypothesis.stateful import (
     invariant,
     rule,
 )
+from sizes import size
 
 from physx_core.errors import ConnectionRefusedByPeerError, SilentPeerError, UnansweredError
 from physx_core.net import FrameReader, Kind, Listener, SecureSocket, encrypt, pack
@@ -143,12 +144,12 @@ class Stream(RuleBasedStateMachine):
 
 
 TestStream = Stream.TestCase
-TestStream.settings = settings(max_examples=25, stateful_step_count=25, deadline=None)
+TestStream.settings = settings(max_examples=size(25, 4), stateful_step_count=25, deadline=None)
 
 
-@settings(max_examples=40)
+@settings(max_examples=size(40, 5))
 @given(data=st.data())
-def test_what_is_cut_or_changed_on_its_way_is_a_beginning_of_what_was_sent_and_an_error(data):
+def test_tls_truncation_and_corruption_are_errors(data):
     near, relay_near = pair()
     relay_far, far = pair()
     relay = Relay(relay_near, relay_far)
@@ -267,7 +268,7 @@ def test_a_listener_finds_every_frame_though_the_system_sees_none_of_it(sizes):
         (None, SilentPeerError, "in time"),
     ],
 )
-def test_a_server_that_does_not_encrypt_is_told_apart(answer, error, text):
+def test_server_without_tls_is_detected(answer, error, text):
     near, far = pair()
     near.settimeout(0.3 if answer is None else PATIENCE)
     with far:
@@ -279,7 +280,7 @@ def test_a_server_that_does_not_encrypt_is_told_apart(answer, error, text):
     assert type(caught.value) is error
 
 
-def test_a_server_that_sends_its_handshake_byte_by_byte_has_no_more_time():
+def test_slow_tls_handshake_times_out():
     near, far = pair()
     near.settimeout(0.5)
     over = threading.Event()
@@ -298,7 +299,7 @@ def test_a_server_that_sends_its_handshake_byte_by_byte_has_no_more_time():
     thread.join()
 
 
-def test_on_this_machine_nothing_is_encrypted():
+def test_loopback_connection_uses_no_tls():
     near, far = pair()
     with near, far:
         assert encrypt(near) is near
@@ -308,7 +309,7 @@ def test_on_this_machine_nothing_is_encrypted():
 
 
 @pytest.mark.parametrize("data", [b"", b"\x16", b"\x16" * 100, b"\x17\x03\x03", b"GET / HTTP/1.1"])
-def test_a_first_byte_decides_and_nonsense_is_an_error_or_left_to_the_reader(data):
+def test_first_byte_selects_tls_or_plain(data):
     near, far = pair()
     server = SecureSocket.of_server(far, IDENTITY, set())
     with near, server:
@@ -324,7 +325,7 @@ def test_a_first_byte_decides_and_nonsense_is_an_error_or_left_to_the_reader(dat
             plain.close()
 
 
-def test_the_key_of_a_certificate_is_on_no_disk(tmp_path, monkeypatch):
+def test_private_key_is_never_on_disk(tmp_path, monkeypatch):
     import tempfile
 
     monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))

@@ -14,6 +14,7 @@ from pathlib import Path
 import h5py
 import numpy as np
 import pytest
+from sizes import seed, trials
 
 from physx_core import (
     DataGeneration,
@@ -76,7 +77,7 @@ def stripes(folder):
 
 
 @pytest.mark.parametrize(("clients", "batches", "size"), [(1, 3, 40), (3, 4, 41), (4, 30, 1)])
-def test_rows_are_those_that_the_server_would_write(clients, batches, size, nothing_stays_behind):
+def test_client_writers_store_rows_of_server_writer(clients, batches, size, nothing_stays_behind):
     wanted = rows(generate("server", "server", num_clients=clients, batches=batches, size=size))
     folder = generate("clients", num_clients=clients, batches=batches, size=size)
     assert_same(rows(folder), wanted)
@@ -88,7 +89,7 @@ def test_rows_are_those_that_the_server_would_write(clients, batches, size, noth
     assert not list((folder / "dataset").glob("dataset.clients"))
 
 
-def test_every_reader_takes_them(nothing_stays_behind, tmp_path):
+def test_client_written_rows_are_read_by_every_reader(nothing_stays_behind, tmp_path):
     plain = generate("server", "server", size=30)
     folder = generate("clients", size=30)
     wanted = rows(plain)
@@ -146,7 +147,7 @@ def test_commands_take_them(nothing_stays_behind, tmp_path):
 
 
 @pytest.mark.faults
-def test_runs_add_to_each_other(nothing_stays_behind):
+def test_client_writers_extend_sessions(nothing_stays_behind):
     turns = [("clients", 3, 20), ("server", 2, 15), ("clients", 2, 25), ("clients", 4, 3)]
     for name in ("one", "two"):
         for place, (writers, clients, size) in enumerate(turns):
@@ -171,7 +172,7 @@ def test_runs_add_to_each_other(nothing_stays_behind):
     "step",
     [pytest.param(0, marks=pytest.mark.faults), 3, pytest.param(29, marks=pytest.mark.faults)],
 )
-def test_a_client_that_was_killed_continues_its_partitions(step, nothing_stays_behind):
+def test_restarted_client_writer_continues_its_partitions(step, nothing_stays_behind):
     wanted = rows(generate("server", "server", size=40))
     arguments = {"dies": (2, step)}
     folder = generate("clients", size=40, env_kwargs=arguments, restarts=1)
@@ -180,9 +181,9 @@ def test_a_client_that_was_killed_continues_its_partitions(step, nothing_stays_b
 
 
 @pytest.mark.faults
-def test_clients_that_are_killed_at_any_moments(nothing_stays_behind, process_ids):
+def test_client_writers_killed_at_random_moments(nothing_stays_behind, process_ids):
     wanted = rows(generate("server", "server", batches=30))
-    chance, ended = random.Random(5), threading.Event()
+    chance, ended = random.Random(seed()), threading.Event()
 
     def kill():
         while not ended.wait(0.2 + 0.3 * chance.random()):
@@ -202,9 +203,7 @@ def test_clients_that_are_killed_at_any_moments(nothing_stays_behind, process_id
 
 
 @pytest.mark.faults
-def test_a_client_that_leaves_an_elastic_run_has_its_instances_continued(
-    nothing_stays_behind, process_ids
-):
+def test_elastic_client_writer_is_replaced(nothing_stays_behind, process_ids):
     wanted = rows(generate("server", "server", batches=20, num_clients=4))
     clients = threading.Timer(1.5, lambda: os.kill(process_ids()[1], signal.SIGKILL))
     clients.start()
@@ -214,7 +213,7 @@ def test_a_client_that_leaves_an_elastic_run_has_its_instances_continued(
     assert_same(rows(folder), wanted)
 
 
-def test_a_full_disk_keeps_all_rows_before_it(small_disk, nothing_stays_behind):
+def test_full_disk_of_client_writers_keeps_committed_rows(small_disk, nothing_stays_behind):
     with (
         pytest.raises(DatasetError, match="the disk is full"),
         DataGeneration(
@@ -237,7 +236,7 @@ def test_a_full_disk_keeps_all_rows_before_it(small_disk, nothing_stays_behind):
         assert dataset.verify() == []
 
 
-def test_what_was_written_before_an_error_stays(nothing_stays_behind):
+def test_rows_before_error_of_client_writer_stay(nothing_stays_behind):
     wanted = rows(generate("server", "server", batches=3, size=60))
     with pytest.raises(NotFiniteError, match='field "x"'):
         generate("clients", environment=f"{PROGRAM}:Gaps", batches=30)
@@ -270,34 +269,22 @@ def check_killed_run(run_killed, folder, moment, wanted):
 
 def server_rows(run_killed):
     Path("server").mkdir()
-    run_killed(str(PROGRAM), Path("server").resolve(), [], "server", "3", "12", "30")
-    return rows(Path("server/sessions/run"))
+    _, duration = run_killed(str(PROGRAM), Path("server").resolve(), [], "server", "3", "12", "30")
+    return rows(Path("server/sessions/run")), duration
 
 
-def test_a_run_that_is_killed_leaves_rows_before_which_none_is_missing(
-    run_killed, nothing_stays_behind
-):
-    wanted = server_rows(run_killed)
-    _, duration = run_killed(str(PROGRAM), Path.cwd(), [], "clients", "3", "12", "30")
-    left = [
-        check_killed_run(run_killed, Path(f"killed-{share}").resolve(), share * duration, wanted)
-        for share in (0.5, 0.8)
-    ]
-    assert all(count >= 0 for count in left)
+def test_killed_run_of_client_writers_leaves_no_gap(run_killed, nothing_stays_behind):
+    wanted, duration = server_rows(run_killed)
+    assert check_killed_run(run_killed, Path("killed").resolve(), 0.8 * duration, wanted) >= 0
 
 
 @pytest.mark.faults
-def test_runs_that_are_killed_at_any_moments(run_killed, nothing_stays_behind):
-    wanted, chance = server_rows(run_killed), random.Random(7)
-    _, duration = run_killed(str(PROGRAM), Path.cwd(), [], "clients", "3", "12", "30")
+def test_runs_of_client_writers_killed_at_random_moments(run_killed, nothing_stays_behind):
+    (wanted, duration), chance = server_rows(run_killed), random.Random(seed())
+    shares = [0.9, *(chance.uniform(0.3, 1.0) for _ in range(trials(4, 2)))]
     left = [
-        check_killed_run(
-            run_killed,
-            Path(f"killed-{number}").resolve(),
-            duration * chance.uniform(0.3, 1.0),
-            wanted,
-        )
-        for number in range(5)
+        check_killed_run(run_killed, Path(f"killed-{place}").resolve(), duration * share, wanted)
+        for place, share in enumerate(shares)
     ]
     assert max(left) > 0
 
@@ -314,13 +301,15 @@ def test_runs_that_are_killed_at_any_moments(run_killed, nothing_stays_behind):
         ({"environment": f"{PROGRAM}:Drawn", "redraw": 1}, "redraw needs the rows"),
     ],
 )
-def test_what_needs_the_rows_is_refused(options, text, nothing_stays_behind):
+def test_options_that_need_rows_are_refused_with_client_writers(
+    options, text, nothing_stays_behind
+):
     with pytest.raises(ConfigError, match=text):
         generate("clients", **options)
     assert not Path("sessions/clients").exists()
 
 
-def test_other_pipelines_refuse_it(nothing_stays_behind):
+def test_other_pipelines_refuse_client_writers(nothing_stays_behind):
     folder = generate("rows")
     dataset = DatasetConfig(existing_dir=folder, writers="clients")
     network = NetworkConfig("toy/linear")
@@ -340,7 +329,7 @@ def test_other_pipelines_refuse_it(nothing_stays_behind):
         ("something else", ClientError, "it is not the same folder"),
     ],
 )
-def test_a_client_that_sees_another_folder_is_refused(content, error, text, nothing_stays_behind):
+def test_client_writer_on_other_file_system_is_refused(content, error, text, nothing_stays_behind):
     with pytest.raises(error, match=text):
         generate(
             "clients",
@@ -364,7 +353,7 @@ def test_a_client_that_sees_another_folder_is_refused(content, error, text, noth
         ({"kind": "SEALED", "number": 99, "value": "plausible"}, "did not seal its partition 99"),
     ],
 )
-def test_a_client_that_breaks_a_rule_is_cut_off(message, text, nothing_stays_behind):
+def test_protocol_violation_disconnects_client_writer(message, text, nothing_stays_behind):
     with pytest.raises(ClientError, match=text):
         generate("clients", environment=f"{PROGRAM}:Rogue", batches=20, env_kwargs=message)
     if Path("sessions/clients").exists():  # it is removed if no row was complete by then
@@ -372,7 +361,7 @@ def test_a_client_that_breaks_a_rule_is_cut_off(message, text, nothing_stays_beh
             assert dataset.verify() == []
 
 
-def test_nobody_else_changes_the_rows_meanwhile(nothing_stays_behind):
+def test_dataset_is_locked_while_clients_write(nothing_stays_behind):
     class Meddling(DataGeneration):
         def batch_end(self):
             super().batch_end()

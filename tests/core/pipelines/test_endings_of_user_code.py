@@ -98,7 +98,7 @@ EVERY = [(place, way) for place in ("step", "forward", "train_end") for way in H
 
 
 @pytest.mark.parametrize(("place", "way"), sorted({*EACH, *EVERY}))
-def test_in_this_process_it_is_an_error_that_names_the_place(place, way):
+def test_system_exit_of_user_code_in_process_is_an_error(place, way):
     base, run = PLACES[place]
     run = train_stored_by if base is Training else run
     with pytest.raises(BaseException) as caught:
@@ -111,7 +111,7 @@ def test_in_this_process_it_is_an_error_that_names_the_place(place, way):
 
 
 @pytest.mark.parametrize("way", ["sys.exit(0)", "own"])
-def test_the_network_trained_so_far_is_kept(way):
+def test_system_exit_in_training_keeps_checkpoint(way):
     with pytest.raises(UsageError) as caught:
         train_stored_by(endings.ending(Training, "epoch_end", way))
     assert "network_0" in caught.value.__notes__[0]
@@ -149,7 +149,7 @@ def test_a_visualizer_does_not_end_the_run(way):
 
 @pytest.mark.parametrize("method", ["create", "step"])
 @pytest.mark.parametrize("way", endings.WAYS)
-def test_in_a_client_it_is_an_error(method, way, nothing_stays_behind):
+def test_system_exit_of_user_code_in_client_is_an_error(method, way, nothing_stays_behind):
     config = EnvironmentConfig(
         f"{PROGRAM}:client", {"method": method, "way": way}, num_clients=2, seed=1
     )

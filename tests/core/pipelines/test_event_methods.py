@@ -183,6 +183,7 @@ def without(kind, *names):
     return type("Own", (kind,), {name: lambda self: None for name in names})
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("make", PIPELINES)
 def test_overriding_events_changes_no_file(make):
     make().execute()
@@ -277,6 +278,7 @@ def test_a_prediction_that_records_nothing_is_named():
         prediction(Own).execute()
 
 
+@pytest.mark.slow
 def test_replaced_steps_that_do_the_same_store_the_same():
     class Generates(DataGeneration):
         def batch_produce(self):

@@ -9,6 +9,7 @@ from dataclasses import dataclass
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sizes import size
 
 from physx_core.pipelines.learning.batches.feeder import Feeder
 
@@ -55,7 +56,7 @@ class Maker:
 NUMBERS = st.sets(st.integers(0, 11))
 
 
-@settings(max_examples=60, deadline=None)
+@settings(max_examples=size(60, 7), deadline=None)
 @given(
     steps=st.lists(
         st.one_of(st.just("next"), st.lists(st.integers(0, 9), max_size=4)), max_size=12

@@ -53,7 +53,7 @@ def checkpoints(session="training"):
 # Within epochs ------------------------------------------------------------------------------------
 
 
-def test_of_the_checkpoints_within_epochs_the_last_two_stay(monkeypatch):
+def test_last_two_checkpoints_within_epochs_are_kept(monkeypatch):
     done = []
     for name in ("rename", "sync_folder"):
         operation = getattr(files, name)
@@ -73,7 +73,7 @@ def test_of_the_checkpoints_within_epochs_the_last_two_stay(monkeypatch):
     assert (folder,) in done[appears:vanishes]  # the new one is on the disk by then
 
 
-def test_a_training_that_is_killed_while_it_removes_a_checkpoint_resumes(monkeypatch):
+def test_training_killed_while_removing_checkpoint_resumes(monkeypatch):
     network = NetworkConfig(Linear, optimization=Descending)
     Training(network, DATA, session_name="whole", checkpoint_every=1, **OPTIONS).execute()
     rename = files.rename
@@ -94,7 +94,7 @@ def test_a_training_that_is_killed_while_it_removes_a_checkpoint_resumes(monkeyp
     assert one.tobytes() == two.tobytes()
 
 
-def test_a_checkpoint_after_each_epoch_is_one_to_resume_from():
+def test_resume_from_checkpoint_of_each_epoch():
     network = NetworkConfig(Linear, optimization=Descending)
     options = {**OPTIONS, "checkpoint_every": "epoch"}
     Training(network, DATA, session_name="whole", **options).execute()
@@ -193,7 +193,7 @@ LEFT = {
 
 
 @pytest.mark.parametrize("kind", PIPELINES)
-def test_sigterm_ends_every_pipeline_in_order_with_status_143(kind, nothing_stays_behind):
+def test_sigterm_ends_pipeline_cleanly_with_status_143(kind, nothing_stays_behind):
     Training(NETWORK, DATA, session_name="trained", **OPTIONS).execute()
     code, text = signaled(saying(PIPELINES[kind], EVENTS.get(kind, "batch_end")), [signal.SIGTERM])
     assert code == 143 and "Traceback" not in text
@@ -229,7 +229,7 @@ def test_a_signal_that_is_sent_to_the_process_and_to_its_group_is_one():
 
 
 @pytest.mark.parametrize("busy", ["optimize", "batch_produce"])
-def test_a_second_signal_ends_a_training_whose_clients_run_ahead(busy, nothing_stays_behind):
+def test_second_signal_ends_online_training(busy, nothing_stays_behind):
     """It is learning, or waits for a client that takes its time."""
     slow = Path(__file__).parents[1] / "programs" / "online_envs.py"
     make = (
@@ -281,7 +281,7 @@ class Failing(Spring):
         super().step()
 
 
-def test_an_environment_that_fails_leaves_a_checkpoint_and_the_error_names_it():
+def test_environment_failure_leaves_checkpoint():
     config = EnvironmentConfig(Failing, as_tcp_ip_client=False, seed=1, always_produce=True)
     with pytest.raises(EnvironmentFailedError, match="the solver diverged") as caught:
         Training(NETWORK, None, config, batch_nb=3, **OPTIONS).execute()
@@ -303,7 +303,7 @@ class Asking(Failing):
         )
 
 
-def test_a_training_that_cannot_be_resumed_says_how_to_go_on(capfd):
+def test_training_without_resume_names_alternative(capfd):
     config = EnvironmentConfig(Asking, as_tcp_ip_client=False, seed=1)
     with pytest.raises(EnvironmentFailedError) as caught:
         Training(NETWORK, None, config, batch_nb=9, **OPTIONS).execute()
@@ -337,7 +337,7 @@ class Descending(LeastSquares):
         self._network.weights -= 1e-3 * self._rows.T @ error
 
 
-def test_after_an_error_within_an_epoch_a_training_resumes_bit_for_bit():
+def test_resume_after_error_within_epoch_is_bit_identical():
     class Mine(Training):
         def batch_end(self):
             if (self.epoch_id, self.batch_id) == (1, 2):
@@ -384,7 +384,7 @@ def diverging(optimization=Diverging, **options):
     return training
 
 
-def test_a_loss_that_is_nan_stops_the_training_with_the_network_of_before():
+def test_nan_loss_stops_training_with_previous_checkpoint():
     with pytest.raises(
         DivergedError, match=r"^Epoch 2, batch 2: the loss is nan, though"
     ) as caught:
@@ -397,20 +397,20 @@ def test_a_loss_that_is_nan_stops_the_training_with_the_network_of_before():
 
 
 @pytest.mark.parametrize("save_each_epoch", [False, True])
-def test_parameters_that_are_nan_are_never_a_checkpoint(save_each_epoch):
+def test_nan_parameters_are_never_saved(save_each_epoch):
     network = NetworkConfig(Linear, optimization=Spoiling, save_each_epoch=save_each_epoch)
     with pytest.raises(DivergedError, match="Epoch 2, batch 3: the loss is nan, as the network's"):
         Training(network, DATA, **OPTIONS).execute()
     assert checkpoints() == (["network_0"] if save_each_epoch else [])
 
 
-def test_the_parameters_are_looked_at_before_they_are_saved():
+def test_parameters_are_checked_for_nan_before_checkpoint():
     with pytest.raises(DivergedError, match='Epoch 1: the parameter "weights" holds NaN'):
         diverging(Spoiling, epoch_nb=1, batch_size=7)  # the last of six batches spoils them
     assert checkpoints() == []
 
 
-def test_a_validation_loss_that_is_nan_stops_the_training():
+def test_nan_validation_loss_stops_training():
     DataGeneration(
         SPRING, session_name="run", new_session=False, mode="validation", batch_nb=1, batch_size=8
     ).execute()

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sizes import seed, trials
 
 from physx_core import (
     DataGeneration,
@@ -84,9 +85,7 @@ RESERVOIR = {
 
 @pytest.mark.parametrize("online", [{}, RESERVOIR], ids=["stream", "reservoir"])
 @pytest.mark.parametrize("delay", [0, pytest.param(1, marks=pytest.mark.faults), 3])
-def test_simulations_are_the_same_in_process_in_clients_and_with_random_delays(
-    tmp_path, delay, online
-):
+def test_active_sampler_is_independent_of_clients_and_delays(tmp_path, delay, online):
     options = {"sampler": Recording, "sampler_kwargs": {"delay": delay}, "online": online}
     _, expected = train(tmp_path, clients=False, **options)
     for kwargs in ({}, {"how": "slow"}):
@@ -175,19 +174,17 @@ def survives(run_killed, folder, seed, kills, words):
     ],
     ids=str,
 )
-def test_a_training_whose_sampler_learns_is_killed_and_resumed_bit_for_bit(
-    tmp_path, words, run_killed
-):
+def test_kill_and_resume_with_active_sampler_is_bit_identical(tmp_path, words, run_killed):
     assert survives(run_killed, tmp_path, 2, 3, words)
 
 
 @pytest.mark.faults
 @pytest.mark.parametrize("words", [("clients", "stream"), ("clients", "reservoir")], ids=str)
-def test_such_a_training_survives_being_killed_at_any_moments(tmp_path, words, run_killed):
-    assert survives(run_killed, tmp_path, 0, 10, words)
+def test_kills_at_random_moments_with_active_sampler(tmp_path, words, run_killed):
+    assert survives(run_killed, tmp_path, seed(), trials(10, 4), words)
 
 
-def test_after_failed_sets_resuming_is_refused_if_rejected_samples_are_recorded(tmp_path):
+def test_resume_after_failed_parameters_is_refused_with_recorded_rejections(tmp_path):
     environment = EnvironmentConfig(
         SWING,
         env_kwargs={"fails_above": 25.0},
@@ -212,7 +209,7 @@ def test_after_failed_sets_resuming_is_refused_if_rejected_samples_are_recorded(
 
 
 @pytest.mark.parametrize("delay", [0, 1])
-def test_an_error_ends_a_run_whose_clients_wait_for_losses(tmp_path, delay, nothing_stays_behind):
+def test_error_ends_run_whose_clients_wait_for_losses(tmp_path, delay, nothing_stays_behind):
     class Failing(Training):
         def batch_begin(self):
             super().batch_begin()

@@ -14,6 +14,7 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from sizes import seed, trials
 
 from physx_core import (
     DataGeneration,
@@ -125,7 +126,7 @@ def scalars(name):
     ],
     ids=str,
 )
-def test_a_training_is_the_same_in_process_and_with_clients_of_any_speed(
+def test_online_training_is_independent_of_clients_and_speed(
     options, nothing_stays_behind, monkeypatch
 ):
     runs, calls = [], []
@@ -178,7 +179,7 @@ def test_a_training_that_decides_itself_when_an_epoch_ends_generates_no_more_tha
 @pytest.mark.parametrize(
     "options", [{"fails_at": 12}, {"fails_at": 0}, {"fails_at": 12, "asks": True}]
 )
-def test_an_error_is_raised_when_the_batch_is_due(over_tcp, options, nothing_stays_behind):
+def test_environment_error_is_raised_at_its_batch(over_tcp, options, nothing_stays_behind):
     """Instance 3 fails at its 13th row, which is number 38 and so in the sixth batch."""
     run = training(pupil(over_tcp, **options), "failed")
     with pytest.raises(EnvironmentFailedError, match="no more beans"):
@@ -191,9 +192,7 @@ def test_an_error_is_raised_when_the_batch_is_due(over_tcp, options, nothing_sta
     assert "physx-feeder" not in {thread.name for thread in threading.enumerate()}
 
 
-def test_an_error_of_the_network_while_it_answers_is_the_error_of_the_training(
-    nothing_stays_behind, monkeypatch
-):
+def test_prediction_error_during_online_training_is_raised(nothing_stays_behind, monkeypatch):
     answers = []
 
     def predict(self, batch):
@@ -210,7 +209,7 @@ def test_an_error_of_the_network_while_it_answers_is_the_error_of_the_training(
     assert answers == [True] * 5
 
 
-def test_a_client_that_is_killed_and_replaced_leaves_the_training_as_it_is(nothing_stays_behind):
+def test_client_restart_does_not_change_online_training(nothing_stays_behind):
     runs = []
     for name, options in (("whole", {}), ("broken", {"kill_at": 9, "restarts": 1, "delay": 0.01})):
         run = training(pupil(asks=True, **options), name)
@@ -294,7 +293,7 @@ REFUSING = {"refuse": 3, "record_wrong_samples": True}
     ],
     ids=str,
 )
-def test_an_interrupted_training_is_resumed_while_environments_generate(
+def test_interrupted_online_training_resumes_bit_identically(
     over_tcp, always, options, nothing_stays_behind
 ):
     config = pupil(over_tcp, delay=0.01, always_produce=always, **options)
@@ -406,10 +405,8 @@ def survives(run_killed, random, kills, words):
     ],
     ids=" ".join,
 )
-def test_a_training_that_is_killed_while_environments_generate_is_resumed_bit_for_bit(
-    words, run_killed
-):
-    survives(run_killed, random.Random(1), 2, words)
+def test_killed_online_training_resumes_bit_identically(words, run_killed):
+    survives(run_killed, random.Random(1), trials(2, 1), words)
 
 
 @pytest.mark.faults
@@ -418,11 +415,11 @@ def test_a_training_that_is_killed_while_environments_generate_is_resumed_bit_fo
     [(("clients", "once", "fifo"), 10), (("clients", "always", "stream"), 5)],
     ids=["clients once fifo", "clients always stream"],
 )
-def test_a_training_survives_being_killed_at_many_moments(words, kills, run_killed):
-    survives(run_killed, random.Random(2), kills, words)
+def test_online_training_killed_at_random_moments(words, kills, run_killed):
+    survives(run_killed, random.Random(seed()), trials(kills, 3), words)
 
 
-def test_the_command_resumes_with_the_environments_of_the_session(capfd, nothing_stays_behind):
+def test_resume_command_uses_environments_of_session(capfd, nothing_stays_behind):
     spring = EnvironmentConfig("toy/spring", num_clients=2)
     options = {"epoch_nb": 2, "batch_nb": 8, "batch_size": 7, "quiet": True}
     network = NetworkConfig("toy/linear")
@@ -445,9 +442,7 @@ def test_the_command_resumes_with_the_environments_of_the_session(capfd, nothing
         (True, "kill", 2),
     ],
 )
-def test_simulations_that_failed_before_fail_again_when_their_training_is_resumed(
-    over_tcp, how, least, nothing_stays_behind
-):
+def test_resume_repeats_failed_simulations(over_tcp, how, least, nothing_stays_behind):
     config = EnvironmentConfig(
         f"{PROGRAM.with_name('parameter_envs.py')}:Swing",
         env_kwargs={"fails_above": 34.0 if how == "kill" else 25.0, "how": how},

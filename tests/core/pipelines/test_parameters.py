@@ -145,7 +145,7 @@ def test_the_command_line_chooses_the_sampler(tmp_path, capsys):
     assert main(["verify", str(tmp_path / "run")]) == 0
 
 
-def test_restarted_clients_get_the_same_parameters_again(tmp_path):
+def test_restarted_client_gets_same_parameters(tmp_path):
     kwargs = {"how": "once", "folder": str(tmp_path)}
     failing = generate(tmp_path, restarts=1, sampler="physx/sobol", kwargs=kwargs)
     whole = generate(tmp_path, clients=False, sampler="physx/sobol")
@@ -158,7 +158,7 @@ def test_restarted_clients_get_the_same_parameters_again(tmp_path):
 
 
 @pytest.mark.parametrize("how", ["raise", "reset", "nan", "wrong"])
-def test_a_set_that_fails_is_recorded_and_the_next_one_takes_its_place(tmp_path, how):
+def test_failed_parameters_are_recorded_and_redrawn(tmp_path, how):
     kwargs = {"how": how, "fails_above": 32.0}
     options = {"sampler": "physx/sobol", "redraw": 9, "kwargs": kwargs}
     runs = [generate(tmp_path, clients=clients, **options) for clients in (False, True)]
@@ -173,7 +173,7 @@ def test_a_set_that_fails_is_recorded_and_the_next_one_takes_its_place(tmp_path,
     assert {*runs[1].source.sets.failures} >= {*sets["set"][sets["failed"]].tolist()}
 
 
-def test_a_set_that_kills_its_client_is_found_and_replaced(tmp_path):
+def test_parameters_that_crash_the_client_are_redrawn(tmp_path):
     options = {"sampler": "physx/sobol", "redraw": 5, "batch_nb": 2, "batch_size": 6}
     raising = generate(
         tmp_path, clients=False, kwargs={"how": "raise", "fails_above": 32.0}, **options
@@ -187,9 +187,7 @@ def test_a_set_that_kills_its_client_is_found_and_replaced(tmp_path):
 
 
 @pytest.mark.parametrize("clients", [False, True])
-def test_a_run_ends_after_as_many_failures_as_it_may_redraw_and_names_the_sets(
-    tmp_path, clients, capsys
-):
+def test_run_ends_at_redraw_limit_and_names_parameters(tmp_path, clients, capsys):
     config = EnvironmentConfig(
         SWING, env_kwargs={"fails_above": 11.0}, seed=3, redraw=2, as_tcp_ip_client=clients
     )

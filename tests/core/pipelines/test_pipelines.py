@@ -176,7 +176,7 @@ def test_failing_environments_are_named(method):
     assert caught.value.method == method
 
 
-def test_what_was_committed_stays_when_a_sample_is_bad():
+def test_committed_rows_survive_invalid_sample():
     with pytest.raises(NotFiniteError, match='Instance 1, step 60: field "x"'):
         generate(environment_config=counting(bad_step=60))
     with Dataset.open("sessions/run") as dataset:
@@ -367,7 +367,7 @@ def test_a_failing_observer_is_muted_and_the_run_goes_on(monkeypatch):
         Mine(SPRING, batch_nb=3, batch_size=2).execute()
 
 
-def test_ctrl_c_keeps_what_was_committed_and_writes_a_checkpoint(tmp_path):
+def test_ctrl_c_keeps_committed_rows_and_writes_checkpoint(tmp_path):
     script = tmp_path / "endless.py"
     script.write_text(
         "from physx_core import *\n"

@@ -211,7 +211,7 @@ def test_the_command_replays_too(capsys):
 
 
 @pytest.mark.parametrize("steps", [-1, 1_000_000])
-def test_ctrl_c_ends_in_order(tmp_path, steps, nothing_stays_behind):
+def test_ctrl_c_ends_prediction_cleanly(tmp_path, steps, nothing_stays_behind):
     script = tmp_path / "script.py"
     script.write_text(
         "from physx_core import *\n"

@@ -55,7 +55,7 @@ def train(epoch_nb, name="run", before=lambda epoch: None, existing="data", **op
 
 @pytest.mark.parametrize("config", [{}, {"validation_split": 0.2}])
 @pytest.mark.parametrize(("first", "then"), [(PLENTY, LITTLE), (LITTLE, PLENTY)])
-def test_a_resumed_training_keeps_the_order_whatever_memory_is_free(free, first, then, config):
+def test_resume_keeps_reading_order_at_any_free_memory(free, first, then, config):
     free(first)
     whole = train(3, "whole", config=config)
     train(1, config=config)

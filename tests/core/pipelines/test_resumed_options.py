@@ -53,7 +53,7 @@ BOUND = [
 
 
 @pytest.mark.parametrize(("options", "message"), BOUND)
-def test_a_resume_with_another_option_that_the_training_depends_on_is_refused(options, message):
+def test_resume_with_changed_option_is_refused(options, message):
     train(resume=False)
     before = (SESSION / "config.toml").read_bytes()
     with pytest.raises(ConfigError, match=r"network_dir='sessions.training'") as error:
@@ -129,7 +129,7 @@ def rows(count):
 
 
 @pytest.mark.parametrize(("change", "messages"), CHANGES)
-def test_data_that_changed_are_named_when_a_training_is_resumed(change, messages, capsys):
+def test_resume_with_changed_data_is_refused(change, messages, capsys):
     train(resume=False)
     with Dataset.open("data", writable=True) as dataset:
         change(dataset)

@@ -162,9 +162,7 @@ class Cut(Training):
 @pytest.mark.parametrize("always_produce", [False, True])
 @pytest.mark.parametrize("clients", [False, True])
 @pytest.mark.parametrize("online", BUFFERS)
-def test_a_training_that_was_cut_is_resumed_with_the_rows_of_its_buffer(
-    online, clients, always_produce
-):
+def test_resume_restores_rows_of_buffer(online, clients, always_produce):
     options = {"clients": clients, "always_produce": always_produce}
     options |= {"epoch_nb": 2 if always_produce else 1}
     whole = train("whole", online, **options)
@@ -184,7 +182,7 @@ def test_a_training_is_made_longer_with_the_rows_of_its_buffer():
     assert np.bincount(drawn.ravel()).tolist() == [2] * 360
 
 
-def test_a_training_cannot_be_resumed_with_another_buffer():
+def test_resume_with_another_buffer_is_refused():
     with pytest.raises(RuntimeError, match="cut"):
         train("cut", "reservoir", kind=Cut)
     with pytest.raises(ConfigError, match="online was 'physx/reservoir' and is now 'physx/window'"):
@@ -222,7 +220,7 @@ def test_a_stream_records_no_rows():
         read_drawn_rows(path)
 
 
-def test_a_record_that_was_cut_or_damaged_ends_there():
+def test_truncated_or_corrupt_record_of_drawn_rows_ends_there():
     path = train("run", "window")
     file, whole = path / "stats" / "drawn_rows.bin", read_drawn_rows(path)
     content = file.read_bytes()
@@ -237,7 +235,7 @@ def test_a_record_that_was_cut_or_damaged_ends_there():
         read_drawn_rows(path)
 
 
-def test_an_interrupted_run_leaves_the_state_of_its_buffer_in_the_checkpoint():
+def test_checkpoint_of_interrupted_run_has_buffer_state():
     environment = EnvironmentConfig(
         DRAWN, as_tcp_ip_client=False, seed=1, env_kwargs={"fails_at": 20}
     )

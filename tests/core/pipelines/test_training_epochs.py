@@ -304,7 +304,7 @@ def test_patience_counts_validations(validated):
     assert finished_epochs([1.0] * 9, patience=2, validation_every=2) == 6
 
 
-def test_a_loss_that_is_not_a_number_is_no_improvement(data):
+def test_nan_loss_is_no_improvement(data):
     assert finished_epochs([math.nan] * 9, patience=2, on_nan="continue") == 2
 
 
@@ -322,7 +322,7 @@ def test_a_stopped_training_writes_no_checkpoint_twice(data):
 # The best checkpoint ----------------------------------------------------------------------------
 
 
-def test_the_best_network_is_that_of_the_smallest_validation_loss(validated):
+def test_best_checkpoint_has_smallest_validation_loss(validated):
     pipeline = training([9.0, 8, 7, 6], [4, 2, 3, 5], network={"save_each_epoch": True})
     pipeline.execute()
     assert (pipeline.best.loss, pipeline.best.epoch) == (2, 2)

@@ -3,6 +3,7 @@ import signal
 import subprocess
 import sys
 import time
+from importlib import metadata
 
 import pytest
 
@@ -50,6 +51,20 @@ def physx(folder, *words):
         timeout=60,
         cwd=folder,
     )
+
+
+def test_metadata_is_read_once(monkeypatch):
+    read = []
+    text_of = metadata.PathDistribution.read_text
+    monkeypatch.setattr(
+        metadata.PathDistribution,
+        "read_text",
+        lambda self, name: (read.append(name), text_of(self, name))[1],
+    )
+    known = plugins.available(), plugins.resolve("environment", "toy/spring")
+    read.clear()
+    assert (plugins.available(), plugins.resolve("environment", "toy/spring")) == known
+    assert read == []
 
 
 def test_available_reads_metadata_only():

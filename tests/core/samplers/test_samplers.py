@@ -68,6 +68,7 @@ def test_values_lie_within_the_bounds_and_have_their_types(make):
         assert int(values["n"]) == values["n"]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["uniform", "sobol", "latin_hypercube"])
 def test_other_seeds_and_numbers_have_other_values(name):
     sets = {flat(begun(name, seed=seed).ask(n)) for seed in ([1], [2], [1, 5]) for n in range(40)}

@@ -35,7 +35,7 @@ def errors_of(local, simulated):
 
 
 @pytest.mark.parametrize("method", ["__init__", "create", "init_database", "step", "close"])
-def test_an_exception_comes_back_with_place_and_traceback(errors_of, method):
+def test_client_exception_has_location_and_traceback(errors_of, method):
     kwargs = {"what": "fail", "method": method, "who": 2}
     (local, rows), (error, client_rows) = errors_of(
         "Trouble", [4, 4], num_clients=2, env_kwargs=kwargs
@@ -49,7 +49,7 @@ def test_an_exception_comes_back_with_place_and_traceback(errors_of, method):
 
 
 @pytest.mark.parametrize("method", ["__init__", "create", "step"])
-def test_an_error_of_physx_comes_back_as_itself(errors_of, method):
+def test_physx_error_of_client_keeps_its_type(errors_of, method):
     kwargs = {"what": "fail_known", "method": method}
     (local, _), (error, _) = errors_of("Trouble", [8], env_kwargs=kwargs)
     assert type(error) is type(local) is FieldShapeError
@@ -69,7 +69,7 @@ def test_an_error_of_physx_comes_back_as_itself(errors_of, method):
         (1.0, "velocity", UnknownFieldError),
     ],
 )
-def test_invalid_data_is_rejected_as_in_process(errors_of, value, field, expected):
+def test_client_rejects_invalid_data_as_in_process(errors_of, value, field, expected):
     kwargs = {"value": value, "field": field, "at": 7, "who": 2}
     (local, rows), (error, client_rows) = errors_of(
         "Bad", [5, 5, 5, 5], num_clients=2, env_kwargs=kwargs
@@ -80,7 +80,7 @@ def test_invalid_data_is_rejected_as_in_process(errors_of, value, field, expecte
     assert rows == client_rows == 15
 
 
-def test_rows_before_a_bad_one_arrive_though_they_were_made_together(simulated):
+def test_rows_before_an_invalid_row_arrive(simulated):
     kwargs = {"value": np.full(2, np.nan), "at": 50}
     with simulated("Bad", run_ahead=1000, env_kwargs=kwargs) as source:
         assert source.batch(49)["step"][-1] == 48
@@ -89,7 +89,7 @@ def test_rows_before_a_bad_one_arrive_though_they_were_made_together(simulated):
             source.batch(1)
 
 
-def test_an_error_in_a_row_that_nobody_asked_for_is_no_error(simulated, simulation):
+def test_error_in_an_unrequested_row_is_ignored(simulated, simulation):
     kwargs = {"value": np.full(2, np.nan), "at": 5}
     with simulated("Bad", run_ahead=1000, env_kwargs=kwargs) as source:
         assert len(source.batch(5)["x"]) == 5
@@ -97,7 +97,7 @@ def test_an_error_in_a_row_that_nobody_asked_for_is_no_error(simulated, simulati
 
 
 @pytest.mark.parametrize("goes_on", [True, False])
-def test_an_error_far_ahead_waits_until_the_server_hears_it(simulated, simulation, goes_on):
+def test_error_of_run_ahead_row_waits_until_requested(simulated, simulation, goes_on):
     kwargs = {"value": np.full(2, np.nan), "at": 30_000}
     with simulated("Bad", run_ahead=40_000, env_kwargs=kwargs) as source:
         assert len(source.batch(5)["x"]) == 5

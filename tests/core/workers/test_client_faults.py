@@ -26,7 +26,7 @@ SOON = 30.0  # far below the time for which a client may be silent, on the busie
 
 
 @pytest.mark.parametrize(("method", "rows"), [("__init__", 0), ("step", 3)])
-def test_a_client_whose_environment_exits_is_named(clients, method, rows):
+def test_exit_of_environment_is_reported_with_client(clients, method, rows):
     kwargs = {"what": "leave", "method": method, "who": 2}
     with (
         pytest.raises(ClientError, match=f"Client 2 ended with exit status 5 after {rows} rows"),
@@ -37,7 +37,7 @@ def test_a_client_whose_environment_exits_is_named(clients, method, rows):
 
 
 @pytest.mark.parametrize("number", [signal.SIGKILL, signal.SIGSEGV])
-def test_a_client_that_is_killed_is_named_at_once(clients, process_ids, number):
+def test_killed_client_is_reported_at_once(clients, process_ids, number):
     with (
         pytest.raises(
             ClientError, match=rf"Client 2 was killed by signal .*{number.name}"
@@ -55,7 +55,7 @@ def test_a_client_that_is_killed_is_named_at_once(clients, process_ids, number):
     timer.join()
 
 
-def test_a_client_that_cannot_start_is_noticed_at_once(clients, monkeypatch, tmp_path):
+def test_client_that_cannot_start_is_reported_at_once(clients, monkeypatch, tmp_path):
     broken = tmp_path / "broken"
     broken.mkdir()
     (broken / "numpy.py").write_text("raise ImportError('numpy is broken today')\n")
@@ -68,7 +68,7 @@ def test_a_client_that_cannot_start_is_noticed_at_once(clients, monkeypatch, tmp
     assert "numpy is broken today" in caught.value.stderr
 
 
-def test_a_crash_says_where_it_happened(clients):
+def test_crash_of_client_reports_location(clients):
     with (
         pytest.raises(ClientError, match=r"SIGSEGV") as caught,
         clients("Trouble", env_kwargs={"what": "crash"}) as source,
@@ -77,7 +77,7 @@ def test_a_crash_says_where_it_happened(clients):
     assert "in crash" in caught.value.stderr
 
 
-def test_what_a_generation_committed_before_a_client_broke_is_there(nothing_stays_behind):
+def test_committed_rows_survive_client_crash(nothing_stays_behind):
     config = EnvironmentConfig(
         f"{ENVS}:Faulty", num_clients=2, env_kwargs={"fault": "kill", "place": "step", "at": 3000}
     )
@@ -94,7 +94,7 @@ def test_what_a_generation_committed_before_a_client_broke_is_there(nothing_stay
             assert np.array_equal(dataset["training"]["x"][:].T, [row % 2 + 1, row // 2])
 
 
-def test_what_an_environment_leaves_running_is_ended(clients, tmp_path, monkeypatch):
+def test_child_processes_of_environment_are_terminated(clients, tmp_path, monkeypatch):
     note = tmp_path / "child"
     monkeypatch.setenv("PHYSX_TEST_CHILD", str(note))
     with clients("Trouble", env_kwargs={"what": "leave_child", "method": "create"}) as source:
@@ -102,7 +102,7 @@ def test_what_an_environment_leaves_running_is_ended(clients, tmp_path, monkeypa
         os.kill(int(note.read_text()), 0)
 
 
-def test_after_an_error_outside_the_clients_are_not_waited_for(clients):
+def test_error_of_the_run_terminates_clients_without_waiting(clients):
     began = time.monotonic()
     with (
         pytest.raises(KeyboardInterrupt),
@@ -128,7 +128,7 @@ with ClientSource(config, None, [0]) as source:
 
 
 @pytest.mark.parametrize("fault", ["nothing", "stop", "hold"])
-def test_nothing_is_left_when_the_server_is_killed(nothing_stays_behind, fault):
+def test_killed_server_leaves_no_client_process(nothing_stays_behind, fault):
     """Nor a client that is stopped, or in which no Python can run."""
     # Each of the two clients has a child of its own; the fixture looks for all four.
     Path("server.py").write_text(SERVER.format(environment=f"{ENVS}:Faulty", fault=fault))

@@ -98,7 +98,7 @@ CASES = [
 
 
 @pytest.mark.parametrize(("fault", "place"), CASES)
-def test_a_client_that_breaks_is_named(
+def test_client_fault_is_reported_with_client(
     clients, batch_services, folder, fault, place, record_property, unhurried
 ):
     hangs = fault in HANGS

@@ -8,6 +8,7 @@ import pytest
 from hypothesis import settings
 from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, invariant, precondition, rule
+from sizes import size
 
 from physx_core import EnvironmentConfig
 from physx_core.errors import ConnectionRefusedByPeerError
@@ -146,5 +147,5 @@ def peer_of(worker):
     return worker.client.peer if worker.client is not None else None
 
 
-PoolMachine.TestCase.settings = settings(max_examples=60, stateful_step_count=30)
+PoolMachine.TestCase.settings = settings(max_examples=size(60, 7), stateful_step_count=30)
 test_any_history = PoolMachine.TestCase

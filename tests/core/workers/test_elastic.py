@@ -27,7 +27,7 @@ HOST = socket.gethostname()
 
 
 @pytest.mark.parametrize("asks", [False, True])
-def test_fewer_clients_than_instances_make_the_same_rows(local, clients, services, taking, asks):
+def test_elastic_run_with_fewer_clients_gives_same_rows(local, clients, services, taking, asks):
     if asks:
         services.predict_batch = lambda batch: {"y": 2 * batch["x"]}
     settings = {"num_clients": 5, "env_kwargs": {"asks": asks, "refuse": 4}}
@@ -61,9 +61,7 @@ def test_parameters_that_fail_are_replaced_as_in_other_runs(local, clients, taki
     rows.check(local(SWING, **settings))
 
 
-def test_a_client_more_than_there_are_instances_takes_over(
-    local, clients, process_ids, taking, said
-):
+def test_spare_elastic_client_takes_over(local, clients, process_ids, taking, said):
     settings = {"num_clients": 1, "env_kwargs": {"pace": 0.003}}
     with clients(WANDERER, min_clients=1, max_clients=2, run_ahead=2, **settings) as source:
         rows = taking(source)
@@ -80,7 +78,7 @@ def test_a_client_more_than_there_are_instances_takes_over(
 # Coming and going -------------------------------------------------------------------------------
 
 
-def test_a_late_client_takes_over_instances(local, by_hand, join, taking, said, caplog):
+def test_late_elastic_client_takes_over_instances(local, by_hand, join, taking, said, caplog):
     caplog.set_level("INFO", "physx")
     settings = {"num_clients": 4, "env_kwargs": {"pace": 0.002}}
     ours = [join()]
@@ -102,7 +100,7 @@ def test_a_late_client_takes_over_instances(local, by_hand, join, taking, said, 
 
 
 @pytest.mark.parametrize("how", [signal.SIGINT, signal.SIGKILL])
-def test_a_client_that_leaves_ends_nothing(local, by_hand, join, taking, said, how):
+def test_leaving_elastic_client_does_not_end_run(local, by_hand, join, taking, said, how):
     settings = {"num_clients": 3, "env_kwargs": {"pace": 0.002, "asks": True}}
     leaver, _ = join(), join()
     with by_hand(WANDERER, min_clients=1, run_ahead=2, **settings) as source:
@@ -116,7 +114,7 @@ def test_a_client_that_leaves_ends_nothing(local, by_hand, join, taking, said, h
     assert re.match(rf"Client \d on {HOST} left\.", text)
 
 
-def test_a_run_with_too_few_clients_waits_and_says_so(
+def test_elastic_run_below_min_clients_waits_with_message(
     local, by_hand, join, taking, said, monkeypatch
 ):
     monkeypatch.setattr("physx_core.workers.server.client_pool._SAY_EVERY", 0.2)
@@ -144,7 +142,7 @@ def test_a_run_with_too_few_clients_waits_and_says_so(
     )
 
 
-def test_a_run_that_too_few_clients_join_ends(by_hand, join, unhurried):
+def test_elastic_run_below_min_clients_ends_after_timeout(by_hand, join, unhurried):
     join()
     with (
         pytest.raises(
@@ -157,7 +155,7 @@ def test_a_run_that_too_few_clients_join_ends(by_hand, join, unhurried):
     assert (caught.value.clients, caught.value.needed) == (1, 2)
 
 
-def test_one_client_too_many_is_told_so(by_hand, join):
+def test_client_beyond_max_clients_is_refused(by_hand, join):
     join("--instance", "1")
     with by_hand(WANDERER, num_clients=2, max_clients=1) as source:
         rest = [join(), join("--instance", "2")]
@@ -172,7 +170,7 @@ def test_one_client_too_many_is_told_so(by_hand, join):
 # Configurations ---------------------------------------------------------------------------------
 
 
-def test_what_cannot_be_combined_is_refused(clients, local):
+def test_invalid_elastic_options_are_refused(clients, local):
     with pytest.raises(ConfigError, match=r"min_clients is 3, but max_clients lets only 2"):
         clients(min_clients=3, max_clients=2)
     with pytest.raises(ConfigError, match=r"runs in this process.*leave them out"):
@@ -181,7 +179,7 @@ def test_what_cannot_be_combined_is_refused(clients, local):
         EnvironmentConfig("toy/spring", max_clients=0)
 
 
-def test_the_command_line_runs_it(nothing_stays_behind):
+def test_elastic_run_from_command_line(nothing_stays_behind):
     for options in ([], ["--environment.max-clients", "2", "--environment.min-clients", "1"]):
         command = [sys.executable, "-m", "physx_core", "generate", "toy/spring"]
         command += ["--environment.num-clients", "3", "--environment.seed", "4", *options]

@@ -40,7 +40,7 @@ WORKER = rf"The worker of instance 2 \(client [12] on {HOST}\)"
 # Clients ----------------------------------------------------------------------------------------
 
 
-def test_a_killed_client_is_replaced_by_the_launcher(local, clients, process_ids, taking, said):
+def test_killed_elastic_client_is_restarted_by_launcher(local, clients, process_ids, taking, said):
     settings = {"num_clients": 4, "env_kwargs": {"pace": 0.003}}
     options = {"min_clients": 2, "max_clients": 2, "restarts": 1, "run_ahead": 2}
     with clients(WANDERER, **options, **settings) as source:
@@ -55,7 +55,7 @@ def test_a_killed_client_is_replaced_by_the_launcher(local, clients, process_ids
     assert text.endswith("another client takes over. Restart 1 of 1.")
 
 
-def test_a_killed_client_that_nobody_replaces_ends_the_run_at_once(clients, process_ids, taking):
+def test_killed_elastic_client_without_restart_ends_run(clients, process_ids, taking):
     settings = {"num_clients": 2, "env_kwargs": {"pace": 0.003}}
     with (
         pytest.raises(
@@ -71,7 +71,7 @@ def test_a_killed_client_that_nobody_replaces_ends_the_run_at_once(clients, proc
         rows.take(600)
 
 
-def test_a_stopped_client_is_given_up(local, clients, process_ids, taking, said, unhurried):
+def test_stopped_elastic_client_times_out(local, clients, process_ids, taking, said, unhurried):
     """The client and its workers stop. No instance needs a restart for that."""
     settings = {"num_clients": 3, "env_kwargs": {"pace": 0.003}}
     timeout = unhurried(2.0)
@@ -88,7 +88,9 @@ def test_a_stopped_client_is_given_up(local, clients, process_ids, taking, said,
     assert re.search(r"was cut off. It has not answered for \d+ s: it is stopped, or hangs", text)
 
 
-def test_a_client_that_stops_at_the_end_ends_nothing(clients, process_ids, taking, said, unhurried):
+def test_elastic_client_timeout_at_end_of_run_is_harmless(
+    clients, process_ids, taking, said, unhurried
+):
     settings = {"num_clients": 2, "max_clients": 1, "timeout": unhurried(2.0)}
     with clients(WANDERER, run_ahead=0, **settings) as source:
         taking(source).take(8)
@@ -100,7 +102,7 @@ def test_a_client_that_stops_at_the_end_ends_nothing(clients, process_ids, takin
     assert text.endswith("The run was ending, and it has all its rows.")
 
 
-def test_clients_that_cannot_start_end_the_run_at_once(clients, monkeypatch, said):
+def test_elastic_clients_that_cannot_start_end_run_at_once(clients, monkeypatch, said):
     monkeypatch.setattr(sys, "executable", "/bin/false")
     with (
         pytest.raises(
@@ -120,7 +122,7 @@ def test_clients_that_cannot_start_end_the_run_at_once(clients, monkeypatch, sai
     ("elastic", "name"),
     [({"min_clients": 4}, rf"client \d on {HOST}"), ({}, r"its client at 127\.0\.0\.1:\d+")],
 )
-def test_a_slow_client_is_named_once(clients, taking, said, monkeypatch, elastic, name):
+def test_straggler_client_is_reported_once(clients, taking, said, monkeypatch, elastic, name):
     monkeypatch.setattr("physx_core.workers.server.pace._HELD", 0.5)
     environment = f"{PROGRAMS / 'elastic_envs.py'}:Slow"
     with clients(environment, num_clients=4, run_ahead=4, **elastic) as source:
@@ -135,7 +137,7 @@ def test_a_slow_client_is_named_once(clients, taking, said, monkeypatch, elastic
 
 @pytest.mark.slow
 @pytest.mark.faults
-def test_a_client_that_is_unplugged_is_given_up(
+def test_network_loss_of_elastic_client_is_detected(
     local, by_hand, join, another_machine, port, taking, said
 ):
     settings = {"num_clients": 3, "env_kwargs": {"pace": 0.002}}
@@ -168,7 +170,7 @@ def wait_for(said, pattern):
 
 
 @pytest.mark.parametrize("launcher", ["physx/subprocess", "physx/manual"])
-def test_nothing_is_left_of_a_run_that_is_killed(join, port, launcher):
+def test_killed_elastic_run_leaves_no_process(join, port, launcher):
     """What the environments started is gone, too, as `nothing_stays_behind` checks."""
     options = {"num-clients": 3, "max-clients": 2, "port": port, "launcher": launcher}
     words = [word for name, value in options.items() for word in (f"--environment.{name}", value)]
@@ -193,7 +195,7 @@ def test_nothing_is_left_of_a_run_that_is_killed(join, port, launcher):
 
 
 @pytest.mark.parametrize("fault", ["kill", "stop", "leave"])
-def test_a_worker_that_breaks_is_started_again(local, clients, taking, said, fault, unhurried):
+def test_failed_elastic_worker_is_restarted(local, clients, taking, said, fault, unhurried):
     settings = {"num_clients": 3, "env_kwargs": {"pace": 0.002}}
     timeout = unhurried(2.0) if fault == "stop" else 60.0
     broken = {**settings, "env_kwargs": {"pace": 0.002, "fault": fault, "at": 7}}
@@ -206,7 +208,7 @@ def test_a_worker_that_breaks_is_started_again(local, clients, taking, said, fau
     assert re.match(f"{WORKER} {HOW[fault]}", text)
 
 
-def test_a_worker_that_breaks_too_often_is_named_with_its_client_and_its_host(clients):
+def test_elastic_worker_beyond_restart_limit_is_reported_with_host(clients):
     kwargs = {"fault": "kill", "at": 7}
     with (
         pytest.raises(ClientError, match=f"{WORKER} {HOW['kill']}") as caught,
@@ -218,7 +220,7 @@ def test_a_worker_that_breaks_too_often_is_named_with_its_client_and_its_host(cl
     assert caught.value.exit_status == -signal.SIGKILL
 
 
-def test_an_error_of_an_environment_ends_the_run(clients):
+def test_environment_error_ends_elastic_run(clients):
     kwargs = {"fault": "fail", "at": 3}
     with (
         pytest.raises(EnvironmentFailedError, match="no more beans"),
@@ -242,7 +244,7 @@ def test_an_error_of_an_environment_ends_the_run(clients):
         (b"\xff" * 100, "not a physx message"),
     ],
 )
-def test_a_client_that_breaks_the_protocol_is_cut_off(
+def test_protocol_violation_disconnects_elastic_client(
     by_hand, join, port, taking, said, message, text
 ):
     join("--instance", "1")

@@ -13,6 +13,7 @@ from pathlib import Path
 import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
+from sizes import trials
 
 pytestmark = pytest.mark.processes
 
@@ -96,9 +97,9 @@ OPTIONS = {
 }
 
 
-@settings(max_examples=3, **OPTIONS)
+@settings(max_examples=trials(3, 2), **OPTIONS)
 @given(st.lists(ACTION, min_size=2, max_size=6), st.booleans())
-def test_any_history_gives_the_same_rows(
+def test_any_elastic_history_gives_same_rows(
     local, by_hand, join, process_ids, taking, said, caplog, history, asks
 ):
     caplog.set_level("INFO", "physx")
@@ -107,9 +108,9 @@ def test_any_history_gives_the_same_rows(
 
 @pytest.mark.slow
 @pytest.mark.faults
-@settings(max_examples=5, **OPTIONS)
+@settings(max_examples=trials(5, 2), **OPTIONS)
 @given(st.lists(ACTION, min_size=5, max_size=12), st.booleans())
-def test_any_long_history_gives_the_same_rows(
+def test_any_long_elastic_history_gives_same_rows(
     local, by_hand, join, process_ids, taking, said, caplog, history, asks
 ):
     caplog.set_level("INFO", "physx")

@@ -150,7 +150,7 @@ def notes(tmp_path):
 
 
 @pytest.mark.parametrize("reference", [CommandLauncher, f"{HERE}:CommandLauncher"])
-def test_a_launcher_of_ones_own_starts_the_clients(clients, notes, reference):
+def test_custom_launcher_starts_clients(clients, notes, reference):
     settings = {"launcher": reference, "launcher_kwargs": {"notes": str(notes)}}
     with clients(num_clients=2, **settings) as source:
         assert source.batch(4)["env_id"].tolist() == [1, 2, 1, 2]
@@ -160,7 +160,7 @@ def test_a_launcher_of_ones_own_starts_the_clients(clients, notes, reference):
     assert said.endswith("the run has ended\n")
 
 
-def test_a_launcher_of_ones_own_starts_a_client_again(clients, notes):
+def test_custom_launcher_restarts_client(clients, notes):
     settings = {"launcher": CommandLauncher, "launcher_kwargs": {"notes": str(notes)}}
     kwargs = {"fault": "fail", "at": 3}
     wanderer = f"{HERE.parents[1] / 'programs' / 'restart_envs.py'}:Wanderer"
@@ -171,7 +171,7 @@ def test_a_launcher_of_ones_own_starts_a_client_again(clients, notes):
 
 
 @pytest.mark.parametrize("ip_address", ["127.0.0.1", "127.0.0.2", "0.0.0.0"])
-def test_the_server_listens_where_clients_elsewhere_reach_it(clients, notes, ip_address):
+def test_server_listens_on_address_reachable_by_remote_clients(clients, notes, ip_address):
     settings = {"launcher": FarLauncher, "launcher_kwargs": {"notes": str(notes)}}
     with clients(num_clients=2, ip_address=ip_address, **settings) as source:
         assert source.batch(2)["env_id"].tolist() == [1, 2]
@@ -180,13 +180,13 @@ def test_the_server_listens_where_clients_elsewhere_reach_it(clients, notes, ip_
     assert (notes / "closed").read_text().count("the run has ended") == 2
 
 
-def test_the_run_says_what_an_absent_client_waits_for(clients):
+def test_run_reports_what_a_queued_client_waits_for(clients):
     error = r"(?s)did not connect for 0\.5 s while the server waited for it: pending \(Resources\)"
     with pytest.raises(ClientError, match=error), clients(launcher=IdleLauncher, timeout=0.5):
         pass
 
 
-def test_the_time_of_a_client_begins_when_it_is_not_queued_any_more(clients, caplog):
+def test_timeout_of_queued_client_starts_when_it_runs(clients, caplog):
     settings = {"launcher": IdleLauncher, "launcher_kwargs": {"queued": 6.0}, "timeout": 0.5}
     began = time.monotonic()
     with pytest.raises(ClientError, match="did not connect"), clients(**settings):
@@ -196,7 +196,7 @@ def test_the_time_of_a_client_begins_when_it_is_not_queued_any_more(clients, cap
     assert "once it has left the queue" in caplog.text
 
 
-def test_a_launcher_that_forgets_its_handles_is_named(clients):
+def test_launcher_without_handles_is_an_error(clients):
     with (
         pytest.raises(ClientError, match=r"ForgetfulLauncher\.launch\(\) returned no handle"),
         clients(launcher=ForgetfulLauncher),
@@ -212,12 +212,12 @@ def test_a_launcher_that_forgets_its_handles_is_named(clients):
         ({"launcher": "physx/manuel"}, ComponentNotFoundError, 'Did you mean "manual"'),
     ],
 )
-def test_an_unfit_launcher_is_named(clients, settings, error, text):
+def test_invalid_launcher_is_an_error(clients, settings, error, text):
     with pytest.raises(error, match=text), clients(**settings):
         pass
 
 
-def test_the_launchers_of_the_core_come_through_the_hook():
+def test_core_launchers_are_registered_by_hook():
     assert plugins.resolve("launcher", "physx/subprocess") is SubprocessLauncher
     assert plugins.resolve("launcher", "physx/manual") is ManualLauncher
     assert "launcher" in plugins.kind_names()
@@ -227,7 +227,7 @@ def test_the_launchers_of_the_core_come_through_the_hook():
 # Processes --------------------------------------------------------------------------------------
 
 
-def test_clients_are_bound_to_processor_cores_in_turn(clients, services):
+def test_affinity_pins_clients_to_cores_in_turn(clients, services):
     cores = sorted(os.sched_getaffinity(0))
     settings = {"num_clients": 3, "launcher_kwargs": {"affinity": True}}
     with clients(f"{HERE}:Bound", **settings) as source:
@@ -237,13 +237,13 @@ def test_clients_are_bound_to_processor_cores_in_turn(clients, services):
     assert sorted(os.sched_getaffinity(0)) == cores
 
 
-def test_a_process_that_cannot_be_started_leaves_none_behind(clients, monkeypatch):
+def test_failed_start_leaves_no_process(clients, monkeypatch):
     monkeypatch.setattr(sys, "executable", "/nonexistent/python")
     with pytest.raises(ClientError, match="Client 1 could not be started"), clients(num_clients=2):
         pass
 
 
-def test_the_token_is_where_only_the_owner_reads_it():
+def test_token_has_owner_only_permissions():
     token = "a token that nobody sees"
     process = ClientProcess(1, "127.0.0.1:1", token)
     process.start()

@@ -47,7 +47,7 @@ def gone_after(numbers, seconds):
 # Joining, leaving, taking over ------------------------------------------------------------------
 
 
-def test_clients_join_a_waiting_run_and_say_what_they_do(by_hand, join, port, caplog):
+def test_manual_clients_join_waiting_run(by_hand, join, port, caplog):
     ours = [join("--instance", "2"), join()]  # nothing listens yet
     with by_hand(num_clients=2) as source:
         batch = {name: values.copy() for name, values in source.batch(6).items()}
@@ -66,7 +66,7 @@ def test_clients_join_a_waiting_run_and_say_what_they_do(by_hand, join, port, ca
     assert TOKEN not in caplog.text
 
 
-def test_the_server_says_now_and_then_what_it_waits_for(by_hand, caplog, monkeypatch):
+def test_server_reports_missing_manual_clients(by_hand, caplog, monkeypatch):
     monkeypatch.setattr("physx_core.workers.server.client_group._SAY_EVERY", 0.2)
     with (
         pytest.raises(ClientError, match=r"Client 1 did not connect for 3 s"),
@@ -78,7 +78,7 @@ def test_the_server_says_now_and_then_what_it_waits_for(by_hand, caplog, monkeyp
     assert "has been waiting for a client to run instance 1, 2 for 3 s" in texts[-1]
 
 
-def test_another_client_takes_the_place_of_one_that_leaves(local, by_hand, join, caplog):
+def test_manual_client_replaces_one_that_left(local, by_hand, join, caplog):
     settings = {"num_clients": 2, "env_kwargs": {"pace": 0.002, "asks": True}}
     with local(WANDERER, **settings) as source:
         expected = source.batch(60)
@@ -100,7 +100,7 @@ def test_another_client_takes_the_place_of_one_that_leaves(local, by_hand, join,
     assert "The run waits up to 20 s for another client to take its place" in text
 
 
-def test_a_place_that_nobody_takes_ends_the_run(by_hand, join, unhurried):
+def test_missing_manual_client_ends_run_after_timeout(by_hand, join, unhurried):
     client, timeout = join(), unhurried(2.0)
     assert "connecting to the server" in client.stdout.readline()
     with (
@@ -115,7 +115,7 @@ def test_a_place_that_nobody_takes_ends_the_run(by_hand, join, unhurried):
             source.batch(1)
 
 
-def test_a_client_too_many_is_told_so(by_hand, join):
+def test_surplus_manual_client_is_refused(by_hand, join):
     join("--instance", "1")
     with by_hand() as source:
         rest = [join(), join("--instance", "1"), join("--instance", "2")]
@@ -127,7 +127,7 @@ def test_a_client_too_many_is_told_so(by_hand, join):
         assert "The server has no place for " in process.stderr.read()
 
 
-def test_an_environment_that_fails_is_told_on_both_sides(by_hand, join):
+def test_environment_failure_is_reported_on_both_sides(by_hand, join):
     client = join()
     kwargs = {"fault": "fail", "who": 1}
     with pytest.raises(Exception, match="no more beans"), by_hand(WANDERER, env_kwargs=kwargs) as s:
@@ -137,7 +137,7 @@ def test_an_environment_that_fails_is_told_on_both_sides(by_hand, join):
     assert "EnvironmentFailedError: Instance 1 raised in step() at step 5" in said
 
 
-def test_a_client_gives_up_after_a_while(join):
+def test_manual_client_connection_timeout(join):
     began = time.monotonic()
     client = join("--patience", "0.5")
     error = client.communicate(timeout=30)[1]
@@ -149,7 +149,7 @@ def test_a_client_gives_up_after_a_while(join):
 # Tokens -----------------------------------------------------------------------------------------
 
 
-def test_the_token_may_come_from_a_file(clients, join, port, tmp_path, monkeypatch):
+def test_token_from_file(clients, join, port, tmp_path, monkeypatch):
     monkeypatch.delenv("PHYSX_TOKEN")
     file = tmp_path / "token"
     file.write_text(f"{TOKEN}\n")
@@ -170,7 +170,9 @@ def test_the_token_may_come_from_a_file(clients, join, port, tmp_path, monkeypat
         (None, 0, "cannot be read"),
     ],
 )
-def test_an_unfit_token_file_is_refused(clients, join, tmp_path, content, mode, text):
+def test_token_file_with_wrong_permissions_or_content_is_refused(
+    clients, join, tmp_path, content, mode, text
+):
     file = tmp_path / "token"
     if content is not None:
         file.write_text(content)
@@ -182,7 +184,7 @@ def test_an_unfit_token_file_is_refused(clients, join, tmp_path, content, mode, 
     assert client.returncode == 1
 
 
-def test_clients_by_hand_and_addresses_that_others_reach_need_a_token(clients, monkeypatch):
+def test_manual_clients_and_public_addresses_require_token(clients, monkeypatch):
     monkeypatch.delenv("PHYSX_TOKEN", raising=False)
     with pytest.raises(ConfigError, match="PHYSX_TOKEN"), clients(launcher="physx/manual"):
         pass
@@ -195,7 +197,7 @@ def test_clients_by_hand_and_addresses_that_others_reach_need_a_token(clients, m
         source.batch(1)
 
 
-def test_a_client_without_a_token_is_told_so(monkeypatch, port):
+def test_client_without_token_is_refused(monkeypatch, port):
     environment = {name: value for name, value in os.environ.items() if name != "PHYSX_TOKEN"}
     command = [*CLIENT, "--connect", f"127.0.0.1:{port}"]
     done = subprocess.run(command, env=environment, capture_output=True, text=True, check=False)
@@ -224,7 +226,7 @@ def flood(kind, port, over, opened):
 
 
 @pytest.mark.parametrize("kind", ["silent", "talkative", "quick"])
-def test_a_flood_of_strangers_does_not_keep_a_late_client_out(by_hand, join, port, kind):
+def test_connection_flood_does_not_block_late_client(by_hand, join, port, kind):
     """Connections are opened as fast as it goes, and kept or closed at once."""
     over = threading.Event()
     opened = []
@@ -280,7 +282,7 @@ with ClientSource(config, Services(), [0]) as source:
 
 
 @pytest.mark.parametrize("pace", [0.01, 30.0])
-def test_clients_by_hand_leave_when_the_server_is_killed(join, port, pace):
+def test_manual_clients_exit_when_server_is_killed(join, port, pace):
     """The environments sleep for most of the time, and each has started a process."""
     started = [join(), join(start_new_session=True)]
     server = subprocess.Popen([sys.executable, "-c", SERVER, str(port), str(pace)])
@@ -311,9 +313,7 @@ def children_of(parent):
 # Another machine --------------------------------------------------------------------------------
 
 
-def test_a_client_on_another_machine_joins_with_the_token_and_not_without(
-    by_hand, join, port, another_machine
-):
+def test_remote_client_needs_token(by_hand, join, port, another_machine):
     prefix, address = another_machine.prefix, another_machine.address
     where = {"prefix": prefix, "address": f"{address}:{port}"}
     strangers = {**os.environ, "PHYSX_TOKEN": "another token than that"}

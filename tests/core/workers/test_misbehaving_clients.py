@@ -181,7 +181,7 @@ BEFORE = {
 
 
 @pytest.mark.parametrize("case", LATER)
-def test_a_bad_message_after_good_rows_is_reported(run_with, case):
+def test_malformed_message_after_rows_is_reported(run_with, case):
     message, text = LATER[case]
     error, stored = run_with((0, READY), (1, FIELDS), (2, rows(0, 1)), (3, message))
     assert type(error) is ClientError
@@ -193,7 +193,7 @@ def test_a_bad_message_after_good_rows_is_reported(run_with, case):
 
 
 @pytest.mark.parametrize("case", FIRST)
-def test_bad_fields_of_rows_are_reported(run_with, case):
+def test_malformed_fields_are_reported(run_with, case):
     message, text = FIRST[case]
     error, stored = run_with((0, READY), (2, message))
     assert str(error).startswith("Client 1 was cut off after 0 rows. ")
@@ -202,7 +202,7 @@ def test_bad_fields_of_rows_are_reported(run_with, case):
 
 
 @pytest.mark.parametrize("case", BEFORE)
-def test_a_bad_message_before_the_environment_is_ready_is_reported(run_with, case):
+def test_malformed_message_before_ready_is_reported(run_with, case):
     message, text = BEFORE[case]
     error, stored = run_with((0, message))
     assert str(error).startswith("Client 1 was cut off after 0 rows. ")
@@ -220,14 +220,14 @@ def test_huge_rows_are_rejected_before_anything_is_allocated(run_with, sizes):
 
 
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
-def test_rows_that_are_not_finite_are_not_stored(run_with, value):
+def test_nan_and_inf_rows_are_not_stored(run_with, value):
     error, stored = run_with((0, READY), (1, FIELDS), (2, rows(0, 1)), (3, rows(2, x=value)))
     assert type(error) is NotFiniteError
     assert (error.instance_id, error.field, error.step) == (1, "x", 2)
     assert stored == 2
 
 
-def test_a_client_that_reads_no_answers_is_cut_off(run_with, services):
+def test_client_that_reads_no_answers_is_disconnected(run_with, services):
     services.kept[1] = {"large": np.zeros(1 << 21)}
     requests = b"".join(pack(Kind.LOAD, encode(None), number) for number in range(1, 20))
     error, _ = run_with((0, READY), (1, requests), deaf=True)

@@ -23,7 +23,7 @@ pytestmark = pytest.mark.processes
 ENVS = Path(__file__).parents[1] / "programs" / "worker_envs.py"
 
 
-def test_what_a_client_process_sees(clients, services, monkeypatch):
+def test_environment_variables_of_client_process(clients, services, monkeypatch):
     monkeypatch.delenv("OMP_NUM_THREADS", raising=False)
     with clients("Surroundings"):
         pass
@@ -50,7 +50,7 @@ def test_the_token_is_not_on_the_command_line():
     assert b"secret" not in command
 
 
-def test_stop_ends_what_ignores_a_polite_signal(clients, services, tmp_path):
+def test_client_that_ignores_sigterm_is_killed(clients, services, tmp_path):
     script = tmp_path / "stubborn.py"
     script.write_text(
         "import signal, time\n"
@@ -102,7 +102,7 @@ def by_hand(clients, monkeypatch, port):
     return functools.partial(clients, "Plain", launcher="physx/manual", port=port, timeout=20.0)
 
 
-def test_clients_started_by_hand_join_with_the_token(by_hand, port):
+def test_manual_clients_join_with_token(by_hand, port):
     with hands(2, port) as processes:
         with by_hand(num_clients=2) as source:
             batch = source.batch(6)
@@ -111,13 +111,13 @@ def test_clients_started_by_hand_join_with_the_token(by_hand, port):
     assert list(batch["step"]) == [0, 0, 1, 1, 2, 2]
 
 
-def test_clients_started_by_hand_need_a_token(clients, monkeypatch):
+def test_manual_clients_require_token(clients, monkeypatch):
     monkeypatch.delenv("PHYSX_TOKEN", raising=False)
     with pytest.raises(ConfigError, match="PHYSX_TOKEN"), clients(launcher="physx/manual"):
         pass
 
 
-def test_a_client_without_a_place_is_told_so(by_hand, port):
+def test_client_without_free_slot_is_refused(by_hand, port):
     errors = []
 
     def join():
@@ -193,7 +193,7 @@ def test_ctrl_c_ends_server_and_clients(process_ids):
 
 
 @pytest.mark.parametrize("name", ["Walk", "Trouble"])
-def test_clients_end_when_their_server_is_killed(name, process_ids):
+def test_clients_exit_when_server_is_killed(name, process_ids):
     # Trouble: within a step that takes a minute
     kwargs = {"what": "sleep", "at": 2} if name == "Trouble" else {}
     server = start_server(name, **kwargs)

@@ -141,7 +141,7 @@ class Between:
 # What can be read on the way ------------------------------------------------------------------
 
 
-def test_who_records_the_traffic_reads_neither_token_nor_rows(local, clients, here, port, join):
+def test_tls_hides_token_and_rows_from_eavesdropper(local, clients, here, port, join):
     settings = {"num_clients": 1, "env_kwargs": {"pace": 0.0, "asks": True}}
     with local(WANDERER, **settings) as source:
         expected = source.batch(60)
@@ -170,7 +170,7 @@ def test_who_records_the_traffic_reads_neither_token_nor_rows(local, clients, he
     assert between.sent[0][:3] == b"\x16\x03\x01"
 
 
-def test_rows_of_another_machine_are_those_of_this_one_however_large(local, clients, here):
+def test_tls_client_rows_equal_local_rows_of_any_size(local, clients, here):
     for environment, rows, arguments in (("Walk", 6, {"size": 100_000}), (WANDERER, 200, {})):
         settings = {"num_clients": 2, "env_kwargs": arguments}
         with local(environment, **settings) as source:
@@ -183,16 +183,14 @@ def test_rows_of_another_machine_are_those_of_this_one_however_large(local, clie
                 assert batch[name].tobytes() == values.tobytes(), name
 
 
-def test_a_local_client_of_a_server_on_the_network_stays_plain(clients, another_machine):
+def test_local_client_of_public_server_uses_no_tls(clients, another_machine):
     with clients(num_clients=2, ip_address="0.0.0.0") as source:
         source.batch(4)
         peers = source._group.server.peers.values()
         assert [type(peer.link) for peer in peers] == [socket.socket] * 2
 
 
-def test_connections_that_are_forwarded_are_encrypted_whichever_side_sees_it(
-    clients, here, port, join
-):
+def test_forwarded_connections_use_tls(clients, here, port, join):
     settings = {"launcher": "physx/manual", "num_clients": 2, "port": port}
     with (
         Between("127.0.0.1", (here, port)) as to_network,
@@ -210,7 +208,7 @@ def test_connections_that_are_forwarded_are_encrypted_whichever_side_sees_it(
 
 
 @pytest.mark.parametrize("onward", ["encrypted", "plain"])
-def test_a_certificate_of_somebody_between_is_found_out(clients, here, port, join, onward):
+def test_tls_detects_man_in_the_middle(clients, here, port, join, onward):
     """He encrypts to the client with his own, and goes on to the server as he likes."""
     identity = Identity()
 
@@ -252,7 +250,7 @@ def memory_of(data):
     return other
 
 
-def test_plain_traffic_from_elsewhere_is_refused_though_it_knows_the_token(clients, here, port):
+def test_remote_client_without_tls_is_refused(clients, here, port):
     with clients(ip_address=here, port=port) as source:
 
         def talk(*messages):
@@ -292,7 +290,7 @@ def refusal(connection):
         introduce(connection, TOKEN, 0)
 
 
-def test_nobody_gets_a_client_on_another_machine_to_speak_plainly(here):
+def test_tls_downgrade_of_remote_client_is_impossible(here):
     """A server that asks for nothing better, and knows the token, receives no greeting."""
     heard = []
     with socket.create_server((here, 0)) as listener:
@@ -315,7 +313,7 @@ def test_nobody_gets_a_client_on_another_machine_to_speak_plainly(here):
 
 
 @pytest.mark.parametrize("place", ["loopback", "network"])
-def test_clients_of_the_version_before_are_told_both_versions(clients, here, port, place):
+def test_client_version_mismatch_names_both_versions(clients, here, port, place):
     host = here if place == "network" else "127.0.0.1"
     with (
         clients(ip_address=here if place == "network" else "0.0.0.0", port=port) as source,
@@ -333,7 +331,7 @@ def test_clients_of_the_version_before_are_told_both_versions(clients, here, por
 # Strangers and faults -------------------------------------------------------------------------
 
 
-def test_garbage_of_strangers_on_the_encrypted_port_disturbs_nobody(local, clients, here, port):
+def test_garbage_on_tls_port_is_harmless(local, clients, here, port):
     rng = random.Random(7)
     greeting = record_of_greeting()
     stop, tried = threading.Event(), []
@@ -392,7 +390,7 @@ def record_of_greeting():
 
 
 @pytest.mark.parametrize("who", ["client", "server"])
-def test_either_side_that_is_killed_is_noticed_by_the_other(
+def test_tls_peer_notices_kill_of_other_side(
     local, clients, here, port, join, another_machine, who, caplog, nothing_stays_behind
 ):
     settings = {"num_clients": 1, "env_kwargs": {"pace": 0.001}}

@@ -105,9 +105,7 @@ def test_rows_depend_on_the_seed_alone(simulated, batch_services, kill_one, asks
     assert len(hashes) == 1
 
 
-def test_the_run_ends_before_a_client_that_was_started_again_has_joined(
-    simulated, batch_services, simulation, caplog
-):
+def test_run_ends_before_restarted_client_joined(simulated, batch_services, simulation, caplog):
     arguments = {"fault": "dawdle", "place": "close", "pace": 0.1}
     source = simulated(WANDERER, num_clients=2, env_kwargs=arguments, run_ahead=0, restarts=1)
     with source:
@@ -133,7 +131,7 @@ def test_the_run_ends_before_a_client_that_was_started_again_has_joined(
         ("fail", "close"),
     ],
 )
-def test_a_client_that_breaks_is_started_again(
+def test_failed_client_is_restarted(
     local, simulated, batch_services, fresh_notes, caplog, fault, place
 ):
     settings = {"num_clients": 2, "env_kwargs": {"asks": True, "refuse": 3}}
@@ -171,9 +169,7 @@ def test_several_restarts_of_several_clients(local, simulated, fresh_notes, capl
     assert "Restart 2 of 2" in texts[2]
 
 
-def test_requests_go_through_the_network_in_the_batches_of_a_run_without_failure(
-    simulated, batch_services, fresh_notes
-):
+def test_restart_keeps_batches_of_prediction_requests(simulated, batch_services, fresh_notes):
     asked = []
     for fault in ("", "kill", "fail"):
         batch_services.sizes.clear()
@@ -189,7 +185,7 @@ def test_requests_go_through_the_network_in_the_batches_of_a_run_without_failure
     assert asked[2] == asked[0]
 
 
-def test_what_was_drawn_and_kept_is_not_repeated(simulated, services, fresh_notes):
+def test_restart_repeats_no_drawing_and_no_saved_parameters(simulated, services, fresh_notes):
     seen = []
     for fault in ("", "kill"):
         services.shown.clear()
@@ -206,7 +202,7 @@ def test_what_was_drawn_and_kept_is_not_repeated(simulated, services, fresh_note
     assert seen[0][1] == {1: 1, 2: 1}
 
 
-def test_rejected_rows_are_those_of_a_run_without_failure(simulated, fresh_notes):
+def test_restart_keeps_rejected_rows(simulated, fresh_notes):
     seen = []
     for fault in ("", "kill", "leave"):
         kwargs = {"refuse": 3, "fault": fault, "at": 11, "pace": 0.002}
@@ -221,7 +217,7 @@ def test_rejected_rows_are_those_of_a_run_without_failure(simulated, fresh_notes
     assert len(set(seen)) == 1
 
 
-def test_stored_rows_are_sent_again(simulated, fresh_notes):
+def test_restart_resends_stored_rows(simulated, fresh_notes):
     stored = [{"position": np.arange(12.0).reshape(6, 2) * k} for k in (1, 2, 3)]
     seen = []
     for fault in ("", "kill"):
@@ -238,7 +234,7 @@ def test_stored_rows_are_sent_again(simulated, fresh_notes):
     assert seen[0] == seen[1]
 
 
-def test_making_rows_again_is_not_taken_for_silence(simulated, caplog):
+def test_regenerating_rows_after_restart_is_no_timeout(simulated, caplog):
     """Making twelve rows again takes longer than a client may be silent."""
     timeout = 1.0
     kwargs = {"pace": timeout / 10, "fault": "kill", "at": 12, "who": 1}
@@ -254,7 +250,7 @@ def test_making_rows_again_is_not_taken_for_silence(simulated, caplog):
 @pytest.mark.parametrize(
     ("fault", "error"), [("kill", ClientError), ("fail", EnvironmentFailedError)]
 )
-def test_a_client_that_fails_too_often_ends_the_run(simulated, caplog, fresh_notes, fault, error):
+def test_client_beyond_restart_limit_ends_run(simulated, caplog, fresh_notes, fault, error):
     kwargs = {"fault": fault, "at": 3, "times": 9}
     with (
         pytest.raises(error, match="SIGKILL|no more beans"),
@@ -268,7 +264,7 @@ def test_a_client_that_fails_too_often_ends_the_run(simulated, caplog, fresh_not
     assert fresh_notes() == 4
 
 
-def test_what_would_come_again_is_raised_at_once(simulated, caplog, fresh_notes):
+def test_deterministic_error_is_not_restarted(simulated, caplog, fresh_notes):
     kwargs = {"fault": "refuse_rows", "at": 3, "times": 9}
     with (
         pytest.raises(SampleError, match="this would come again"),
@@ -300,9 +296,7 @@ def full_disk(monkeypatch, tmp_path):
 ASKS = {"num_clients": 2, "env_kwargs": {"asks": True}}
 
 
-def test_a_run_goes_on_at_the_limit_of_a_journal_and_says_so_once(
-    local, simulated, batch_services, said
-):
+def test_run_continues_at_journal_limit_with_one_warning(local, simulated, batch_services, said):
     expected = digest(run(local(WANDERER, **ASKS), [30, 30], apply=True))
     source = simulated(WANDERER, run_ahead=0, restarts=1, journal_size=2e-6, **ASKS)
     assert digest(run(source, [30, 30], apply=True)) == expected
@@ -312,7 +306,7 @@ def test_a_run_goes_on_at_the_limit_of_a_journal_and_says_so_once(
     assert all("journal_size = 2e-06 GB" in text for text in said())
 
 
-def test_a_client_that_ends_beyond_the_limit_of_its_journal_ends_the_run_with_the_reason(
+def test_client_crash_beyond_journal_limit_ends_run_with_reason(
     simulated, batch_services, simulation
 ):
     with simulated(WANDERER, run_ahead=0, restarts=3, journal_size=2e-6, **ASKS) as source:
@@ -325,9 +319,7 @@ def test_a_client_that_ends_beyond_the_limit_of_its_journal_ends_the_run_with_th
     assert "journal_size" in note
 
 
-def test_a_client_is_restarted_before_its_journal_reaches_the_limit(
-    local, simulated, batch_services, simulation, said
-):
+def test_restart_below_journal_limit(local, simulated, batch_services, simulation, said):
     expected = digest(run(local(WANDERER, **ASKS), [10, 90], apply=False))
     with simulated(WANDERER, run_ahead=0, restarts=1, journal_size=4e-6, **ASKS) as source:
         batches = [{name: rows.copy() for name, rows in source.batch(10).items()}]
@@ -339,7 +331,7 @@ def test_a_client_is_restarted_before_its_journal_reaches_the_limit(
     assert len(said("can no longer")) == 2
 
 
-def test_a_full_folder_for_temporary_files_is_named_and_the_run_goes_on(
+def test_full_temporary_folder_is_reported_and_run_continues(
     local, simulated, batch_services, full_disk, said
 ):
     expected = digest(run(local(WANDERER, **ASKS), [200], apply=True))
@@ -348,7 +340,7 @@ def test_a_full_folder_for_temporary_files_is_named_and_the_run_goes_on(
     assert len(said(f"cannot grow in {full_disk}: No space left")) == 2
 
 
-def test_a_full_folder_is_named_to_whom_a_restarted_client_cannot_be_told(full_disk):
+def test_full_temporary_folder_during_restart_is_an_error(full_disk):
     journal = Journal(2, 1e9)
     journal.record(pack(Kind.APPLY, bytes(3_000), 1))
     with pytest.raises(ClientError, match=rf"Client 2 .* {full_disk}, fails: No space .* TMPDIR"):
@@ -356,7 +348,7 @@ def test_a_full_folder_is_named_to_whom_a_restarted_client_cannot_be_told(full_d
     assert journal.order(0)
 
 
-def test_redrawn_parameters_begin_a_journal_anew(simulated, batch_services, said):
+def test_redraw_of_parameters_clears_journal(simulated, batch_services, said):
     journal = Journal(1, 10)
     journal.record(pack(Kind.APPLY, bytes(100), 1))
     assert journal.given_up
@@ -369,7 +361,7 @@ def test_redrawn_parameters_begin_a_journal_anew(simulated, batch_services, said
 # The journal ------------------------------------------------------------------------------------
 
 
-def test_a_journal_tells_again_what_was_told():
+def test_journal_replays_messages():
     journal = Journal(1, 1e9)
     told = [
         pack(Kind.CREDIT, number=2),
@@ -391,7 +383,7 @@ def test_a_journal_tells_again_what_was_told():
     journal.close()
 
 
-def test_a_journal_at_its_limit_is_given_up_once_its_client_has_been_told_everything(said):
+def test_journal_at_limit_is_dropped_once_client_is_up_to_date(said):
     journal = Journal(3, 1000)
     answers = [pack(Kind.ANSWER, b"x" * 400, number) for number in (1, 2, 3, 4)]
     for answer in answers[:3]:

@@ -16,7 +16,7 @@ from physx_core.workers.client.worker import run_client
 pytestmark = pytest.mark.processes
 
 
-def test_strangers_do_not_disturb_a_run(clients, port):
+def test_unauthenticated_connections_do_not_disturb_run(clients, port):
     stop_it = threading.Event()
     talked = []
 
@@ -62,7 +62,7 @@ def test_strangers_do_not_disturb_a_run(clients, port):
     assert len(talked) > 8
 
 
-def test_a_client_with_another_token_is_told_so(clients, port):
+def test_client_with_wrong_token_is_refused(clients, port):
     errors = []
 
     def join():
@@ -100,7 +100,7 @@ def test_a_client_does_not_trust_a_server_without_the_token():
 
 
 @pytest.mark.parametrize("address", ["127.0.0.1:1", "nonsense", "127.0.0.1:port", "a.invalid:80"])
-def test_nothing_at_the_address_is_an_error_that_names_it(address):
+def test_connection_refused_names_address(address):
     with pytest.raises(ConnectionRefusedByPeerError, match=address):
         run_client(address, "token" * 5, patience=1.0)
 

@@ -81,7 +81,9 @@ class WhileAttacked(DataGeneration):
 
 
 @pytest.mark.parametrize("frames", COUNTS)
-def test_frames_of_strangers_do_not_disturb_a_generation(rogue, port, frames, record_property):
+def test_fuzzed_frames_of_unauthenticated_connections_are_harmless(
+    rogue, port, frames, record_property
+):
     config = EnvironmentConfig(f"{ENVS}:Unhurried", num_clients=2, port=port, seed=1, timeout=20.0)
     with WhileAttacked(config, batch_nb=1, batch_size=16) as pipeline:
         pipeline.attacked_by(rogue(port, 0, frames, seed=frames))
@@ -207,7 +209,7 @@ def honest_clients(port, numbers):
 
 
 @pytest.mark.parametrize("frames", COUNTS)
-def test_frames_of_clients_harm_nobody_else(rogue, port, frames, record_property):
+def test_fuzzed_frames_of_client_do_not_affect_others(rogue, port, frames, record_property):
     attacked = Attacked(port, honest=2, rogues=2)
     server = attacked.server
     server.open()

@@ -44,7 +44,7 @@ def test_requests_of_all_instances_are_one_batch_whatever_their_speed(simulated,
     assert batch_services.asked == ["1"] + 10 * ["1 2 3"] + ["2 3"]
 
 
-def test_who_keeps_a_batch_of_requests_waiting_is_named(simulated, batch_services):
+def test_instance_that_delays_batch_of_requests_is_reported(simulated, batch_services):
     kwargs = {"what": "sleep", "who": 2, "at": 1}
     settings = {"num_clients": 2, "env_kwargs": kwargs, "timeout": 2.5}
     with (
@@ -70,7 +70,7 @@ def test_a_refused_prediction_is_the_error_of_the_services(local, simulated, ser
         assert note in ("in step() of instance 1", "in step() of instance 2")  # whoever was first
 
 
-def test_a_long_prediction_is_not_taken_for_silence(simulated, services, simulation):
+def test_long_prediction_is_no_timeout(simulated, services, simulation):
     quick = services.predict
 
     def predict(fields):
@@ -127,9 +127,7 @@ def test_drawing_events_arrive_exactly(local, simulated, services):
 DRAWING = {"visualizer": "any", "env_kwargs": {"pace": 1e-4}}
 
 
-def test_a_client_at_its_end_stays_until_the_server_has_read_what_it_sent(
-    simulated, services, simulation
-):
+def test_ending_client_waits_until_server_has_read_everything(simulated, services, simulation):
     """The server is slow, and the client comes to its end while thousands of messages wait."""
     shown, closing, ended = [], [], []
 
@@ -151,7 +149,7 @@ def test_a_client_at_its_end_stays_until_the_server_has_read_what_it_sent(
     assert closing[0].exit_status() == 0
 
 
-def test_what_a_client_sent_before_it_was_killed_is_read(simulated, services, simulation):
+def test_rows_sent_before_kill_are_read(simulated, services, simulation):
     """The server is slow, and thousands of messages of a client that is no more wait."""
     shown, killing = [], []
 
@@ -202,7 +200,7 @@ def test_options_arrive_exactly(simulated, services):
     assert type(back["scalar"]) is np.int16
 
 
-def test_options_that_cannot_travel_are_named_before_anything_starts(simulated):
+def test_unserializable_options_are_refused_before_start(simulated):
     message = r"env_kwargs'\]\['options'\]\['deep'\].*cannot be sent"
     kwargs = {"options": {"deep": object()}}
     with pytest.raises(UsageError, match=message), simulated("Echo", env_kwargs=kwargs):

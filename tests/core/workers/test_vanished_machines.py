@@ -34,7 +34,7 @@ def connected():
             yield near, far
 
 
-def test_the_system_probes_an_idle_connection_and_gives_it_up_in_time():
+def test_tcp_keepalive_detects_dead_connection_in_time():
     with connected() as (near, _):
         prepare_connection(near)
         assert near.getsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE)
@@ -48,7 +48,7 @@ def test_the_system_probes_an_idle_connection_and_gives_it_up_in_time():
 
 @pytest.mark.slow
 @pytest.mark.faults
-def test_a_peer_that_reads_nothing_for_a_while_is_alive():
+def test_slow_reader_is_not_taken_for_dead():
     with connected() as (near, far):
         prepare_connection(near)
         near.setblocking(False)
@@ -67,7 +67,7 @@ def test_a_peer_that_reads_nothing_for_a_while_is_alive():
 
 @pytest.mark.slow
 @pytest.mark.faults
-def test_a_client_that_is_unplugged_is_replaced_and_the_rows_are_the_same(
+def test_network_loss_restarts_client_with_same_rows(
     local, clients, another_machine, monkeypatch, port, caplog
 ):
     monkeypatch.setenv("PHYSX_TOKEN", TOKEN)

@@ -91,6 +91,7 @@ def test_fields_are_those_of_the_samples(drive):
         assert {name for name, role in roles.items() if role == "training"} == {"state", "torque"}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("arm", ARMS)
 def test_feed_forward_makes_the_arm_follow(arm, drive):
     def follow(feedforward, trajectory=0):

@@ -84,6 +84,7 @@ def errors(env, size, rest=0):
     return worst, tilt
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["dart", "pinocchio"])
 def test_roll_pitch_yaw_over_200_steps(backend):
     worst, tilt = errors(walker(backend=backend), 0.3, rest=80)

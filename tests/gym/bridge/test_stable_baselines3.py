@@ -9,6 +9,7 @@ import pytest
 from gymnasium.vector import AutoresetMode, SyncVectorEnv
 from hypothesis import stateful
 from hypothesis import strategies as st
+from sizes import trials
 
 from physx_core.errors import ConfigError, UsageError
 from physx_gym import ParallelVectorEnv, Policy
@@ -135,7 +136,8 @@ def test_any_history_is_that_of_stable_baselines3(kind):
     else:
         vector = SyncVectorEnv([Walk] * COUNT, autoreset_mode=SAME_STEP)
     machine = type(kind, (Histories,), {"vector": vector})
-    settings = hypothesis.settings(max_examples=20, stateful_step_count=15, deadline=None)
+    sizes = {"max_examples": trials(20, 8), "stateful_step_count": 15}
+    settings = hypothesis.settings(deadline=None, **sizes)
     try:
         stateful.run_state_machine_as_test(machine, settings=settings)
     finally:

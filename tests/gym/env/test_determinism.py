@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sizes import size
 
 from physx_gym import Layer, RobotEnv
 from physx_gym.spaces import copy_tree
@@ -178,7 +179,7 @@ class Wandering(RobotEnv):
 WAYS = ("place", "binding", "containers", "objects", "members")
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=size(25, 4), deadline=None)
 @given(st.lists(st.sampled_from(WAYS), min_size=1, max_size=6), st.integers(0, 5))
 def test_a_snapshot_has_the_future_of_a_copy(changes, steps):
     """Whatever attributes a subclass has, and however it changes them."""

@@ -137,6 +137,7 @@ def test_what_a_replay_shows_is_chosen(paths):
         replay(paths[0], trajectories="trunk", visualizer=Witness)
 
 
+@pytest.mark.slow
 def test_a_command_replays_with_ghosts(paths, tmp_path, capsys):
     path = tmp_path / "both.rrd"
     words = [str(paths[0]), "--replay", str(path), "--ghosts", str(paths[1])]

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from sizes import size
 
 from physx_core.errors import ConfigError, EpisodeError
 from physx_gym.telemetry.telemetry import MOST_IN_TRAINING, Telemetry
@@ -89,7 +90,7 @@ def test_variables_are_read_when_a_row_is_recorded():
     assert found["counts.0"].dtype == np.int64
 
 
-@settings(max_examples=60)
+@settings(max_examples=size(60, 7))
 @given(st.data())
 def test_any_arrangement_of_memory_is_recorded_in_order(data):
     base = np.arange(120.0).reshape(4, 5, 6)

@@ -20,6 +20,7 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
+from sizes import trials
 
 from physx_gym import ParallelVectorEnv
 
@@ -153,7 +154,7 @@ class Arrival(RuleBasedStateMachine):
 
 @pytest.mark.parametrize("mode", ["NextStep", "SameStep", "Disabled"])
 @pytest.mark.parametrize(
-    ("processes", "examples"), [(2, 15), pytest.param(5, 75, marks=pytest.mark.faults)]
+    ("processes", "examples"), [(2, 15), pytest.param(5, trials(75, 25), marks=pytest.mark.faults)]
 )
 def test_each_goes_its_way_under_any_order_of_calls_and_arrivals(
     mode, processes, examples, nothing_stays_behind

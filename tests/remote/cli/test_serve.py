@@ -161,7 +161,7 @@ def test_errors_say_what_to_do(capsys, monkeypatch, words, message):
     assert "Traceback" not in printed.err
 
 
-def test_a_token_file_that_others_may_read(capsys, tmp_path):
+def test_token_file_with_group_permissions_is_refused(capsys, tmp_path):
     file = tmp_path / "token"
     file.write_text("0123456789abcdef")
     file.chmod(0o644)

@@ -153,7 +153,7 @@ def test_configuration_reaches_the_application(application):
     env.close()
 
 
-def test_an_application_that_hangs_or_dies(application):
+def test_hang_or_crash_of_godot_application(application):
     process, address = application
     env = connected(address)
     env.reset()

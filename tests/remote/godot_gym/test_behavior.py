@@ -143,7 +143,7 @@ def test_waiting_after_slow_requests_takes_no_time_of_the_processor(peer, scene,
     assert time.monotonic() - begin >= 0.05, "nothing came, so it waited"
 
 
-def test_a_client_that_is_never_silent_keeps_nobody_out(in_thread, scene, peer_class, message):
+def test_busy_client_does_not_starve_others(in_thread, scene, peer_class, message):
     service = in_thread(scene, clients="serve")
     called, over = threading.Event(), threading.Event()
     scene.communication.after(0.01, called.set)
@@ -210,7 +210,7 @@ def test_fifty_clients_where_only_one_is_wanted(start, scene, peer_class, messag
 
 
 @pytest.mark.parametrize("length", [1 << 30, (1 << 32) - 1, (1 << 24) + 1])
-def test_a_length_that_is_a_lie_takes_no_memory(peer, peer_class, scene, length):
+def test_false_message_length_allocates_no_memory(peer, peer_class, scene, length):
     peer.send(length.to_bytes(4, "little") + b"x" * 100)
     assert peer.answer() is None
     assert scene.communication.connections == []

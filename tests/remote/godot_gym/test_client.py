@@ -101,7 +101,7 @@ MESSAGES = Messages.of_fields(agent=[Field("a", (1,))])
 
 
 @pytest.mark.parametrize("part", [b"", b"\x08\0", b"\x08\0\0\0", b"\x08\0\0\0\x0a\x06"])
-def test_an_end_of_the_connection_raises(part):
+def test_closed_connection_raises(part):
     with Stub(bytes(4), part) as stub, GodotGymClient(MESSAGES, stub.address) as client:
         assert client.request({}) == {"agent": None, "world": None}
         with pytest.raises(RemoteClosedError, match="closed the connection"):
@@ -110,7 +110,7 @@ def test_an_end_of_the_connection_raises(part):
             client.request({})
 
 
-def test_an_answer_that_does_not_come_in_time():
+def test_answer_timeout():
     with Stub(None) as stub, GodotGymClient(MESSAGES, stub.address, timeout=0.05) as client:
         with pytest.raises(RemoteTimeoutError, match=r"within 0\.05 s"):
             client.request({})
@@ -125,7 +125,7 @@ def test_an_answer_that_does_not_come_in_time():
         (struct.pack("<I", 4) + b"\x0a\xff\xff\xff", "4 bytes does not fit the given messages"),
     ],
 )
-def test_an_answer_that_is_too_long_or_nonsense(answer, said):
+def test_oversized_or_malformed_answer_is_an_error(answer, said):
     with (
         Stub(answer) as stub,
         GodotGymClient(MESSAGES, stub.address) as client,

@@ -185,7 +185,7 @@ def test_a_step_that_waits_for_nonsense(peer, peer_class, scene):
         b'\x0d\0\0\0{"action": 1}\x10\0\0',
     ],
 )
-def test_a_client_that_leaves_at_any_moment(peer, peer_class, scene, how, sent):
+def test_client_disconnect_at_any_moment(peer, peer_class, scene, how, sent):
     assert peer.ask({"action": [1]}) == b""
     leaving = peer_class(peer.service.address, peer.service)
     peer.leave()
@@ -199,7 +199,7 @@ def test_a_client_that_leaves_at_any_moment(peer, peer_class, scene, how, sent):
 
 
 @pytest.mark.parametrize("how", ["fin", "rst"])
-def test_a_client_that_leaves_in_the_middle_of_a_step(peer, peer_class, scene, how, message):
+def test_client_disconnect_during_step(peer, peer_class, scene, how, message):
     peer.ask({"config": {"environment": {"time_speed": 0.25}}})
     peer.send(message({"action": [1]}))
     while scene.agent.frames < 1:
@@ -221,7 +221,7 @@ def test_a_client_that_says_all_at_once_and_then_only_reads(peer, message):
     assert peer.answer() is None
 
 
-def test_a_client_that_does_not_read_keeps_nobody_else_waiting(start, scene, peer_class, message):
+def test_client_that_does_not_read_blocks_nobody(start, scene, peer_class, message):
     service = start(scene, clients="serve")
     deaf, other = (peer_class(service.address, service) for _ in range(2))
     scene.agent.get_data = lambda request, storage: setattr(storage, "frame", bytes(1 << 20))
@@ -239,7 +239,7 @@ def test_a_client_that_does_not_read_keeps_nobody_else_waiting(start, scene, pee
 # Floods, lies and silence ----------------------------------------------------------------------
 
 
-def test_a_length_of_a_gigabyte(peer, peer_class, caplog):
+def test_message_length_of_a_gigabyte_is_refused(peer, peer_class, caplog):
     peer.send(struct.pack("<I", 1 << 30) + b"{")
     assert peer.answer() is None
     assert "1073741824 bytes" in caplog.text
@@ -253,7 +253,7 @@ def test_requests_before_a_lie_are_answered(peer, message):
     assert [peer.answer() for _ in range(3)] == [ALIVE, ALIVE, None]
 
 
-def test_who_is_silent_keeps_nobody_waiting(peer, peer_class):
+def test_silent_client_blocks_nobody(peer, peer_class):
     silent = [peer_class(peer.service.address) for _ in range(5)]
     silent[0].send(b"\x20\0\0\0{")
     assert peer.ask(LIVES) == ALIVE
@@ -321,7 +321,7 @@ def test_more_clients_than_there_may_be(start, scene, peer_class, caplog):
         peer.leave()
 
 
-def test_clients_that_never_ask_keep_nobody_out(start, scene, peer_class, caplog):
+def test_idle_clients_do_not_exhaust_connections(start, scene, peer_class, caplog):
     service = start(scene, max_clients=4)
     idle = []
     for _ in range(50):

@@ -100,7 +100,7 @@ def test_an_error_of_the_environment_is_told_and_all_agents_begin_anew(trainer, 
     assert [seen["level"] for seen in moved["obs"]] == [1, 1]
 
 
-def test_a_length_beyond_the_limit_ends_the_service(trainer, caplog):
+def test_message_length_beyond_limit_ends_service(trainer, caplog):
     one = trainer()
     one.socket.sendall(struct.pack("<I", 1 << 30))
     with pytest.raises(RemoteError, match=f"The trainer at .* is lost: .*{1 << 30}"):
@@ -137,7 +137,7 @@ def test_the_service_ends_with_its_trainer(trainer, cart, state, end):
     assert [cart.closed for cart in carts] == [1, 1]
 
 
-def test_a_trainer_that_dies_while_a_step_runs(trainer, cart):
+def test_trainer_crash_during_step(trainer, cart):
     class Slow(cart):
         def step(self, action):
             if self.steps == 1:

@@ -117,6 +117,7 @@ def test_clean_rl_sees_the_episodes_of_an_environment_in_this_process(train):
     assert len({tuple(observation) for observation in first}) == 3, "agents differ"
 
 
+@pytest.mark.faults
 def test_stable_baselines_learns_in_environments_that_its_wrapper_starts(train, tmp_path):
     launcher = write_launcher(tmp_path / "cart.x86_64", "gym/CartPole-v1", num_worlds=2)
     told = train("stable_baselines", launcher)
@@ -233,7 +234,7 @@ def test_the_command_says_why_it_ends(port, capsys):
 
 
 @pytest.mark.parametrize("is_told", [False, True])
-def test_the_process_ends_with_its_trainer_or_by_a_signal(is_told):
+def test_process_exits_with_trainer_or_on_signal(is_told):
     with socket.create_server(("127.0.0.1", 0)) as listener:
         words = ["gym/CartPole-v1", f"--port={listener.getsockname()[1]}"]
         process = subprocess.Popen([sys.executable, "-m", MODULE, *words])

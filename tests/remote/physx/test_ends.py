@@ -154,7 +154,7 @@ def test_what_is_no_service(said):
         (NOTHING, pack(Kind.ANSWER, b"\xff" * 40, 1), "damaged"),
     ],
 )
-def test_a_misbehaving_service(introduction, answer, message):
+def test_malformed_answers_of_service_are_errors(introduction, answer, message):
     def work(guest):
         handshake, reader = ServerHandshake(TOKEN), FrameReader(1000)
         guest.sendall(handshake.answer(reader.read(guest)))

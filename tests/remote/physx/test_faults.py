@@ -117,14 +117,14 @@ def _is_closed(stranger):
     ],
     ids=["http", "noise", "1GB", "257B", "twice", "lie", "proof", "magic", "short", "request"],
 )
-def test_strangers_are_turned_away(service, said):
+def test_malformed_handshake_is_refused(service, said):
     with _raw(service) as stranger:
         stranger.sendall(said)
         assert _is_closed(stranger)
     assert lives(service)
 
 
-def test_another_version_of_the_handshake(service):
+def test_handshake_version_mismatch_is_refused(service):
     with _raw(service) as stranger:
         stranger.sendall(pack(Kind.HELLO, struct.pack("<8sI32s", b"physxtcp", 9, bytes(32))))
         length, kind, _, _ = HEADER.unpack(_exactly(stranger, HEADER.size))
@@ -132,7 +132,7 @@ def test_another_version_of_the_handshake(service):
     assert lives(service)
 
 
-def test_neither_side_trusts_one_with_another_token(service):
+def test_wrong_token_is_refused_by_both_sides(service):
     with pytest.raises(RemoteError, match="does not know this client's token"):
         connect(_text(service), token="another-token-of-good-length")
     assert lives(service)
@@ -144,7 +144,7 @@ def test_a_client_that_wants_to_run_an_instance(service):
     assert lives(service)
 
 
-def test_silent_strangers_are_closed(serving, env):
+def test_silent_connections_are_closed_after_timeout(serving, env):
     service = serving(env, handshake_timeout=0.05)
     with _raw(service) as silent, _raw(service) as half, _raw(service) as slow:
         half.sendall(HELLO)
@@ -182,7 +182,7 @@ def test_too_many_clients(serving, env):
     assert lives(service)
 
 
-def test_strangers_take_no_places_of_those_who_know_the_token(serving, env):
+def test_unauthenticated_connections_take_no_client_slots(serving, env):
     service = serving(env, max_clients=4)
     with contextlib.ExitStack() as stack:
         for _ in range(50):
@@ -202,7 +202,7 @@ def test_strangers_take_no_places_of_those_who_know_the_token(serving, env):
         ([-np.inf, 0.0], r"The action\[0\] of world 0 is -inf"),
     ],
 )
-def test_actions_that_are_not_finite_are_refused(service, env, value, said, caplog):
+def test_nan_actions_are_refused(service, env, value, said, caplog):
     with connect(_text(service), token=TOKEN) as client:
         client.reset()
         with pytest.raises(RequestError, match=said):
@@ -240,7 +240,7 @@ def test_discrete_actions_beyond_their_range_are_refused(serving):
     ],
     ids=["noise", "1GB", "kind", "spare", "values", "json", "empty"],
 )
-def test_what_is_no_message_ends_the_connection(service, said):
+def test_malformed_message_closes_connection(service, said):
     link = PhysxLink(service.address, ACT, token=TOKEN)
     link.send(said)
     with pytest.raises(RemoteClosedError):
@@ -272,7 +272,7 @@ def test_what_is_no_message_ends_the_connection(service, said):
         (Kind.SETUP, {"do": "last"}),
     ],
 )
-def test_requests_that_cannot_be_carried_out_are_answered(service, kind, value):
+def test_invalid_requests_are_answered_with_errors(service, kind, value):
     link = PhysxLink(service.address, ACT, token=TOKEN)
     link.send(pack_value(kind, value, "request", 5))
     frame = link.receive()
@@ -298,7 +298,7 @@ def test_requests_byte_by_byte_and_all_at_once(service):
 
 @pytest.mark.parametrize("how", ["fin", "rst"])
 @pytest.mark.parametrize("state", ["guest", "half a proof", "actor", "half a request", "answer"])
-def test_a_client_that_is_gone(service, state, how):
+def test_client_disconnect_frees_its_slot(service, state, how):
     if state in ("guest", "half a proof"):
         gone = _raw(service)
         gone.sendall(HELLO + pack(Kind.PROOF, bytes(32))[: 20 * (state != "guest")])
@@ -313,7 +313,7 @@ def test_a_client_that_is_gone(service, state, how):
     assert lives(service)
 
 
-def test_a_client_that_leaves_in_the_middle_of_a_step(service, env):
+def test_client_disconnect_during_step(service, env):
     leaving = PhysxLink(service.address, ACT, token=TOKEN)
     leaving.send(pack_value(Kind.REQUEST, {"do": "reset"}, "request", 1))
     leaving.receive()
@@ -355,7 +355,7 @@ def test_one_world_of_several_fails(serving):
         assert steps.tolist() == [2, 1, 1], "the first had made its step"
 
 
-def test_an_answer_that_takes_too_long(service, env):
+def test_slow_answer_raises_timeout(service, env):
     late = connect(_text(service), token=TOKEN)
     late.reset()
     late.client.timeout = 0.05

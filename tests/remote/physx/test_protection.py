@@ -77,7 +77,7 @@ def test_large_observations_infos_and_observers_over_an_encrypted_connection(ser
         assert all(isinstance(one.link, SecureSocket) for one in service.connections)
 
 
-def test_on_the_loopback_interface_it_stays_plain(serving, another_machine):
+def test_loopback_service_uses_no_tls(serving, another_machine):
     service = serving(Wide, address="0.0.0.0")
     port = service.address[1]
     with contextlib.closing(connect(f"127.0.0.1:{port}", token=TOKEN)) as near:
@@ -85,7 +85,7 @@ def test_on_the_loopback_interface_it_stays_plain(serving, another_machine):
         assert [type(one.link) for one in service.connections] == [socket.socket]
 
 
-def test_a_client_that_does_not_encrypt_is_refused_and_a_wrong_token_too(serving, here):
+def test_client_without_tls_or_with_wrong_token_is_refused(serving, here):
     service = serving(Wide, address=here)
     with (
         socket.create_connection(service.address, PATIENCE) as plain,
@@ -98,7 +98,7 @@ def test_a_client_that_does_not_encrypt_is_refused_and_a_wrong_token_too(serving
         env.reset()
 
 
-def test_somebody_between_with_a_certificate_of_his_own_is_found_out(serving, here):
+def test_tls_detects_man_in_the_middle_of_service(serving, here):
     service = serving(Wide, address=here)
     heard = []
     with socket.create_server((here, 0)) as listener:

@@ -132,7 +132,7 @@ FIELD = {"name": "a", "shape": [], "dtype": "<f4"}
         b"",
     ],
 )
-def test_a_description_that_is_a_lie(liar, description):
+def test_malformed_description_is_an_error(liar, description):
     with pytest.raises(RemoteError):
         connect(liar(answering(description)), "godot-gym", timeout=20.0)
 
@@ -149,7 +149,7 @@ def test_a_description_that_is_a_lie(liar, description):
         b"",
     ],
 )
-def test_an_answer_that_is_a_lie(liar, answer):
+def test_malformed_answer_is_an_error(liar, answer):
     with connect(liar(answering(described(), parts(), answer)), "godot-gym", timeout=20.0) as env:
         env.reset()
         with pytest.raises(RemoteProtocolError):
@@ -220,7 +220,7 @@ def trusted(introduction, *answers):
         b"\xff" * 64,
     ],
 )
-def test_an_introduction_that_is_a_lie(liar, client, introduction):
+def test_malformed_introduction_is_an_error(liar, client, introduction):
     with pytest.raises(RemoteError):
         client(liar(trusted(introduction)), token=TOKEN, timeout=20.0)
 
@@ -239,7 +239,7 @@ def test_an_introduction_that_is_a_lie(liar, client, introduction):
         {**STEPPED, "truncated": None},
     ],
 )
-def test_an_outcome_that_is_a_lie(liar, answer):
+def test_malformed_step_outcome_is_an_error(liar, answer):
     said = trusted(WORLDS, pack_value(Kind.ANSWER, answer, "", 1))
     with (
         contextlib.closing(connect_vector(liar(said), token=TOKEN, timeout=20.0)) as worlds,
@@ -257,7 +257,7 @@ def test_an_outcome_that_is_a_lie(liar, answer):
         {"infos": [{"a": 1}, {"a": "x"}], "left_out": []},
     ],
 )
-def test_infos_that_are_a_lie(liar, notes):
+def test_malformed_infos_are_an_error(liar, notes):
     said = pack_value(Kind.NOTES, notes, "", 1) + pack_value(Kind.ANSWER, STEPPED, "", 1)
     with (
         contextlib.closing(
@@ -268,7 +268,7 @@ def test_infos_that_are_a_lie(liar, notes):
         worlds.reset()
 
 
-def test_a_snapshot_that_is_a_lie(liar):
+def test_malformed_snapshot_is_an_error(liar):
     said = trusted({**WORLDS, "num_worlds": 1}, pack_value(Kind.ANSWER, "seven", "", 1))
     with (
         connect(liar(said), token=TOKEN, timeout=20.0) as env,
@@ -281,7 +281,7 @@ def test_a_snapshot_that_is_a_lie(liar):
     "change",
     [{"worlds": None}, {"worlds": np.zeros((2, 2))}, {"reward": "x"}, {"is_reset": np.zeros(3)}],
 )
-def test_a_change_that_is_a_lie(liar, change):
+def test_malformed_change_is_an_error(liar, change):
     seen = {"worlds": np.arange(2), "is_reset": np.bool_(True), **STEPPED, **change}
     said = pack_value(Kind.SETUP, WORLDS, "") + pack_value(Kind.SEEN, seen, "", 1)
     with (
@@ -304,7 +304,7 @@ def wait(guest):
 
 
 @pytest.mark.parametrize("said", [wait, drip])
-def test_silence_in_the_handshake_is_told_from_another_token(liar, said):
+def test_handshake_timeout_is_told_from_wrong_token(liar, said):
     began = time.monotonic()
     with pytest.raises(RemoteTimeoutError, match="did not answer within 1 s"):
         connect(liar(said), token=TOKEN, connect_timeout=0.5)
@@ -375,7 +375,7 @@ def application():
         DEEP,
     ],
 )
-def test_agents_that_are_a_lie(application, told):
+def test_malformed_agents_are_an_error(application, told):
     with pytest.raises(RemoteError):
         connect_vector(application(told), "godot-rl", timeout=20.0)
 
@@ -391,7 +391,7 @@ def test_agents_that_are_a_lie(application, told):
         DEEP,
     ],
 )
-def test_an_observation_that_is_a_lie(application, told):
+def test_malformed_observation_is_an_error(application, told):
     with (
         contextlib.closing(
             connect_vector(application(INFO, told), "godot-rl", timeout=20.0)
@@ -402,7 +402,7 @@ def test_an_observation_that_is_a_lie(application, told):
 
 
 @pytest.mark.parametrize("change", [{"reward": [10**400, 1]}, {"reward": None}, {"done": "no"}])
-def test_a_step_that_is_a_lie(application, change):
+def test_malformed_step_is_an_error(application, change):
     step = {**SEEN, "type": "step", "reward": [1, 2], "done": [False, True], **change}
     with (
         contextlib.closing(
@@ -414,7 +414,7 @@ def test_a_step_that_is_a_lie(application, change):
 
 
 @pytest.mark.parametrize("returns", [5, [1], None])
-def test_what_a_call_returns_that_is_a_lie(application, returns):
+def test_malformed_call_result_is_an_error(application, returns):
     told = {"type": "call", "returns": returns}
     with (
         contextlib.closing(

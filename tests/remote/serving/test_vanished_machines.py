@@ -94,7 +94,7 @@ def next_client(protocol, address):
 
 @pytest.mark.slow
 @pytest.mark.faults
-def test_whoever_is_unplugged_keeps_no_place_and_no_client_waiting(serve, far, another_machine):
+def test_network_loss_frees_slot_of_client(serve, far, another_machine):
     each = [(p, what) for p in ("physx", "godot-gym") for what in ("idle", "busy", "waiting")]
     services = {one: serve(one[0], another_machine.address) for one in each}
     address = {

@@ -31,6 +31,7 @@ def test_the_period_of_a_pendulum_is_that_of_the_elliptic_integral(
         np.testing.assert_allclose(2 * (crossings[1] - crossings[0]), period, rtol=accuracy)
 
 
+@pytest.mark.slow
 def test_a_symmetric_body_precesses_at_its_rate(backend):
     rod = Cylinder(name="rod", radius=0.1, length=0.6)
     with backend.build(World(objects=[rod], gravity=(0, 0, 0), integrator="rk4")) as simulation:

@@ -226,6 +226,7 @@ def test_a_quadruped_stands(engine, example):
         assert touched == {f"{leg}_foot" for leg in ("FL", "FR", "RL", "RR")}
 
 
+@pytest.mark.slow
 def test_legs_at_their_limits_carry_without_chatter(pinocchio):
     """What pushes joints over their limits are contacts: the free motion alone does not."""
     world = World([Robot("ant", fixed_base=False)], ground=Ground(), period=2e-3)

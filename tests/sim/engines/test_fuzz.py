@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+from sizes import trials
 
 pytestmark = pytest.mark.processes
 
@@ -164,4 +165,4 @@ def test_random_calls_return_or_are_rejected(engine):
 @pytest.mark.parametrize("engine", ["dart", "pinocchio"])
 @pytest.mark.parametrize("seed", [1, 2])
 def test_ten_thousand_random_calls_return_or_are_rejected(engine, seed):
-    campaign(engine, seed, 10_000)
+    campaign(engine, seed, trials(10_000, 3000))

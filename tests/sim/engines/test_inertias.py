@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from sizes import size
 
 from physx_sim import Robot, World
 from physx_sim.engines import read_parts, read_robot
@@ -106,7 +107,7 @@ def test_links_fixed_to_each_other_are_judged_as_the_body_that_they_are(robot, m
         read_parts(World([robot(BASE, odd, joint("weld", "base", "odd"))]))
 
 
-@settings(max_examples=50, suppress_health_check=list(HealthCheck))
+@settings(max_examples=size(50, 6), suppress_health_check=list(HealthCheck))
 @given(st.lists(st.floats(-1, 1), min_size=3, max_size=3), st.floats(0.01, 100))
 def test_every_body_that_exists_passes_and_no_other(robot, second, mass):
     """Moments are sums of two second moments, which are positive for bodies that exist."""

@@ -48,10 +48,12 @@ def test_the_energy_error_of_a_pendulum_is_proportional_to_the_period(backend, b
     np.testing.assert_allclose(errors[0] / errors[1], 2.0, rtol=0.05)
 
 
+@pytest.mark.slow
 def test_rk4_keeps_the_energy_of_a_pendulum(backend, bar):
     assert energy_error(backend, bar(), 1e-3, "rk4") < 1e-11
 
 
+@pytest.mark.slow
 def test_rk4_keeps_the_energy_of_a_double_pendulum(backend):
     robot = Robot(URDF, joints={name: JointSettings(damping=0.0) for name in ("shoulder", "elbow")})
     with backend.build(World([robot], integrator="rk4")) as simulation:

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
+from sizes import size
 
 from physx_core import PhysxError, plugins
 from physx_dart.dart.loading import load_skeleton
@@ -133,7 +134,7 @@ def test_a_text_that_readers_take_differently_is_an_error_that_names_it(write_ur
     assert text in str(caught.value)
 
 
-@settings(max_examples=40, suppress_health_check=list(HealthCheck))
+@settings(max_examples=size(40, 5), suppress_health_check=list(HealthCheck))
 @given(
     st.sampled_from(["mass", "center", "ixx", "axis", "offset"]),
     BLANKS,

@@ -59,6 +59,7 @@ def test_every_robot_of_physx_is_read(name):
         assert np.linalg.norm(body.axis) == pytest.approx(1.0 if body.joint else 0.0)
 
 
+@pytest.mark.slow
 def test_a_backend_knows_the_robots_of_physx_by_name():
     class Nothing(RobotBackend):
         def build(self, world, seed=None):

@@ -36,6 +36,7 @@ def test_own_robots_are_found_by_name_and_engines_agree_on_them(dart, pinocchio,
         assert np.isfinite(one.layout.max_torque).all() or name == "double_pendulum"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("name", "height"), [("ant", 0.4), ("box", 0.11), ("wheeled_base", 0.151)])
 def test_own_floating_robots_rest_on_the_ground(backend, name, height):
     robot = Robot(name, fixed_base=False, position=(0, 0, height))
@@ -51,6 +52,7 @@ def test_own_floating_robots_rest_on_the_ground(backend, name, height):
         assert 0.05 < simulation.positions()[2] < height
 
 
+@pytest.mark.slow
 def test_the_catalog_describes_each_robot(backend):
     found = {info.name: info for info in backend.robots()}
     for name, (joints, collisions) in OWN.items():
@@ -64,6 +66,7 @@ def test_the_catalog_describes_each_robot(backend):
         assert info.path.is_file() and 0 < info.mass < 20
 
 
+@pytest.mark.slow
 def test_installed_robots_are_in_the_catalog(backend, example):
     found = {info.name: info for info in backend.robots()}
     assert found["a1/a1"].path == example("a1_description/urdf/a1.urdf")
@@ -90,6 +93,7 @@ def test_names_and_paths(tmp_path, monkeypatch):
         plugins.resolve("backend", "dart").build(World([Robot("nowhere.urdf")]))
 
 
+@pytest.mark.slow
 def test_the_command_lists_them(capsys):
     assert main(["robots"]) == 0
     lines = capsys.readouterr().out.splitlines()

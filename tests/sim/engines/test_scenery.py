@@ -26,6 +26,7 @@ def table(request, write_urdf):
     return Robot(path, "table", position=(0.0, 0.0, 0.4))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("contacts", ["all", "static"])
 def test_things_rest_on_a_table_from_a_file(backend, table, contacts):
     box = Box(name="box", size=(0.2, 0.2, 0.2), mass=2.0, position=(0.2, 0.0, 1.01))
@@ -45,6 +46,7 @@ def test_things_rest_on_a_table_from_a_file(backend, table, contacts):
             simulation.apply_wrench(Wrench("leg", (1.0, 0.0, 0.0)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("contacts", ["all", "static"])
 @pytest.mark.parametrize("first", [True, False])
 def test_a_robot_stands_on_scenery_wherever_it_is_in_the_list(backend, table, contacts, first):

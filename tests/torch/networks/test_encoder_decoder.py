@@ -68,6 +68,7 @@ def test_sizes_that_do_not_fit_the_fields():
         EncoderDecoder([3, 2]).bind(fields)
 
 
+@pytest.mark.slow
 def test_learns_to_hand_on_points_of_a_plane(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)

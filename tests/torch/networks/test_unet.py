@@ -290,6 +290,7 @@ def test_scale_is_applied_to_targets_and_taken_back():
 # Learning ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("size", "mode", "normalization"),
     [

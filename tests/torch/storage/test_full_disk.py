@@ -13,6 +13,7 @@ from physx_core.pipelines import Learner, load_learner
 PROGRESS = Progress(1, 0, 1, 0)
 
 
+@pytest.mark.slow
 def test_parameters_that_do_not_fit_leave_the_earlier_checkpoint_and_no_leftover(tmp_path):
     arguments = {"layers": [64, 200, 64], "net_fields": "x", "opt_fields": "y"}
     config = NetworkConfig("torch/fc", arguments, loss="MSELoss", optimizer="Adam")

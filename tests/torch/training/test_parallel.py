@@ -317,6 +317,7 @@ def test_a_sampler_learns_from_the_losses_of_two_processes_as_from_those_of_one(
         assert agree("active", name, second=int(name == "stopped_two")), name
 
 
+@pytest.mark.faults
 def test_ctrl_c_at_the_launcher_keeps_a_checkpoint_that_can_be_resumed():
     process = start("training(5, 'cut', 100_000).execute()")
     stats, deadline = Path("sessions/cut/stats/scalars.csv"), time.monotonic() + 60

@@ -308,6 +308,7 @@ def test_other_errors_of_a_network_are_raised_at_once():
     assert network.calls == 1
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore::DeprecationWarning")
 @pytest.mark.parametrize(
     ("form", "kind"), [("onnx", "potential"), ("pt2", "potential"), ("pt2", "Hamiltonian")]

@@ -131,6 +131,7 @@ def test_wrong_precision(precision, data_type, told):
 # torch.compile ----------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_compiled_network_learns_the_same():
     plain, optimization = made()
     learn(plain, optimization, samples(plain))
@@ -140,6 +141,7 @@ def test_compiled_network_learns_the_same():
     assert list(fast.state_dict()) == list(plain.state_dict())
 
 
+@pytest.mark.slow
 def test_compiled_in_mixed_precision():
     network, optimization = made({"compile": "eager", "mixed_precision": "bfloat16"})
     data = samples(network)
@@ -149,6 +151,7 @@ def test_compiled_in_mixed_precision():
     assert last < first
 
 
+@pytest.mark.slow
 def test_a_machine_without_a_compiler_is_told_so():
     def broken(graph, inputs):
         raise RuntimeError("no compiler found")
@@ -162,6 +165,7 @@ def test_a_machine_without_a_compiler_is_told_so():
         learn(network, optimization, samples(network))
 
 
+@pytest.mark.slow
 def test_unknown_backend():
     with pytest.raises(ConfigError, match="inductor"):
         made({"compile": "indcutor"})

@@ -345,5 +345,5 @@ def describe_environment(config: EnvironmentConfig, seed: int) -> dict[str, Any]
         "simulations_per_step": config.simulations_per_step,
         **{name: plain[name] for name in ("sampler", "sampler_kwargs") if plain.get(name)},
         "seed": seed,
-        "versions": installed_versions(),
+        "versions": dict(installed_versions()),
     }

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import functools
+import os
 import sys
 import tomllib
 from collections.abc import Iterable
@@ -57,6 +58,18 @@ def find_entries(group: str) -> dict[str, list[EntryPoint]]:
     return _read_entries(_installed())[0][group]
 
 
+def find_owners(group: str) -> dict[str, tuple[str, ...]]:
+    """Return the names and versions of the packages that have a group's entry points, by name."""
+    return _owners(group, _installed())
+
+
+@functools.lru_cache(maxsize=4)
+def _owners(group: str, installed: tuple[tuple[str, int], ...]) -> dict[str, tuple[str, ...]]:
+    # Cached: references are resolved often, and this parses each package's whole METADATA.
+    entries = _read_entries(installed)[0][group]
+    return {name: tuple(map(owner_of, found)) for name, found in entries.items()}
+
+
 def find_unreadable() -> dict[str, str]:
     """Return the packages whose entry points cannot be read, with the reason."""
     return _read_entries(_installed())[1]
@@ -77,7 +90,7 @@ def _installed() -> tuple[tuple[str, int], ...]:
 def _last_change(folder: str) -> int:
     """Return the time at which a folder's packages last changed; 0 if there is no such folder."""
     try:
-        return Path(folder).stat().st_mtime_ns
+        return os.stat(folder or ".").st_mtime_ns  # noqa: PTH116 - each resolve asks for all
     except OSError:
         return 0
 

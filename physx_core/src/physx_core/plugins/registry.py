@@ -15,6 +15,7 @@ from physx_core.plugins.entries import (
     PLUGINS,
     describe_conflict,
     find_entries,
+    find_owners,
     official_package,
     owner_of,
     unreadable_hint,
@@ -66,8 +67,9 @@ class Plugin:
 
 def available() -> dict[str, PluginInfo]:
     """Return the installed plugins by name, from metadata only."""
+    owners = find_owners(PLUGINS)
     return {
-        name: PluginInfo(name, tuple(map(owner_of, found)), found[0].value)
+        name: PluginInfo(name, owners[name], found[0].value)
         for name, found in find_entries(PLUGINS).items()
     }
 

@@ -19,11 +19,12 @@ from hypothesis.stateful import (
     rule,
     run_state_machine_as_test,
 )
+from sizes import size
 
 from physx_core.components import Factory
 from physx_core.errors import ConfigError
 
-QUICK = settings(database=None, max_examples=15, stateful_step_count=50)
+QUICK = settings(database=None, max_examples=size(15, 4), stateful_step_count=50)
 LONG = settings(QUICK, max_examples=40)
 
 CHANCE = st.integers(0, 2**32 - 1).map(random.Random)

@@ -6,6 +6,7 @@
 
 from __future__ import annotations
 
+import functools
 import itertools
 import json
 import platform
@@ -299,9 +300,12 @@ def has_statistics(of: Field) -> bool:
 def versions() -> dict[str, str]:
     """Return the versions of the software that writes datasets."""
     packages = ("physx-core", "numpy", "h5py")
-    return {"python": platform.python_version()} | {
-        package: metadata.version(package) for package in packages
-    }
+    return {"python": platform.python_version()} | {name: _version_of(name) for name in packages}
+
+
+@functools.cache
+def _version_of(package: str) -> str:
+    return metadata.version(package)
 
 
 @dataclass
