@@ -327,6 +327,12 @@ class Link:
         self._end_comes = self._has_ended = self._is_closed = False
         self._unplugged = math.inf
 
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        self.close()
+
     @property
     def has_news(self):
         """Whether something can arrive."""

@@ -6,7 +6,7 @@ import select
 import selectors
 import socket
 from collections.abc import Callable, Iterable
-from typing import Any, Protocol
+from typing import Any, Protocol, Self
 
 from physx_core.clock import SYSTEM_CLOCK, Clock
 from physx_core.net.spin_wait import spin_until
@@ -19,6 +19,12 @@ class Link(Protocol):
 
     It is one on TCP or Unix sockets, a `SecureSocket`, or a simulated one, which has no descriptor.
     """
+
+    def __enter__(self) -> Self:
+        """Return the link."""
+
+    def __exit__(self, *_: object) -> None:
+        """Release the link."""
 
     @property
     def family(self) -> int:
