@@ -16,7 +16,7 @@ PROGRESS = Progress(1, 0, 1, 0)
 @pytest.mark.slow
 def test_parameters_that_do_not_fit_leave_the_earlier_checkpoint_and_no_leftover(tmp_path):
     arguments = {"layers": [64, 200, 64], "net_fields": "x", "opt_fields": "y"}
-    config = NetworkConfig("torch/fc", arguments, loss="MSELoss", optimizer="Adam")
+    config = NetworkConfig("torch/fc", arguments, loss="MSELoss", optimizer="Adam", device="cpu")
     learner = Learner(config, trains=True)
     learner.bind({name: Field(name, (64,)) for name in ("x", "y")}, {})
     folder = tmp_path / "network"
