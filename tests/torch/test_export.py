@@ -47,7 +47,7 @@ NETWORKS = {
 
 def learner_of(name):
     reference, arguments, fields = NETWORKS[name]
-    learner = Learner(NetworkConfig(reference, arguments), trains=False)
+    learner = Learner(NetworkConfig(reference, arguments, device="cpu"), trains=False)
     rng = np.random.default_rng(0)
     normalization = {
         field.name: Normalization(rng.random(field.shape), 0.5 + rng.random(field.shape))
