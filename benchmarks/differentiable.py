@@ -65,7 +65,7 @@ def main() -> None:
     torch.set_num_threads(1)
     world = World([Robot("a1/a1", fixed_base=False)])
     simulation = plugins.resolve("backend", "pinocchio").build(world)
-    model = PinocchioAlgorithms.of(world).movers[0].model
+    model = PinocchioAlgorithms.of(world).movables[0].model
     rng = np.random.default_rng(0)
     neutral, moves = pinocchio.neutral(model), rng.normal(size=(STATES, model.nv))
     drawn = [pinocchio.integrate(model, neutral, move) for move in moves]

@@ -543,7 +543,7 @@ def turn(env: Any, actions: list[np.ndarray]) -> int:
         ids = env.recv()[4]["env_id"]
         env.send(actions[done % ACTIONS][ids], ids)
         done += 1
-    while env.owing:
+    while env.num_pending:
         env.recv()
     return done * env.batch_size + len(actions[0])
 

@@ -117,7 +117,7 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
 RECORDS = {
     *("Layout", "Part", "State", "AppliedWrench", "MotorState", "SensorState", "RobotInfo"),
     *("UrdfShape", "Episode", "StepperState", "Result", "Trial", "Normalization"),
-    *("CollisionShape", "Joint", "Mover", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
+    *("CollisionShape", "Joint", "MovableBody", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
     *("Kind", "Format", "Table"),
 }
 ABSTRACT = {"Pipeline", "Sensor"}

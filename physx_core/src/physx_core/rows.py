@@ -209,7 +209,7 @@ class RejectedSamples:
             copies = {name: np.array(value) for name, value in sample.items()}
             self._waiting.append((copies, episode, step))
 
-    def forget(self, count: int) -> None:
+    def discard(self, count: int) -> None:
         """Discard the first samples."""
         del self._waiting[:count]
 

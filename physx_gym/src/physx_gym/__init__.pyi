@@ -21,8 +21,6 @@ from .env.pipeline_env import PipelineEnv as PipelineEnv
 from .env.robot_env import RobotEnv as RobotEnv
 from .pipeline.recipe import build_pipeline as build_pipeline
 from .pipeline.recipe import load_pipeline as load_pipeline
-from .show.plotting import plot as plot
-from .show.replaying import replay as replay
 from .simulator.simulator import Simulator as Simulator
 from .simulator.states import RobotState as RobotState
 from .simulator.states import StepperState as StepperState
@@ -31,3 +29,5 @@ from .telemetry.episode_log import Log as Log
 from .telemetry.log_file import read_log as read_log
 from .vector.vector_env import ParallelVectorEnv as ParallelVectorEnv
 from .version import __version__ as __version__
+from .visualization.plotting import plot as plot
+from .visualization.replaying import replay as replay

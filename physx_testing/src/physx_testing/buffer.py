@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.components import Buffer, Draw
+from physx_core.components import BatchSelection, Buffer
 from physx_core.typing import Batch
 from physx_testing.process_state import unchanged
 from physx_testing.report import NotApplicableError, Report
@@ -67,7 +67,7 @@ def _keeping(subject: Subject, seed: int = _SEED) -> Buffer:
     return buffer
 
 
-def _take(buffer: Buffer, batch: int) -> Draw:
+def _take(buffer: Buffer, batch: int) -> BatchSelection:
     return buffer.take(batch, buffer.needed(batch) - buffer.arrived)
 
 

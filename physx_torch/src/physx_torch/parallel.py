@@ -52,12 +52,12 @@ class TorchGroup(Group):
         is_cuda_only = distributed.get_backend() == "nccl"  # a group that the user's code created
         self._device = device if is_cuda_only else torch.device("cpu")
 
-    def tell(self, value: Any) -> Any:
+    def broadcast(self, value: Any) -> Any:
         """Return the leading process's value in all processes."""
-        content = encode(value) if self.leads else b""
+        content = encode(value) if self.is_main else b""
         length = self._broadcast(torch.tensor([len(content)]))
         told = torch.zeros(int(length.item()), dtype=torch.uint8)
-        if self.leads:
+        if self.is_main:
             told = torch.frombuffer(bytearray(content), dtype=torch.uint8)
         return decode(self._broadcast(told).cpu().numpy().tobytes())
 
@@ -66,14 +66,14 @@ class TorchGroup(Group):
         distributed.broadcast(tensor, 0)
         return tensor
 
-    def deal(self, batch: Batch) -> tuple[Batch, float]:
+    def scatter(self, batch: Batch) -> tuple[Batch, float]:
         """Return this process's share of the leading process's batch, and its weight."""
         kinds = {name: (array.dtype.str, array.shape[1:]) for name, array in batch.items()}
-        shares = [self.share_for(rank, batch) for rank in range(self.size if self.leads else 0)]
+        shares = [self.share_for(rank, batch) for rank in range(self.size if self.is_main else 0)]
         rows = [len(next(iter(share.values()))) for share, _ in shares]
-        told = self.tell([kinds, rows, [weight for _, weight in shares]])
+        told = self.broadcast([kinds, rows, [weight for _, weight in shares]])
         kinds, count, weight = told[0], told[1][self.rank], told[2][self.rank]
-        if self.leads:
+        if self.is_main:
             for rank in range(1, self.size):
                 distributed.send(self._packed(shares[rank][0]), rank)
             return shares[0]

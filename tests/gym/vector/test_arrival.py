@@ -185,7 +185,7 @@ def test_none_is_passed_over_and_a_slow_one_delays_no_other(nothing_stays_behind
         vector.send(batch_of([(0.0, 3)]), [0])
         vector.send(batch_of([(0.0, 0)] * 3), [3, 5, 4])
         assert vector.recv()[4]["env_id"].tolist() == [3, 4]
-        assert vector.owing == 2
+        assert vector.num_pending == 2
 
 
 @pytest.mark.parametrize("count", [1, 3])

@@ -180,9 +180,9 @@ def test_all_readers_read_the_same_number_or_physx_refuses_it(write_urdf, where,
 
 LOADERS = {
     "dart": load_skeleton,
-    "pinocchio": lambda mover: load_model(mover, (0.0, 0.0, -9.81), armature=np.zeros(2)),
-    "pinocchio, stepping": lambda mover: load_stepping_model(
-        mover, (0.0, 0.0, -9.81), armature=np.zeros(2 if mover.fixed_base else 8)
+    "pinocchio": lambda movable: load_model(movable, (0.0, 0.0, -9.81), armature=np.zeros(2)),
+    "pinocchio, stepping": lambda movable: load_stepping_model(
+        movable, (0.0, 0.0, -9.81), armature=np.zeros(2 if movable.fixed_base else 8)
     ),
 }
 LOST = {
@@ -205,37 +205,39 @@ def test_a_number_that_an_engine_reads_differently_is_an_error_that_names_it(
     write_urdf, loader, lost, fixed_base
 ):
     robot = Robot(write_urdf(arm()), "left", fixed_base=fixed_base, position=(1.0, 2.0, 3.0))
-    mover = read_parts(World([robot])).movers[0]
-    LOADERS[loader](mover)
+    movable = read_parts(World([robot])).movables[0]
+    LOADERS[loader](movable)
     (owner, quantity), (text, other) = lost.split(": "), LOST[lost]
-    assert mover.model.text.count(text) == 1
-    model = dataclasses.replace(mover.model, text=mover.model.text.replace(text, other))
+    assert movable.model.text.count(text) == 1
+    model = dataclasses.replace(movable.model, text=movable.model.text.replace(text, other))
     with pytest.raises(ModelError, match=rf"{quantity} \S.* instead of ") as caught:
-        LOADERS[loader](dataclasses.replace(mover, model=model))
+        LOADERS[loader](dataclasses.replace(movable, model=model))
     message = str(caught.value)
     assert owner in message and '"left"' in message and str(robot.urdf) in message
 
 
 def test_a_limit_that_an_engine_does_not_keep_is_an_error():
-    mover = read_parts(World([Robot("cartpole")])).movers[0]
-    bodies = mover.model.bodies
+    movable = read_parts(World([Robot("cartpole")])).movables[0]
+    bodies = movable.model.bodies
     poses = np.array([body.pose for body in bodies])
     axes = np.array([body.axis for body in bodies if body.joint is not None])
     held = [LoadedBody((i,), body.mass, body.center, body.inertia) for i, body in enumerate(bodies)]
-    upper = np.array([joint.upper for joint in mover.model.joints])
-    check_loaded("mine", mover, LoadedRobot(poses, axes, held, {"upper": upper}))
-    name = mover.model.joints[0].name
+    upper = np.array([joint.upper for joint in movable.model.joints])
+    check_loaded("mine", movable, LoadedRobot(poses, axes, held, {"upper": upper}))
+    name = movable.model.joints[0].name
     with pytest.raises(ModelError, match=rf'mine gives joint "{name}" the upper 0.0 instead of'):
-        check_loaded("mine", mover, LoadedRobot(poses, axes, held, {"upper": np.zeros(len(upper))}))
+        check_loaded(
+            "mine", movable, LoadedRobot(poses, axes, held, {"upper": np.zeros(len(upper))})
+        )
 
 
 def test_what_an_engine_does_not_understand_is_not_lost(write_urdf):
     """The engines' own reader drops the inertia of a link with a number that it does not take."""
-    mover = read_parts(World([Robot(write_urdf(arm()))])).movers[0]
-    text = mover.model.text.replace('mass value="1.0"', 'mass value="1.0 "')
+    movable = read_parts(World([Robot(write_urdf(arm()))])).movables[0]
+    text = movable.model.text.replace('mass value="1.0"', 'mass value="1.0 "')
     for load in LOADERS.values():
         with pytest.raises(ModelError, match=r'"upper" the mass .* instead of 1\.0'):
-            load(dataclasses.replace(mover, model=dataclasses.replace(mover.model, text=text)))
+            load(dataclasses.replace(movable, model=dataclasses.replace(movable.model, text=text)))
 
 
 # The third reader -----------------------------------------------------------------------------

@@ -52,9 +52,9 @@ def test_links_are_rigid_bodies_in_the_order_of_the_tree(tmp_path):
 @pytest.mark.parametrize("name", [name for name in named_robots() if "/" not in name])
 def test_every_robot_of_physx_is_read(name):
     parts = read_parts(World([Robot(name, fixed_base=False)]))
-    bodies = parts.movers[0].model.bodies
+    bodies = parts.movables[0].model.bodies
     joints = [body.joint for body in bodies if body.joint is not None]
-    assert tuple(joints) == parts.movers[0].model.joints
+    assert tuple(joints) == parts.movables[0].model.joints
     for body in bodies:
         assert np.linalg.norm(body.axis) == pytest.approx(1.0 if body.joint else 0.0)
 

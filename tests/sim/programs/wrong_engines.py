@@ -35,7 +35,7 @@ class InAnotherWorld(Wrong):
 
 class KeepsImpulses(Wrong):
     class made(PinocchioSimulation):
-        def forget(self):
+        def clear_warm_start(self):
             pass
 
 

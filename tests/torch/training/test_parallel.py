@@ -138,7 +138,7 @@ def living():
     try:
         failing.execute()
     except RuntimeError:
-        failing.group.tell(None)  # the first one has written the checkpoint
+        failing.group.broadcast(None)  # the first one has written the checkpoint
     generating(5, "failed_two", resume=True, **failed).execute()
     generating(5, "fails", over_tcp=False, fails_at=20).execute()
 
@@ -182,9 +182,9 @@ def together():
     with training(5, "free", 2, seed=None) as made:
         made.execute()
         mine = [float(p.detach().abs().sum()) for p in made.learner.network.parameters()]
-        assert mine == made.group.tell(mine), "without a seed they do not begin alike"
-        wide = np.arange(5e5) / 3 if made.group.leads else None
-        told = made.group.tell({"x": [wide, (1, "two")]})
+        assert mine == made.group.broadcast(mine), "without a seed they do not begin alike"
+        wide = np.arange(5e5) / 3 if made.group.is_main else None
+        told = made.group.broadcast({"x": [wide, (1, "two")]})
         assert told["x"][0].tobytes() == (np.arange(5e5) / 3).tobytes(), "bits were lost"
         assert told["x"][1] == (1, "two") and told["x"][0].shape == (500_000,)
     training(5, "dies", kind=Dies).execute()

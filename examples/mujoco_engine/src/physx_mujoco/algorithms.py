@@ -36,7 +36,7 @@ class MujocoAlgorithms(Algorithms):
         places = list(layout.parts.values())
         bases = [place for place in places if place.floating]
         self._bases = [(place.positions.start, place.velocities.start) for place in bases]
-        tables = [Resistance.of(mover).table for mover in parts.movers]
+        tables = [Resistance.of(movable).table for movable in parts.movables]
         self._resistance = Resistance(np.concatenate(tables, axis=1))
         ends = [np.arange(p.positions.stop - p.nv, p.positions.stop) for p in places]
         self._stretched = np.concatenate(ends).astype(np.intp)

@@ -20,7 +20,7 @@ from physx_sim.engines import (
     Joint,
     LoadedBody,
     LoadedRobot,
-    Mover,
+    MovableBody,
     Parts,
     RigidBody,
     Static,
@@ -68,15 +68,15 @@ class ModelBuilder:
         self._hard = {"solref": (_STEPS * parts.world.period, _DAMPING), "solimp": _IMPEDANCE}
         self._moments: list[Vector] = []
         self._owners: list[int] = []
-        shapes = [shape for mover in parts.movers for shape in mover.model.shapes]
+        shapes = [shape for movable in parts.movables for shape in movable.model.shapes]
         frictions = {float(x.friction) for x in (*shapes, *(each.what for each in parts.statics))}
         # Of two shapes, MuJoCo uses the friction of the one with the higher priority.
         self._priorities = {mu: i for i, mu in enumerate(sorted(frictions, reverse=True))}
 
     def build(self) -> WorldModel:
         """Return the model, with MuJoCo's default options."""
-        for place, mover in enumerate(self._parts.movers):
-            self._add_mover(place, mover)
+        for place, movable in enumerate(self._parts.movables):
+            self._add_movable(place, movable)
         count = len(self._moments)
         if self._parts.world.contacts != "none":
             for place, static in enumerate(self._parts.statics):
@@ -92,34 +92,36 @@ class ModelBuilder:
         model.body_inertia[bodies] = self._moments
         mujoco.mj_setConst(model, mujoco.MjData(model))
         first = 0
-        for mover in self._parts.movers:
-            last = first + len(mover.model.links)
-            check_loaded("mujoco", mover, _loaded(model, mover, bodies[first:last]))
+        for movable in self._parts.movables:
+            last = first + len(movable.model.links)
+            check_loaded("mujoco", movable, _loaded(model, movable, bodies[first:last]))
             first = last
         return WorldModel(model, bodies, owners)
 
     # Robots and objects ---------------------------------------------------------------------
 
-    def _add_mover(self, place: int, mover: Mover) -> None:
+    def _add_movable(self, place: int, movable: MovableBody) -> None:
         added: list[Any] = []
         first = len(self._moments)
-        for body in mover.model.bodies:
+        for body in movable.model.bodies:
             if body.parent < 0:
-                turn = to_matrix(mover.orientation)
-                new = self._add_body(self._spec.worldbody, body, np.array(mover.position), turn)
-                if not mover.fixed_base:
+                turn = to_matrix(movable.orientation)
+                new = self._add_body(self._spec.worldbody, body, np.array(movable.position), turn)
+                if not movable.fixed_base:
                     new.add_freejoint()
             else:
                 pose, parent = body.pose, added[body.parent]
                 new = self._add_body(parent, body, pose[:3, 3], pose[:3, :3])
             if body.joint is not None:
                 self._add_joint(new, body.joint, body.axis)
-                if body.parent == 0 and mover.fixed_base:  # else it collides with its fixed parent
+                if (
+                    body.parent == 0 and movable.fixed_base
+                ):  # else it collides with its fixed parent
                     self._spec.add_exclude(bodyname1=new.parent.name, bodyname2=new.name)
             added.append(new)
-        masks = self._masks(place, mover)
-        for shape in mover.model.shapes:
-            link = 0 if mover.is_object else mover.model.links.index(shape.body)
+        masks = self._masks(place, movable)
+        for shape in movable.model.shapes:
+            link = 0 if movable.is_object else movable.model.links.index(shape.body)
             self._add_shape(added[link], shape, first + link, **masks)
 
     def _add_body(self, parent: Any, body: RigidBody, position: Vector, turn: Vector) -> Any:
@@ -145,11 +147,11 @@ class ModelBuilder:
             setattr(added, f"{option}_limit", value)
             setattr(added, f"{option}_friction", value)
 
-    def _masks(self, place: int, mover: Mover) -> dict[str, int]:
+    def _masks(self, place: int, movable: MovableBody) -> dict[str, int]:
         if self._parts.world.contacts == "static":
-            own = 0 if mover.moves else _STATIC | _MOVING
-            return {"contype": own, "conaffinity": _STATIC if mover.moves else 0}
-        if mover.is_object or mover.self_collisions:
+            own = 0 if movable.moves else _STATIC | _MOVING
+            return {"contype": own, "conaffinity": _STATIC if movable.moves else 0}
+        if movable.is_object or movable.self_collisions:
             return {"contype": _MOVING, "conaffinity": _ALL}
         if place + _OWN > 30:
             raise ModelError("MuJoCo has room for 29 robots. Use contacts='static' or 'none'.")
@@ -207,15 +209,15 @@ class ModelBuilder:
         return body.add_geom(type=kind, condim=3, priority=priority, **self._hard, **more)
 
 
-def _loaded(model: Any, mover: Mover, bodies: Index) -> LoadedRobot:
+def _loaded(model: Any, movable: MovableBody, bodies: Index) -> LoadedRobot:
     """Return what MuJoCo holds of a robot or object, for `check_loaded`."""
     poses = _matrices(model.body_pos[bodies], model.body_quat[bodies])
-    if not mover.fixed_base:
+    if not movable.fixed_base:
         poses[0] = np.eye(4)
     turns = _matrices(model.body_ipos[bodies], model.body_iquat[bodies])[:, :3, :3]
     inertia = np.einsum("nij,nj,nkj->nik", turns, model.body_inertia[bodies], turns)
     values = zip(model.body_mass[bodies], model.body_ipos[bodies], inertia, strict=True)
-    moving = [body.joint is not None for body in mover.model.bodies]
+    moving = [body.joint is not None for body in movable.model.bodies]
     joints = model.body_jntadr[bodies[moving]]
     places = model.jnt_dofadr[joints]
     limits = {"damping": model.dof_damping[places], "friction": model.dof_frictionloss[places]}

@@ -11,7 +11,7 @@ import numpy as np
 from physx_core.rotations import rotate, rotate_back
 from physx_core.typing import Index, Vector
 from physx_sim import Part
-from physx_sim.engines import Mover, RobotEngine, twist_change
+from physx_sim.engines import MovableBody, RobotEngine, twist_change
 
 INWARDS = [0, 1, 2, 6, 3, 4, 5]
 """Order of a floating base's positions in MuJoCo, whose quaternions are w, x, y, z."""
@@ -38,8 +38,8 @@ class Running:
 class MujocoRobot(RobotEngine):
     """The part of a world's state that belongs to a robot or object, as views."""
 
-    def __init__(self, mover: Mover, part: Part, bodies: Index, running: Running) -> None:
-        super().__init__(mover)
+    def __init__(self, movable: MovableBody, part: Part, bodies: Index, running: Running) -> None:
+        super().__init__(movable)
         self._running, self._bodies = running, bodies
         self._q, self._v = running.data.qpos[part.positions], running.data.qvel[part.velocities]
         self._earlier = running.positions[part.positions]

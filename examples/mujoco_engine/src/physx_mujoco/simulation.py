@@ -77,8 +77,8 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         self._running = Running(model, data, data.qpos.copy(), data.qvel.copy())
         layout = layout_of(parts)
         robots = [
-            MujocoRobot(mover, part, self._world.bodies[part.bodies], self._running)
-            for mover, part in zip(parts.movers, layout.parts.values(), strict=True)
+            MujocoRobot(movable, part, self._world.bodies[part.bodies], self._running)
+            for movable, part in zip(parts.movables, layout.parts.values(), strict=True)
         ]
         self._drives = Drives(layout, self._running)
         super().__init__(parts, robots, () if world.integrator == "euler" else RK4_LACKS)
@@ -89,7 +89,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
             raise FeatureNotSupportedError(self.engine, f"detector {world.detector}", features)
         if world.integrator == "rk4":
             check_rk4(parts, self.engine, features)
-        shapes = [shape for mover in parts.movers for shape in mover.model.shapes]
+        shapes = [shape for movable in parts.movables for shape in movable.model.shapes]
         if any(shape.restitution for shape in shapes):
             raise FeatureNotSupportedError(self.engine, "restitution", features)
 
@@ -115,7 +115,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
             for _ in range(n):
                 self._drives.step()
 
-    def forget(self) -> None:
+    def clear_warm_start(self) -> None:
         self._running.data.qacc_warmstart[:] = 0.0
 
     def read_contacts(self) -> Records:

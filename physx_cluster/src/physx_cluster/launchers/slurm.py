@@ -14,7 +14,7 @@ from typing import Any
 
 from physx_cluster.launchers.slurm_guard import start_guard
 from physx_cluster.launchers.slurm_queue import (
-    FORGOTTEN,
+    UNKNOWN_TO_SCHEDULER,
     JobState,
     LocalQueue,
     Queue,
@@ -164,7 +164,7 @@ class SlurmLauncher(Launcher):
             self._asked = time.monotonic()
             if found is not None:
                 self._states = found
-        return self._states.get(job.job_id, FORGOTTEN)
+        return self._states.get(job.job_id, UNKNOWN_TO_SCHEDULER)
 
     def interrupt(self, job: Any) -> None:
         """Ask a job's client to exit."""
@@ -303,7 +303,7 @@ class JobHandle(ClientHandle):
         if self._status is not None:
             return self._status
         state = self.look(max_age)
-        if state.is_hopeless:
+        if state.is_unschedulable:
             self._launcher.cancel(self.job)
             text = f"Slurm cannot give job {self.job.job_id} what it requests ({state.reason})."
             self._end(1, f"{text} {_ADVICE}")

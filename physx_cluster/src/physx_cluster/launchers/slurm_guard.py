@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from physx_core.processes import ChildProcess
 
 _PATIENCE = 20.0  # s, for jobs to leave the queue
-_KINDNESS = 3.0  # s, for processes to obey Ctrl-C, which they ignore if the run did
+_TERMINATION_GRACE = 3.0  # s, for processes to obey Ctrl-C, which they ignore if the run did
 _PAUSE = 0.1
 # Modules that submitit's local executor runs, compared as whole words: a path may contain them.
 _MODULES = {b"submitit.local._local", b"submitit.core._submit"}
@@ -62,7 +62,7 @@ def main(descriptor: int, folder: Path, name: str) -> None:
     if name:
         _end_jobs(name, until)
     else:
-        _end_processes(folder, time.monotonic() + _KINDNESS)
+        _end_processes(folder, time.monotonic() + _TERMINATION_GRACE)
     while folder.exists() and time.monotonic() < until:  # a job may still be writing
         shutil.rmtree(folder, ignore_errors=True)
         time.sleep(_PAUSE)

@@ -45,7 +45,7 @@ class JobState:
         return self.name in _SOON
 
     @property
-    def is_hopeless(self) -> bool:
+    def is_unschedulable(self) -> bool:
         """Whether it waits for something that it can never get."""
         return self.is_queued and self.reason in _NEVER
 
@@ -55,7 +55,7 @@ class JobState:
         return self.name not in (*_SOON, *_NOW, *_LEAVING)
 
 
-FORGOTTEN = JobState("COMPLETED")
+UNKNOWN_TO_SCHEDULER = JobState("COMPLETED")
 """State of a job that the queue no longer knows: it ended some time ago."""
 
 

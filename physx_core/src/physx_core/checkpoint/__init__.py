@@ -34,7 +34,7 @@ from physx_core.checkpoint.reading import (
     read_buffer,
     read_sampler,
 )
-from physx_core.checkpoint.writing import check_session, rehearse, remove, save
+from physx_core.checkpoint.writing import check_session, dry_run_save, remove, save
 
 __all__ = [
     "BEST",
@@ -47,6 +47,7 @@ __all__ = [
     "Progress",
     "check_session",
     "check_unchanged",
+    "dry_run_save",
     "find",
     "list_all",
     "list_numbers",
@@ -54,7 +55,6 @@ __all__ = [
     "read",
     "read_buffer",
     "read_sampler",
-    "rehearse",
     "remove",
     "save",
 ]

@@ -172,7 +172,7 @@ def _write(
         files.sync_file(partial / file)
 
 
-def rehearse(place: Path, network: Network, optimization: Optimization) -> None:
+def dry_run_save(place: Path, network: Network, optimization: Optimization) -> None:
     """Check that a network and its optimization can be saved, using a temporary folder.
 
     Args:

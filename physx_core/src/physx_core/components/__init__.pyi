@@ -1,7 +1,7 @@
 """Base classes of the components that plugins implement and pipelines use."""
 
+from .buffer import BatchSelection as BatchSelection
 from .buffer import Buffer as Buffer
-from .buffer import Draw as Draw
 from .environment import Environment as Environment
 from .environment import Services as Services
 from .environment import options_of as options_of

@@ -13,7 +13,7 @@ from physx_core.typing import Index
 _STREAM = 2
 
 
-class Draw(NamedTuple):
+class BatchSelection(NamedTuple):
     """What a buffer decided for one batch.
 
     Attributes:
@@ -105,7 +105,7 @@ class Buffer(ABC):
         """
         raise NotImplementedError(f"{type(self).__name__} does not implement draw().")
 
-    def take(self, batch: int, count: int) -> Draw:
+    def take(self, batch: int, count: int) -> BatchSelection:
         """Place the rows that have arrived for a batch, then draw the batch.
 
         Args:
@@ -129,7 +129,7 @@ class Buffer(ABC):
             raise UsageError(f"{type(self).__name__}.draw() returned a slot without a row.")
         np.add.at(self.uses, drawn, 1)
         self._taken, self._before = batch + 1, (arrived, placed, *before, drawn)
-        return Draw(placed, drawn, rows)
+        return BatchSelection(placed, drawn, rows)
 
     @property
     def kept(self) -> Index:

@@ -25,11 +25,11 @@ class Group:
     size: int = 1
 
     @property
-    def leads(self) -> bool:
+    def is_main(self) -> bool:
         """Whether this process writes the session, checkpoints, and statistics."""
         return self.rank == 0
 
-    def tell(self, value: Any) -> Any:
+    def broadcast(self, value: Any) -> Any:
         """Return the leading process's value in all processes.
 
         Args:
@@ -76,7 +76,7 @@ class Group:
         own = slice(first, last) if last > first else slice(0, 1)
         return {name: values[own] for name, values in batch.items()}, (last - first) / rows
 
-    def deal(self, batch: Batch) -> tuple[Batch, float]:
+    def scatter(self, batch: Batch) -> tuple[Batch, float]:
         """Return this process's share of a batch that only the leading one has: see `share_of`.
 
         Args:

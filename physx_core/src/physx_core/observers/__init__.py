@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 from physx_core.observers.chosen import statistics_observers
+from physx_core.observers.composite import Observers
 from physx_core.observers.progress import ProgressBar
 from physx_core.observers.scalars_file import FIELDS, REPORT_SECONDS, ScalarsFile, read_scalars
-from physx_core.observers.several import Observers
 
 __all__ = [
     "FIELDS",

@@ -72,7 +72,7 @@ class Pipeline(ABC):
     session: Session = field(init=False, repr=False)
     observers: Observers = field(init=False, repr=False)
     _resources: contextlib.ExitStack | None = field(init=False, repr=False, default=None)
-    _leads = True  # whether this process writes the session; others only help with training
+    _is_main = True  # whether this process writes the session; others only help with training
     _began = 0.0
 
     if not TYPE_CHECKING:  # type checkers would accept every misspelled attribute
@@ -187,14 +187,14 @@ class Pipeline(ABC):
 
     def _say(self, *lines: str) -> None:
         """Print lines to stderr, in the process that writes the session."""
-        if self._leads and not self.quiet and sys.stderr is not None:
+        if self._is_main and not self.quiet and sys.stderr is not None:
             with contextlib.suppress(OSError, ValueError):  # a closed stderr must not end a run
                 sys.stderr.write("".join(f"{line}\n" for line in lines))
                 sys.stderr.flush()
 
     def _describe_components(self) -> None:
         components = self._components()
-        if self._leads and components:
+        if self._is_main and components:
             texts = (f"{name}: {text}" for name, text in components.items())
             self.session.note("\n".join(text.replace("\n", "\n  ") for text in texts))
 
@@ -209,7 +209,7 @@ class Pipeline(ABC):
             how = "interrupted"
         elif error is not None:
             how = f"ended by {type(error).__name__}"
-        if self._leads:
+        if self._is_main:
             with contextlib.suppress(OSError):  # the run's own error matters more
                 self.session.note(f"{how} after {self._duration:.1f} s")
 
@@ -253,7 +253,7 @@ class Pipeline(ABC):
         further: Iterable[Observer] = (),
     ) -> None:
         """Open the run's observers, only in the process that writes the session."""
-        if not self._leads:
+        if not self._is_main:
             self.observers = Observers([])
             return
         bars = [] if self.quiet else [ProgressBar()]
@@ -335,7 +335,7 @@ class Pipeline(ABC):
 
     def _record_config(self, seed: int) -> None:
         """Write the options and the actual seed to the session."""
-        if not self._leads:
+        if not self._is_main:
             return
         plain = {**to_plain(self), "session_name": self.session.name}
         plain = {name.removesuffix("_config"): value for name, value in plain.items()}

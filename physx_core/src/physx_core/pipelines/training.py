@@ -166,10 +166,10 @@ class Training(NewSessionPipeline):
     _within_epochs: list[Path] | None = field(init=False, repr=False, default=None)
     _epoch_batches: int | None = field(init=False, repr=False, default=None)
     _is_savable: bool = field(init=False, repr=False, default=False)
-    _met_nan: bool = field(init=False, repr=False, default=False)
-    _told_fields: bool = field(init=False, repr=False, default=False)
+    _saw_nan: bool = field(init=False, repr=False, default=False)
+    _fields_reported: bool = field(init=False, repr=False, default=False)
     _blocks: int = field(init=False, repr=False, default=0)
-    _told_order: bool = field(init=False, repr=False, default=False)
+    _order_reported: bool = field(init=False, repr=False, default=False)
     _told: Sequence[str] = field(init=False, repr=False, default=())
     _recorded: dict[str, float] | None = field(init=False, repr=False, default=None)
 
@@ -232,10 +232,10 @@ class Training(NewSessionPipeline):
             return
         names = self.learner.batch_fields
         self._epoch_batches = self.data.begin_epoch(self.epoch_id, names, self.batch_id)
-        if self.data.stored.notice and not self._told_order and self._leads:
+        if self.data.stored.notice and not self._order_reported and self._is_main:
             self.observers.note(self.data.stored.notice)
             self.session.note(self.data.stored.notice)
-            self._told_order = True
+            self._order_reported = True
         if self.data.stored.has_changed:
             self.learner.normalize(self.data.normalization())
         if self.epoch_id == self._resumed.epoch:
@@ -281,8 +281,8 @@ class Training(NewSessionPipeline):
             made.tell(self.batch, self.learner.row_losses)
         if self.on_nan == "continue" and not math.isfinite(self.losses["loss"]):
             self._continue_after_nan()
-        if self._leads and not self._is_savable:
-            self.learner.rehearse(self.session.path)
+        if self._is_main and not self._is_savable:
+            self.learner.dry_run_save(self.session.path)
             self._is_savable = True
 
     def batch_count(self) -> None:
@@ -298,7 +298,7 @@ class Training(NewSessionPipeline):
         if now > self._reported + REPORT_SECONDS or self.data.generated is not None:
             self._reported = now
             self._report()
-            if self._leads:
+            if self._is_main:
                 checkpoint.check_session(self.session.network_dir)
 
     def _report(self) -> None:
@@ -306,9 +306,9 @@ class Training(NewSessionPipeline):
         batches, online = self._record.take_batches(), {}
         if not batches:
             return
-        if not self._told_fields:
+        if not self._fields_reported:
             self.observers.fields(list(self.learner.fields.values()))
-            self._told_fields = True
+            self._fields_reported = True
         if self.data.generated is not None and self.data.online is not None:
             self._blocks = self.data.online.number
             online = self.data.online.recent_statistics()
@@ -347,7 +347,7 @@ class Training(NewSessionPipeline):
         self.observers.scalars(values, self.epoch_id, "epoch")
         if self.histograms_every and self.epoch_id % self.histograms_every == 0:
             self.observers.histograms(self.learner.distributions(), self.epoch_id, "epoch")
-        if is_due and self.best.judge(judged, self.epoch_id):
+        if is_due and self.best.update(judged, self.epoch_id):
             wanted = self.network_config.save_best
             if wanted or (wanted is None and (validates or self.patience is not None)):
                 self._write(best=True)
@@ -384,7 +384,7 @@ class Training(NewSessionPipeline):
     def _finish(self) -> None:
         """Write the last checkpoint and report an early stop."""
         self.observers.end()
-        if self.stopped and self._leads:
+        if self.stopped and self._is_main:
             self.observers.note(self.stopped)
             self.session.note(self.stopped)
         self.save_checkpoint()
@@ -418,8 +418,8 @@ class Training(NewSessionPipeline):
 
     def _write(self, *, best: bool = False) -> Path:
         self._check_parameters()
-        written = str(self._write_own(best=best)) if self._leads else None
-        return Path(self.group.tell(written))
+        written = str(self._write_own(best=best)) if self._is_main else None
+        return Path(self.group.broadcast(written))
 
     def _write_own(self, *, best: bool = False) -> Path:
         self._report()
@@ -454,7 +454,7 @@ class Training(NewSessionPipeline):
 
         The previous one is kept in case the new one gets damaged on the disk.
         """
-        if not self._leads:
+        if not self._is_main:
             self.save_checkpoint()
             return
         if self._within_epochs is None:  # find those of earlier runs
@@ -476,7 +476,7 @@ class Training(NewSessionPipeline):
         Other processes of the group may have failed, so nothing is exchanged with them.
         """
         now = (self.epoch_id, self.batch_id)
-        if not self._leads or now == (self._resumed.epoch, self._resumed.batch):
+        if not self._is_main or now == (self._resumed.epoch, self._resumed.batch):
             return
         try:
             if self._saved != now:
@@ -507,14 +507,14 @@ class Training(NewSessionPipeline):
 
     def _continue_after_nan(self) -> None:
         """Report once that training continues although a loss is not finite."""
-        if self._leads and not self._met_nan:
+        if self._is_main and not self._saw_nan:
             text = (
                 f"Epoch {self.epoch_id + 1}, batch {self.batch_id + 1}: the loss is "
                 f'{self.losses["loss"]}; the training continues (on_nan="continue").'
             )
             self.observers.note(text)
             self.session.note(text)
-        self._met_nan = True
+        self._saw_nan = True
 
     def _close(self, kind: Any, error: BaseException | None, trace: Any) -> None:
         """Keep what was trained since the last checkpoint, by `execute` or by a user's own loop."""
@@ -532,7 +532,7 @@ class Training(NewSessionPipeline):
         check_sources(start.config, start.environment)
         reject_client_writers(start.config, "a training")
         self.group, network_class = join_group(self.network_config)
-        self._leads = self.group.leads
+        self._is_main = self.group.is_main
         if self.group.size > 1 and start.environment is not None and not self.resume:
             reject_environments(start.environment)
         if self.resume:
@@ -551,7 +551,7 @@ class Training(NewSessionPipeline):
         dataset = resources.enter_context(open_dataset(self.session, start, self.group))
         self._record_config(self._resumed.seed)
         further = statistics_observers(self.statistics, self.statistics_kwargs, start.environment)
-        self._observe(resources, start.environment, further if self._leads else ())
+        self._observe(resources, start.environment, further if self._is_main else ())
         opening = DataOpening(
             start,
             self.session,
@@ -570,7 +570,7 @@ class Training(NewSessionPipeline):
         )
         self.data = opening.open(resources, dataset)
         self._prepare_learner(start)
-        if start.checkpoint is not None and start.environment is None and self._leads:
+        if start.checkpoint is not None and start.environment is None and self._is_main:
             self._tell_changed_data(dataset, start.config.mode)
         resources.push(self._close)
 
@@ -608,7 +608,7 @@ class Training(NewSessionPipeline):
     def _begin_at(self, start: Start) -> None:
         """Start at the first batch, or where a checkpoint was written."""
         former, last = start.generation, start.checkpoint
-        seed = self.group.tell(choose_seed(self.seed) if former is None else former.seed)
+        seed = self.group.broadcast(choose_seed(self.seed) if former is None else former.seed)
         self._resumed = last.progress if last else Progress(0, 0, 0, seed)
         self._resumed_from = last
         self._saved = (self._resumed.epoch, self._resumed.batch)
@@ -633,9 +633,9 @@ class Training(NewSessionPipeline):
 
     def _open_session(self) -> Session:
         made = None
-        if self._leads:
+        if self._is_main:
             made = self._create_session()
-        path = Path(self.group.tell(made and str(made.path)))
+        path = Path(self.group.broadcast(made and str(made.path)))
         return made or Session(path)
 
     def _prepare_learner(self, start: Start) -> None:
@@ -673,7 +673,7 @@ class Training(NewSessionPipeline):
             place = Path(config.network_dir)
             found = checkpoint.find(place, config.network_name, config.which_network)
             self.learner.load_parameters(found)
-        if found is not None and found.notice and self._leads:
+        if found is not None and found.notice and self._is_main:
             self.session.note(found.notice)
 
     # Describing -----------------------------------------------------------------------------

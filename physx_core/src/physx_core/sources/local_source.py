@@ -161,7 +161,7 @@ class LocalSource(Source):
             self._fill(min(left, size)).clear()
         for instance in self._instances:
             if instance.rejected is not None:
-                instance.rejected.forget(self._skip.rejected_of(instance.instance_id))
+                instance.rejected.discard(self._skip.rejected_of(instance.instance_id))
 
     def pop_rejected(self) -> Batch:
         """Return the rejected samples: see `Source.pop_rejected`."""

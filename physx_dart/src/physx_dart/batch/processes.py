@@ -24,7 +24,7 @@ from physx_dart.batch.worker import (
     compute,
     describe_models,
 )
-from physx_dart.pinocchio.algorithms import MoverAlgorithms, PinocchioAlgorithms
+from physx_dart.pinocchio.algorithms import MovableAlgorithms, PinocchioAlgorithms
 from physx_sim.errors import SimulationError
 
 _LEAST_ROWS = 16
@@ -39,9 +39,9 @@ class ParallelAlgorithms(PinocchioAlgorithms):
     computes all rows itself.
     """
 
-    def __init__(self, movers: Sequence[MoverAlgorithms], statics: Vector) -> None:
-        """Combine movers with static bodies, whose poses have the shape (statics, 7)."""
-        super().__init__(movers, statics)
+    def __init__(self, movables: Sequence[MovableAlgorithms], statics: Vector) -> None:
+        """Combine movables with static bodies, whose poses have the shape (statics, 7)."""
+        super().__init__(movables, statics)
         self._owner = os.getpid()
         self._workers: list[_Worker] = []
         self._memory: SharedRows | None = None

@@ -18,7 +18,7 @@ import numpy as np
 import pinocchio
 
 from physx_core.typing import Vector
-from physx_dart.pinocchio.algorithms import MoverAlgorithms, PinocchioAlgorithms
+from physx_dart.pinocchio.algorithms import MovableAlgorithms, PinocchioAlgorithms
 from physx_sim.engines import Resistance
 
 FORWARD, GRADIENTS = range(2)
@@ -72,20 +72,20 @@ def compute(algorithms: PinocchioAlgorithms, kind: int, states: tuple[Vector, ..
 
 def describe_models(algorithms: PinocchioAlgorithms) -> bytes:
     """Return a line of text, free of code, from which `algorithms_of` rebuilds the algorithms."""
-    movers = [
-        (each.model.saveToString(), each.resistance.table.tolist()) for each in algorithms.movers
+    movables = [
+        (each.model.saveToString(), each.resistance.table.tolist()) for each in algorithms.movables
     ]
-    return json.dumps(movers).encode("ascii") + b"\n"
+    return json.dumps(movables).encode("ascii") + b"\n"
 
 
 def algorithms_of(line: bytes) -> PinocchioAlgorithms:
     """Return the algorithms, without bodies, described by a line from `describe_models`."""
-    movers = []
+    movables = []
     for text, table in json.loads(line):
         model = pinocchio.Model()
         model.loadFromString(text)
-        movers.append(MoverAlgorithms(model, Resistance(np.array(table).reshape(5, model.nv))))
-    return PinocchioAlgorithms(movers, np.zeros((0, 7)))
+        movables.append(MovableAlgorithms(model, Resistance(np.array(table).reshape(5, model.nv))))
+    return PinocchioAlgorithms(movables, np.zeros((0, 7)))
 
 
 def serve(link: socket.socket, file: int) -> None:

@@ -62,7 +62,7 @@ class ContactReader:
             record["fraction"] = hit.mFraction
         return records
 
-    def forget(self) -> None:
+    def clear_warm_start(self) -> None:
         """Drop references to DART's objects, which are about to be replaced."""
         self._places.clear()
 

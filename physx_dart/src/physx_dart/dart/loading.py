@@ -21,7 +21,7 @@ from physx_sim.engines import (
     Joint,
     LoadedBody,
     LoadedRobot,
-    Mover,
+    MovableBody,
     Static,
     check_loaded,
     geometry_file,
@@ -57,25 +57,25 @@ _MESH = (
 )
 
 
-def load_skeleton(mover: Mover, *, free: bool = False) -> dynamics.Skeleton:
+def load_skeleton(movable: MovableBody, *, free: bool = False) -> dynamics.Skeleton:
     """Return the skeleton of a robot or object, without shapes.
 
     Args:
-        mover: The robot or object.
+        movable: The robot or object.
         free: Whether its joints have neither limits nor resistance, and take torques.
 
     Raises:
         ModelError: If DART cannot load it, or holds something else than physx read.
     """
-    model, text = mover.model, mover.model.text
+    model, text = movable.model, movable.model.text
     if model.links[0] == WORLD:
         text = text.replace(f'link="{WORLD}"', f'link="{ROOT}"')
         text = text.replace(f'<link name="{WORLD}">', f'<link name="{ROOT}">')
-    skeleton = _parse(text, mover.fixed_base, str(model.path))
-    if mover.fixed_base:
-        place = _transform(mover.position, to_matrix(mover.orientation))
+    skeleton = _parse(text, movable.fixed_base, str(model.path))
+    if movable.fixed_base:
+        place = _transform(movable.position, to_matrix(movable.orientation))
         skeleton.getRootJoint().setTransformFromParentBodyNode(place)
-    skeleton.setName(mover.name)
+    skeleton.setName(movable.name)
     joints = [skeleton.getJoint(joint.name) for joint in model.joints]
     limits: dict[str, Vector] = {}
     if not free:
@@ -83,23 +83,25 @@ def load_skeleton(mover: Mover, *, free: bool = False) -> dynamics.Skeleton:
             _configure(joint, native)
         for name, read in _LIMITS.items():
             limits[name] = np.array([read(native) for native in joints], np.float64)
-    check_loaded("dart", mover, _loaded(skeleton, mover, limits))
+    check_loaded("dart", movable, _loaded(skeleton, movable, limits))
     return skeleton
 
 
-def _loaded(skeleton: dynamics.Skeleton, mover: Mover, limits: Mapping[str, Vector]) -> LoadedRobot:
+def _loaded(
+    skeleton: dynamics.Skeleton, movable: MovableBody, limits: Mapping[str, Vector]
+) -> LoadedRobot:
     """Return what DART holds of a robot or object."""
     bodies, poses = [], []
-    for place, link in enumerate(mover.model.links):
+    for place, link in enumerate(movable.model.links):
         body = skeleton.getBodyNode(link_name(link))
         if body is None:
-            raise ModelError(f'DART finds no link "{link}" in {mover.model.path}.')
+            raise ModelError(f'DART finds no link "{link}" in {movable.model.path}.')
         joint, inertia = body.getParentJoint(), body.getInertia()
         child = joint.getTransformFromChildBodyNode().inverse()
         poses.append(joint.getTransformFromParentBodyNode().multiply(child).matrix())
         found = inertia.getLocalCOM(), inertia.getMoment()
         bodies.append(LoadedBody((place,), inertia.getMass(), *found))
-    joints = [skeleton.getJoint(joint.name) for joint in mover.model.joints]
+    joints = [skeleton.getJoint(joint.name) for joint in movable.model.joints]
     axes = np.array([joint.getAxis() for joint in joints]).reshape(-1, 3)
     return LoadedRobot(np.array(poses), axes, bodies, limits)
 

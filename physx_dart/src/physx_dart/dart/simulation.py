@@ -85,7 +85,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
             if name is not None and name not in known:
                 raise UnknownOptionError(f"World.{option} for dart", [name], known)
         parts = read_parts(world)
-        touching = any(mover.model.shapes for mover in parts.movers)
+        touching = any(movable.model.shapes for movable in parts.movables)
         solver = world.solver or ("nsgs" if touching else "dantzig")
         detector = world.detector or ("dart" if solver == "dantzig" else "bullet")
         self._check_features(parts, detector)
@@ -93,7 +93,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
         self._stateless = (detector, solver) == _STATELESS
         self._kept: Records | None = None
         self._rk4 = world.integrator == "rk4"
-        robots = [self._add(parts, place) for place in range(len(parts.movers))]
+        robots = [self._add(parts, place) for place in range(len(parts.movables))]
         statics = [] if world.contacts == "none" else parts.statics
         self._statics = [static_skeleton(static) for static in statics]
         for skeleton in self._statics:
@@ -101,10 +101,12 @@ class DartSimulation(RobotSimulation[DartRobot]):
         bodies = [body for robot in robots for body in robot.bodies]
         bodies += [skeleton.getBodyNode(0) for skeleton in self._statics]
         immobile = [[each.getBodyNode(0)] for each in self._statics]
-        immobile += [robot.bodies for robot in robots if not robot.mover.moves]
+        immobile += [robot.bodies for robot in robots if not robot.movable.moves]
         _disable_contacts(self._world, immobile)
         if world.contacts == "static":
-            _disable_contacts(self._world, [robot.bodies for robot in robots if robot.mover.moves])
+            _disable_contacts(
+                self._world, [robot.bodies for robot in robots if robot.movable.moves]
+            )
         self._reader = ContactReader(self._world, bodies, world.period)
         self._step_world = self._world.step
         lacks = [] if solver in _ISOTROPIC else ["isotropic_friction"]
@@ -117,20 +119,20 @@ class DartSimulation(RobotSimulation[DartRobot]):
         features = frozenset(FEATURES) - self.lacks
         if parts.world.integrator == "rk4":
             check_rk4(parts, self.engine, features)
-        if any(joint.settings.armature for each in parts.movers for joint in each.model.joints):
+        if any(joint.settings.armature for each in parts.movables for joint in each.model.joints):
             raise FeatureNotSupportedError(self.engine, "armature", features)
-        shapes = [shape for each in parts.movers for shape in each.model.shapes]
+        shapes = [shape for each in parts.movables for shape in each.model.shapes]
         shapes += [each.what for each in parts.statics if isinstance(each.what, CollisionShape)]
         if detector == "fcl" and any(shape.kind == "capsule" for shape in shapes):
             advice = "Use another detector."
             raise FeatureNotSupportedError(self.engine, "capsules in fcl", features, advice)
 
     def _add(self, parts: Parts, place: int) -> DartRobot:
-        mover = parts.movers[place]
-        robot = DartRobot(mover, parts.world.gravity)
+        movable = parts.movables[place]
+        robot = DartRobot(movable, parts.world.gravity)
         if parts.world.contacts != "none":
-            attach_shapes(robot.skeleton, mover.model.shapes)
-        if mover.self_collisions and mover.moves and parts.world.contacts == "all":
+            attach_shapes(robot.skeleton, movable.model.shapes)
+        if movable.self_collisions and movable.moves and parts.world.contacts == "all":
             robot.skeleton.enableSelfCollisionCheck()
         self._world.addSkeleton(robot.skeleton)
         return robot
@@ -151,7 +153,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
         for _ in range(n):
             step(False)
 
-    def forget(self) -> None:
+    def clear_warm_start(self) -> None:
         """Make the state alone determine what follows.
 
         Iterative solvers start from the impulses of the last step, and some detectors from its
@@ -161,7 +163,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
             return
         if self._stepped:
             self._kept = self.read_contacts()
-        self._reader.forget()
+        self._reader.clear_warm_start()
         contacts = self._world.getConstraintSolver()
         contacts.removeAllSkeletons()
         for skeleton in [*(robot.skeleton for robot in self._robots), *self._statics]:

@@ -17,7 +17,7 @@ from physx_core.rotations import (
 )
 from physx_core.typing import Vector
 from physx_dart.dart.loading import link_name, load_skeleton
-from physx_sim.engines import Mover, RobotEngine, base_accelerations, rk4_step
+from physx_sim.engines import MovableBody, RobotEngine, base_accelerations, rk4_step
 
 
 class DartRobot(RobotEngine):
@@ -28,9 +28,9 @@ class DartRobot(RobotEngine):
         bodies: Its body for each link.
     """
 
-    def __init__(self, mover: Mover, gravity: tuple[float, ...]) -> None:
-        super().__init__(mover)
-        self.skeleton = load_skeleton(mover)
+    def __init__(self, movable: MovableBody, gravity: tuple[float, ...]) -> None:
+        super().__init__(movable)
+        self.skeleton = load_skeleton(movable)
         self._gravity = gravity
         self._made_shadow: Any = None
         joints = [self.skeleton.getJoint(joint.name) for joint in self.model.joints]
@@ -184,7 +184,7 @@ class DartRobot(RobotEngine):
     @property
     def _shadow(self) -> Any:
         if self._made_shadow is None:
-            self._made_shadow = load_skeleton(self.mover, free=True)
+            self._made_shadow = load_skeleton(self.movable, free=True)
             self._made_shadow.setGravity(list(self._gravity))
         return self._made_shadow
 

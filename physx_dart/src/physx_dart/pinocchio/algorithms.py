@@ -15,13 +15,13 @@ import pinocchio
 from physx_core.typing import Vector
 from physx_dart.pinocchio.models import frames_of, load_model, twists_of
 from physx_sim import World
-from physx_sim.engines import Algorithms, Mover, Parts, Resistance, read_parts, static_poses
+from physx_sim.engines import Algorithms, MovableBody, Parts, Resistance, read_parts, static_poses
 
 _WORLD_AXES = pinocchio.ReferenceFrame.LOCAL_WORLD_ALIGNED
 _velocity, _acceleration = pinocchio.getFrameVelocity, pinocchio.getFrameClassicalAcceleration
 
 
-class MoverAlgorithms:
+class MovableAlgorithms:
     """Pinocchio's algorithms for a robot or object.
 
     Attributes:
@@ -37,11 +37,11 @@ class MoverAlgorithms:
         self._first = 1 if model.nq == model.nv else 2  # a floating base is a joint, too
 
     @classmethod
-    def load(cls, mover: Mover, gravity: tuple[float, ...]) -> Self:
+    def load(cls, movable: MovableBody, gravity: tuple[float, ...]) -> Self:
         """Return the algorithms of a robot or object."""
-        resistance = Resistance.of(mover)
-        model = load_model(mover, gravity, armature=resistance.armature)
-        return cls(model, resistance, frames_of(model, mover))
+        resistance = Resistance.of(movable)
+        model = load_model(movable, gravity, armature=resistance.armature)
+        return cls(model, resistance, frames_of(model, movable))
 
     def write_motion(self, frame: int, out: Vector) -> None:
         """Write pose, velocity, and acceleration of a frame, after `pinocchio.forwardKinematics`.
@@ -164,20 +164,20 @@ class PinocchioAlgorithms(Algorithms):
     length 1.
 
     Attributes:
-        movers: Algorithms of each robot, then of each moving object.
+        movables: Algorithms of each robot, then of each moving object.
     """
 
-    def __init__(self, movers: Sequence[MoverAlgorithms], statics: Vector) -> None:
-        """Combine movers with static bodies, whose poses have the shape (statics, 7)."""
-        self.movers = tuple(movers)
-        self._slices: list[tuple[MoverAlgorithms, slice, slice]] = []
+    def __init__(self, movables: Sequence[MovableAlgorithms], statics: Vector) -> None:
+        """Combine movables with static bodies, whose poses have the shape (statics, 7)."""
+        self.movables = tuple(movables)
+        self._slices: list[tuple[MovableAlgorithms, slice, slice]] = []
         nq = nv = 0
-        for each in self.movers:
+        for each in self.movables:
             ends = nq + each.model.nq, nv + each.model.nv
             self._slices.append((each, slice(nq, ends[0]), slice(nv, ends[1])))
             nq, nv = ends
         self.nq, self.nv = nq, nv
-        self._links = [(i, frame) for i, each in enumerate(self.movers) for frame in each.frames]
+        self._links = [(i, frame) for i, each in enumerate(self.movables) for frame in each.frames]
         self._still = np.zeros((len(statics), 19))
         self._still[:, :7] = statics
 
@@ -189,8 +189,8 @@ class PinocchioAlgorithms(Algorithms):
     @classmethod
     def of_parts(cls, parts: Parts) -> Self:
         """Return the algorithms of the parts of a world."""
-        movers = [MoverAlgorithms.load(each, parts.world.gravity) for each in parts.movers]
-        return cls(movers, static_poses(parts))
+        movables = [MovableAlgorithms.load(each, parts.world.gravity) for each in parts.movables]
+        return cls(movables, static_poses(parts))
 
     def body_poses(self, q: Vector, bodies: Sequence[int]) -> Vector:
         """Return the poses of bodies, given as indices into `Layout.names`, shape (bodies, 7)."""
@@ -200,11 +200,11 @@ class PinocchioAlgorithms(Algorithms):
             if body >= len(self._links):
                 row[:] = self._still[body - len(self._links), :7]
                 continue
-            mover, frame = self._links[body]
-            each, x, _ = self._slices[mover]
-            if mover not in known:
+            movable, frame = self._links[body]
+            each, x, _ = self._slices[movable]
+            if movable not in known:
                 pinocchio.forwardKinematics(each.model, each.data, q[x])
-                known.add(mover)
+                known.add(movable)
             row[:] = each.pose(frame)
         return found
 
@@ -226,11 +226,11 @@ class PinocchioAlgorithms(Algorithms):
             if body >= len(self._links):
                 row[:] = self._still[body - len(self._links)]
                 continue
-            mover, frame = self._links[body]
-            each, x, y = self._slices[mover]
-            if mover not in known:
+            movable, frame = self._links[body]
+            each, x, y = self._slices[movable]
+            if movable not in known:
                 pinocchio.forwardKinematics(each.model, each.data, q[x], v[y], a[y])
-                known.add(mover)
+                known.add(movable)
             each.write_motion(frame, row)
         return found
 
@@ -301,7 +301,7 @@ class PinocchioAlgorithms(Algorithms):
 
     def _diagonal(self, blocks: Any) -> Vector:
         """Return a block-diagonal matrix of square blocks."""
-        if len(self.movers) == 1:
+        if len(self.movables) == 1:
             return blocks[0]
         whole = np.zeros((self.nv, self.nv))
         begin = 0

@@ -31,7 +31,7 @@ class Warmth:
     def __init__(self, points: int, rows: int) -> None:
         self.points, self.rows = np.zeros((points, 3)), np.zeros(rows)
 
-    def forget(self) -> None:
+    def clear_warm_start(self) -> None:
         """Start with no impulses."""
         self.points.fill(0.0)
         self.rows.fill(0.0)
@@ -102,9 +102,9 @@ class Constraints:
         self.acts |= missed
         return bool(np.count_nonzero(missed))
 
-    def forget(self) -> None:
+    def clear_warm_start(self) -> None:
         """Start the next step with no impulses."""
-        self._warmth.forget()
+        self._warmth.clear_warm_start()
 
     def keep(self, points: Vector, rows: Vector) -> None:
         """Store the impulses of the touching points and of all rows."""
@@ -118,7 +118,7 @@ class Constraints:
 def limited(part: Constraints, v: Vector) -> Vector:
     """Return the velocities after the impulses of the joint rows only."""
     joints, rows = part.joints, part.acts.nonzero()[0]
-    part.forget()
+    part.clear_warm_start()
     if not len(rows):
         return v
     column = joints.columns[rows]

@@ -18,7 +18,7 @@ from physx_core.typing import Records, Vector
 from physx_dart.pinocchio.models import twists_of
 from physx_dart.pinocchio.surfaces import Plane, surface_of
 from physx_sim import CONTACT
-from physx_sim.engines import CollisionShape, Mover, Static
+from physx_sim.engines import CollisionShape, MovableBody, Static
 from physx_sim.errors import FeatureNotSupportedError
 
 MARGIN = 1e-4
@@ -106,7 +106,7 @@ class ContactFinder:
 
     def __init__(
         self,
-        mover: Mover,
+        movable: MovableBody,
         statics: Sequence[Static],
         model: Any,
         data: Any,
@@ -124,10 +124,10 @@ class ContactFinder:
             (each.normal for _, each in self._surfaces if isinstance(each, Plane)),
             np.array([0.0, 0.0, 1.0]),
         )
-        links = {name: i for i, name in enumerate(mover.model.links)}
+        links = {name: i for i, name in enumerate(movable.model.links)}
         points: list[tuple[int, Vector, float, int, CollisionShape]] = []
         rims: list[tuple[int, Vector, float, int, CollisionShape, Vector]] = []
-        for shape in mover.model.shapes if self._surfaces else ():
+        for shape in movable.model.shapes if self._surfaces else ():
             if shape.kind == "mesh":
                 advice = 'Use Robot(collisions="boxes") or "capsules".'
                 raise FeatureNotSupportedError("pinocchio", "mesh_contacts", features, advice)

@@ -37,7 +37,7 @@ class Coupling:
         """Return whether any pair of shapes may touch."""
         return len(self._finder) > 0
 
-    def forget(self) -> None:
+    def clear_warm_start(self) -> None:
         """Discard the impulses of the last step."""
         self._warmth.fill(0.0)
 
@@ -50,7 +50,7 @@ class Coupling:
             if place not in coupled:
                 robot.finish(robot.constrained(free[place]))
         if touching is None:
-            self.forget()
+            self.clear_warm_start()
             return
         group = [self._robots[place] for place in coupled]
         contacts = touching.contacts
@@ -67,7 +67,7 @@ class Coupling:
             contacts,
             np.einsum("kij,kj->ki", contacts.axes, share),
         )
-        self.forget()
+        self.clear_warm_start()
         along = np.einsum("kij,ki->kj", contacts.axes, self._impulses)
         np.add.at(self._warmth, touching.pairs, along)
         first = 0

@@ -9,7 +9,7 @@ import pinocchio
 
 from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
-from physx_sim.engines import LoadedBody, LoadedRobot, Mover, check_loaded
+from physx_sim.engines import LoadedBody, LoadedRobot, MovableBody, check_loaded
 from physx_sim.errors import ModelError
 
 _TRANSLATION, _ROTATION = "physx translation", "physx rotation"
@@ -17,44 +17,46 @@ _LINK = "physx link "
 _MOST_VELOCITIES = 192
 
 
-def load_model(mover: Mover, gravity: tuple[float, ...], *, armature: Vector) -> Any:
+def load_model(movable: MovableBody, gravity: tuple[float, ...], *, armature: Vector) -> Any:
     """Return the model of a robot or object in the convention of `physx_core`."""
-    if mover.fixed_base:
-        model = _parse(mover)
-        _weld(model, mover)
+    if movable.fixed_base:
+        model = _parse(movable)
+        _weld(model, movable)
     else:
-        model = _parse(mover, pinocchio.JointModelFreeFlyer())
-    return _finish(model, mover, gravity, armature, 1 if mover.fixed_base else 2)
+        model = _parse(movable, pinocchio.JointModelFreeFlyer())
+    return _finish(model, movable, gravity, armature, 1 if movable.fixed_base else 2)
 
 
-def load_stepping_model(mover: Mover, gravity: tuple[float, ...], *, armature: Vector) -> Any:
+def load_stepping_model(
+    movable: MovableBody, gravity: tuple[float, ...], *, armature: Vector
+) -> Any:
     """Return the model for stepping, whose base translates along the world's axes.
 
     Its positions are those of `load_model`. The first three velocities of a floating base are in
     the world frame, not its own, so that semi-implicit Euler conserves the linear momentum of a
     tumbling body, as in DART; in the base's own frame it would not.
     """
-    if mover.fixed_base:
-        return load_model(mover, gravity, armature=armature)
+    if movable.fixed_base:
+        return load_model(movable, gravity, armature=armature)
     nowhere = pinocchio.SE3.Identity()
     base = pinocchio.Model()
     first = base.addJoint(0, pinocchio.JointModelTranslation(), nowhere, _TRANSLATION)
     second = base.addJoint(first, pinocchio.JointModelSpherical(), nowhere, _ROTATION)
     frame = pinocchio.Frame(_ROTATION, second, 0, nowhere, pinocchio.FrameType.BODY)
     place = base.addFrame(frame)
-    robot = _parse(mover)
+    robot = _parse(movable)
     links = [frame for frame in robot.frames if frame.type == pinocchio.FrameType.BODY]
     for frame in links:  # appendModel confuses a link and a joint with the same name
         frame.name = f"{_LINK}{frame.name}"
     model = pinocchio.appendModel(base, robot, place, nowhere)
     for frame in model.frames:
         frame.name = frame.name.removeprefix(_LINK)
-    return _finish(model, mover, gravity, armature, 3)
+    return _finish(model, movable, gravity, armature, 3)
 
 
-def frames_of(model: Any, mover: Mover) -> list[int]:
+def frames_of(model: Any, movable: MovableBody) -> list[int]:
     """Return the frame of each link of a model."""
-    return [model.getFrameId(link, pinocchio.FrameType.BODY) for link in mover.model.links]
+    return [model.getFrameId(link, pinocchio.FrameType.BODY) for link in movable.model.links]
 
 
 def twists_of(found: Vector) -> Vector:
@@ -62,23 +64,23 @@ def twists_of(found: Vector) -> Vector:
     return found.reshape(6, -1)
 
 
-def _parse(mover: Mover, *root: Any) -> Any:
+def _parse(movable: MovableBody, *root: Any) -> Any:
     try:
-        model = pinocchio.buildModelFromXML(mover.model.text, *root)
+        model = pinocchio.buildModelFromXML(movable.model.text, *root)
     except (ValueError, RuntimeError) as error:
-        raise ModelError(f"Pinocchio cannot load {mover.model.path}: {error}") from error
+        raise ModelError(f"Pinocchio cannot load {movable.model.path}: {error}") from error
     if model.nv > _MOST_VELOCITIES:
         raise ModelError(
-            f"{mover.model.path} has {model.nv} degrees of freedom. Pinocchio's memory grows with "
-            f"their cube, so at most {_MOST_VELOCITIES} are allowed; use the engine dart."
+            f"{movable.model.path} has {model.nv} degrees of freedom. Pinocchio's memory grows "
+            f"with their cube, so at most {_MOST_VELOCITIES} are allowed; use the engine dart."
         )
     return model
 
 
-def _weld(model: Any, mover: Mover) -> None:
+def _weld(model: Any, movable: MovableBody) -> None:
     """Place the root of a fixed-base robot."""
-    rotation = to_matrix(mover.orientation)
-    base = pinocchio.SE3(rotation, np.array(mover.position))
+    rotation = to_matrix(movable.orientation)
+    base = pinocchio.SE3(rotation, np.array(movable.position))
     for joint in range(1, model.njoints):
         if model.parents[joint] == 0:
             model.jointPlacements[joint] = base * model.jointPlacements[joint]
@@ -88,22 +90,22 @@ def _weld(model: Any, mover: Mover) -> None:
 
 
 def _finish(
-    model: Any, mover: Mover, gravity: tuple[float, ...], armature: Vector, first: int
+    model: Any, movable: MovableBody, gravity: tuple[float, ...], armature: Vector, first: int
 ) -> Any:
     model.gravity.linear = np.array(gravity, np.float64)
     model.armature = np.asarray(armature, np.float64)
     moving = list(model.names)[first:]
-    if moving != [joint.name for joint in mover.model.joints]:
-        path = mover.model.path
+    if moving != [joint.name for joint in movable.model.joints]:
+        path = movable.model.path
         raise ModelError(f"Pinocchio reads the joints of {path} in a different order: {moving}.")
-    check_loaded("pinocchio", mover, _loaded(model, mover))
+    check_loaded("pinocchio", movable, _loaded(model, movable))
     return model
 
 
-def _loaded(model: Any, mover: Mover) -> LoadedRobot:
+def _loaded(model: Any, movable: MovableBody) -> LoadedRobot:
     """Return what Pinocchio holds of a robot or object, whose limits it does not use."""
-    bodies = mover.model.bodies
-    frames = [model.frames[frame] for frame in frames_of(model, mover)]
+    bodies = movable.model.bodies
+    frames = [model.frames[frame] for frame in frames_of(model, movable)]
     poses, axes = [], []
     for frame, body in zip(frames, bodies, strict=True):
         joint, place = frame.parentJoint, frame.placement

@@ -105,15 +105,17 @@ class PairFinder:
 
     def _moving(self) -> Iterator[_Solid]:
         first = 0
-        for owner, (mover, robot) in enumerate(zip(self._parts.movers, self._robots, strict=True)):
-            links = {name: i for i, name in enumerate(mover.model.links)}
-            for shape in mover.model.shapes:
+        for owner, (movable, robot) in enumerate(
+            zip(self._parts.movables, self._robots, strict=True)
+        ):
+            links = {name: i for i, name in enumerate(movable.model.links)}
+            for shape in movable.model.shapes:
                 link = links.get(shape.body, 0)
                 frame = robot.model_in_motion.frames[robot.frames[link]]
                 turn, place = frame.placement.rotation, frame.placement.translation
                 pose = turn @ shape.rotation, turn @ shape.position + place
                 yield _Solid(owner, frame.parentJoint, link, first + link, shape, *pose)
-            first += len(mover.model.links)
+            first += len(movable.model.links)
         self.statics = first
 
     def _static(self) -> Iterator[_Solid]:
@@ -130,8 +132,8 @@ class PairFinder:
 
     def _possible(self, solids: Sequence[_Solid]) -> Iterator[tuple[int, int]]:
         """Yield the pairs of shapes that may touch: those that can move relative to each other."""
-        contacts, movers = self._parts.world.contacts, self._parts.movers
-        moves = [solid.owner is not None and movers[solid.owner].moves for solid in solids]
+        contacts, movables = self._parts.world.contacts, self._parts.movables
+        moves = [solid.owner is not None and movables[solid.owner].moves for solid in solids]
         for (i, a), (j, b) in itertools.combinations(enumerate(solids), 2):
             wanted = contacts == "all" or (contacts == "static" and moves[i] != moves[j])
             if a.owner is None or not wanted:
@@ -145,7 +147,7 @@ class PairFinder:
                 )
                 if near:
                     continue
-                if not movers[a.owner].self_collisions:
+                if not movables[a.owner].self_collisions:
                     continue
             yield i, j
 
@@ -247,7 +249,7 @@ class PairFinder:
             solid.owner
             for both in touching
             for solid in both
-            if solid.owner is not None and self._parts.movers[solid.owner].moves
+            if solid.owner is not None and self._parts.movables[solid.owner].moves
         }
         bodies = np.array([(a.body, b.body) for a, b in touching], np.intp)
         return PairPoints(pairs, bodies, owners, contacts)

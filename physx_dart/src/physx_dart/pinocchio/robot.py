@@ -24,7 +24,7 @@ from physx_dart.pinocchio.limits import JointConstraints
 from physx_dart.pinocchio.models import frames_of, load_stepping_model, twists_of
 from physx_dart.pinocchio.solver import ImpulseSolver
 from physx_sim import CONTACT, World
-from physx_sim.engines import Mover, RobotEngine, Static, rk4_step, twist_change
+from physx_sim.engines import MovableBody, RobotEngine, Static, rk4_step, twist_change
 
 _UNSEEN = 10
 """Steps between checks of whether a limit might have acted."""
@@ -38,31 +38,31 @@ class PinocchioRobot(RobotEngine):
 
     def __init__(
         self,
-        mover: Mover,
+        movable: MovableBody,
         world: World,
         statics: Sequence[Static],
         solver: ImpulseSolver,
         features: Sequence[str],
     ) -> None:
         """Load the models."""
-        super().__init__(mover)
+        super().__init__(movable)
         self._period = world.period
         resists, dt = self.resistance, world.period
         implicit = resists.armature + dt * resists.damping + dt * dt * resists.stiffness
-        self.model_in_motion = load_stepping_model(mover, world.gravity, armature=implicit)
+        self.model_in_motion = load_stepping_model(movable, world.gravity, armature=implicit)
         self.data = self.model_in_motion.createData()
         # Constraints act on the robot without its implicit damping, as in DART.
         self._model = self.model_in_motion.copy()
         self._model.armature = np.asarray(resists.armature, np.float64)
         self._data = self._model.createData()
-        self.frames = frames_of(self.model_in_motion, mover)
+        self.frames = frames_of(self.model_in_motion, movable)
         self._pushes = pinocchio.StdVec_Force()
         self._pushes.extend(pinocchio.Force.Zero() for _ in range(self.model_in_motion.njoints))
         self._more: tuple[Any, ...] = ()  # the wrenches, if there are any
         self._joints = JointConstraints(self.model.joints, dt, self.base)
         self._contacts = ContactFinder(
-            mover,
-            statics if mover.moves else (),
+            movable,
+            statics if movable.moves else (),
             self.model_in_motion,
             self.data,
             self.frames,
@@ -210,9 +210,9 @@ class PinocchioRobot(RobotEngine):
         upper = self._upper * pinocchio.computeMinverse(self._model, self._data, self._positions)
         return upper + upper.T
 
-    def forget(self) -> None:
+    def clear_warm_start(self) -> None:
         """Discard the impulses of the last step."""
-        self._warmth.forget()
+        self._warmth.clear_warm_start()
 
     def place_joints(self) -> Vector:
         """Place the joints in `data`; return the twists for unit velocities, shape (6, nv)."""

@@ -60,7 +60,9 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
         self._check_features(parts)
         statics = [] if world.contacts == "none" else parts.statics
         features = sorted(frozenset(FEATURES) - self.lacks)
-        robots = [PinocchioRobot(mover, world, statics, solver, features) for mover in parts.movers]
+        robots = [
+            PinocchioRobot(movable, world, statics, solver, features) for movable in parts.movables
+        ]
         self._coupling = Coupling(parts, robots, solver, features)
         super().__init__(parts, robots, () if world.integrator == "euler" else RK4_LACKS)
 
@@ -84,11 +86,11 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
         for robot in self._robots:
             robot.run(n)
 
-    def forget(self) -> None:
+    def clear_warm_start(self) -> None:
         """Make the state alone determine what follows: discard the impulses of the last step."""
-        self._coupling.forget()
+        self._coupling.clear_warm_start()
         for robot in self._robots:
-            robot.forget()
+            robot.clear_warm_start()
 
     def read_contacts(self) -> Records:
         """Return the contacts of the last physics step."""

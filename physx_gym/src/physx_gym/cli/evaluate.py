@@ -18,7 +18,7 @@ from physx_gym.bridge.make_env import make_env
 from physx_gym.bridge.plain import PlainEnv
 from physx_gym.bridge.policy import Policy
 from physx_gym.env.robot_env import RobotEnv
-from physx_gym.show.replaying import replay
+from physx_gym.visualization.replaying import replay
 
 SPEED = "x_velocity"
 """Name, in information, of the velocity in the direction of walking, in m/s."""

@@ -42,12 +42,12 @@ def run(words: Sequence[str]) -> None:
     options = tyro.cli(ShowLog, args=words, prog="physx log")
     logs = [read_log(file) for file in options.files]
     if options.plot is not None:
-        from physx_gym.show.plotting import plot
+        from physx_gym.visualization.plotting import plot
 
         plot(logs, path=options.plot, columns=options.columns or None, enable_block_states=True)
         show(f"plot: {options.plot}")
     if options.replay is not None:
-        from physx_gym.show.replaying import replay
+        from physx_gym.visualization.replaying import replay
 
         path = replay(
             logs,

@@ -241,8 +241,8 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         enable_replay: bool | None = None,
         **kwargs: Any,
     ) -> tuple[list[float], list[Info]]:
-        """Run an episode in evaluation mode; see `physx_gym.show.evaluating.evaluate`."""
-        from physx_gym.show.evaluating import evaluate
+        """Run an episode in evaluation mode; see `physx_gym.visualization.evaluating.evaluate`."""
+        from physx_gym.visualization.evaluating import evaluate
 
         return evaluate(self, policy_fn, seed, horizon, enable_stats, enable_replay, **kwargs)
 
@@ -254,8 +254,8 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         verbose: bool = True,
         **kwargs: Any,
     ) -> None:
-        """Play using the keyboard; see `physx_gym.show.interactive.play`."""
-        from physx_gym.show.interactive import play
+        """Play using the keyboard; see `physx_gym.visualization.interactive.play`."""
+        from physx_gym.visualization.interactive import play
 
         play(self, enable_travelling, start_paused, enable_is_done, verbose, **kwargs)
 
@@ -307,19 +307,19 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
         return self.recorder.data()
 
     def plot(self, enable_block_states: bool = False, **kwargs: Any) -> Any:
-        """Plot the running episode, or the last one; see `physx_gym.show.plotting.plot`.
+        """Plot the running episode, or the last one; see `physx_gym.visualization.plotting.plot`.
 
         Args:
             enable_block_states: Whether to show the states of blocks too.
-            kwargs: For `physx_gym.show.plotting.plot`.
+            kwargs: For `physx_gym.visualization.plotting.plot`.
         """
-        from physx_gym.show.plotting import plot
+        from physx_gym.visualization.plotting import plot
 
         return plot(self.log_data, enable_block_states=enable_block_states, **kwargs)
 
     def replay(self, **kwargs: Any) -> Any:
-        """Show the running episode, or the last one; see `physx_gym.show.replaying.replay`."""
-        from physx_gym.show.replaying import replay
+        """Show the running episode, or the last one; see `physx_gym.replay`."""
+        from physx_gym.visualization.replaying import replay
 
         return replay(self.log_data, **kwargs)
 
@@ -360,7 +360,7 @@ class PipelineEnv(SharedArrays, gymnasium.Env[Any, Any], ABC):
     def _recall(self, memory: Any) -> None:
         """Restore what `_memory` returned."""
 
-    def _foresee(self, memory: Any) -> bool:
+    def _prepare_restore(self, memory: Any) -> bool:
         """Prepare `_setup` for a memory that `_recall` will get.
 
         Returns:

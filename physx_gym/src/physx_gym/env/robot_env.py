@@ -616,14 +616,14 @@ class RobotEnv(PipelineEnv):
             VisualizerError: If the viewer cannot draw; the message says what is missing.
         """
         if self._own_renderer is None:
-            from physx_gym.show.rendering import Renderer
+            from physx_gym.visualization.rendering import Renderer
 
             self._own_renderer = Renderer(self)
         return self._own_renderer.frame()
 
     def make_drawing(self, factory: Factory) -> Callable[[], None]:
         """Return a function that draws the present state with a factory; for pipelines."""
-        from physx_gym.show.environment_drawing import EnvironmentDrawing
+        from physx_gym.visualization.environment_drawing import EnvironmentDrawing
 
         return EnvironmentDrawing(self, factory).draw
 
@@ -646,8 +646,10 @@ class RobotEnv(PipelineEnv):
             raise SimulationError(f"The snapshot is of {given}, not of {names}.")
         runs = state["own"][0]["simulator"]["running"]
         memories = [own["memory"] for own in state["own"]]
-        foreseen = [layer._foresee(each) for layer, each in zip(layers, memories, strict=True)]
-        if any(foreseen):
+        prepared = [
+            layer._prepare_restore(each) for layer, each in zip(layers, memories, strict=True)
+        ]
+        if any(prepared):
             self.stop()
         if not runs or self.derived is not outermost or not self.is_simulation_running:
             self.run_reset(outermost, None, state["own"][0]["options"])

@@ -9,7 +9,7 @@ from typing import Any
 import gymnasium
 
 from physx_core.errors import ConfigError, UnknownArgumentError, UnknownOptionError
-from physx_gym.show.display import has_display
+from physx_gym.visualization.display import has_display
 
 
 def construct_next(

@@ -533,7 +533,7 @@ class Simulator(SharedArrays, Closeable):
         self._forces, self._pending = list(state["forces"]), list(state["pending"])
         self.stepper_state.iter = state["frame"]
         self.stepper_state.t = state["frame"] * engine.simulation.period
-        self.robot_state.recall(state["accelerations"], state["torques"])
+        self.robot_state.restore_memory(state["accelerations"], state["torques"])
         self.is_simulation_running[...] = state["running"]
 
     def __getstate__(self) -> dict[str, Any]:

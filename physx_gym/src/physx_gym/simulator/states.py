@@ -93,7 +93,7 @@ class RobotState(SharedArrays):
         """Note that the simulation's state was set, not simulated."""
         self._when = -1
 
-    def recall(self, accelerations: Vector, torques: Vector) -> None:
+    def restore_memory(self, accelerations: Vector, torques: Vector) -> None:
         """Restore what engines do not keep in their snapshots."""
         self._when = self._stepper.iter
         self._a[:], self._torques[:] = accelerations, torques

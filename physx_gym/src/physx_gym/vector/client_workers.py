@@ -18,10 +18,10 @@ from physx_core.net import Frame, Kind, decode, decode_error, encode
 from physx_core.sources import ClientSource
 from physx_core.typing import Array, Batch
 from physx_gym.vector.batch import COMMAND, SharedBatch
+from physx_gym.vector.env_slice_environment import COUNT, ENTRIES, ORDER, ORDER_SIZE
 from physx_gym.vector.rows import ROW, RowLayout, copy_results
-from physx_gym.vector.share_environment import COUNT, ENTRIES, ORDER, ORDER_SIZE
 
-_ENVIRONMENT = "physx_gym.vector.share_environment:ShareEnvironment"
+_ENVIRONMENT = "physx_gym.vector.env_slice_environment:EnvSliceEnvironment"
 
 
 class ClientWorkers:
@@ -67,7 +67,7 @@ class ClientWorkers:
             num_clients=len(shares),
             **config,
         )
-        self._source = ClientSource(environment, _Mail(self._take), [0], run_ahead=0)
+        self._source = ClientSource(environment, _MessageSink(self._take), [0], run_ahead=0)
         try:
             self._source.open()
         except BaseException:
@@ -173,7 +173,7 @@ class ClientWorkers:
         raise error
 
 
-class _Mail:
+class _MessageSink:
     """Services for the clients of the run: they receive messages."""
 
     def __init__(self, take: Any) -> None:

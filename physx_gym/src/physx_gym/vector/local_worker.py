@@ -11,7 +11,7 @@ from physx_core.errors import EnvironmentFailedError, PhysxError
 from physx_core.net import Frame, Kind, decode, decode_error, encode
 from physx_core.typing import Array
 from physx_gym.vector.batch import SharedBatch
-from physx_gym.vector.share import Share
+from physx_gym.vector.env_slice import EnvSlice
 
 
 class LocalWorker:
@@ -41,9 +41,9 @@ class LocalWorker:
         self.messages: list[tuple[int, Frame]] = []
         # What is given and returned is copied, as it is by a process.
         plain = decode(bytearray(encode({**setup, "number": 0}, "env_kwargs")))
-        self._share = Share(plain, batch, self._take)
+        self._slice = EnvSlice(plain, batch, self._take)
         try:
-            self._share.create()
+            self._slice.create()
         except BaseException as error:
             self._interrupt(error, "__init__")
         self._raise(is_step=True)
@@ -58,7 +58,7 @@ class LocalWorker:
         command = decode(bytearray(encode({"name": name, "arguments": arguments[0]}, name)))
         self.wait(self.asked[0])
         try:
-            self._share.execute(command)
+            self._slice.execute(command)
         except BaseException as error:
             self._interrupt(error, name)
         answers = [decode(f.payload) for _, f in self.messages if f.kind is Kind.ANSWER]
@@ -72,7 +72,7 @@ class LocalWorker:
             queue, self._queue = self._queue, []
             try:
                 for entry in queue:
-                    self._share.step(entry)
+                    self._slice.step(entry)
             except BaseException as error:
                 self._interrupt(error, "step")
             self._done += len(queue)
@@ -89,7 +89,7 @@ class LocalWorker:
             return
         self.is_open = False
         if os.getpid() == self._owner:  # a forked process leaves it alone
-            self._share.close()
+            self._slice.close()
         if orderly and self._errors:
             raise self._errors[0]
 

@@ -122,8 +122,8 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         self._all = np.arange(num_envs)
         self._shares = [np.arange(share) for share in shares]
         # The environments with pending results, by worker, in the order in which it delivers them.
-        self._owed: list[deque[int]] = [deque() for _ in range(workers)]
-        self._owes = np.zeros(num_envs, np.bool_)
+        self._pending: list[deque[int]] = [deque() for _ in range(workers)]
+        self._is_pending = np.zeros(num_envs, np.bool_)
         self._next = 0  # the worker to take results from first
         self._infos = _Infos(workers)
         fields = self._observations.fields, self._actions.fields
@@ -208,7 +208,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
             UsageError: If results of `send` are pending.
             PhysxError: If an environment raises, or a process fails.
         """
-        if any(self._owed):
+        if any(self._pending):
             self.send(actions)  # which names one of them
         workers = self._open()
         for name, array in self._action_arrays(actions, self.num_envs).items():
@@ -218,7 +218,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
                 workers.ask(number, mine)
             workers.wait(sum(workers.asked))
         except BaseException:  # after an interrupt, `recv` and `reset` wait for them
-            self._owe_all()
+            self._set_all_pending()
             raise
         self._read_messages()
         return self._results(None)
@@ -271,9 +271,9 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         """
         self._open()
         ids = self._all if env_ids is None else self._chosen(env_ids)
-        if self._owes.any() and len(owing := ids[self._owes[ids]]):
+        if self._is_pending.any() and len(pending := ids[self._is_pending[ids]]):
             raise UsageError(
-                f"The result of environment {owing[0]} is still pending: call recv() before "
+                f"The result of environment {pending[0]} is still pending: call recv() before "
                 "sending it another action, or start over with reset()."
             )
         for name, array in self._action_arrays(actions, len(ids)).items():
@@ -302,30 +302,30 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         return observations, *results, {**infos, "env_id": ids.copy()}
 
     @property
-    def owing(self) -> int:
+    def num_pending(self) -> int:
         """Number of environments whose result is pending."""
-        return int(self._owes.sum())
+        return int(self._is_pending.sum())
 
     def _ask(self, ids: Array) -> None:
         """Have environments step."""
         workers = self._open()
         if ids is self._all:
-            self._owe_all()
+            self._set_all_pending()
             for number, mine in enumerate(self._shares):
                 workers.ask(number, mine)
             return
-        self._owes[ids] = True
+        self._is_pending[ids] = True
         ends = ids.searchsorted(self._starts).tolist()  # where each worker's environments end
         for number, (first, last) in enumerate(pairwise(ends)):
             if first < last:
                 mine = ids[first:last]
-                self._owed[number].extend(mine.tolist())
+                self._pending[number].extend(mine.tolist())
                 workers.ask(number, mine - self._starts[number])
 
-    def _owe_all(self) -> None:
+    def _set_all_pending(self) -> None:
         """Note that the results of all environments are pending."""
-        self._owes[:] = True
-        for owed, bounds in zip(self._owed, pairwise(self._starts), strict=True):
+        self._is_pending[:] = True
+        for owed, bounds in zip(self._pending, pairwise(self._starts), strict=True):
             owed.extend(range(*bounds))
 
     def _read_messages(self) -> None:
@@ -336,13 +336,13 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
 
     def _take(self, count: int) -> Array:
         """Wait for `count` results, or all pending ones; return their environments, in order."""
-        workers, owed = self._open(), [len(each) for each in self._owed]
+        workers, owed = self._open(), [len(each) for each in self._pending]
         total = sum(owed)
         count = min(count, total)
         done = workers.wait(sum(workers.asked) - total + count)
         if count == total:  # no need to know which come first
-            taken = self._all if count == self.num_envs else np.flatnonzero(self._owes)
-            for each in self._owed:
+            taken = self._all if count == self.num_envs else np.flatnonzero(self._is_pending)
+            for each in self._pending:
                 each.clear()
         else:
             ready = [n - (a - d) for n, a, d in zip(owed, workers.asked, done, strict=True)]
@@ -350,10 +350,10 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
             while len(found) < count:
                 if ready[self._next]:
                     ready[self._next] -= 1
-                    found.append(self._owed[self._next].popleft())
+                    found.append(self._pending[self._next].popleft())
                 self._next = (self._next + 1) % len(ready)
             taken = np.array(sorted(found))
-        self._owes[taken] = False
+        self._is_pending[taken] = False
         self._read_messages()
         return taken
 
@@ -460,7 +460,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         """
         if name in FORBIDDEN:
             raise UsageError(f'call("{name}") would bypass this object: call {name}() directly.')
-        arguments = [(name, list(args), kwargs)] * len(self._owed)
+        arguments = [(name, list(args), kwargs)] * len(self._pending)
         return tuple(chain.from_iterable(self._open().command("call", arguments)))
 
     def get_attr(self, name: str) -> tuple[Any, ...]:

@@ -30,10 +30,10 @@ from physx_core.net import (
 )
 from physx_core.processes import kill_descendants, prepare_worker
 from physx_gym.vector.batch import COMMAND, END, SharedBatch
-from physx_gym.vector.share import Share
+from physx_gym.vector.env_slice import EnvSlice
 from physx_gym.vector.spinning import Spinner
 
-_BELL = pack(Kind.READY)
+_WAKEUP = pack(Kind.READY)
 _LOOK_EVERY = 1000  # ms
 
 
@@ -60,11 +60,11 @@ class Worker:
         self._done = 0
         self._spinner = Spinner(spins=has_core_for_each(len(setup["shares"])))
         sys.path[:] = setup["path"]
-        self._share = Share(setup, self._batch, self._send)
+        self._slice = EnvSlice(setup, self._batch, self._send)
 
     def run(self) -> None:
         """Create the environments, and step them until told to exit."""
-        share = self._share
+        share = self._slice
         try:
             share.create()
             self._finish()
@@ -111,7 +111,7 @@ class Worker:
         batch.done[self._number] = self._done
         fence()
         if sum(batch.done) >= batch.awaited[0]:
-            self._link.sendall(_BELL)
+            self._link.sendall(_WAKEUP)
 
     def _send(self, kind: Kind, content: bytes, number: int) -> None:
         self._link.sendall(pack(kind, content, number))

@@ -30,7 +30,7 @@ from physx_core.typing import Array
 from physx_gym.vector.batch import COMMAND, END, NEVER, SharedBatch
 from physx_gym.vector.spinning import Spinner
 
-_BELL = pack(Kind.ACTIONS)
+_WAKEUP = pack(Kind.ACTIONS)
 _TICK = 0.1
 _LAST_WORDS_TIME = 0.3
 _EXIT_TIME = 5.0
@@ -105,7 +105,7 @@ class Workers:
         batch.asked[number] = self.asked[number]
         fence()
         if batch.idle[number]:
-            self._workers[number].ring()
+            self._workers[number].wake()
 
     def command(self, name: str, arguments: Sequence[Any]) -> list[Any]:
         """Have each worker execute a command after its other entries.
@@ -252,7 +252,7 @@ class Workers:
         try:
             for number, worker in enumerate(self._workers):
                 self._batch.asked[number] = END
-                worker.ring()
+                worker.wake()
             while running and time.monotonic() < until:
                 for file, _ in self._poll.poll(1000 * _TICK):
                     if not self._receive(number := self._by_file[file]):
@@ -327,7 +327,7 @@ class _Worker:
         self.process.link.setblocking(False)
         self.reader = FrameReader(MAX_PAYLOAD)
 
-    def ring(self) -> None:
+    def wake(self) -> None:
         """Wake the worker if it sleeps."""
         with contextlib.suppress(OSError):  # it is gone, or already has something to wake up for
-            self.process.link.send(_BELL)
+            self.process.link.send(_WAKEUP)

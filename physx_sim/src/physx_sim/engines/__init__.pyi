@@ -12,7 +12,7 @@ from .models.meshes import bounding_box as bounding_box
 from .models.meshes import bounding_capsule as bounding_capsule
 from .models.meshes import geometry_file as geometry_file
 from .models.meshes import read_vertices as read_vertices
-from .models.parts import Mover as Mover
+from .models.parts import MovableBody as MovableBody
 from .models.parts import Parts as Parts
 from .models.parts import Static as Static
 from .models.parts import layout_of as layout_of

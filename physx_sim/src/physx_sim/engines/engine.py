@@ -9,7 +9,7 @@ import numpy as np
 
 from physx_core.rotations import Triple, cross, rotate, rotate_back
 from physx_core.typing import Vector
-from physx_sim.engines.models.parts import Mover
+from physx_sim.engines.models.parts import MovableBody
 from physx_sim.engines.resistance import Resistance
 
 
@@ -17,7 +17,7 @@ class RobotEngine(ABC):
     """A robot or object in an engine; vectors follow the convention of `physx_core`.
 
     Attributes:
-        mover: Its description.
+        movable: Its description.
         model: Its model.
         fixed_base: Whether the root link is welded to the world.
         nq: Length of its positions.
@@ -26,19 +26,19 @@ class RobotEngine(ABC):
         resistance: Resistance of its joints.
     """
 
-    def __init__(self, mover: Mover) -> None:
-        self.mover, self.model = mover, mover.model
-        self.fixed_base = mover.fixed_base
+    def __init__(self, movable: MovableBody) -> None:
+        self.movable, self.model = movable, movable.model
+        self.fixed_base = movable.fixed_base
         joints = self.model.joints
         self.base = 0 if self.fixed_base else 6
         self.nq = len(joints) + (0 if self.fixed_base else 7)
         self.nv = len(joints) + self.base
-        self.resistance = Resistance.of(mover)
+        self.resistance = Resistance.of(movable)
 
     def neutral(self) -> Vector:
         """Return the rest positions: 0 or the nearest limit, with the base at its initial pose."""
-        mover = self.mover
-        base = [] if self.fixed_base else [*mover.position, *mover.orientation]
+        movable = self.movable
+        base = [] if self.fixed_base else [*movable.position, *movable.orientation]
         return np.array([*base, *(max(j.lower, min(0.0, j.upper)) for j in self.model.joints)])
 
     @abstractmethod

@@ -7,7 +7,7 @@ from typing import Self
 import numpy as np
 
 from physx_core.typing import Vector
-from physx_sim.engines.models.parts import Mover
+from physx_sim.engines.models.parts import MovableBody
 
 
 class Resistance:
@@ -34,11 +34,11 @@ class Resistance:
         self._any = self._smooth or bool(self.friction.any())
 
     @classmethod
-    def of(cls, mover: Mover) -> Self:
+    def of(cls, movable: MovableBody) -> Self:
         """Return the resistance of a robot or object."""
-        base = 0 if mover.fixed_base else 6
-        table = np.zeros((5, base + len(mover.model.joints)))
-        for column, joint in zip(table.T[base:], mover.model.joints, strict=True):
+        base = 0 if movable.fixed_base else 6
+        table = np.zeros((5, base + len(movable.model.joints)))
+        for column, joint in zip(table.T[base:], movable.model.joints, strict=True):
             extra = joint.settings
             column[:] = joint.damping, joint.friction, extra.stiffness, extra.rest, extra.armature
         return cls(table)

@@ -31,10 +31,10 @@ def check_rk4(parts: Parts, engine: str, features: Collection[str]) -> None:
             mode other than ``"force"``.
     """
     advice = 'Use World(integrator="euler").'
-    solid = sum(bool(mover.model.shapes) for mover in parts.movers) + len(parts.statics)
+    solid = sum(bool(movable.model.shapes) for movable in parts.movables) + len(parts.statics)
     if parts.world.contacts != "none" and solid > 1:
         raise FeatureNotSupportedError(engine, "contacts in rk4", features, advice)
-    for joint in (joint for mover in parts.movers for joint in mover.model.joints):
+    for joint in (joint for movable in parts.movables for joint in movable.model.joints):
         limits = [joint.lower, joint.upper, joint.max_velocity]
         for name, asked in (
             ("limits", np.isfinite(limits).any()),

@@ -53,7 +53,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
 
         Args:
             parts: Everything in the world.
-            robots: One for each mover of the world.
+            robots: One for each movable of the world.
             lacks: Features that this simulation lacks.
         """
         self.features = frozenset(FEATURES) - self.lacks - set(lacks)
@@ -83,7 +83,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         commands = np.zeros(self._joint_count)
         commands[self._positioned] = self.positions()[self._positioned_q]
         self._hold(commands)
-        self.forget()
+        self.clear_warm_start()
 
     def _set_command_limits(self) -> None:
         layout = self.layout
@@ -101,7 +101,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         # Square of the norm up to which no command needs clipping.
         self._tame = tame**2 if tame > 0 else -1.0
         self._positioned = np.flatnonzero(modes == "position")
-        joints = [joint for mover in self.parts.movers for joint in mover.model.joints]
+        joints = [joint for movable in self.parts.movables for joint in movable.model.joints]
         gains = np.array([min(joint.settings.gain, 1 / self.period) for joint in joints])
         self._gains = gains[self._positioned]
         places = np.array(list(layout.position_index.values()), np.intp)
@@ -117,7 +117,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
     def make_algorithms(self) -> Algorithms:
         """Return the algorithms for any state of the world; called on first use."""
 
-    def forget(self) -> None:
+    def clear_warm_start(self) -> None:
         """Clear what the engine keeps from earlier steps, so that only the state matters."""
 
     @property
@@ -249,7 +249,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
                 advice = reasons or ["Use a smaller period or smaller torques."]
                 raise SimulationError(
                     f"The state is no longer finite, or faster than {_FASTEST:g} rad/s or m/s, "
-                    f'after frame {self._frame} ("{robot.mover.name}", {robot.model.path.name}). '
+                    f'after frame {self._frame} ("{robot.movable.name}", {robot.model.path.name}). '
                     + " ".join(advice)
                 )
 
@@ -324,7 +324,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._check_open()
         q = self._checks.positions(positions)
         self._write(q, self._checks.velocities("velocities", velocities))
-        self.forget()
+        self.clear_warm_start()
 
     def _write(self, q: Vector, v: Vector) -> None:
         self._stepped = False
@@ -334,7 +334,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
     def snapshot(self) -> State:
         """Return everything that `restore` needs to continue exactly from here."""
         self._check_open()
-        self.forget()
+        self.clear_warm_start()
         return State(
             self.positions(),
             self.velocities(),
@@ -364,7 +364,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._write(q, v)
         for robot, pair in zip(self._robots, native, strict=False):
             robot.set_native(*pair)
-        self.forget()
+        self.clear_warm_start()
         self._release()
         self._wrenches.restore(state.wrenches)
         self._watch()
@@ -463,7 +463,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._check_open()
         place, along = self._checks.part(name), finite_vector("direction", direction, 3)
         if place not in self._reaches:
-            self._reaches[place] = Reach(self.parts.movers[place])
+            self._reaches[place] = Reach(self.parts.movables[place])
         bodies = self.layout.parts[name].bodies
         q = self.positions() if positions is None else self._checks.positions(positions)
         poses = self._algorithms.body_poses(q, range(bodies.start, bodies.stop))

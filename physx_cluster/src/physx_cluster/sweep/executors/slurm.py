@@ -13,7 +13,12 @@ from types import SimpleNamespace
 from typing import Any
 
 from physx_cluster.launchers.slurm_guard import start_guard
-from physx_cluster.launchers.slurm_queue import FORGOTTEN, JobState, SlurmQueue, find_controller
+from physx_cluster.launchers.slurm_queue import (
+    UNKNOWN_TO_SCHEDULER,
+    JobState,
+    SlurmQueue,
+    find_controller,
+)
 from physx_cluster.sweep.executors.executor import (
     PATIENCE,
     Executor,
@@ -103,7 +108,7 @@ class SlurmExecutor(Executor):
             found = self._queue.states()
             self._asked = time.monotonic()
             self._states = self._states if found is None else found
-        return self._states.get(job.job_id, FORGOTTEN)
+        return self._states.get(job.job_id, UNKNOWN_TO_SCHEDULER)
 
     def cancel(self, job: Any) -> None:
         """End a job."""
@@ -157,7 +162,7 @@ class SlurmJob(Job):
         """
         if not self.is_over:
             state = self._executor.state_of(self._job)
-            if state.is_hopeless:
+            if state.is_unschedulable:
                 raise ConfigError(
                     f"Slurm cannot give job {self._job.job_id} what it requests ({state.reason}). "
                     "Set a job's resources with run.options, such as timeout_min, mem_gb and "

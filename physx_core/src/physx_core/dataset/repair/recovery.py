@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from physx_core import files
-from physx_core.dataset.repair.aside import FOLDER, keep, set_aside
+from physx_core.dataset.repair.quarantine import FOLDER, keep, set_aside
 from physx_core.dataset.repair.salvage import seal_without_damage
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.definitions import compare_fields

@@ -10,7 +10,7 @@ from physx_core import files
 from physx_core.dataset.read.mode_statistics import compute_statistics
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.repair import recovery
-from physx_core.dataset.repair.aside import set_aside, unused
+from physx_core.dataset.repair.quarantine import set_aside, unused
 from physx_core.dataset.repair.report import (
     find_partition_problems,
     find_problem,

@@ -234,7 +234,7 @@ class Stripes:
                 "their machines switched off? The rows before them are intact."
             )
 
-    def forget(self) -> None:
+    def remove_proof(self) -> None:
         """Remove the `PROOF` file; nothing is written any more."""
         self._groups.clear()
         with contextlib.suppress(OSError):

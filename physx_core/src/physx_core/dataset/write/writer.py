@@ -249,7 +249,7 @@ class Writer:
                 raise
         finally:
             for stripes in self._stripes.values():
-                stripes.forget()
+                stripes.remove_proof()
             self._sealer.close()
             self._digester.close()
             for opened in self._open.values():

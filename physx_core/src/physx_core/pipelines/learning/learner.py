@@ -397,13 +397,13 @@ class Learner:
             best=best,
         )
 
-    def rehearse(self, place: Path) -> None:
+    def dry_run_save(self, place: Path) -> None:
         """Check that the network can be saved, using a temporary folder in `place`.
 
         Raises:
             CheckpointError: If it cannot be saved.
         """
-        checkpoint.rehearse(place, self.network, self._trainer())
+        checkpoint.dry_run_save(place, self.network, self._trainer())
 
     def export(self, path: str | Path, form: str) -> None:
         """Write network and transformation to one file that other programs can run.

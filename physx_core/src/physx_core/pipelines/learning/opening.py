@@ -59,11 +59,11 @@ def open_dataset(session: Session, start: Start, group: Group) -> Dataset:
     config = start.config
     if start.environment is None:
         return open_existing(session, config)
-    if group.leads:
+    if group.is_main:
         dataset = open_own(session, config)
         copy_existing(dataset, config)
-    group.tell(None)
-    return dataset if group.leads else open_existing(session, config)
+    group.broadcast(None)
+    return dataset if group.is_main else open_existing(session, config)
 
 
 @dataclass(eq=False)
@@ -156,7 +156,7 @@ class DataOpening:
                 "Training.batch_nb is missing: it is the number of batches to generate in an epoch."
             )
         source = online = None
-        if self.group.leads:
+        if self.group.is_main:
             source, online = self._open_online(resources, environment, stored)
         made = GeneratedBatches(
             stored, source, online, self.group, ahead=self.ahead, repeats=self._repeats

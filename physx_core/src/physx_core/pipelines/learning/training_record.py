@@ -130,7 +130,7 @@ class BestEpoch:
             "reference": self._reference,
         }
 
-    def judge(self, loss: float, epoch: int) -> bool:
+    def update(self, loss: float, epoch: int) -> bool:
         """Record an epoch's loss and return whether it is the smallest so far.
 
         Args:

@@ -33,7 +33,7 @@ class RandomizedEnv(Layer):
         "randomizations",
         "every",
         "drawn",
-        "_foreseen",
+        "_prepared",
         "_nominal_options",
     )
 
@@ -60,7 +60,7 @@ class RandomizedEnv(Layer):
         self.randomizations = tuple(given)
         self.every = every
         self.drawn: dict[str, Any] = {}
-        self._foreseen: dict[str, Any] | None = None
+        self._prepared: dict[str, Any] | None = None
         super().__init__(env)
         self._check()
         self._nominal_options = env.simulator.get_options()
@@ -104,8 +104,8 @@ class RandomizedEnv(Layer):
         super()._setup()
         before = self.drawn
         number, rest = divmod(self._base._control_loop.episode, self.every)
-        if self._foreseen:
-            self.drawn = self._foreseen
+        if self._prepared:
+            self.drawn = self._prepared
         elif rest == 0 or not before:
             self.drawn = self._draw(number)
         if self.drawn != before:
@@ -122,10 +122,10 @@ class RandomizedEnv(Layer):
         return self.drawn
 
     def _recall(self, memory: Any) -> None:
-        self._foreseen = None
+        self._prepared = None
 
-    def _foresee(self, memory: Any) -> bool:
-        self._foreseen = memory
+    def _prepare_restore(self, memory: Any) -> bool:
+        self._prepared = memory
         return bool(memory != self.drawn)
 
     def _constants(self) -> dict[str, Any]:

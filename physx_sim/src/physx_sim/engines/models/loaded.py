@@ -10,7 +10,7 @@ import numpy as np
 from physx_core.errors import listed
 from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
-from physx_sim.engines.models.parts import Mover
+from physx_sim.engines.models.parts import MovableBody
 from physx_sim.engines.models.rigid_bodies import RigidBody, together
 from physx_sim.errors import ModelError
 
@@ -54,7 +54,7 @@ class LoadedRobot:
     limits: Mapping[str, Vector] = field(default_factory=dict)
 
 
-def check_loaded(engine: str, mover: Mover, loaded: LoadedRobot) -> None:
+def check_loaded(engine: str, movable: MovableBody, loaded: LoadedRobot) -> None:
     """Check that an engine holds a robot or object as physx read it.
 
     An engine calls it whenever it has loaded a model: a reader that silently drops what it does not
@@ -62,18 +62,18 @@ def check_loaded(engine: str, mover: Mover, loaded: LoadedRobot) -> None:
 
     Args:
         engine: Name of the engine.
-        mover: The robot or object.
+        movable: The robot or object.
         loaded: What the engine holds.
 
     Raises:
         ModelError: If they differ; the message names link or joint, quantity and both values.
     """
-    bodies, joints = mover.model.bodies, mover.model.joints
+    bodies, joints = movable.model.bodies, movable.model.joints
     names = [f'link "{body.name}"' for body in bodies]
     poses = np.array([body.pose for body in bodies])
-    if mover.fixed_base:
-        poses[0, :3, :3], poses[0, :3, 3] = to_matrix(mover.orientation), mover.position
-    where = _Where(engine, mover)
+    if movable.fixed_base:
+        poses[0, :3, :3], poses[0, :3, 3] = to_matrix(movable.orientation), movable.position
+    where = _Where(engine, movable)
     where.compare(names, "position", loaded.poses[:, :3, 3], poses[:, :3, 3], 1.0)
     where.compare(names, "rotation", loaded.poses[:, :3, :3], poses[:, :3, :3], 1.0)
     axes = [body.axis for body in bodies if body.joint is not None]
@@ -113,7 +113,7 @@ class _Where:
     """Which engine holds which robot."""
 
     engine: str
-    mover: Mover
+    movable: MovableBody
 
     def compare(
         self, names: Sequence[str], what: str, found: Vector, wanted: Vector, scale: float | Vector
@@ -139,7 +139,7 @@ class _Where:
             return
         row = int(np.argmin(same))
         raise ModelError(
-            f'Robot "{self.mover.name}", {self.mover.model.path}: the engine {self.engine} gives '
-            f"{names[row]} the {what} {found[row].tolist()} instead of {wanted[row].tolist()}. It "
-            "cannot simulate this file; please report it."
+            f'Robot "{self.movable.name}", {self.movable.model.path}: the engine {self.engine} '
+            f"gives {names[row]} the {what} {found[row].tolist()} instead of "
+            f"{wanted[row].tolist()}. It cannot simulate this file; please report it."
         )

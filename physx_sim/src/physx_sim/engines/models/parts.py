@@ -1,4 +1,4 @@
-"""Parts of a world as loaded by engines: movers as robot models, and static bodies."""
+"""Parts of a world as loaded by engines: movables as robot models, and static bodies."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ from physx_sim.errors import ModelError
 
 
 @dataclass(frozen=True)
-class Mover:
+class MovableBody:
     """A robot or moving object.
 
     Attributes:
@@ -77,12 +77,12 @@ class Parts:
 
     Attributes:
         world: Its description.
-        movers: Robots, then moving objects.
+        movables: Robots, then moving objects.
         statics: The ground, then static objects.
     """
 
     world: World
-    movers: tuple[Mover, ...]
+    movables: tuple[MovableBody, ...]
     statics: tuple[Static, ...]
 
 
@@ -92,29 +92,29 @@ def read_parts(world: World) -> Parts:
     Raises:
         ModelError: If a robot or mesh cannot be loaded, or nothing can move.
     """
-    movers = [_robot(robot, _touches(world, robot.self_collisions)) for robot in world.robots]
-    scenery = [mover for mover in movers if not mover.moves]
+    movables = [_robot(robot, _touches(world, robot.self_collisions)) for robot in world.robots]
+    scenery = [movable for movable in movables if not movable.moves]
     if scenery and world.contacts == "static":  # they touch like static objects
-        movers = [_robot(robot, True) for robot in world.robots]
-    for mover in movers:
-        for text in mover.model.warnings:
-            _warn(f'Robot "{mover.name}", {mover.model.path}: {text}.')
+        movables = [_robot(robot, True) for robot in world.robots]
+    for movable in movables:
+        for text in movable.model.warnings:
+            _warn(f'Robot "{movable.name}", {movable.model.path}: {text}.')
     statics = [] if world.ground is None else [Static("ground", world.ground)]
     for thing in world.objects:
         if thing.static:
             shape = shape_of_object(thing)
             statics.append(Static(thing.name, shape, thing.position, thing.orientation))
         else:
-            movers.append(_object(thing))
-    if not any(mover.moves for mover in movers):
+            movables.append(_object(thing))
+    if not any(movable.moves for movable in movables):
         raise _nothing_moves(scenery[0])
-    return Parts(world, tuple(movers), tuple(statics))
+    return Parts(world, tuple(movables), tuple(statics))
 
 
-def _robot(robot: Robot, touching: bool) -> Mover:
+def _robot(robot: Robot, touching: bool) -> MovableBody:
     model = read_robot(robot, touching=touching)
     pose = robot.position, robot.orientation
-    return Mover(robot.name, model, robot.fixed_base, *pose, robot.self_collisions)
+    return MovableBody(robot.name, model, robot.fixed_base, *pose, robot.self_collisions)
 
 
 @functools.cache
@@ -123,7 +123,7 @@ def _warn(text: str) -> None:
     warnings.warn(text, stacklevel=5)
 
 
-def _nothing_moves(scenery: Mover) -> ModelError:
+def _nothing_moves(scenery: MovableBody) -> ModelError:
     floats = scenery.model.links[0] != "world"
     return ModelError(
         f'Robot "{scenery.name}", {scenery.model.path}: it has no movable joint and a fixed base, '
@@ -142,12 +142,12 @@ def _touches(world: World, itself: bool) -> bool:
     return static or (world.contacts == "all" and moving)
 
 
-def _object(thing: WorldObject) -> Mover:
+def _object(thing: WorldObject) -> MovableBody:
     shape = shape_of_object(thing)
     xx, yy, zz = moments(shape, thing.mass).tolist()
     inertial = Inertial(float(thing.mass), (xx, yy, zz, 0.0, 0.0, 0.0))
     model = model_of_body("body", Path(thing.name), inertial, shape)
-    return Mover(thing.name, model, False, thing.position, thing.orientation, is_object=True)
+    return MovableBody(thing.name, model, False, thing.position, thing.orientation, is_object=True)
 
 
 def static_poses(parts: Parts) -> np.ndarray:
@@ -168,19 +168,21 @@ def layout_of(parts: Parts) -> Layout:
     velocity_index: dict[str, int] = {}
     places: dict[str, Part] = {}
     nq = nv = 0
-    for mover in parts.movers:
-        prefix = f"{mover.name}/" if several else ""
+    for movable in parts.movables:
+        prefix = f"{movable.name}/" if several else ""
         begin = nq, nv, len(joint_names), len(bodies)
-        nq, nv = nq + (0 if mover.fixed_base else 7), nv + (0 if mover.fixed_base else 6)
-        for joint in mover.model.joints:
+        nq, nv = nq + (0 if movable.fixed_base else 7), nv + (0 if movable.fixed_base else 6)
+        for joint in movable.model.joints:
             joint_names.append(prefix + joint.name)
             position_index[joint_names[-1]], velocity_index[joint_names[-1]] = nq, nv
             nq, nv = nq + 1, nv + 1
-        joints += mover.model.joints
-        bodies += [mover.name] if mover.is_object else [prefix + name for name in mover.model.links]
+        joints += movable.model.joints
+        bodies += (
+            [movable.name] if movable.is_object else [prefix + name for name in movable.model.links]
+        )
         ends = nq, nv, len(joint_names), len(bodies)
         slices = [slice(*pair) for pair in zip(begin, ends, strict=True)]
-        places[mover.name] = Part(mover.name, not mover.fixed_base, *slices)
+        places[movable.name] = Part(movable.name, not movable.fixed_base, *slices)
     statics = tuple(static.name for static in parts.statics)
     _check_names([*bodies, *statics])
     return Layout(

@@ -9,16 +9,16 @@ import numpy as np
 from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
 from physx_sim.engines.models.meshes import read_vertices
-from physx_sim.engines.models.parts import Mover
+from physx_sim.engines.models.parts import MovableBody
 from physx_sim.engines.models.shapes import CollisionShape
 
 
 class Reach:
     """Collision shapes of a robot or object, prepared for extent queries."""
 
-    def __init__(self, mover: Mover) -> None:
-        links = {name: i for i, name in enumerate(mover.model.links)}
-        self._shapes = [(links.get(shape.body, 0), shape) for shape in mover.model.shapes]
+    def __init__(self, movable: MovableBody) -> None:
+        links = {name: i for i, name in enumerate(movable.model.links)}
+        self._shapes = [(links.get(shape.body, 0), shape) for shape in movable.model.shapes]
         self._corners: list[Vector | None] = [_corners(shape) for _, shape in self._shapes]
 
     def along(self, direction: Vector, poses: Vector) -> float:

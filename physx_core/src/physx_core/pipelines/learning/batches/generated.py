@@ -57,7 +57,7 @@ class GeneratedBatches:
         self._stored, self._group, self._ahead, self.repeats = stored, group, ahead, repeats
         self._names: Sequence[str] = ()
         self._shared: SharedBatches | None = None
-        self.learns: bool = group.tell(source is not None and source.sets.learns)
+        self.learns: bool = group.broadcast(source is not None and source.sets.learns)
         if group.size > 1:
             self._shared = SharedBatches(group, online, source.fields if source else ())
 

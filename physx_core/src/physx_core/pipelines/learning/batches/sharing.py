@@ -35,7 +35,7 @@ class SharedBatches:
         self.number, self.weight = 0, 1.0
         self.whole: Batch = {}
         self._group, self._online = group, online
-        told = group.tell([field.to_dict() for field in fields])
+        told = group.broadcast([field.to_dict() for field in fields])
         self.block = _to_block({"fields": told, "normalization": {}})
         self._last: Block | None = None
 
@@ -56,10 +56,10 @@ class SharedBatches:
             if self._last is None or block.rows:
                 changed = _to_plain(block)
             self._last = block
-        changed = self._group.tell(changed)
+        changed = self._group.broadcast(changed)
         if changed is not None:
             self.block = _to_block(changed)
-        share, self.weight = self._group.deal(self.whole)
+        share, self.weight = self._group.scatter(self.whole)
         self.number += 1
         return share
 
@@ -67,7 +67,7 @@ class SharedBatches:
         """Make the stored rows visible to all processes, which read them from now on."""
         if self._online is not None:
             dataset.flush()
-        self._group.tell(None)
+        self._group.broadcast(None)
         if self._online is None:
             dataset.refresh()
 

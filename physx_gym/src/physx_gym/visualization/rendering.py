@@ -14,9 +14,9 @@ from physx_core import plugins
 from physx_core.components import Factory, Visualizer
 from physx_core.errors import UnknownOptionError, VisualizerError
 from physx_gym.defaults import VIEWER
-from physx_gym.show.display import has_display
-from physx_gym.show.environment_drawing import EnvironmentDrawing
-from physx_gym.show.playable import Drawable
+from physx_gym.visualization.display import has_display
+from physx_gym.visualization.environment_drawing import EnvironmentDrawing
+from physx_gym.visualization.playable import Drawable
 
 MODES = ("human", "rgb_array")
 PICTURE_SIZE = (640, 480)

@@ -14,14 +14,14 @@ from physx_core.components import Factory, Visualizer
 from physx_core.errors import VisualizerError
 from physx_core.typing import Vector
 from physx_gym.errors import LogError
-from physx_gym.show.drawing import WorldDrawing
-from physx_gym.show.film import write_film
-from physx_gym.show.plotting import Groups, groups_of
-from physx_gym.show.rendering import PICTURE_SIZE, Picture, open_viewer
-from physx_gym.show.replayed import Contacts, Line, Plots, Scene, row_at
 from physx_gym.tasks.trajectory import Trajectory
 from physx_gym.telemetry.episode_log import Log
 from physx_gym.telemetry.log_file import Source, as_logs
+from physx_gym.visualization.drawing import WorldDrawing
+from physx_gym.visualization.film import write_film
+from physx_gym.visualization.plotting import Groups, groups_of
+from physx_gym.visualization.rendering import PICTURE_SIZE, Picture, open_viewer
+from physx_gym.visualization.replayed import Contacts, Line, Plots, Scene, row_at
 from physx_sim import Backend, World
 
 _FRAMES, _FRAMES_PER_ROW = 10_000, 100

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from physx_core import plugins
 from physx_core.components import Factory
-from physx_gym.show.drawing import WorldDrawing
-from physx_gym.show.playable import Drawable
+from physx_gym.visualization.drawing import WorldDrawing
+from physx_gym.visualization.playable import Drawable
 from physx_sim import World
 
 

@@ -10,8 +10,8 @@ from typing import Any
 
 from physx_core import checks
 from physx_core.errors import ConfigError
-from physx_gym.show.display import has_display
-from physx_gym.show.playable import Info, Playable
+from physx_gym.visualization.display import has_display
+from physx_gym.visualization.playable import Info, Playable
 
 PolicyFn = Callable[[Any, Any, float | None, bool, bool, dict[str, Any]], Any]
 """Takes observation, previous action, reward, terminated, truncated and information; returns an

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from physx_core.errors import MissingLibraryError, listed
 from physx_gym.errors import LogError
-from physx_gym.show.display import has_display
 from physx_gym.telemetry.episode_log import TIME, Log
 from physx_gym.telemetry.log_file import Source, as_logs
 from physx_gym.telemetry.standard_columns import BASE_POSITION, BASE_VELOCITY
+from physx_gym.visualization.display import has_display
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes

@@ -11,8 +11,8 @@ from physx_core.components import Factory
 from physx_core.errors import ConfigError
 from physx_core.typing import Vector
 from physx_gym.errors import LogError
-from physx_gym.show.plotting import Groups, label_of
 from physx_gym.telemetry.episode_log import Log
+from physx_gym.visualization.plotting import Groups, label_of
 
 _LONG = 0.5  # length of a strong force's arrow, as a fraction of the size of what moves
 _THIN = 0.006  # radius of an arrow, likewise

@@ -1,4 +1,4 @@
-"""ShareEnvironment: a share of a vector environment's environments, in a client of a run."""
+"""EnvSliceEnvironment: a slice of a vector environment's environments, in a client of a run."""
 
 from __future__ import annotations
 
@@ -13,14 +13,14 @@ from physx_core import Environment, Field
 from physx_core.net import Kind, decode, decode_error
 from physx_core.typing import Batch
 from physx_gym.vector.batch import COMMAND
+from physx_gym.vector.env_slice import EnvSlice
 from physx_gym.vector.rows import ROW, RowLayout
-from physx_gym.vector.share import Share
 
 ENTRIES, COUNT, ORDER, ORDER_SIZE = "entries", "count", "order", "order_size"
 """Names of the stored fields that hold a client's entries, and a command, with their lengths."""
 
 
-class ShareEnvironment(Environment):
+class EnvSliceEnvironment(Environment):
     """An environment whose steps execute entries from the vector environment, as a worker does.
 
     What it sends besides the results are the parameters that it saves.
@@ -51,8 +51,8 @@ class ShareEnvironment(Environment):
         whole = self._row[: count * self._layout.dtype.itemsize]
         arrays = self._layout.arrays(whole, self._actions, sum(shares[:number]))
         sys.path += [each for each in setup["path"] if each not in sys.path]
-        self._share = Share(setup, arrays, lambda *message: self._messages.append(message))
-        self._share.create()
+        self._slice = EnvSlice(setup, arrays, lambda *message: self._messages.append(message))
+        self._slice.create()
         self._report()
 
     def init_database(self) -> None:
@@ -66,16 +66,16 @@ class ShareEnvironment(Environment):
             array[:] = told[name][: len(array)]
         for entry in told[ENTRIES][: int(told[COUNT])].tolist():
             if entry == COMMAND:
-                self._share.execute(decode(told[ORDER][: int(told[ORDER_SIZE])].tobytes()))
+                self._slice.execute(decode(told[ORDER][: int(told[ORDER_SIZE])].tobytes()))
             else:
-                self._share.step(entry)
+                self._slice.step(entry)
         self._report()
         self.set_training_data(**{ROW: self._row})
 
     def close(self) -> None:
         """Close the environments."""
         if hasattr(self, "_share"):
-            self._share.close()
+            self._slice.close()
             for kind, content, _ in self._messages:
                 if kind is Kind.ERROR:
                     raise decode_error(content)

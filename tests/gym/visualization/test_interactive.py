@@ -11,7 +11,7 @@ import pytest
 
 from physx_core.errors import UsageError
 from physx_gym import Layer, RobotEnv
-from physx_gym.show.interactive import Keyboard
+from physx_gym.visualization.interactive import Keyboard
 
 pty = pytest.importorskip("pty", reason="there are no pseudo terminals")
 termios = pytest.importorskip("termios", reason="there are no terminals of this kind")

@@ -17,8 +17,8 @@ from physx_core.components import Factory, Visualizer
 from physx_core.errors import ConfigError, PluginNotFoundError, UnknownOptionError, VisualizerError
 from physx_gym import RobotEnv, Simulator, replay
 from physx_gym.errors import LogError
-from physx_gym.show.drawing import WorldDrawing
-from physx_gym.show.film import write_film
+from physx_gym.visualization.drawing import WorldDrawing
+from physx_gym.visualization.film import write_film
 from physx_sim import (
     Box,
     Capsule,

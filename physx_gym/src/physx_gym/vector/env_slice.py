@@ -1,4 +1,4 @@
-"""Share: the environments that one worker steps."""
+"""EnvSlice: the environments that one worker steps."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ _FRESH = (None, None)
 _NO_INFO = int(InfoKind.NONE)
 
 
-class Share:
+class EnvSlice:
     """Some of a vector environment's environments; their results go into its arrays."""
 
     def __init__(

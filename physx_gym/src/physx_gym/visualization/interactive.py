@@ -11,9 +11,9 @@ from types import TracebackType
 from typing import Any, Self
 
 from physx_core.errors import UsageError
-from physx_gym.show.display import has_display
-from physx_gym.show.playable import Playable
-from physx_gym.show.rendering import Renderer
+from physx_gym.visualization.display import has_display
+from physx_gym.visualization.playable import Playable
+from physx_gym.visualization.rendering import Renderer
 
 EXIT, PAUSE = "k", "p"
 ARROWS = {b"A": "Up", b"B": "Down", b"C": "Right", b"D": "Left"}
