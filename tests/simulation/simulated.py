@@ -21,7 +21,7 @@ from hypothesis import strategies as st
 
 from physx_core import Launcher
 from physx_core.components.launcher import ClientHandle
-from physx_core.net import Network
+from physx_core.net import Transport
 from physx_core.workers.client.joining import join
 from physx_core.workers.client.link import RunEnded
 from physx_core.workers.client.worker import run_instance
@@ -48,7 +48,7 @@ class Deadlock(Exception):
     """Everybody waits for something that cannot happen."""
 
 
-class Simulation(Network):
+class Simulation(Transport):
     """A network that is its own clock; time passes when everybody waits.
 
     Attributes:
@@ -139,7 +139,7 @@ class Simulation(Network):
     def _pass_time(self, until):
         self._now = max(self._now, until)
 
-    # Network --------------------------------------------------------------------------------
+    # Transport -----------------------------------------------------------------------------
 
     def listen(self, address, port):
         port = port or 1 + len(self._listening)
@@ -258,7 +258,7 @@ class Client(ClientHandle):
 
     def _run(self):
         try:
-            self.link, setup = join(*self._arguments, network=self.clock)
+            self.link, setup = join(*self._arguments, transport=self.clock)
             try:
                 del setup["path"], setup["directory"]
                 self._status = run_instance(self.link, setup)

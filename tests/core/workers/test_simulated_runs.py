@@ -59,7 +59,7 @@ def simulate(simulation, environment, *, run_ahead=30, **options):
     config = EnvironmentConfig(
         environment, num_clients=2, launcher="simulated:SimulatedLauncher", **options
     )
-    return ClientSource(config, Services(), SEED, run_ahead=run_ahead, network=simulation)
+    return ClientSource(config, Services(), SEED, run_ahead=run_ahead, transport=simulation)
 
 
 def local(environment, **options):

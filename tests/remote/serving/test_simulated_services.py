@@ -40,14 +40,14 @@ def serve(simulation, service):
 
 
 def link(simulation, **options):
-    return RequestLink(("127.0.0.1", PORT), network=simulation, **options)
+    return RequestLink(("127.0.0.1", PORT), transport=simulation, **options)
 
 
 @settings(max_examples=30)
 @given(drawn, st.lists(st.lists(st.binary(max_size=300), max_size=4), min_size=1, max_size=4))
 def test_each_client_gets_its_answers_in_any_order_of_events(choose, told):
     with Simulation(choose) as simulation:
-        service = serve(simulation, Echo(network=simulation))
+        service = serve(simulation, Echo(transport=simulation))
         answers = [[] for _ in told]
 
         def ask(number):
@@ -66,7 +66,7 @@ def test_each_client_gets_its_answers_in_any_order_of_events(choose, told):
 @given(drawn)
 def test_a_request_that_takes_long_keeps_the_others_waiting(choose):
     with Simulation(choose) as simulation:
-        service, began = serve(simulation, Echo(network=simulation)), simulation.monotonic()
+        service, began = serve(simulation, Echo(transport=simulation)), simulation.monotonic()
         slow, quick = link(simulation), link(simulation)
         task = simulation.start(lambda: slow.exchange(bytes([30])))
         simulation.sleep(1.0)
@@ -79,7 +79,7 @@ def test_a_request_that_takes_long_keeps_the_others_waiting(choose):
 @pytest.mark.parametrize("timeout", [0.5, 86_400.0])
 def test_an_answer_that_does_not_come_is_given_up(timeout):
     with Simulation() as simulation:
-        Echo(network=simulation).listen("127.0.0.1", PORT)  # and nobody runs it
+        Echo(transport=simulation).listen("127.0.0.1", PORT)  # and nobody runs it
         client, began = link(simulation, timeout=timeout), simulation.monotonic()
         with pytest.raises(RemoteTimeoutError, match=f"did not answer within {timeout} s"):
             client.exchange(b"\0")
@@ -90,7 +90,7 @@ def test_a_service_is_waited_for():
     with Simulation() as simulation:
         with pytest.raises(RemoteTimeoutError, match="Nothing answered at .* within 600 s"):
             link(simulation, connect_timeout=600)
-        service = Echo(network=simulation)
+        service = Echo(transport=simulation)
         later = simulation.monotonic() + 300
         simulation.start(lambda: (simulation.sleep(300), serve(simulation, service)))
         assert link(simulation, connect_timeout=600).exchange(b"\0a") == b"\0a"
@@ -100,7 +100,7 @@ def test_a_service_is_waited_for():
 
 def test_a_silent_client_is_left_after_its_time_where_another_waits(caplog):
     with Simulation() as simulation:
-        service = serve(simulation, Communication(patience=3600.0, network=simulation))
+        service = serve(simulation, Communication(patience=3600.0, transport=simulation))
         service.got_connection.connect(lambda request: service.put_message(b"yes"))
         silent, other = link(simulation), link(simulation, timeout=7200.0)
         assert silent.exchange(b"{}") == b"yes"

@@ -23,7 +23,7 @@ from .handshake import encrypt as encrypt
 from .handshake import introduce as introduce
 from .link import SOCKETS as SOCKETS
 from .link import Link as Link
-from .link import Network as Network
+from .link import Transport as Transport
 from .listener import Listener as Listener
 from .liveness import VANISHED as VANISHED
 from .liveness import is_loss as is_loss

@@ -1,4 +1,4 @@
-"""Link, Network: what servers and clients exchange bytes through, so that tests can simulate it."""
+"""Link, Transport: what servers and clients exchange bytes through; tests simulate it."""
 
 from __future__ import annotations
 
@@ -99,7 +99,7 @@ class Poll(Protocol):
         """Wait for events; return what occurred."""
 
 
-class Network:
+class Transport:
     """Sockets, and the clock by which those that use them wait; tests derive a simulated one.
 
     Attributes:
@@ -165,5 +165,5 @@ class Network:
         return poll
 
 
-SOCKETS = Network()
+SOCKETS = Transport()
 """The sockets of this machine."""

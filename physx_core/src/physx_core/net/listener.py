@@ -13,7 +13,7 @@ from weakref import WeakSet
 from physx_core.closeable import Closeable
 from physx_core.net.addresses import is_loopback
 from physx_core.net.connection import Connection
-from physx_core.net.link import SOCKETS, Link, ListeningLink, Network
+from physx_core.net.link import SOCKETS, Link, ListeningLink, Transport
 from physx_core.net.liveness import CHECK_INTERVAL, has_vanished
 from physx_core.net.timers import Timers
 from physx_core.net.tls import Identity, SecureSocket
@@ -39,7 +39,7 @@ class Listener(Closeable, Generic[AnyConnection]):
         vanished: Callable[[AnyConnection], Any],
         *,
         encrypts: bool = False,
-        network: Network = SOCKETS,
+        transport: Transport = SOCKETS,
     ) -> None:
         """Start without listening.
 
@@ -47,19 +47,19 @@ class Listener(Closeable, Generic[AnyConnection]):
             accepted: Called with each new connection and its peer as ``host:port``.
             vanished: Called with a connection if the peer's machine no longer answers.
             encrypts: Whether clients may encrypt; `accepted` then gets a `SecureSocket`.
-            network: What it listens on.
+            transport: What it listens on.
         """
         self.address = ("", 0)
-        self.timers = Timers(network.clock)
-        self._network = network
+        self.timers = Timers(transport.clock)
+        self._transport = transport
         self._accepted, self._vanished = accepted, vanished
         self._connections: WeakSet[AnyConnection] = WeakSet()
         self._is_watching = self._has_guests = False
         self._identity = Identity() if encrypts else None
         self._buffered: set[SecureSocket] = set()
         self._link: ListeningLink | None = None
-        self._selector = network.selector()
-        self._waker, self._wakes = network.pair()
+        self._selector = transport.selector()
+        self._waker, self._wakes = transport.pair()
         for one in (self._waker, self._wakes):
             one.setblocking(False)
         self._selector.register(self._waker, selectors.EVENT_READ)
@@ -79,7 +79,7 @@ class Listener(Closeable, Generic[AnyConnection]):
         Raises:
             OSError: If the address is not one of this machine, or the port is in use.
         """
-        self._link = self._network.listen(address, port)
+        self._link = self._transport.listen(address, port)
         if self._identity is not None and not is_loopback(address):
             self._identity.prepare()
         self._link.setblocking(False)
@@ -105,7 +105,7 @@ class Listener(Closeable, Generic[AnyConnection]):
         buffered = self._find_buffered() if self._buffered else {}
         if buffered:
             timeout, spin = 0.0, 0.0
-        found = (spin and self._network.spin_until(lambda: select(0), spin)) or select(timeout)
+        found = (spin and self._transport.spin_until(lambda: select(0), spin)) or select(timeout)
         ready = []
         for key, events in found:
             if key.data is not None:

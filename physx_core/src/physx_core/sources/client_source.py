@@ -19,7 +19,7 @@ from physx_core.errors import (
 )
 from physx_core.fields import Field
 from physx_core.net.frames import Kind, pack
-from physx_core.net.link import SOCKETS, Network
+from physx_core.net.link import SOCKETS, Transport
 from physx_core.net.values import encode
 from physx_core.rows import ROW_FIELDS, concatenate
 from physx_core.sources.source import Canceled, Source, check_stored
@@ -58,7 +58,7 @@ class ClientSource(Source):
         accept_all: bool = False,
         skip: Skip = NOTHING,
         stripes: Stripes | None = None,
-        network: Network = SOCKETS,
+        transport: Transport = SOCKETS,
     ) -> None:
         """Prepare the clients.
 
@@ -74,7 +74,7 @@ class ClientSource(Source):
             accept_all: Whether samples that `check_sample` rejects count like the others.
             skip: The rows that an earlier run already got: generated again, but not returned.
             stripes: Where the clients write the rows themselves; None: `batch` returns them.
-            network: What connects the clients, and the clock that the run follows.
+            transport: What connects the clients, and the clock that the run follows.
         """
         self._written = None if stripes is None else WrittenRows(stripes)
         self.instance_nb = config.num_clients
@@ -88,7 +88,7 @@ class ClientSource(Source):
             skip=skip,
             total=total,
             written=self._written,
-            network=network,
+            transport=transport,
         )
         self._rejections = 0
         if config.record_wrong_samples:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any, Literal, get_args
 
 from physx_core.errors import ConfigError, UsageError
-from physx_core.net import SOCKETS, Network, Reader, check_address
+from physx_core.net import SOCKETS, Reader, Transport, check_address
 from physx_remote.errors import RequestError
 from physx_remote.godot_gym.frames_timer import Signal
 from physx_remote.godot_gym.messages import ERROR, encode_extension
@@ -43,7 +43,7 @@ class Communication(SocketService):
         max_request: int = MAX_REQUEST,
         patience: float | None = None,
         max_clients: int = 256,
-        network: Network = SOCKETS,
+        transport: Transport = SOCKETS,
     ) -> None:
         """Store the options.
 
@@ -62,12 +62,12 @@ class Communication(SocketService):
             max_clients: Maximum number of clients; further ones are disconnected at their first
                 request. In addition, as many connections that have not sent a whole request are
                 kept, but at least 32; if another arrives, one of them is closed.
-            network: What connects the clients, and the clock that `patience` follows.
+            transport: What connects the clients, and the clock that `patience` follows.
 
         Raises:
             ConfigError: If a value is out of range.
         """
-        super().__init__(max_clients=max_clients, network=network)
+        super().__init__(max_clients=max_clients, transport=transport)
         choices = (
             ("clients", clients, Clients),
             ("reply", reply, Reply),

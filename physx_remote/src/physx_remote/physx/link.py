@@ -17,8 +17,8 @@ from physx_core.net import (
     Frame,
     FrameReader,
     Kind,
-    Network,
     PlainRefusedError,
+    Transport,
     decode,
     decode_error,
     encrypt,
@@ -62,7 +62,7 @@ class PhysxLink(ClientConnection):
         timeout: float | None = 60.0,
         connect_timeout: float = 10.0,
         max_answer: int = MAX_ANSWER,
-        network: Network = SOCKETS,
+        transport: Transport = SOCKETS,
     ) -> None:
         """Connect; retry while nothing listens.
 
@@ -74,9 +74,9 @@ class PhysxLink(ClientConnection):
             timeout: Time limit for an answer in s; None: no limit.
             connect_timeout: Time in s to keep trying to connect.
             max_answer: Size of the longest accepted answer in bytes.
-            network: What connects, and the clock that the time limits follow.
+            transport: What connects, and the clock that the time limits follow.
         """
-        super().__init__(address, network)
+        super().__init__(address, transport)
         self.timeout = timeout
         found = find_token(token_file, token)
         if found is None:
@@ -109,7 +109,7 @@ class PhysxLink(ClientConnection):
         until = self._clock.monotonic() + patience
         unread = _BACKLOG if role == OBSERVE else None
         self._socket = self._reach(
-            lambda left: self._network.connect(address, left, unread=unread), patience
+            lambda left: self._transport.connect(address, left, unread=unread), patience
         )
         try:
             return self._authenticate(

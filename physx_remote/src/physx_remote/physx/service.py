@@ -17,8 +17,8 @@ from physx_core.net import (
     FrameReader,
     Handshakes,
     Kind,
-    Network,
     Reader,
+    Transport,
     decode,
     describe_flat,
     encode_error,
@@ -67,10 +67,10 @@ class PhysxService(SocketService):
         max_request: int,
         max_clients: int,
         max_snapshots: int,
-        network: Network = SOCKETS,
+        transport: Transport = SOCKETS,
     ) -> None:
         """Store the worlds; the options are those of `Physx`."""
-        super().__init__(max_clients=max_clients, network=network)
+        super().__init__(max_clients=max_clients, transport=transport)
         self.token = token
         self._worlds = worlds
         self._requests = WorldRequests(worlds, max_snapshots, self._clock)

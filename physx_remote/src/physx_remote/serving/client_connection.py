@@ -11,7 +11,7 @@ from physx_core.net import (
     SOCKETS,
     VANISHED,
     Link,
-    Network,
+    Transport,
     is_loss,
     poll_peer,
     prepare_connection,
@@ -37,9 +37,9 @@ class ClientConnection:
     """What to do if it does not answer in time, or a possible reason."""
     _socket: Link
 
-    def __init__(self, address: tuple[str, int], network: Network = SOCKETS) -> None:
+    def __init__(self, address: tuple[str, int], transport: Transport = SOCKETS) -> None:
         """Store the address, and what connects to it."""
-        self._network, self._clock = network, network.clock
+        self._transport, self._clock = transport, transport.clock
         self.name = "{}:{}".format(*address)
         self._why_closed = ""
         self._buffered: Collection[Any] = ()
@@ -67,8 +67,8 @@ class ClientConnection:
         prepare_connection(self._socket)
         self._socket.setblocking(False)
         self._buffered = getattr(self._socket, "buffered", ())  # see SecureSocket
-        self._readable = self._network.poll(self._socket)
-        self._writable = self._network.poll(self._socket, select.POLLOUT)
+        self._readable = self._transport.poll(self._socket)
+        self._writable = self._transport.poll(self._socket, select.POLLOUT)
 
     def _send(self, message: bytes, patience: float | None) -> None:
         """Send a message.

@@ -5,7 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from physx_core.errors import ConfigError
-from physx_core.net import SOCKETS, Link, Network
+from physx_core.net import SOCKETS, Link, Transport
 from physx_remote.errors import RemoteClosedError
 from physx_remote.serving.client_connection import ClientConnection
 from physx_remote.serving.framing import MAX_ANSWER, PrefixReader, add_prefix
@@ -26,7 +26,7 @@ class RequestLink(ClientConnection):
         timeout: float | None = 60.0,
         connect_timeout: float = 10.0,
         max_answer: int = MAX_ANSWER,
-        network: Network = SOCKETS,
+        transport: Transport = SOCKETS,
     ) -> None:
         """Connect; retry while nothing listens.
 
@@ -35,7 +35,7 @@ class RequestLink(ClientConnection):
             timeout: Time limit for an answer in s; None: no limit.
             connect_timeout: Time in s to keep trying to connect.
             max_answer: Longest accepted answer in bytes.
-            network: What connects, and the clock that the time limits follow.
+            transport: What connects, and the clock that the time limits follow.
         """
         if timeout is not None:
             _check_time("timeout", timeout)
@@ -44,14 +44,14 @@ class RequestLink(ClientConnection):
             raise ConfigError(
                 f"max_answer is {max_answer!r} but must be a positive integer (bytes)."
             )
-        super().__init__(address, network)
+        super().__init__(address, transport)
         self._timeout = timeout
         self._reader = PrefixReader(max_answer)
         self._socket = self._connected(address, connect_timeout)
         self._begin()
 
     def _connected(self, address: tuple[str, int], patience: float) -> Link:
-        return self._reach(lambda left: self._network.connect(address, left), patience)
+        return self._reach(lambda left: self._transport.connect(address, left), patience)
 
     def tell(self, body: bytes) -> None:
         """Send a message that has no answer."""

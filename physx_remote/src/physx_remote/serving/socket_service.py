@@ -16,9 +16,9 @@ from physx_core.net import (
     VANISHED,
     Link,
     Listener,
-    Network,
     PendingConnections,
     Reader,
+    Transport,
     is_loopback,
     is_loss,
 )
@@ -52,19 +52,19 @@ class SocketService(Service):
     encrypts: ClassVar[bool] = False
     """Whether the protocol encrypts what leaves this machine, and authenticates."""
 
-    def __init__(self, *, max_clients: int = 256, network: Network = SOCKETS) -> None:
+    def __init__(self, *, max_clients: int = 256, transport: Transport = SOCKETS) -> None:
         """Start without connections.
 
         Args:
             max_clients: Maximum number of clients; further ones are turned away. In addition, as
                 many pending connections are kept, but at least 32; if another arrives, one of them
                 is closed.
-            network: What connects the clients, and the clock that the service follows.
+            transport: What connects the clients, and the clock that the service follows.
         """
         self.address = ("", 0)
         self.connections: list[RequestConnection] = []
         self._max_clients = max_clients
-        self._network, self._clock = network, network.clock
+        self._transport, self._clock = transport, transport.clock
         self.log = ClientLog(self.after)
         self._listener: Listener[RequestConnection]
         self._pending: PendingConnections[RequestConnection]
@@ -264,7 +264,7 @@ class SocketService(Service):
             return False
         try:
             # For such a short time, polling is faster than being woken by the system.
-            if not self._network.spin_until(connection.receive, SPIN_LIMIT):
+            if not self._transport.spin_until(connection.receive, SPIN_LIMIT):
                 return False
         except OSError as error:
             self._on_io_error(connection, error)
@@ -285,7 +285,7 @@ class SocketService(Service):
             if not (self._is_open or self._released):
                 self._is_open = True
                 self._listener = Listener(
-                    self._meet, self._give_up, encrypts=self.encrypts, network=self._network
+                    self._meet, self._give_up, encrypts=self.encrypts, transport=self._transport
                 )
                 self._pending = self.new_pending()
 

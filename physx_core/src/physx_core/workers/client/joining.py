@@ -9,7 +9,7 @@ from physx_core.errors import ConfigError, ConnectionRefusedByPeerError, Unanswe
 from physx_core.net.addresses import parse_address, retry
 from physx_core.net.frames import Kind
 from physx_core.net.handshake import PlainRefusedError, encrypt, introduce
-from physx_core.net.link import SOCKETS, Link, Network
+from physx_core.net.link import SOCKETS, Link, Transport
 from physx_core.net.liveness import prepare_connection
 from physx_core.net.remote_errors import decode_error
 from physx_core.net.values import decode
@@ -27,7 +27,7 @@ def join(
     token: str,
     instance: int,
     patience: float = PATIENCE,
-    network: Network = SOCKETS,
+    transport: Transport = SOCKETS,
 ) -> tuple[WorkerLink, dict[str, Any] | None]:
     """Connect to a server and receive what to run.
 
@@ -39,7 +39,7 @@ def join(
         token: Token of the run.
         instance: Number of the instance to run or a ticket for it, 0 for any that is free.
         patience: How long to retry, in s.
-        network: What connects the client, and the clock that it follows.
+        transport: What connects the client, and the clock that it follows.
 
     Returns:
         The connection, and the arguments of the instance; None: the client hosts workers.
@@ -47,26 +47,26 @@ def join(
 
     def attempt(seconds: float) -> tuple[WorkerLink, dict[str, Any] | None]:
         try:
-            return _try_to_join(network, address, token, instance)
+            return _try_to_join(transport, address, token, instance)
         except PlainRefusedError:
-            return _try_to_join(network, address, token, instance, encrypted=True)
+            return _try_to_join(transport, address, token, instance, encrypted=True)
 
-    return retry(attempt, patience, _PAUSE, UnansweredError, clock=network.clock)
+    return retry(attempt, patience, _PAUSE, UnansweredError, clock=transport.clock)
 
 
 def _try_to_join(
-    network: Network, address: str, token: str, instance: int, *, encrypted: bool = False
+    transport: Transport, address: str, token: str, instance: int, *, encrypted: bool = False
 ) -> tuple[WorkerLink, dict[str, Any] | None]:
-    connection = _connect(network, address)
+    connection = _connect(transport, address)
     try:
         prepare_connection(connection)
         connection = encrypt(connection, always=encrypted)
-        reader = introduce(connection, token, instance, network.clock)
+        reader = introduce(connection, token, instance, transport.clock)
         connection.settimeout(None)
     except BaseException:
         connection.close()
         raise
-    link = WorkerLink(connection, reader, network)
+    link = WorkerLink(connection, reader, transport)
     try:
         return link, _receive_setup(link)
     except BaseException:
@@ -74,11 +74,11 @@ def _try_to_join(
         raise
 
 
-def _connect(network: Network, address: str) -> Link:
+def _connect(transport: Transport, address: str) -> Link:
     what = f'No server can be reached at "{address}"'
     advice = "Give the HOST:PORT at which the run listens."
     try:
-        return network.connect(parse_address(address), _ANSWER_TIME)
+        return transport.connect(parse_address(address), _ANSWER_TIME)
     except (ConfigError, socket.gaierror) as error:
         raise ConnectionRefusedByPeerError(f"{what}: {error} {advice}") from error
     except OSError as error:

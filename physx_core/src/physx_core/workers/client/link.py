@@ -13,7 +13,7 @@ from collections.abc import Collection, Sequence
 from typing import Any
 
 from physx_core.net.frames import Frame, FrameReader, Kind
-from physx_core.net.link import SOCKETS, Link, Network
+from physx_core.net.link import SOCKETS, Link, Transport
 from physx_core.net.liveness import poll_peer
 from physx_core.net.remote_errors import decode_error
 from physx_core.net.values import decode, pack_value
@@ -42,22 +42,24 @@ class WorkerLink:
         spins: Whether to spin-wait for an answer for up to 0.2 ms.
     """
 
-    def __init__(self, connection: Link, reader: FrameReader, network: Network = SOCKETS) -> None:
+    def __init__(
+        self, connection: Link, reader: FrameReader, transport: Transport = SOCKETS
+    ) -> None:
         """Take over a connection whose handshake is done.
 
         Args:
             connection: The link.
             reader: The reader that the handshake returned.
-            network: What the link belongs to.
+            transport: What the link belongs to.
         """
-        self.clock, self.spins = network.clock, False
-        self._network = network
+        self.clock, self.spins = transport.clock, False
+        self._transport = transport
         self._connection = connection
         self._reader = reader
         self._buffered: Collection[Any] = getattr(connection, "buffered", ())  # see SecureSocket
         self._postponed: deque[Frame] = deque()
         self._requests = 0
-        self._poll = network.poll(connection)
+        self._poll = transport.poll(connection)
         self._over = threading.Event()
 
     def exit_if_lost(self) -> None:
@@ -156,7 +158,7 @@ class WorkerLink:
 
     def _spin(self) -> None:
         if self.spins:
-            self._network.spin_until(self.has_message, _SPIN_TIME)
+            self._transport.spin_until(self.has_message, _SPIN_TIME)
 
     def _next(self) -> Frame:
         try:
@@ -169,7 +171,7 @@ class WorkerLink:
 
     def _watch(self) -> None:
         try:
-            poll_peer(self._network.poll(self._connection, _HANGUP), self._connection, None)
+            poll_peer(self._transport.poll(self._connection, _HANGUP), self._connection, None)
         except TimeoutError:
             with contextlib.suppress(OSError):  # unblock a call that sends or receives
                 self._connection.shutdown(socket.SHUT_RDWR)

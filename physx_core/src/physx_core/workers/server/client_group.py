@@ -22,7 +22,7 @@ from physx_core.errors import (
 )
 from physx_core.net.addresses import format_address, is_loopback, parse_address
 from physx_core.net.handshake import TOKEN_VARIABLE
-from physx_core.net.link import SOCKETS, Network
+from physx_core.net.link import SOCKETS, Transport
 from physx_core.net.tokens import choose_token, find_token
 from physx_core.net.values import encode
 from physx_core.plugins import reference_of, resolve
@@ -65,7 +65,7 @@ class ClientGroup:
         skip: Skip = NOTHING,
         total: int | None = None,
         written: WrittenRows | None = None,
-        network: Network = SOCKETS,
+        transport: Transport = SOCKETS,
     ) -> None:
         """Store the arguments; `open` starts the clients.
 
@@ -78,9 +78,9 @@ class ClientGroup:
             skip: What an earlier run already got: clients generate it again, but do not send it.
             total: Number of rows of the whole run, including those to skip; None: unknown.
             written: Counts the rows that the clients write themselves; None: they send them.
-            network: What connects the clients, and the clock that the run follows.
+            transport: What connects the clients, and the clock that the run follows.
         """
-        self._clock = network.clock
+        self._clock = transport.clock
         self._written = written
         self.config = config
         self._seed, self._sets = list(seed), sets
@@ -116,7 +116,7 @@ class ClientGroup:
             skip,
             self._pool,
             written,
-            network,
+            transport,
         )
 
     def open(self) -> None:

@@ -14,7 +14,7 @@ from physx_core.errors import (
 )
 from physx_core.net.addresses import format_address
 from physx_core.net.frames import MAX_PAYLOAD, Frame, Kind, pack
-from physx_core.net.link import SOCKETS, Link, Network
+from physx_core.net.link import SOCKETS, Link, Transport
 from physx_core.net.listener import Listener
 from physx_core.net.liveness import is_loss
 from physx_core.net.pending import Handshakes
@@ -67,7 +67,7 @@ class Server:
         skip: Skip = NOTHING,
         pool: ClientPool | None = None,
         written: WrittenRows | None = None,
-        network: Network = SOCKETS,
+        transport: Transport = SOCKETS,
     ) -> None:
         """Store the arguments; `open` starts listening.
 
@@ -85,11 +85,11 @@ class Server:
             skip: What an earlier run already got from the instances.
             pool: The clients, if they run workers for several instances; None: each runs one.
             written: Counts the rows that the clients write themselves; None: they send them.
-            network: What connects the clients, and the clock that the server follows.
+            transport: What connects the clients, and the clock that the server follows.
         """
         self.peers: dict[int, Peer] = {}
         self.token = token
-        self._network, self._clock = network, network.clock
+        self._transport, self._clock = transport, transport.clock
         self._ip_address, self._port, self._instance_nb = ip_address, port, instance_nb
         self._spin_time = _SPIN_TIME if has_core_for_each(instance_nb) else 0.0
         self._requests = ServiceRequests(services, sets)
@@ -97,7 +97,9 @@ class Server:
         self._journal_size = journal_size
         self._pool = pool
         self._ending = self._has_news = False
-        self._listener = Listener[Peer](self._meet, self._give_up, encrypts=True, network=network)
+        self._listener = Listener[Peer](
+            self._meet, self._give_up, encrypts=True, transport=transport
+        )
         self._strangers = Handshakes[Peer](
             token, _HANDSHAKE_TIME, _MAX_STRANGERS, self._drop, self._listener.timers
         )
@@ -148,7 +150,7 @@ class Server:
 
     def listen_to(self, peer: Peer, seconds: float) -> None:
         """Handle what one client has sent, and nothing else; wait up to `seconds` for it."""
-        if self._network.poll(peer.link).poll(1000 * seconds):
+        if self._transport.poll(peer.link).poll(1000 * seconds):
             self._read(peer)
 
     def _answer_at_once(self, timeout: float, spin: float) -> bool:
