@@ -171,7 +171,7 @@ def simulated(services, simulation):
 
     def make(environment="Plain", *, run_ahead=None, total=None, **options):
         settings = configured(environment, {"launcher": "simulated:SimulatedLauncher", **options})
-        options = {"run_ahead": run_ahead, "total": total, "network": simulation}
+        options = {"run_ahead": run_ahead, "total": total, "transport": simulation}
         return ClientSource(settings, services, SEED, **options)
 
     return make
