@@ -31,7 +31,7 @@ FACES = {
             "rotations",
         ),
         *("errors", "fields", "typing", "checks", "parsing", "rows", "sources"),
-        *("workers", "net", "processes", "files", "origin", "cli", "statistics", "observers"),
+        *("workers", "net", "clock", "processes", "files", "origin", "cli", "statistics", "observers"),
     ),
     "physx_sim": ("", "engines", "conformance", "errors"),
     "physx_testing": ("",),
