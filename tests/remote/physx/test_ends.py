@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import itertools
+import re
 import socket
 import struct
 import threading
@@ -188,6 +190,19 @@ def test_what_cannot_be_served():
         serve(POLE, "physx", token="short")
     with pytest.raises(ConfigError, match="handshake_timeout"):
         serve(POLE, "physx", handshake_timeout=0)
+
+
+WRONG = [
+    *itertools.product(("handshake_timeout", "max_clients"), ("many", True, [1])),
+    *itertools.product(("max_request", "max_snapshots"), ("many", 1.5, None)),
+    *itertools.product(("token", "token_file"), (1.5, True, [1])),
+]
+
+
+@pytest.mark.parametrize(("option", "value"), WRONG)
+def test_service_option_of_wrong_type_is_named(option, value):
+    with pytest.raises(ConfigError, match=f"{option} is {re.escape(repr(value))}"):
+        serve(POLE, "physx", **{option: value})
 
 
 def test_a_token_of_ones_own_and_none_at_all(serving, monkeypatch, tmp_path):

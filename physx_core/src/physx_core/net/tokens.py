@@ -23,8 +23,12 @@ def find_token(token_file: str | None, token: str | None = None) -> str | None:
         token: The token itself, which takes precedence.
 
     Raises:
-        ConfigError: If the file cannot be read, other users can read it, or the token is too short.
+        ConfigError: If the file cannot be read, other users can read it, or the token is too short
+            or no text.
     """
+    for option, value in (("token", token), ("token_file", token_file)):
+        if not isinstance(value, str | os.PathLike | None):
+            raise ConfigError(f"{option} is {value!r} but must be text.")
     if token is not None:
         return check_token(token, "token")
     if token_file is None:

@@ -54,11 +54,11 @@ class Physx(Protocol):
         """
         super().__init__(**options)
         positive("handshake_timeout", handshake_timeout)
-        if not 1 <= max_request <= MAX_PAYLOAD:
-            raise ConfigError(f"max_request is {max_request} but must be in 1 .. {MAX_PAYLOAD}.")
+        if type(max_request) is not int or not 1 <= max_request <= MAX_PAYLOAD:
+            raise ConfigError(f"max_request is {max_request!r} but must be in 1 .. {MAX_PAYLOAD}.")
         for option, value in (("max_clients", max_clients), ("max_snapshots", max_snapshots)):
-            if value < 1:
-                raise ConfigError(f"{option} is {value} but must be at least 1.")
+            if type(value) is not int or value < 1:
+                raise ConfigError(f"{option} is {value!r} but must be an integer of at least 1.")
         found = find_token(token_file, token)
         self.token = secrets.token_hex(32) if found is None else found
         self._options: dict[str, Any] = {
