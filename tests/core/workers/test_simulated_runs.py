@@ -10,6 +10,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from simulated import HOST, ROOM, Deadlock, Simulation, drawn
+from sizes import size
 
 from physx_core import EnvironmentConfig
 from physx_core.errors import ClientError
@@ -66,7 +67,7 @@ def local(environment, **options):
     return LocalSource(EnvironmentConfig(environment, num_clients=2, **options), Services(), SEED)
 
 
-@settings(max_examples=30)
+@settings(max_examples=size(30, 4))
 @given(drawn, rooms)
 def test_rows_are_the_same_in_any_order_of_events(program, choose, room):
     kwargs = {"refuse": 5, "delay": 1e-3}
@@ -76,7 +77,7 @@ def test_rows_are_the_same_in_any_order_of_events(program, choose, room):
         assert [client.exit_status() for client in simulation.clients] == [0, 0]
 
 
-@settings(max_examples=30)
+@settings(max_examples=size(30, 4))
 @given(drawn)
 def test_predictions_are_the_same_in_any_order_of_events(program, choose):
     expected = run(local(program("Asking")))
@@ -85,7 +86,7 @@ def test_predictions_are_the_same_in_any_order_of_events(program, choose):
         assert run(source) == expected
 
 
-@settings(max_examples=30)
+@settings(max_examples=size(30, 4))
 @given(drawn, rooms, st.integers(1, 100), st.booleans(), st.sampled_from([1, 2]))
 def test_rows_are_the_same_whenever_a_client_is_lost(program, choose, room, event, begun, victim):
     kwargs = {"delay": 10e-3}  # so that there are some rows in each message
@@ -103,7 +104,7 @@ def test_rows_are_the_same_whenever_a_client_is_lost(program, choose, room, even
         assert ended.count(0) == 2 or ended.count(-signal.SIGKILL) == 1
 
 
-@settings(max_examples=30)
+@settings(max_examples=size(30, 4))
 @given(drawn, st.integers(30, 60))
 def test_a_lost_client_that_is_not_replaced_is_named(program, choose, event):
     with Simulation(choose) as simulation:
@@ -115,7 +116,7 @@ def test_a_lost_client_that_is_not_replaced_is_named(program, choose, event):
         assert all(client.exit_status() is not None for client in simulation.clients)
 
 
-@settings(max_examples=30)
+@settings(max_examples=size(30, 4))
 @given(drawn, st.floats(0.5, 10.0))
 def test_a_client_that_hangs_is_named_after_its_time(program, choose, timeout):
     kwargs = {"what": "hang", "who": 2}
