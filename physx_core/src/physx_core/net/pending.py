@@ -96,7 +96,7 @@ class Handshakes(PendingConnections[AnyConnection]):
             self._timers.add(self.patience, self._drop_silent)
 
     def greet(self, connection: AnyConnection, frame: Frame) -> tuple[bytes, int | None]:
-        """Continue the handshake of a connection, which is forgotten once it is trusted.
+        """Continue the handshake of a connection, which is removed once it is trusted.
 
         Returns:
             The bytes to send back, and the number that the client requests, None until trusted.

@@ -176,7 +176,7 @@ class Writer:
                 self._collect(wait=False)
             while done < count:
                 partition = self._open.get(mode_name)
-                free = 0 if partition is None else partition.capacity - partition.partition.rows
+                free = 0 if partition is None else partition.free
                 if partition is None or not free:
                     if partition is not None:
                         self._retire(mode_name)
