@@ -73,6 +73,8 @@ def test_elastic_ray_run_survives_lost_node(runs, local_rows, ray_cluster, event
     """Of four clients two find a place, of which one is lost with its node."""
     expected = local_rows(batches=30)
     lost = ray_cluster.nodes.pop()
+    hold = runs.folder / "hold"  # else the first client may be done before there is a second
+    hold.touch()
     process = runs.start(
         *on(ray_cluster, "num_cpus=1"),
         *("--environment.min-clients", "1", "--environment.max-clients", "4"),
@@ -81,7 +83,9 @@ def test_elastic_ray_run_survives_lost_node(runs, local_rows, ray_cluster, event
         **ray_cluster.variables,
     )
     node = str(ray_cluster.raylet_of(lost))
-    eventually(lambda: node in {there for *_, there in runs.clients()} or process.poll(), 90)
+    eventually(lambda: node in {there for *_, there in runs.clients()}, 90)
+    hold.unlink()
+    time.sleep(1)
     ray_cluster.kill(lost)
     status, said = runs.finish(process)
     ray_cluster.nodes.append(ray_cluster.add_node())

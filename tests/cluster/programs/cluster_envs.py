@@ -16,7 +16,8 @@ from physx_core import Environment
 class Walk(Environment):
     """A random walk in a client that has a process of its own.
 
-    Each client leaves a file INSTANCE-PID-CHILD-NODE in the folder `notes`.
+    Each client leaves a file INSTANCE-PID-CHILD-NODE in the folder `notes`, and takes no step while
+    there is a file of the name `hold` beside that folder.
     """
 
     def __init__(self, *, notes: str, pace: float = 0.0, fail_at: int = -1, **kwargs):
@@ -36,6 +37,8 @@ class Walk(Environment):
     def step(self):
         if self.step_index == self.fail_at:
             raise RuntimeError("on purpose")
+        while (self.notes.parent / "hold").exists():
+            time.sleep(0.02)
         time.sleep(self.pace)
         self.position = self.position + self.rng.normal(size=3)
         self.set_training_data(position=self.position)
