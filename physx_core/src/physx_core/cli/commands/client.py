@@ -36,7 +36,8 @@ class Client:
     token_file: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """File with the token, readable only by you."""
     patience: float = PATIENCE
-    """Time in s to keep trying while nothing listens at the address."""
+    """Time in s to keep trying while nothing listens at the address, and to wait for the answer of
+    a run that is busy."""
 
 
 def run(words: Sequence[str]) -> None:
@@ -53,7 +54,12 @@ def run(words: Sequence[str]) -> None:
     os.environ.pop(TOKEN_VARIABLE, None)  # the environment and its processes must not see it
     try:
         status = run_client(
-            options.connect, token, options.instance, patience=options.patience, say=_say
+            options.connect,
+            token,
+            options.instance,
+            patience=options.patience,
+            answer_time=max(options.patience, PATIENCE),
+            say=_say,
         )
     finally:
         signal.signal(signal.SIGTERM, signal.SIG_IGN)  # it is already ending

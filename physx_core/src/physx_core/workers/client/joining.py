@@ -18,7 +18,6 @@ from physx_core.workers.client.link import RunEnded, WorkerLink
 PATIENCE = 10.0
 """How long a client tries to join, in s."""
 
-_ANSWER_TIME = 10.0
 _PAUSE = 0.2
 
 
@@ -27,6 +26,7 @@ def join(
     token: str,
     instance: int,
     patience: float = PATIENCE,
+    answer_time: float | None = None,
     transport: Transport = SOCKETS,
 ) -> tuple[WorkerLink, dict[str, Any] | None]:
     """Connect to a server and receive what to run.
@@ -39,6 +39,8 @@ def join(
         token: Token of the run.
         instance: Number of the instance to run or a ticket for it, 0 for any that is free.
         patience: How long to retry, in s.
+        answer_time: How long a server that accepted the connection may take to answer, in s; None:
+            without limit, as its run may be busy, for example with a long validation.
         transport: What connects the client, and the clock that it follows.
 
     Returns:
@@ -47,19 +49,26 @@ def join(
 
     def attempt(seconds: float) -> tuple[WorkerLink, dict[str, Any] | None]:
         try:
-            return _try_to_join(transport, address, token, instance)
+            return _try_to_join(transport, address, token, instance, answer_time)
         except PlainRefusedError:
-            return _try_to_join(transport, address, token, instance, encrypted=True)
+            return _try_to_join(transport, address, token, instance, answer_time, encrypted=True)
 
     return retry(attempt, patience, _PAUSE, UnansweredError, clock=transport.clock)
 
 
 def _try_to_join(
-    transport: Transport, address: str, token: str, instance: int, *, encrypted: bool = False
+    transport: Transport,
+    address: str,
+    token: str,
+    instance: int,
+    answer_time: float | None,
+    *,
+    encrypted: bool = False,
 ) -> tuple[WorkerLink, dict[str, Any] | None]:
     connection = _connect(transport, address)
     try:
         prepare_connection(connection)
+        connection.settimeout(answer_time)
         connection = encrypt(connection, always=encrypted)
         reader = introduce(connection, token, instance, transport.clock)
         connection.settimeout(None)
@@ -78,7 +87,7 @@ def _connect(transport: Transport, address: str) -> Link:
     what = f'No server can be reached at "{address}"'
     advice = "Give the HOST:PORT at which the run listens."
     try:
-        return transport.connect(parse_address(address), _ANSWER_TIME)
+        return transport.connect(parse_address(address), PATIENCE)
     except (ConfigError, socket.gaierror) as error:
         raise ConnectionRefusedByPeerError(f"{what}: {error} {advice}") from error
     except OSError as error:

@@ -31,6 +31,7 @@ def run_client(
     instance: int | None = None,
     *,
     patience: float = PATIENCE,
+    answer_time: float | None = None,
     say: Callable[[str], None] = lambda text: None,
 ) -> int:
     """Run one instance of the environment for a server until it ends the run.
@@ -43,6 +44,8 @@ def run_client(
         instance: Number of the instance to run, counted from 1, or a ticket for it; None: any that
             is free. In an elastic run, the number of the client.
         patience: How long to retry if nothing listens, in s.
+        answer_time: How long to wait for the answer of a server that listens, in s; None: without
+            limit.
         say: Called with a description of what happens.
 
     Returns:
@@ -50,7 +53,7 @@ def run_client(
         server knows why) or the server is gone.
     """
     say(f"connecting to the server at {address}")
-    link, setup = join(address, token, instance or 0, patience)
+    link, setup = join(address, token, instance or 0, patience, answer_time)
     link.exit_if_lost()
     try:
         if setup is None:
