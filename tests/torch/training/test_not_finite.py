@@ -98,11 +98,14 @@ KINDS += [{"sparse": True}, {"sparse": True, "size": 5000}, {"dtype": torch.floa
 
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("clip", [None, 0.5])
 @pytest.mark.parametrize("kind", KINDS, ids=str)
-def test_one_gradient_of_any_kind_that_is_not_finite_is_found_in_the_step_that_makes_it(kind, bad):
+def test_one_gradient_that_is_not_finite_is_named_in_its_step(kind, clip, bad):
+    if clip and kind.get("sparse"):
+        pytest.skip("PyTorch cannot clip sparse gradients")
     network = Parts(**kind)
     network.set_train()
-    optimization = TorchOptimization()
+    optimization = TorchOptimization(gradient_clip=clip)
     optimization.set_loss(real_sum)
     optimization.set_optimizer("SGD", network, lr=0.1, momentum=0.9)
     data = network.numpy_to_tensor({"input": np.ones((1, 1)), "ground_truth": np.ones((1, 1))})
@@ -247,6 +250,28 @@ def test_the_network_before_the_first_gradient_that_is_nan_is_kept(
     assert is_equal(kept, spoiled.before)
     losses = read_scalars(Path("sessions/training"))["batch", "loss/batch"]
     assert list(losses) == [1, 2, 3, 4, 5]
+
+
+@pytest.mark.parametrize("batch", [0, 1, 3])
+def test_a_resumed_training_learns_from_the_batch_that_failed(data, batch):
+    class Fails(Training):
+        """Runs out of memory in a batch of the second epoch, once."""
+
+        def optimize(self):
+            if (self.epoch_id, self.batch_id, self.fails) == (1, batch, True):
+                raise MemoryError("on purpose")
+            super().optimize()
+
+    train = {"batch_size": 10, "seed": 3, "quiet": True, "epoch_nb": 3}
+    Fails.fails = False
+    Fails(config(loss="MSELoss"), data, session_name="whole", **train).execute()
+    Fails.fails = True
+    with pytest.raises(MemoryError):
+        Fails(config(loss="MSELoss"), data, **train).execute()
+    Fails.fails = False
+    Fails(config(loss="MSELoss"), data, resume=True, **train).execute()
+    whole = content(load_learner("sessions/whole").network)
+    assert is_equal(load_learner("sessions/training").network, whole)
 
 
 def test_a_training_says_where_the_gradient_became_nan(data):

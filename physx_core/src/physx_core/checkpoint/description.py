@@ -47,7 +47,7 @@ class Progress:
     Attributes:
         epoch: Number of finished epochs.
         batch: Number of finished batches of the next epoch.
-        batches_read: Number of batches read from the dataset, in all epochs.
+        batches_read: Number of batches of the dataset that were learned from, in all epochs.
         seed: Seed of the training.
         blocks: Number of batches whose rows environments generated.
         best: State of `BestEpoch`.

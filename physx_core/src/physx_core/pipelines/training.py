@@ -172,6 +172,7 @@ class Training(NewSessionPipeline):
     _order_reported: bool = field(init=False, repr=False, default=False)
     _told: Sequence[str] = field(init=False, repr=False, default=())
     _recorded: dict[str, float] | None = field(init=False, repr=False, default=None)
+    _batches_read: int = field(init=False, repr=False, default=0)
 
     def execute(self) -> None:
         """Train, and write a checkpoint to resume from however the training ends.
@@ -241,6 +242,7 @@ class Training(NewSessionPipeline):
         if self.epoch_id == self._resumed.epoch:
             for _ in range(self._resumed.batches_read):  # skipped
                 self.data.next_batch()
+            self._batches_read = self.data.stored.count
             left = (self.epoch_nb - self.epoch_id) * self._epoch_batches - self.batch_id
             self.observers.begin("training", max(0, left), "batches")
 
@@ -292,7 +294,7 @@ class Training(NewSessionPipeline):
 
     def _record_batch(self) -> None:
         """Record the batch's losses."""
-        self._recorded = self.losses
+        self._recorded, self._batches_read = self.losses, self.data.stored.count
         self._record.add(self.epoch_id * (self._epoch_batches or 0) + self.batch_id, self.losses)
         now = time.monotonic()
         if now > self._reported + REPORT_SECONDS or self.data.generated is not None:
@@ -427,7 +429,7 @@ class Training(NewSessionPipeline):
         progress = Progress(
             self.epoch_id,
             self.batch_id,
-            self.data.stored.count,
+            self._batches_read,
             self._resumed.seed,
             self._blocks,
             self.best.state,

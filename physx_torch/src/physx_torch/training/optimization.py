@@ -376,20 +376,18 @@ class TorchOptimization(Optimization):
         self._accumulated += 1
         if is_due := self._accumulated >= self._accumulate:
             self._accumulated = 0
-        norm = self._limit_gradients(optimizer, network) if is_due and self._gradient_clip else None
+        learned, norm = [], None
+        if is_due and self._gradient_clip is not None:
+            if self._scaler is not None:
+                self._scaler.unscale_(optimizer)
+            learned = [*network.parameters(), *self._learned_by_loss.values()]
+            norm = torch.nn.utils.get_total_norm([p.grad for p in learned if p.grad is not None])
         if self.stops_at_nan:
             self._check_finite(loss, norm, optimizer if is_due else None)
+        if norm is not None and self._gradient_clip is not None:
+            torch.nn.utils.clip_grads_with_norm_(learned, self._gradient_clip, norm)
         if is_due:
             self._step(optimizer)
-
-    def _limit_gradients(
-        self, optimizer: torch.optim.Optimizer, network: TorchNetwork
-    ) -> torch.Tensor:
-        """Scale down large gradients, and return the norm that they had together."""
-        if self._scaler is not None:
-            self._scaler.unscale_(optimizer)
-        learned = [*network.parameters(), *self._learned_by_loss.values()]
-        return torch.nn.utils.clip_grad_norm_(learned, self._gradient_clip or 0.0)
 
     def _check_finite(
         self,
