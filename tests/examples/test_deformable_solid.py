@@ -51,6 +51,7 @@ def test_the_beam_bends_as_beam_theory_says_under_small_loads(way, beam):
     assert np.all(displacement[:, :, 0] == 0)
 
 
+@pytest.mark.slow
 def test_linear_elasticity_is_the_tangent_at_rest_whatever_was_solved_before(beam):
     solver = beam.ElasticBeam()
     solver.solve(tip_load(beam, 40))

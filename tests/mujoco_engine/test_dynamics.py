@@ -41,6 +41,7 @@ def check_close(found, expected, bound):
     assert np.abs(found - expected).max() <= bound * np.abs(expected).max()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ROBOTS)
 def test_accelerations_agree_with_both_engines(backend, dart, pinocchio, name):
     try:

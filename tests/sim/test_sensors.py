@@ -111,6 +111,7 @@ def test_delay_counts_in_time_not_in_the_sensors_own_period():
     np.testing.assert_allclose(found, np.maximum(taken - 0.01, 0), atol=1e-15)
 
 
+@pytest.mark.slow
 def test_jitter_is_uniform_in_its_range():
     simulation = Signal()
     encoder = Encoder(name="a", joint="a", delay=2e-3, jitter=5e-3, interpolation=1)

@@ -46,6 +46,7 @@ def elsewhere(monkeypatch):
     return "meta"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", NETWORKS)
 def test_training_and_prediction_stay_on_the_device_of_the_network(name, elsewhere):
     reference, kwargs, shapes = NETWORKS[name]

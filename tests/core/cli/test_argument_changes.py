@@ -166,6 +166,7 @@ def test_mistakes_are_named(words, message, capsys):
     assert message in text.err + text.out and "Traceback" not in text.err
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("verb", "option"),
     [

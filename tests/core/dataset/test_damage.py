@@ -173,6 +173,7 @@ def flip_bits(places, tmp_path, step):
     return tried, noticed
 
 
+@pytest.mark.slow
 def test_bit_flips_are_detected(places, tmp_path):
     tried, noticed = flip_bits(places, tmp_path, 1500)
     assert 0 < noticed < tried

@@ -280,6 +280,7 @@ def test_server_without_tls_is_detected(answer, error, text):
     assert type(caught.value) is error
 
 
+@pytest.mark.slow
 def test_slow_tls_handshake_times_out():
     near, far = pair()
     near.settimeout(0.5)

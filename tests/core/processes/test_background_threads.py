@@ -28,6 +28,7 @@ def test_a_thread_is_joined_although_its_start_was_interrupted(monkeypatch):
     assert done.is_set() and not thread.is_alive()
 
 
+@pytest.mark.slow
 def test_joining_a_thread_without_a_start_returns():
     BackgroundThread(print, "test").join()
 

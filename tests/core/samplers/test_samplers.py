@@ -75,6 +75,7 @@ def test_other_seeds_and_numbers_have_other_values(name):
     assert len(sets) == 120
 
 
+@pytest.mark.slow
 def test_a_sobol_sequence_fills_every_part_once():
     sampler = begun("sobol", [Parameter("a", 0, 1), Parameter("b", 0, 1)])
     points = np.array([list(sampler.ask(n).values()) for n in range(64)])

@@ -247,6 +247,7 @@ def test_regenerating_rows_after_restart_is_no_timeout(simulated, caplog):
 # Limits -----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "error"), [("kill", ClientError), ("fail", EnvironmentFailedError)]
 )

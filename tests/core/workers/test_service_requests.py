@@ -127,6 +127,7 @@ def test_drawing_events_arrive_exactly(local, simulated, services):
 DRAWING = {"visualizer": "any", "env_kwargs": {"pace": 1e-4}}
 
 
+@pytest.mark.slow
 def test_ending_client_waits_until_server_has_read_everything(simulated, services, simulation):
     """The server is slow, and the client comes to its end while thousands of messages wait."""
     shown, closing, ended = [], [], []
@@ -149,6 +150,7 @@ def test_ending_client_waits_until_server_has_read_everything(simulated, service
     assert closing[0].exit_status() == 0
 
 
+@pytest.mark.slow
 def test_rows_sent_before_kill_are_read(simulated, services, simulation):
     """The server is slow, and thousands of messages of a client that is no more wait."""
     shown, killing = [], []

@@ -106,6 +106,7 @@ def test_gears_and_the_order_of_encoders_do_not_matter():
     np.testing.assert_allclose(geared, plain, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("backend", ["dart", "pinocchio"])
 def test_standing_comes_to_rest(backend):
     options = {"period": 2e-3, "control_period": 2e-3, "backend": backend}

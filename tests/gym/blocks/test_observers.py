@@ -149,6 +149,7 @@ def test_begin_without_orientation_and_without_twist():
     )
 
 
+@pytest.mark.slow
 def test_the_bias_of_the_gyroscope_is_estimated():
     imu = Imu(name="trunk", body="base", bias={"angular_velocity": [0.05, 0.0, 0.0]})
     env = walker(sensors=[*encoders(), imu], filtered={"kp": 2.0, "ki": 1.0})

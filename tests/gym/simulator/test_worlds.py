@@ -97,6 +97,7 @@ def test_a_robot_without_motors(backend):
         env.step([0.0])
 
 
+@pytest.mark.slow
 def test_two_robots_and_an_object_of_which_one_acts(backend, tmp_path):
     robots = [Robot("cartpole", "one"), Robot("cartpole", "two")]
     ball = Sphere(name="ball", radius=0.1, position=(0, 0, 3))

@@ -303,6 +303,7 @@ def wait(guest):
         continue
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("said", [wait, drip])
 def test_handshake_timeout_is_told_from_wrong_token(liar, said):
     began = time.monotonic()

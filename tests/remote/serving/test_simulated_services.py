@@ -76,6 +76,7 @@ def test_a_request_that_takes_long_keeps_the_others_waiting(choose):
         service.close()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("timeout", [0.5, 86_400.0])
 def test_an_answer_that_does_not_come_is_given_up(timeout):
     with Simulation() as simulation:

@@ -118,6 +118,7 @@ def test_every_environment_is_in_its_picture(reference, tmp_path):
     assert hidden_of(Recorder.steps) == set()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", GYM)
 def test_every_robot_environment_is_in_its_picture(name):
     env = gymnasium.make(name, render_mode="rgb_array")

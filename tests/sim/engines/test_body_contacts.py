@@ -43,6 +43,7 @@ def test_a_cradle_hands_its_speed_on(backend):
         np.testing.assert_allclose(simulation.velocities()[::6], [0, 0, 0, 0, 1], atol=1e-3)
 
 
+@pytest.mark.slow
 def test_a_stack_rests_and_the_ground_carries_it(backend):
     boxes = [
         Box(name=f"box{i}", size=(0.2, 0.2, 0.2), position=(0, 0, 0.1 + 0.2 * i)) for i in range(5)
@@ -58,6 +59,7 @@ def test_a_stack_rests_and_the_ground_carries_it(backend):
         np.testing.assert_allclose(force, [0, 0, 5 * 9.81], atol=0.02 * 5 * 9.81)
 
 
+@pytest.mark.slow
 def test_friction_between_bodies_carries_along(backend):
     """A brick on a sliding plank is dragged by friction until both have the same speed."""
     plank = Box(name="plank", size=(2.0, 0.4, 0.1), mass=3.0, position=(0, 0, 0.05), friction=0.3)

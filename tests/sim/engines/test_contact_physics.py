@@ -45,6 +45,7 @@ def test_a_box_on_an_incline_holds_below_the_friction_angle_and_slides_above(eng
         np.testing.assert_allclose(simulation.positions()[0], expected, rtol=0.01)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ISOTROPIC, ids=str)
 def test_friction_is_isotropic_with_the_feature(engine):
     gravity, angle = tilted(1.2, 0.5, (1.0, 1.0))
@@ -197,6 +198,7 @@ def test_light_wheels_under_a_heavy_base_do_not_bounce(engine):
         assert np.abs(simulation.positions()[:2]).max() < 1e-4
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", BOTH, ids=str)
 def test_a_quadruped_stands(engine, example):
     robot = Robot(

@@ -69,6 +69,7 @@ def test_the_option_contacts_disables_collisions(backend, contacts):
             assert heights[0] < -0.5
 
 
+@pytest.mark.slow
 def test_links_collide_with_each_other_if_asked(backend, write_urdf):
     ball = '<collision><geometry><sphere radius="0.3"/></geometry></collision>'
     mass = '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/>'

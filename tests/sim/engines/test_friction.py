@@ -54,6 +54,7 @@ def test_friction_is_right_with_few_iterations(backend):
         )
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("degrees", [35, 50])
 def test_an_a_frame_stands_if_friction_holds_its_legs_together(backend, write_urdf, degrees):
     """Friction bears load here: a bound from the normal forces without friction is too small."""

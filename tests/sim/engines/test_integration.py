@@ -224,6 +224,7 @@ def test_rk4_rejects_limits(pinocchio, bar):
         pinocchio.build(World([robot], integrator="rk4"))
 
 
+@pytest.mark.slow
 def test_engines_agree_in_rk4_under_wrenches(dart, pinocchio, brick):
     world, ends = dataclasses.replace(brick, integrator="rk4"), []
     for backend in (dart, pinocchio):

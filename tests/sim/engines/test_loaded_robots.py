@@ -245,6 +245,7 @@ def test_what_an_engine_does_not_understand_is_not_lost(write_urdf):
 IMPOSSIBLE = re.compile("inertia must satisfy|positive eigenvalues")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", sorted(named_robots()))
 def test_every_robot_is_the_one_that_mujoco_reads(name):
     mujoco = pytest.importorskip("mujoco")
@@ -301,6 +302,7 @@ def compare_dynamics(mujoco, theirs, model):
                 assert abs(found - bias).max() <= 1e-6 * max(abs(bias).max(), 1e-2)
 
 
+@pytest.mark.slow
 def test_mujoco_reads_most_robots():
     """Enough for the comparison to mean something: what it refuses is counted."""
     mujoco = pytest.importorskip("mujoco")

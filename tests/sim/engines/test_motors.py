@@ -42,6 +42,7 @@ def test_the_velocity_approaches_its_bound_exponentially(backend, bar):
         assert abs((simulation.velocities()[0] - v[-1]) / PERIOD + 40 / INERTIA) < 1e-6
 
 
+@pytest.mark.slow
 def test_viscous_friction_and_reduction_give_the_steady_speed(backend, bar):
     world = floating(bar())
     with backend.build(world) as simulation:

@@ -44,6 +44,7 @@ def network(tmp_path, monkeypatch):
     return NetworkConfig("torch/fc", options, loss="MSELoss", optimizer="Adam", lr=1e-3)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("normalize", [False, True])
 def test_a_training_batch_makes_at_most_40_calls(network, normalize):
     data = DatasetConfig(existing_dir="data", normalize=normalize)

@@ -376,18 +376,24 @@ class TorchOptimization(Optimization):
         self._accumulated += 1
         if is_due := self._accumulated >= self._accumulate:
             self._accumulated = 0
-        learned, norm = [], None
-        if is_due and self._gradient_clip is not None:
-            if self._scaler is not None:
-                self._scaler.unscale_(optimizer)
+        learned, norm, clip = [], None, self._gradient_clip or 0.0
+        if is_due and clip:
             learned = [*network.parameters(), *self._learned_by_loss.values()]
-            norm = torch.nn.utils.get_total_norm([p.grad for p in learned if p.grad is not None])
+            norm = self._norm(optimizer, learned)
         if self.stops_at_nan:
             self._check_finite(loss, norm, optimizer if is_due else None)
-        if norm is not None and self._gradient_clip is not None:
-            torch.nn.utils.clip_grads_with_norm_(learned, self._gradient_clip, norm)
+        if norm is not None:
+            torch.nn.utils.clip_grads_with_norm_(learned, clip, norm)
         if is_due:
             self._step(optimizer)
+
+    def _norm(
+        self, optimizer: torch.optim.Optimizer, learned: Sequence[torch.nn.Parameter]
+    ) -> torch.Tensor:
+        """Return the norm of all gradients together, not scaled."""
+        if self._scaler is not None:
+            self._scaler.unscale_(optimizer)
+        return torch.nn.utils.get_total_norm([p.grad for p in learned if p.grad is not None])
 
     def _check_finite(
         self,
