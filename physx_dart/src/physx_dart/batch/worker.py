@@ -36,7 +36,7 @@ class SharedRows:
     """
 
     def __init__(self, file: int, nq: int, nv: int) -> None:
-        """Map nothing yet.
+        """Store the arguments; `arrays` maps the file.
 
         Args:
             file: Descriptor of the file; it must stay open.

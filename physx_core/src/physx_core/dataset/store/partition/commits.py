@@ -147,7 +147,7 @@ class BlockDigests:
 
 
 @dataclass(frozen=True)
-class Rows:
+class RowLayout:
     """Where the rows of a partition file are, and the digests of its full blocks.
 
     Attributes:
@@ -171,8 +171,8 @@ class Rows:
         """Return what computes the digests from a row on."""
         return BlockDigests(self.row_nbytes, self.ends, row)
 
-    def read(self, descriptor: int, start: int, stop: int) -> BlockDigests | None:
-        """Return the digests of the rows that a file has from `start` on; None if it lacks some."""
+    def digests_of(self, descriptor: int, start: int, stop: int) -> BlockDigests | None:
+        """Return the digests of rows `start` to `stop` of a file; None if it lacks some."""
         begin, end = (self.data_offset + row * self.row_nbytes for row in (start, stop))
         if start > stop or end > files.size(descriptor):
             return None
@@ -216,12 +216,12 @@ class Kept:
     """
 
     commit: Commit
-    rows: Rows
+    rows: RowLayout
     damaged: tuple[Range, ...] = ()
 
 
 def find_kept(
-    descriptor: int, rows: Rows, commits: Sequence[Commit], *, certain: bool
+    descriptor: int, rows: RowLayout, commits: Sequence[Commit], *, certain: bool
 ) -> Kept | None:
     """Return which rows of a file count; None if none of its records can be right.
 
@@ -235,7 +235,7 @@ def find_kept(
     possible = [c for c in sorted(set(commits), reverse=True) if c.base <= c.rows <= rows.capacity]
     stored = commits[0].rows if certain else min(commit.rows for commit in commits[1:])
     for commit in possible:
-        digests = rows.read(descriptor, commit.base, commit.rows)
+        digests = rows.digests_of(descriptor, commit.base, commit.rows)
         if digests is None:
             continue
         different = rows.differences(digests, commit, commit.rows)
@@ -246,13 +246,17 @@ def find_kept(
 
 
 def _spare(
-    descriptor: int, rows: Rows, commit: Commit, others: Sequence[Commit], different: list[Range]
+    descriptor: int,
+    rows: RowLayout,
+    commit: Commit,
+    others: Sequence[Commit],
+    different: list[Range],
 ) -> None:
     """Spare the rows of the last block that an older record proves, if that block differs."""
     start, stop = different[-1] if different else (0, 0)
     for other in others:
         if stop == commit.rows and start < other.rows < stop and other.base == commit.base:
-            digests = rows.read(descriptor, start, other.rows)
+            digests = rows.digests_of(descriptor, start, other.rows)
             if digests is not None and digests.running.intdigest() == other.digest:
                 different[-1] = other.rows, stop
                 return

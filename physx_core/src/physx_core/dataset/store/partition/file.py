@@ -19,7 +19,7 @@ from physx_core.dataset.store.partition.commits import (
     RECORD,
     Commit,
     Range,
-    Rows,
+    RowLayout,
     encode,
 )
 from physx_core.dataset.store.partition.format import Header, Identity, inspect, make_header
@@ -60,7 +60,7 @@ class PartitionFile:
         self.data_offset = header.data_offset
         self.path = path
         self.committed: tuple[int, int, int] = Commit.unchecked(0)
-        self._rows = Rows(header.data_offset, identity.field.nbytes, header.capacity, b"")
+        self._rows = RowLayout(header.data_offset, identity.field.nbytes, header.capacity, b"")
         self._digests, self._digester = self._rows.begin(0), digester
         self._next_mark = 0
         self._lock = threading.Lock()
@@ -193,7 +193,7 @@ class PartitionFile:
         self._digester.drain()
         rows, base, _ = commit
         with self._lock:
-            found = self._rows.read(self.descriptor, base, rows)
+            found = self._rows.digests_of(self.descriptor, base, rows)
             self._digests = self._rows.begin(rows) if found is None else found
             self._store_digests()
             self.committed = rows, base, self._digests.running.intdigest()

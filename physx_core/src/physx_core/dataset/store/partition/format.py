@@ -31,7 +31,7 @@ from physx_core.dataset.store.partition.commits import (
     SECTOR,
     Commit,
     Kept,
-    Rows,
+    RowLayout,
     block_ends,
     boot_id,
     decode,
@@ -297,7 +297,7 @@ def find_rows(
         while True:
             found = inspect_open(file, path, offset, row_nbytes)
             nbytes = found.identity.field.nbytes
-            rows = Rows(found.data_offset, nbytes, found.capacity, found.table)
+            rows = RowLayout(found.data_offset, nbytes, found.capacity, found.table)
             if found.certain and not thorough:
                 return found, Kept(found.commits[0], rows)
             try:
