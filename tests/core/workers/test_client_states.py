@@ -164,6 +164,15 @@ def test_replaced_client_waits_for_run_that_is_busy_between_batches():
     run.check_rows()
 
 
+def test_client_is_not_called_slow_because_the_run_was_busy(caplog):
+    with Simulation() as simulation:
+        fates = {2: [Fate("busy", "vanishes", 4)]}
+        options = {"pauses": [1, 1, 300], "run_ahead": 30, "restarts": 1}
+        run = Run(simulation, fates, [6, 5, 13], 3, **options)
+    assert run.error is None
+    assert "for a row" not in caplog.text
+
+
 FATES = st.lists(
     st.builds(
         lambda place, after: Fate(*place, after), st.sampled_from(list(TABLE)), st.integers(0, 8)

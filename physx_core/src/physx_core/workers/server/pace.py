@@ -52,6 +52,10 @@ class Pace:
             self._seconds += self._clock.monotonic() - self._since
             self._since = None
 
+    def leave_out(self) -> None:
+        """Do not count the rows that are being generated: when they arrive will say nothing."""
+        self._since = None
+
     def go_on(self) -> None:
         """Note that the client no longer waits for the server."""
         if self._has_begun and self._since is None:
