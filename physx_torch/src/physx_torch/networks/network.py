@@ -369,7 +369,10 @@ class TorchNetwork(torch.nn.Module, Network):
         """Return tensors as arrays; those on the CPU share memory."""
         arrays = {}
         for name, tensor in tensors.items():
-            arrays[name] = tensor.numpy(force=True)
+            try:
+                arrays[name] = tensor.numpy()
+            except (RuntimeError, TypeError):  # of a graph, of another device, or a conjugate
+                arrays[name] = tensor.numpy(force=True)
         return arrays
 
 
