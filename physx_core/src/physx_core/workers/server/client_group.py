@@ -154,8 +154,8 @@ class ClientGroup:
         """
         began = self._began = self._clock.monotonic()
         if began - self._served > _GRACE:  # what arrived meanwhile may have waited to be read
-            for peer in self.server.peers.values():
-                peer.pace.leave_out()
+            for each in self.server.peers.values():
+                each.pace.leave_out()
         if began - self._served > _TICK / 10:
             self._serve(0.0)
         while waited := missing():
