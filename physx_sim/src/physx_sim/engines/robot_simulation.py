@@ -332,7 +332,10 @@ class RobotSimulation(Simulation, Generic[Engine]):
             robot.write(q[part], v[speed])
 
     def snapshot(self) -> State:
-        """Return everything that `restore` needs to continue exactly from here."""
+        """Return everything that `restore` needs to continue exactly from here.
+
+        The engine's warm start is cleared, so that this simulation continues alike.
+        """
         self._check_open()
         self.clear_warm_start()
         return State(
