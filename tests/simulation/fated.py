@@ -36,10 +36,12 @@ class Fate:
             client.leave(3)
         elif self.event == "fails":
             raise RuntimeError("no more beans")
+        elif self.event == "is killed":
+            client.kill()
+        elif self.event == "hangs":
+            client.stop()
         else:
-            {"is killed": client.kill, "hangs": client.stop, "vanishes": client.vanish}[
-                self.event
-            ]()
+            client.vanish()
 
 
 class Fates:

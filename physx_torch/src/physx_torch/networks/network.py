@@ -369,10 +369,8 @@ class TorchNetwork(torch.nn.Module, Network):
         """Return tensors as arrays; those on the CPU share memory."""
         arrays = {}
         for name, tensor in tensors.items():
-            try:
-                arrays[name] = tensor.numpy()
-            except (RuntimeError, TypeError):  # of a graph, of another device, or a conjugate
-                arrays[name] = tensor.numpy(force=True)
+            is_plain = tensor.is_cpu and not (tensor.requires_grad or tensor.is_conj())
+            arrays[name] = tensor.numpy(force=not is_plain or tensor.is_neg())  # costs more
         return arrays
 
 

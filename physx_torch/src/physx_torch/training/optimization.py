@@ -379,7 +379,7 @@ class TorchOptimization(Optimization):
         learned, norm, clip = [], None, self._gradient_clip or 0.0
         if is_due and clip:
             learned = [*network.parameters(), *self._learned_by_loss.values()]
-            norm = self._norm(optimizer, learned)
+            norm = self._unscaled_norm(optimizer, learned)
         if self.stops_at_nan:
             self._check_finite(loss, norm, optimizer if is_due else None)
         if norm is not None:
@@ -387,10 +387,10 @@ class TorchOptimization(Optimization):
         if is_due:
             self._step(optimizer)
 
-    def _norm(
+    def _unscaled_norm(
         self, optimizer: torch.optim.Optimizer, learned: Sequence[torch.nn.Parameter]
     ) -> torch.Tensor:
-        """Return the norm of all gradients together, not scaled."""
+        """Undo the scaling of the gradients for float16; return the norm of all together."""
         if self._scaler is not None:
             self._scaler.unscale_(optimizer)
         return torch.nn.utils.get_total_norm([p.grad for p in learned if p.grad is not None])

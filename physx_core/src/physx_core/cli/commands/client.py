@@ -37,7 +37,7 @@ class Client:
     """File with the token, readable only by you."""
     patience: float = PATIENCE
     """Time in s to keep trying while nothing listens at the address, and to wait for the answer of
-    a run that is busy."""
+    a run that is busy; for the latter at least 10 s."""
 
 
 def run(words: Sequence[str]) -> None:

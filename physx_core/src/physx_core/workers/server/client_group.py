@@ -40,6 +40,7 @@ from physx_core.workers.server.written_rows import WrittenRows
 _ALL = ("", "0.0.0.0", "::")  # all addresses of this machine
 _TICK = 0.1
 _GRACE = 1.0
+_BUSY = 1.0
 _EXIT_TIME = 5.0
 _SAY_EVERY = 5.0
 _PASSING = (EnvironmentFailedError, ProgramError, ClientError)  # errors that may not recur
@@ -153,7 +154,7 @@ class ClientGroup:
             missing: Returns the instances to wait for; called after each round.
         """
         began = self._began = self._clock.monotonic()
-        if began - self._served > _GRACE:  # what arrived meanwhile may have waited to be read
+        if began - self._served > _BUSY:  # what arrived meanwhile may have waited to be read
             for each in self.server.peers.values():
                 each.pace.leave_out()
         if began - self._served > _TICK / 10:
