@@ -91,6 +91,11 @@ def pytest_ignore_collect(collection_path, config):
     return True if is_test and APART in collection_path.read_text() else None
 
 
+def pytest_make_parametrize_id(val, argname):
+    """Name long values by their argument: some differ between processes, as archives with times."""
+    return argname if isinstance(val, str | bytes) and len(val) > 60 else None
+
+
 def pytest_itemcollected(item):
     """Let pytest-xdist run a file, or all that need a cluster, in one process, one by one."""
     clusters = [name for name in ("ray_cluster", "slurm") if name in item.fixturenames]
