@@ -48,10 +48,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 APART = "pytest.mark.processes"  # in a file whose tests start processes
 STARTS = ("subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.system")
 RUNNING = {"quick": False}  # what kind of test
-DAYS = 4
+DAYS = 8
 """After so many days each case was in a sample."""
-QUICK_DAYS = 8
-"""The same, of samples of quick tests."""
 
 
 def pytest_addoption(parser):
@@ -125,8 +123,7 @@ def sampled(items):
     others = (item for item in items if item not in known)
     for _, group in itertools.groupby(others, key=lambda item: item.nodeid.partition("[")[0]):
         cases = list(group)
-        few = DAYS if cases[0].get_closest_marker("processes") else 1
-        parts = QUICK_DAYS if sizes.is_quick() else few
+        parts = DAYS if sizes.is_quick() or cases[0].get_closest_marker("processes") else 1
         chosen.update(sizes.share(cases, min(parts, len(cases))))
     return chosen
 

@@ -2,6 +2,7 @@
 
 import json
 import sys
+import uuid
 
 import gymnasium
 import pytest
@@ -44,7 +45,7 @@ gymnasium.register("NAME", entry_point=make)
 @pytest.fixture
 def own(tmp_path, monkeypatch):
     """The name of a module in the working directory, which Python does not look for there."""
-    name = "own_" + "".join(filter(str.isalnum, tmp_path.name))
+    name = f"own_{uuid.uuid4().hex}"  # modules stay imported, and folders have former names again
     (tmp_path / f"{name}.py").write_text(OWN.replace("NAME", name))
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [each for each in sys.path if each])

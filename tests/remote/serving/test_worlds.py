@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import uuid
 
 import gymnasium
 import numpy as np
@@ -67,16 +68,17 @@ gymnasium.register("own/Served-v0", entry_point=Own)
 
 
 @pytest.mark.parametrize("prefix", ["", "gym/"])
-@pytest.mark.parametrize("place", ["served_module", "served_module.py"])
+@pytest.mark.parametrize("ending", ["", ".py"])
 @pytest.mark.parametrize("name", ["own/Served-v0", "Own", "make"])
-def test_environments_in_the_working_directory(prefix, place, name, tmp_path, monkeypatch):
-    (tmp_path / "served_module.py").write_text(OWN)
+def test_environments_in_the_working_directory(prefix, ending, name, tmp_path, monkeypatch):
+    module = f"served_{uuid.uuid4().hex}"  # modules stay imported
+    place = f"{module}{ending}"
+    (tmp_path / f"{module}.py").write_text(OWN)
     monkeypatch.chdir(tmp_path)
     monkeypatch.setattr(sys, "path", [each for each in sys.path if each])
-    monkeypatch.delitem(sys.modules, "served_module", raising=False)
     with open_worlds(f"{prefix}{place}:{name}", 2) as worlds:
         assert type(worlds.environments[1].unwrapped).__name__ == "Own"
-    with pytest.raises(ComponentNotFoundError, match="no_served_module"):
+    with pytest.raises(ComponentNotFoundError, match=f"no_{module}"):
         open_worlds(f"{prefix}no_{place}:{name}")
     gymnasium.registry.pop("own/Served-v0")
 

@@ -87,13 +87,14 @@ def test_a_world_in_which_nothing_moves_says_what_to_add(backend, table):
             pytest.warns(UserWarning, match="the robot cannot be moved")  # it has no mass
         )
     ):
-        backend.build(World([Robot(table.urdf, fixed_base=False)])).close()
+        robot = Robot(table.urdf, type(backend).__name__, fixed_base=False)  # each file warns once
+        backend.build(World([robot])).close()
     advised = "fixed_base=False" in str(caught.value)
     assert advised == ("world" not in table.urdf.read_text())
 
 
 def test_torques_on_a_robot_without_inertia_fail_with_the_right_advice(backend, write_urdf):
-    robot = Robot(write_urdf(BARE))
+    robot = Robot(write_urdf(BARE), type(backend).__name__)  # each file warns once
     with pytest.warns(UserWarning, match="joint wrist cannot be moved by torques"):
         simulation = backend.build(World([robot]))
     with simulation:

@@ -98,7 +98,8 @@ def read_parts(world: World) -> Parts:
         movables = [_robot(robot, True) for robot in world.robots]
     for movable in movables:
         for text in movable.model.warnings:
-            _warn(f'Robot "{movable.name}", {movable.model.path}: {text}.')
+            where = f'Robot "{movable.name}", {movable.model.path}'
+            _warn(f"{where}: {text}.", movable.model.text)
     statics = [] if world.ground is None else [Static("ground", world.ground)]
     for thing in world.objects:
         if thing.static:
@@ -118,8 +119,8 @@ def _robot(robot: Robot, touching: bool) -> MovableBody:
 
 
 @functools.cache
-def _warn(text: str) -> None:
-    """Warn once: simulations of the same file are built many times."""
+def _warn(text: str, content: str) -> None:
+    """Warn once of each content: simulations of the same file are built many times."""
     warnings.warn(text, stacklevel=5)
 
 
