@@ -24,6 +24,8 @@ class Heat(Environment):
         Parameter("diffusivity", 0.05, 1.0, unit="m^2/s"),
     )
 
+    episode_steps = FRAMES
+
     def create(self):
         """Define the parameters."""
         self.define_parameters(self.PARAMETERS)
@@ -50,9 +52,7 @@ class Heat(Environment):
         self._rate = share / self._steps
 
     def step(self):
-        """Simulate until the next frame; after the last one, start the next simulation."""
-        if self._frame == FRAMES:
-            self.new_episode()
+        """Simulate until the next frame."""
         for _ in range(self._steps):
             near = np.pad(self._temperature, 1, mode="edge")
             around = near[2:, 1:-1] + near[:-2, 1:-1] + near[1:-1, 2:] + near[1:-1, :-2]

@@ -186,6 +186,11 @@ class EnvironmentConfig:
     """Address of the server."""
     port: int = field(default=0, metadata={"minimum": 0, "maximum": 65535})
     """Port of the server; 0: any free one."""
+    independent_episodes: bool = False
+    """Say for the environment that its episodes are independent: see `Environment`."""
+    episode_steps: int | None = at_least(1, None)
+    """Number of samples of an episode, which is then independent; 1 if each is a simulation of its
+    own. None: the environment decides."""
     simulations_per_step: int = at_least(1, 1)
     """Calls of `step` per sample; `compute_training_data` is False in all but the last call."""
     max_wrong_samples_per_step: int = at_least(0, 10)

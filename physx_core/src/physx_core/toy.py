@@ -82,6 +82,10 @@ class Spring(Environment):
         self.factory.add_sphere("mass", 0.2, color="orange")
         self.factory.add_lines("spring", [[-3, 0, 0], [0, 0, 0]], color="gray", size=0.02)
 
+    def reset_parameters(self, **values: Any) -> None:
+        """Place the mass at random, in an independent episode."""
+        self.state = self.rng.standard_normal(2)
+
     def step(self) -> None:
         """Move the mass by one period."""
         if self.sample is None:

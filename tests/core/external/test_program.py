@@ -108,6 +108,22 @@ def test_rows_do_not_depend_on_how_often_a_program_is_started(local, heat, episo
         np.testing.assert_array_equal(rows[name], others[name])
 
 
+@pytest.mark.parametrize("episodes", [1, 2, 100])
+def test_independent_episodes_of_a_program_follow_from_their_number(local, heat, episodes):
+    """It is started for each one, or asks for the next parameters."""
+    by_number = {}
+    for instances in (1, 2):
+        given = {"num_clients": instances, "independent_episodes": True}
+        kwargs = options(heat, SIZE, STEPS, episodes)
+        rows = run(local("external/program", env_kwargs=kwargs, **given), 5, 13)
+        assert len(check_heat(rows, instances)) == 6
+        numbers = rows["episode"] * instances + rows["env_id"] - 1
+        for number in range(6):
+            seed, *others = rows["seed"][numbers == number].tolist()
+            assert by_number.setdefault(number, seed) == seed
+            assert others == [seed] * (STEPS - 1)
+
+
 def test_clients_make_the_rows_that_are_made_in_process(local, clients, heat, heat_fortran):
     given = {"num_clients": 2}
     ours = run(local("external/program", env_kwargs=options(heat, SIZE, STEPS, 2), **given), 8, 20)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, ClassVar, Protocol, TypeAlias
@@ -24,6 +25,7 @@ from physx_core.errors import (
     nearest,
 )
 from physx_core.fields import NO_ARRAY, Field, FieldLike, as_fields, is_finite
+from physx_core.random_streams import NumberedStreams
 from physx_core.rows import infer_shapes
 from physx_core.typing import Array, Sample
 
@@ -94,18 +96,24 @@ class Environment(Closeable):
 
     Subclasses implement `create`, `init_database` and `step`. The methods are called in this
     order: `create`, `init`, `init_database`, `init_visualization` (only with a visualizer),
-    `reset_parameters` (only if parameters are defined), then `step` repeatedly, and `close` at the
-    end, even after a failure.
+    `reset_parameters` (only if parameters are defined, or episodes are independent), then `step`
+    repeatedly, and `close` at the end, even after a failure.
+
+    An environment is a stream, in which each row may depend on all before it, unless it says that
+    its episodes are independent: then nothing but an episode's number, with its parameters and its
+    random stream, may influence its rows, and any instance may simulate it.
 
     Attributes:
+        independent_episodes: Whether the episodes are independent; each ends with `end_episode`,
+            or after `episode_steps` rows.
+        episode_steps: Class attribute: number of rows of an episode, which is then independent; 1
+            if each step is a simulation of its own. None: `end_episode` ends it.
         instance_id: Number of this instance among all instances of the run, from 1.
         instance_nb: Number of instances in the run.
-        rng: Random number generator of this instance, with its own stream; if parameters are
-            defined, with one for each episode.
         factory: Draws the environment. Without a visualizer it accepts everything, does nothing,
             and is false: ``if self.factory:`` skips work that only drawing needs.
         compute_training_data: False in sub-steps whose data is not used.
-        step_index: Number of finished steps.
+        step_index: Number of finished steps; if episodes are independent, of this one.
         episode_index: Index of the current trajectory, from 0.
         sample_episode: Index of the trajectory of the last training data.
         runs_programs: Whether arguments name programs to run; then no file may supply them.
@@ -115,6 +123,8 @@ class Environment(Closeable):
 
     step_time: float | None = None
     runs_programs: ClassVar[bool] = False
+    independent_episodes: bool = False
+    episode_steps: int | None = None
     _has_seed: bool | None = None  # until the constructor has run
 
     def __init__(
@@ -140,14 +150,13 @@ class Environment(Closeable):
             raise UnknownOptionError(type(self).__name__, kwargs, options_of(type(self)))
         self.instance_id = instance_id
         self.instance_nb = instance_nb
-        stream = np.random.SeedSequence(seed, spawn_key=(instance_id - 1,))
-        self._seed_entropy: Any = stream.entropy
-        self.rng = np.random.default_rng(stream)
+        self._seed_entropy: Any = np.random.SeedSequence(seed).entropy
         self.factory: Factory = NullFactory()
         self.compute_training_data = True
         self.step_index = 0
         self.episode_index = 0
         self.sample_episode = 0
+        self.independent_episodes |= type(self).episode_steps is not None
         self._has_seed = seed is not None
         self._has_read_sample = False
         self._sample: Sample | None = None
@@ -159,6 +168,8 @@ class Environment(Closeable):
         self._defined_parameters: list[Parameter] = []
         self._choose_parameters: Choose | None = None
         self._has_begun_episodes = False
+        self._episode_is_over = True  # there is no episode that a step can continue
+        self._earlier_steps = 0  # of the episodes before this one
         self._replayed: tuple[int, dict[str, Any]] | None = None  # index of a set, and its values
 
     # What a subclass implements -------------------------------------------------------------
@@ -180,9 +191,11 @@ class Environment(Closeable):
     def reset_parameters(self, **values: Any) -> None:
         """Prepare the next episode with these values of the defined parameters.
 
-        Called before the first step and by `new_episode`, if `define_parameters` was called. Just
-        before the call, `rng` is reseeded for this episode: if this method sets the whole state,
-        the episode depends on nothing that came before it.
+        Called before the first step of each independent episode, without values if no parameters
+        are defined. In a stream, called before the first step and by `new_episode` if
+        `define_parameters` was called. Just before the call, `rng` is set to the random stream of
+        this episode: if this method sets the whole state, the episode depends on nothing that came
+        before it.
 
         When stored samples are replayed, these are the values that the sample was generated with.
         The method is then called for each sample whose episode differs from the previous one's, and
@@ -191,7 +204,8 @@ class Environment(Closeable):
         Args:
             values: A number for each parameter of shape ``()``, else an array.
         """
-        raise self._lacks("reset_parameters")
+        if values or not self.independent_episodes:
+            raise self._lacks("reset_parameters")
 
     def step(self) -> Any:
         """Simulate one step and set its data with `set_training_data`; may be a coroutine."""
@@ -208,6 +222,23 @@ class Environment(Closeable):
         """Free the resources that `create` acquired."""
 
     # What a subclass calls ------------------------------------------------------------------
+
+    @functools.cached_property
+    def rng(self) -> np.random.Generator:
+        """The random number generator of this instance.
+
+        In a stream it has a stream of its own, and with parameters one for each episode. If
+        episodes are independent, each has one, and the steps before the first episode another,
+        which is the same in every instance.
+        """
+        if self.independent_episodes:
+            return self._episode_streams.generator
+        spawned = np.random.SeedSequence(self._seed_entropy, spawn_key=(self.instance_id - 1,))
+        return np.random.default_rng(spawned)
+
+    @functools.cached_property
+    def _episode_streams(self) -> NumberedStreams:
+        return NumberedStreams(self._seed_entropy)
 
     @property
     def sample(self) -> Sample | None:
@@ -271,10 +302,35 @@ class Environment(Closeable):
         starts automatically. Rows keep its index in the field ``episode``, from which
         `Dataset.episodes` recovers the trajectories. If there are parameters, the next values are
         chosen and `reset_parameters` is called.
+
+        Raises:
+            UsageError: If episodes are independent.
         """
+        if self.independent_episodes:
+            raise UsageError(
+                f"{type(self).__name__} has independent episodes, but called new_episode(), which "
+                "is for streams: call end_episode() in the last step of an episode. The next one "
+                "begins with reset_parameters()."
+            )
         self.episode_index += 1
         if self._has_begun_episodes and self._defined_parameters:
             self._reset_with_parameters()
+
+    def end_episode(self) -> None:
+        """End this independent episode with the row of this step, or before it if it sets no data.
+
+        In a replay of stored samples, which may be of many episodes, this does nothing.
+
+        Raises:
+            UsageError: If episodes are not independent.
+        """
+        if not self.independent_episodes:
+            raise UsageError(
+                f"{type(self).__name__} called end_episode(), but is a stream: call new_episode(), "
+                "or set independent_episodes = True if nothing but an episode's parameters and "
+                "random stream influences its rows."
+            )
+        self._episode_is_over = self._sample is None
 
     def set_additional_data(self, **fields: Any) -> None:
         """Set this step's additional data: every additional field, as arrays or numbers."""
@@ -306,7 +362,7 @@ class Environment(Closeable):
                 if not _is_finite(value):
                     raise not_finite_prediction(name)
         except SampleError as error:
-            raise error.at(self.instance_id, self.step_index) from None
+            raise error.at(self.instance_id, self._step_count) from None
         return prediction
 
     def _infer_shapes(self) -> None:
@@ -329,18 +385,26 @@ class Environment(Closeable):
         physx calls it after `step` and `apply_prediction`; call it to show more in between.
         """
         if self.factory:
+            steps = self._step_count
             if self.step_time is not None:
-                self.factory.set_time(self.step_index * self.step_time)
-            self._run().show(self.instance_id, self.step_index, self.factory.take_events())
+                self.factory.set_time(steps * self.step_time)
+            self._run().show(self.instance_id, steps, self.factory.take_events())
 
-    def begin_episodes(self, episode: int | None = None) -> None:
-        """Begin the first episode; physx calls it before the first step.
+    @property
+    def _step_count(self) -> int:
+        """Number of finished steps of all episodes of this instance."""
+        return self._earlier_steps + self.step_index
+
+    def begin_episode(self, episode: int | None = None) -> None:
+        """Begin the first episode of a stream, or any independent one; physx calls it.
 
         Args:
             episode: Index of the episode; None: the environment decides.
         """
-        self._has_begun_episodes = True
-        if self._defined_parameters:
+        if self.independent_episodes:
+            self._earlier_steps, self.step_index = self._step_count, 0
+        self._has_begun_episodes, self._episode_is_over = True, False
+        if self._defined_parameters or self.independent_episodes:
             self.episode_index = self.episode_index if episode is None else episode
             self._reset_with_parameters()
 
@@ -356,7 +420,7 @@ class Environment(Closeable):
         Raises:
             ConfigError: If they are not the defined parameters.
         """
-        self._has_begun_episodes = True
+        self._has_begun_episodes, self._episode_is_over = True, False
         if self._replayed is None or self._replayed[0] != place:
             try:
                 self._replayed = place, checked(self._defined_parameters, values)
@@ -368,7 +432,7 @@ class Environment(Closeable):
             self._reset_with_parameters()
 
     def _reset_with_parameters(self) -> None:
-        """Get the parameters of the current episode, and prepare it with them.
+        """Get the parameters of the current episode, if any, and prepare it with them.
 
         In a replay they are those of the stored row, and `rng` is not reseeded, because rows of an
         episode may come one by one.
@@ -377,13 +441,26 @@ class Environment(Closeable):
             self.reset_parameters(**self._replayed[1])
             return
         number = self.episode_index * self.instance_nb + self.instance_id - 1
-        if self._choose_parameters is not None:
+        values: Mapping[str, Any] = {}
+        if self._defined_parameters and self._choose_parameters is not None:
             values = self._choose_parameters(self.episode_index)
-        else:
+        elif self._defined_parameters:
             values = draw(self._defined_parameters, self._seed_entropy, number)
-        fresh = random_of(self._seed_entropy, number, 0).bit_generator.state
-        self.rng.bit_generator.state = fresh  # in place: others may hold the generator
+        if self.independent_episodes:
+            self._seek_stream(number)
+        else:
+            fresh = random_of(self._seed_entropy, number, 0).bit_generator.state
+            self.rng.bit_generator.state = fresh  # in place: others may hold the generator
         self.reset_parameters(**values)
+
+    def _seek_stream(self, number: int) -> None:
+        """Set `rng` to the random stream of an independent episode."""
+        if self.rng is not self._episode_streams.generator:
+            raise UsageError(
+                f"{type(self).__name__} has replaced self.rng, but its episodes are independent: "
+                "the numbers of an episode must come from the generator that physx sets."
+            )
+        self._episode_streams.seek(number)
 
     def _lacks(self, method: str) -> UsageError:
         own = [name for name in dir(type(self)) if not hasattr(Environment, name)]
@@ -403,18 +480,20 @@ class Environment(Closeable):
             raise UsageError("This environment is not part of a run yet.")
         return self._services
 
-    def take_sample(self) -> dict[str, Any]:
-        """Return and clear this step's data by field name.
+    def take_sample(self) -> dict[str, Any] | None:
+        """Return and clear this step's data by field name; None if the episode ended before it.
 
         Raises:
             MissingFieldError: If the step did not set any training data.
         """
         sample, additional = self._training, self._additional
         if sample is None:
+            if self._episode_is_over and self._has_begun_episodes:
+                return None
             raise MissingFieldError(
                 "step() did not set any data: call set_training_data() in every step.",
                 instance_id=self.instance_id,
-                step=self.step_index,
+                step=self._step_count,
             )
         self._training = self._additional = None
         return sample if additional is None else {**sample, **additional}

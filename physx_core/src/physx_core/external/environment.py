@@ -77,6 +77,7 @@ class ExternalProgram(Environment):
         self._process: ProgramProcess | None = None
         self._declared: Sequence[Field] = ()
         self._seed: int | None = None
+        self._held: Message | None = None  # a request that the next episode answers
         self._is_new = True  # whether the episode has no sample yet
 
     def create(self) -> None:
@@ -100,14 +101,22 @@ class ExternalProgram(Environment):
         self.define_additional_fields(additional)
 
     def reset_parameters(self, **values: Any) -> None:
-        """Keep the values until the program requests them."""
+        """Keep the values until the program requests them.
+
+        For an independent episode, a program that has ended or is in the middle of another one is
+        started again.
+        """
         self._chosen = values
+        if self.independent_episodes:
+            if not self._is_new and self._held is None:
+                self._start_again()
+            self._is_new, self._seed = True, None
 
     def step(self) -> None:
         """Take the program's next sample, answering requests that precede it."""
         while True:
             assert self._process is not None
-            message = self._process.receive()
+            message, self._held = self._held or self._process.receive(), None
             if message.kind is Kind.SAMPLE:
                 self._process.samples += 1
                 self._is_new = False
@@ -116,12 +125,22 @@ class ExternalProgram(Environment):
                 self.set_training_data(**given)
                 self.set_additional_data(**additional)
                 return
+            ends = message.kind is Kind.PARAMETERS and not self._is_new
+            if ends and self.independent_episodes:
+                self._held = message
+                self.end_episode()
+                return
             if message.kind is Kind.PARAMETERS:
                 self._answer_parameters(self._process, message)
             elif message.kind is Kind.PREDICT:
                 self._answer_prediction(self._process, message)
             elif message.kind is Kind.CLOSE:
-                self._restart(self._process)
+                self._end(self._process)
+                if self.independent_episodes:
+                    self.end_episode()
+                    return
+                self._begin_episode()
+                self._start_again()
             else:
                 raise self._process.error("called physx_open() twice.")
 
@@ -144,12 +163,15 @@ class ExternalProgram(Environment):
             raise
         return process, message.wanted
 
-    def _restart(self, process: ProgramProcess) -> None:
-        """Start the program again after it has ended normally."""
+    def _end(self, process: ProgramProcess) -> None:
+        """Wait until a program that has sent all its samples has ended normally."""
         if not process.samples:
             raise process.error("called physx_close() without having sent a sample.")
         process.end()
-        self._begin_episode()
+
+    def _start_again(self) -> None:
+        """Start the program once more."""
+        self.close()
         self._process, declared = self._start()
         if declared != self._declared:
             raise self._process.error(

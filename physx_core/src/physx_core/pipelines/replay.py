@@ -26,7 +26,10 @@ from physx_core.processes import deferred_interrupt
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 
-_RECORDED = ("environment", "env_kwargs", "num_clients", "simulations_per_step")
+_RECORDED = (
+    *("environment", "env_kwargs", "num_clients"),
+    *("independent_episodes", "episode_steps", "simulations_per_step"),
+)
 _MOST_CLIENTS = 64
 
 

@@ -28,6 +28,7 @@ from physx_core.sources.source import Source
 PARAMETERS = "parameters_{}.bin"
 """Name of the file in a dataset's folder that contains an instance's saved parameters."""
 _FORMER = ".former"
+_IF_SET = ("independent_episodes", "episode_steps", "sampler", "sampler_kwargs")
 LARGEST_PARAMETERS = 2**32
 """Maximum size of such a file in bytes."""
 GENERATION = "generation"
@@ -343,7 +344,7 @@ def describe_environment(config: EnvironmentConfig, seed: int) -> dict[str, Any]
         "env_kwargs": plain["env_kwargs"],
         "num_clients": config.num_clients,
         "simulations_per_step": config.simulations_per_step,
-        **{name: plain[name] for name in ("sampler", "sampler_kwargs") if plain.get(name)},
+        **{name: plain[name] for name in _IF_SET if plain.get(name)},
         "seed": seed,
         "versions": dict(installed_versions()),
     }

@@ -38,6 +38,8 @@ PARAMETER = "parameters/"
 name has this prefix."""
 SET = PARAMETER + "/"
 """Name of the entry with the index of the set in the dataset's record; -1: unknown."""
+_MOST_EMPTY = 1000
+"""Number of episodes in a row that may end without a row."""
 _STEPPING = ("reset_parameters", "step", "check_sample", "apply_prediction", "close")
 
 
@@ -91,6 +93,8 @@ def instance_arguments(
         "instance_id": instance_id,
         "instance_nb": config.num_clients,
         "seed": list(seed),
+        "independent_episodes": config.independent_episodes,
+        "episode_steps": config.episode_steps,
         "simulations_per_step": config.simulations_per_step,
         "max_wrong_samples": config.max_wrong_samples_per_step,
         "record_wrong": config.record_wrong_samples,
@@ -104,7 +108,8 @@ class Instance(Closeable):
     Attributes:
         instance_id: Number of the instance, counted from 1.
         environment: The environment; None before `open` and after `close`.
-        last_step: Number of the step that generated the last sample, counted from 0.
+        last_step: Number of the step that generated the last sample, counted from 0 over all
+            episodes.
         last_episode: Number of the trajectory that the last sample belongs to, counted from 0.
         rejected: The samples that `check_sample` rejected, if they are recorded; else None.
     """
@@ -117,6 +122,8 @@ class Instance(Closeable):
         instance_id: int,
         instance_nb: int,
         seed: Sequence[int],
+        independent_episodes: bool = False,
+        episode_steps: int | None = None,
         simulations_per_step: int = 1,
         max_wrong_samples: int = 10,
         record_wrong: bool = False,
@@ -132,6 +139,8 @@ class Instance(Closeable):
             instance_id: Number of the instance, counted from 1.
             instance_nb: How many instances run together.
             seed: Seed of the whole run.
+            independent_episodes: Whether its episodes are independent, even if it does not say so.
+            episode_steps: Number of rows of an episode; None: the environment decides.
             simulations_per_step: Calls of `step` for one sample.
             max_wrong_samples: How many consecutive samples `check_sample` may reject.
             record_wrong: Whether to keep the samples that it rejects in `rejected`.
@@ -151,10 +160,14 @@ class Instance(Closeable):
             "instance_nb": instance_nb,
             "seed": list(seed),
         }
+        self._independent, self._episode_steps = independent_episodes, episode_steps
         self._sub_steps = simulations_per_step - 1
         self._max_wrong_samples = max_wrong_samples
         self._accepts_all = accept_all
-        self._first_step, self._first_episode = first_step, first_episode
+        self._first_step, self._next_episode = first_step, first_episode
+        self._rows = 0  # of this episode
+        self._counts = False  # whether rows are counted, or must be read
+        self._simulate: Callable[[], Any] = self._alive
         self._draws = False
         self._runner: Any = None
 
@@ -167,6 +180,12 @@ class Instance(Closeable):
     def ignores_predictions(self) -> bool:
         """Whether the environment does not define `Environment.apply_prediction`."""
         return type(self._alive()).apply_prediction is Environment.apply_prediction
+
+    @property
+    def has_ended(self) -> bool:
+        """Whether the last sample is the last one of its episode, which is independent."""
+        environment = self._alive()
+        return environment._episode_is_over and environment.independent_episodes
 
     @property
     def parameters(self) -> list[Parameter]:
@@ -191,11 +210,16 @@ class Instance(Closeable):
         """
         environment = self.environment = self._create()
         environment._services, environment._choose_parameters = services, choose
-        environment.step_index = self._first_step
+        self._configure_episodes(environment)
+        if environment.independent_episodes:
+            environment._earlier_steps = self._first_step
+        else:
+            environment.step_index = self._first_step
         _warn_of_misspelt_methods(type(environment))
         self._call("create", environment.create)
         self._call("init", environment.init)
         self._call("init_database", environment.init_database)
+        self._simulate = self._simulate_sub_steps if self._sub_steps else environment.step
         if not any(field.role == "training" for field in environment.fields):
             raise UsageError(
                 f"{type(environment).__name__}.init_database() defined no training fields: "
@@ -233,6 +257,26 @@ class Instance(Closeable):
             )
         return environment
 
+    def _configure_episodes(self, environment: Environment) -> None:
+        """Make the episodes independent if the run's configuration says so."""
+        configured = self._independent or self._episode_steps is not None
+        self._episode_steps = self._episode_steps or type(environment).episode_steps
+        if not configured or environment.independent_episodes:
+            return
+        name = type(environment).__name__
+        if type(environment).reset_parameters is Environment.reset_parameters:
+            raise UsageError(
+                f"The configuration says that episodes of {name} are independent, but it does not "
+                "implement reset_parameters(), which prepares an episode. If nothing has to be "
+                "prepared, set independent_episodes = True in the class."
+            )
+        if "rng" in vars(environment):
+            raise UsageError(
+                f"{name}.__init__() uses self.rng before it can know that its episodes are "
+                "independent: set independent_episodes = True in the class."
+            )
+        environment.independent_episodes = True
+
     def step(self, stored: Sample | None = None) -> dict[str, Any]:
         """Simulate until `check_sample` accepts a sample; return it without further checks.
 
@@ -249,39 +293,37 @@ class Instance(Closeable):
             EnvironmentFailedError: If the environment raises.
         """
         environment = self.environment or self._alive()
-        if stored is not environment._sample or not environment._has_begun_episodes:
+        if stored is not environment._sample or environment._episode_is_over:
             self._prepare(environment, stored)
-        wrong = 0
+        wrong = empty = 0
         while True:
             method = "step"
             try:
-                if self._sub_steps:
-                    self._simulate_before(environment)
-                result = environment.step()
+                result = self._simulate()
                 if result is not None:
                     self._finish(result)
                 sample = environment.take_sample()
                 method = "check_sample"
-                accepted = environment.check_sample()
-                if accepted is not True:
-                    accepted = _verdict(accepted)
+                accepted = sample is None or environment.check_sample()
                 if self._draws:
                     self._show(environment)
             except Exception as error:
                 raise self._failure(method, error) from error
-            if stored is not None and not environment._has_read_sample:
-                raise UsageError(
-                    f"{type(environment).__name__} never reads Environment.sample, so it "
-                    "generates new samples instead of replaying the stored ones. In step(), take "
-                    "the state from self.sample (field name to array) if it is not None."
-                )
-            self.last_step = environment.step_index
-            self.last_episode = environment.sample_episode
-            environment.step_index += 1
-            if accepted or self._accepts_all:
-                return sample
-            wrong += 1
-            self._reject(sample, wrong)
+            if sample is None:
+                empty += 1
+                _check_empty(environment, empty)
+            else:
+                self.last_step = environment._earlier_steps + environment.step_index
+                self.last_episode = environment.sample_episode
+                environment.step_index += 1
+                if accepted is True or self._accepts(accepted):
+                    if self._counts:
+                        self._count(environment)
+                    return sample
+                wrong += 1
+                self._reject(sample, wrong)
+            if environment._episode_is_over:
+                self._prepare(environment, stored)
 
     def apply(self, prediction: Sample) -> None:
         """Pass a prediction in physical units to the environment.
@@ -299,7 +341,7 @@ class Instance(Closeable):
         Raises:
             EnvironmentFailedError: If the environment raises.
         """
-        environment, self.environment = self.environment, None
+        environment, self.environment, self._simulate = self.environment, None, self._alive
         try:
             if environment is not None:
                 self._call("close", environment.close)
@@ -313,8 +355,11 @@ class Instance(Closeable):
         environment.sample = stored
         if stored is not None and SET in stored:
             self._replay(environment, stored)
-        if not environment._has_begun_episodes:
-            self._call("reset_parameters", environment.begin_episodes, self._first_episode)
+        self._counts = stored is not None or self._episode_steps is not None
+        if environment._episode_is_over:
+            self._rows = 0
+            self._call("reset_parameters", environment.begin_episode, self._next_episode)
+            self._next_episode = environment.episode_index + 1
 
     def _replay(self, environment: Environment, stored: Sample) -> None:
         """Give the environment a stored row, and the parameters that it was generated with."""
@@ -325,12 +370,33 @@ class Instance(Closeable):
             values = {name.removeprefix(PARAMETER): values[name] for name in values}
             self._call("reset_parameters", environment.replay_episode, place, values)
 
-    def _simulate_before(self, environment: Environment) -> None:
-        """Run the sub-steps before the step that generates the sample."""
+    def _count(self, environment: Environment) -> None:
+        """Count a row of an episode, which may be its last, and check that a stored row is read."""
+        if environment._sample is not None and not environment._has_read_sample:
+            raise UsageError(
+                f"{type(environment).__name__} never reads Environment.sample, so it generates "
+                "new samples instead of replaying the stored ones. In step(), take the state from "
+                "self.sample (field name to array) if it is not None."
+            )
+        self._rows += 1
+        if self._rows == self._episode_steps:
+            environment.end_episode()
+
+    def _accepts(self, accepted: Any) -> bool:
+        """Return whether a sample counts if `check_sample` returned something else than True."""
+        if accepted is None:
+            error = UsageError("check_sample() returned None but must return True or False.")
+            raise self._failure("check_sample", error)
+        return bool(accepted) or self._accepts_all
+
+    def _simulate_sub_steps(self) -> Any:
+        """Run the sub-steps, and return the result of the step that generates the sample."""
+        environment = self._alive()
         environment.compute_training_data = False
         for _ in range(self._sub_steps):
             self._finish(environment.step())
         environment.compute_training_data = True
+        return environment.step()
 
     def _show(self, environment: Environment) -> None:
         """Send what the environment drew and did not send itself."""
@@ -366,7 +432,7 @@ class Instance(Closeable):
 
     def _failure(self, method: str, error: Exception) -> Exception:
         """Return the error to raise: physx errors get a note, others are wrapped."""
-        step = self.environment.step_index if self.environment is not None else -1
+        step = self.environment._step_count if self.environment is not None else -1
         if method not in _STEPPING:
             step = -1
         if isinstance(error, PhysxError):
@@ -385,11 +451,13 @@ class Instance(Closeable):
         return self.environment
 
 
-def _verdict(accepted: Any) -> bool:
-    """Return the result of `check_sample` as a boolean."""
-    if accepted is None:
-        raise UsageError("check_sample() returned None but must return True or False.")
-    return bool(accepted)
+def _check_empty(environment: Environment, count: int) -> None:
+    """Check how many episodes in a row ended without a row."""
+    if count == _MOST_EMPTY:
+        raise UsageError(
+            f"{type(environment).__name__} ended {count} episodes in a row without a row: call "
+            "set_training_data() in the step that calls end_episode()."
+        )
 
 
 def _warn_of_misspelt_methods(cls: type[Environment]) -> None:

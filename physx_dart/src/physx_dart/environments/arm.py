@@ -111,7 +111,7 @@ class ArmEnvironment(Environment):
             )
         self.task, self.feedforward, self.trajectory = task, feedforward, trajectory
         self.period, self.steps_per_sample = period, steps_per_sample
-        self.episode_steps, self.draw_every = episode_steps, draw_every
+        self._episode_steps, self.draw_every = episode_steps, draw_every
         self.amplitude, self.excitation = amplitude, excitation
         self.frequencies = (float(frequencies[0]), float(frequencies[1]))
         self.stiffness, self.damping = _gains("stiffness", stiffness), _gains("damping", damping)
@@ -199,7 +199,7 @@ class ArmEnvironment(Environment):
     # Tasks ----------------------------------------------------------------------------------
 
     def _excite(self) -> None:
-        if self._steps % self.episode_steps == 0:
+        if self._steps % self._episode_steps == 0:
             if self._steps:
                 self.new_episode()
             self._motion = self._draw(self.rng, 0.0)

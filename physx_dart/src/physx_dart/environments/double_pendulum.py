@@ -51,7 +51,7 @@ class DoublePendulumEnvironment(Environment):
         if steps_per_sample < 1 or episode_steps < 1:
             raise ConfigError("steps_per_sample and episode_steps must be at least 1.")
         self.period, self.steps_per_sample = period, steps_per_sample
-        self.episode_steps, self.torque_amplitude = episode_steps, torque_amplitude
+        self._episode_steps, self.torque_amplitude = episode_steps, torque_amplitude
         self.step_time = period * steps_per_sample
         self._steps = 0
 
@@ -93,7 +93,7 @@ class DoublePendulumEnvironment(Environment):
 
     def _simulate(self) -> None:
         simulation = self.simulation
-        if self._steps % self.episode_steps == 0:
+        if self._steps % self._episode_steps == 0:
             if self._steps:
                 self.new_episode()
             simulation.set_state(self.rng.uniform(-np.pi, np.pi, 2), self.rng.uniform(-3, 3, 2))

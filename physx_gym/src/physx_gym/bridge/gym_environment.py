@@ -26,7 +26,8 @@ class GymEnvironment(Environment):
     One sample is one transition: ``observation``, ``action``, ``reward``, ``next_observation``,
     ``terminated`` and ``truncated``. A space of several parts has a field for each, for example
     ``observation_states_agent_q``. Episodes are trajectories: `Dataset.episodes` returns them. When
-    stored samples are loaded, their actions are replayed.
+    stored samples are loaded, their actions are replayed. If the configuration says that episodes
+    are independent, ``reset`` gets a seed for each, and not only for the first.
     """
 
     def __init__(
@@ -62,8 +63,7 @@ class GymEnvironment(Environment):
         self._next = SpaceFields(self.env.observation_space, "next_observation")
         self._actions = SpaceFields(self.env.action_space, "action")
         self._act = self._choose_policy()
-        self._first_seed: int | None = int(self.rng.integers(1 << 31))
-        self.env.action_space.seed(int(self.rng.integers(1 << 31)))
+        self._draw_seeds()
 
     def init_database(self) -> None:
         """Define the fields of a transition."""
@@ -103,9 +103,18 @@ class GymEnvironment(Environment):
             )
         self._show()
 
+    def reset_parameters(self, **values: Any) -> None:
+        """Prepare an independent episode, which `reset` begins with a seed of its own."""
+        self._draw_seeds()
+        self._observation = None
+
+    def _draw_seeds(self) -> None:
+        self._seed: int | None = int(self.rng.integers(1 << 31))
+        self.env.action_space.seed(int(self.rng.integers(1 << 31)))
+
     def _begin_episode(self) -> None:
-        self._observation, _ = self.env.reset(seed=self._first_seed)
-        self._first_seed = None
+        self._observation, _ = self.env.reset(seed=self._seed)
+        self._seed = None
 
     def _render(self) -> Any:
         return self.env.render()
@@ -135,7 +144,10 @@ class GymEnvironment(Environment):
             self._show()
         if terminated or truncated:
             self._observation = None
-            self.new_episode()
+            if self.independent_episodes:
+                self.end_episode()
+            else:
+                self.new_episode()
 
     def close(self) -> None:
         """Close the environment."""

@@ -214,7 +214,7 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         observation = {name: row.pop(name) for name in self._observed}
         reward = float(row.pop(REWARD, 0.0))
         terminated = bool(row.pop(TERMINATED, False))
-        jumped = instance.environment.episode_index != episode
+        jumped = instance.has_ended or instance.environment.episode_index != episode
         return observation, reward, terminated, bool(row.pop(TRUNCATED, False)) or jumped, row
 
 

@@ -20,7 +20,10 @@ _FREE = {
     "dataset": {"existing_dir", "max_file_size", "writers"},
 }
 """Options that a resume may change, by table; new options are bound unless they are named here."""
-_ENVIRONMENT = ("environment", "env_kwargs", "simulations_per_step", "sampler", "sampler_kwargs")
+_ENVIRONMENT = (
+    *("environment", "env_kwargs", "independent_episodes", "episode_steps"),
+    *("simulations_per_step", "sampler", "sampler_kwargs"),
+)
 """Options of an environment that are compared even if it has nothing left to generate."""
 _REFERENCES = {
     *("network", "optimization", "transformation", "loss", "optimizer", "scheduler"),

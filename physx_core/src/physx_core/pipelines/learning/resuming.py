@@ -30,6 +30,8 @@ _SAME = (
     "environment",
     "env_kwargs",
     "num_clients",
+    "independent_episodes",
+    "episode_steps",
     "simulations_per_step",
     "sampler",
     "sampler_kwargs",
