@@ -85,7 +85,8 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
         "mean": [1.0, 2.0],
         "deviation": 0.5,
     },
-    EnvironmentConfig: {"environment": "toy/spring", "min_clients": 1, "max_clients": 2, "seed": 3},
+    EnvironmentConfig: {"environment": "toy/spring", "min_clients": 1, "max_clients": 2, "seed": 3}
+    | {"episode_steps": 4},
     DatasetConfig: {"validation_split": 0.25},
     NetworkConfig: {"lr": 0.5, "which_network": 2, "save_best": True},
     physx_core.DataGeneration: {
