@@ -231,6 +231,9 @@ class Environment(Closeable):
         episodes are independent, each has one, and the steps before the first episode another,
         which is the same in every instance.
         """
+        if self._has_seed is None:  # the constructor has not run
+            name = type(self).__name__
+            raise AttributeError(f"{name!r} object has no attribute 'rng'", name="rng", obj=self)
         if self.independent_episodes:
             return self._episode_streams.generator
         spawned = np.random.SeedSequence(self._seed_entropy, spawn_key=(self.instance_id - 1,))
