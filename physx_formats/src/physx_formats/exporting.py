@@ -6,7 +6,7 @@ import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 
-from physx_core.dataset import Dataset
+from physx_core.dataset import EPISODES, Dataset
 from physx_core.errors import ConfigError, PhysxError, listed
 from physx_formats.errors import ExchangeError
 from physx_formats.format import Format, all_formats, find_format
@@ -91,7 +91,10 @@ def _choose_format(to: str, options: ExportOptions) -> Format:
 
 
 def _make_tables(dataset: Dataset, modes: Sequence[str], advance: Advance) -> list[Table]:
-    names = modes or [name for name in dataset.modes if dataset.num_samples(name)]
+    samples = [name for name in dataset.modes if dataset.num_samples(name)]
+    if any(dataset.recorded_episodes(name) is not None for name in samples):
+        samples.remove(EPISODES)  # where rows are stored here says nothing elsewhere
+    names = modes or samples
     tables = []
     for name in dict.fromkeys(names):
         fields, rows = dataset.fields(name), dataset.num_samples(name)

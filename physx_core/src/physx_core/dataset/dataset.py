@@ -13,6 +13,7 @@ from physx_core import files
 from physx_core.closeable import Closeable
 from physx_core.dataset.read.episodes import Episode, find_episodes
 from physx_core.dataset.read.mode_statistics import compute_statistics
+from physx_core.dataset.read.order.records import RecordedEpisodes
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.sampling import BatchOptions, BatchReader
 from physx_core.dataset.read.splits import Subset, split
@@ -22,10 +23,14 @@ from physx_core.dataset.read.strategies.windows import block_rows
 from physx_core.dataset.read.views import ModeView, row_numbers
 from physx_core.dataset.repair import recovery, repair
 from physx_core.dataset.repair.report import find_problems, summarize
+from physx_core.dataset.store import failure_file, locks
+from physx_core.dataset.store.episode_table import EPISODES, EpisodeStatus, has_table
+from physx_core.dataset.store.failure_file import FailedEpisode
 from physx_core.dataset.store.manifest import Manifest, to_plain_info
 from physx_core.dataset.write.appender import Appender
 from physx_core.dataset.write.merging import add_partitions, drop_partition
 from physx_core.dataset.write.opening import WriterOptions, create, extend
+from physx_core.dataset.write.recording import EpisodeRecord
 from physx_core.dataset.write.stripes import Stripes
 from physx_core.dataset.write.updating import check_update
 from physx_core.dataset.write.writer import Writer
@@ -56,6 +61,7 @@ class Dataset(Closeable):
         self._columns = ColumnCache(self._reader)
         self._appender = Appender(writer) if writer else None
         self._closed = False
+        self._look_for_writer()
 
     # Opening and closing --------------------------------------------------------------------
 
@@ -197,6 +203,9 @@ class Dataset(Closeable):
     def refresh(self) -> None:
         """Load the rows that another process has committed since the dataset was opened.
 
+        While it writes, only those of its episodes count that come before the first missing number,
+        so that rows keep their numbers as more of them finish. It is known by its lock.
+
         If that process updates rows of an open partition after `batches` has read them into
         memory, later batches still hold the old values; reopen the dataset to see the new ones.
 
@@ -206,6 +215,7 @@ class Dataset(Closeable):
         self._prepare_reading()
         if self._appender is None:
             self._manifest.take(recovery.load(self.directory))
+            self._look_for_writer()
         else:
             self._appender.writer.refresh()
 
@@ -297,6 +307,33 @@ class Dataset(Closeable):
         """
         return find_episodes(self[mode], self.num_samples(mode))
 
+    def recorded_episodes(self, mode: str) -> RecordedEpisodes | None:
+        """Return the recorded episodes of a mode, in order; None if its rows have no records.
+
+        Raises:
+            DatasetError: If there is no such mode, or the table of episodes is damaged.
+        """
+        self._prepare_reading()
+        order = self._reader.order(mode)
+        if order is None:
+            self._reader.mode(mode)  # there must be one
+            return None
+        return order.episodes
+
+    def failed_episodes(self, mode: str) -> list[FailedEpisode]:
+        """Return the episodes of a mode that are recorded as failed, in order, and why they did.
+
+        Raises:
+            DatasetError: If there is no such mode, or the table of episodes is damaged.
+        """
+        found = self.recorded_episodes(mode)
+        if found is None:
+            return []
+        known = {f[:3]: f for f in failure_file.read(self.directory)}
+        failed = found.status == EpisodeStatus.FAILED
+        keys = zip(found.campaign[failed].tolist(), found.episode[failed].tolist(), strict=True)
+        return [known.get((mode, *key), FailedEpisode(mode, *key, "")) for key in keys]
+
     def split(
         self, mode: str, shares: Mapping[str, float], *, by: str = "row", seed: int = 0
     ) -> dict[str, Subset]:
@@ -339,6 +376,8 @@ class Dataset(Closeable):
         """
         self._prepare_reading()
         self._reader.mode(mode).forget_statistics()
+        if (order := self._reader.order(mode)) is not None:
+            order.statistics.clear()
         found = self.normalization_of(mode)
         store = self._appender.writer.store if self._appender is not None else None
         if store is not None and not store.shared:  # of several writers, the next one stores them
@@ -354,7 +393,7 @@ class Dataset(Closeable):
             bytes (of the values).
         """
         self._prepare_reading()
-        return summarize(self._manifest)
+        return summarize(self._manifest, self._reader.rows)
 
     def contents(self, mode: str) -> list[tuple[str, int, int, str]]:
         """Return what identifies the rows of a mode, from the manifest alone.
@@ -362,10 +401,15 @@ class Dataset(Closeable):
         Returns:
             For each partition the session that wrote it, its number there, its rows, and a digest
             of its fields and their checksums; empty while rows are being written or updated. Rows
-            that are not committed yet do not count.
+            that are not committed yet do not count. If the mode has episodes, the partitions of
+            the table of episodes follow.
         """
-        found = self._manifest.modes[mode]
-        return [(p.session, p.index, p.rows, p.digest(found.fields)) for p in found.partitions]
+        modes = [self._manifest.modes[mode]]
+        if self._reader.order(mode) is not None:
+            modes.append(self._manifest.modes[EPISODES])
+        return [
+            (p.session, p.index, p.rows, p.digest(m.fields)) for m in modes for p in m.partitions
+        ]
 
     def verify(self, *, content: bool = True) -> list[str]:
         """Check that all partition files exist and are complete, consistent and unchanged.
@@ -414,7 +458,46 @@ class Dataset(Closeable):
         appender = self._appender
         if appender is None or self._closed:
             appender = self._for_writing()
+        if mode == EPISODES:
+            self._check_ordinary(mode)
         appender.append(mode, rows, checked=checked)
+
+    def append_episodes(
+        self,
+        mode: str,
+        rows: Mapping[str, Any],
+        episodes: Sequence[EpisodeRecord],
+        *,
+        checked: bool = False,
+    ) -> None:
+        """Store rows of independent episodes, and what is recorded of these.
+
+        From the first call on, the rows of a mode are those of its recorded episodes, in order of
+        campaign and number, in whatever order they come; rows that `append` has stored before come
+        before them, and rows that it stores later after the episodes that are there then. An
+        episode counts once its last part is recorded: if the process dies before, its rows do not
+        exist for any reader. The records are rows of the mode ``episodes``:
+        `physx_core.dataset.store.episode_table` describes them.
+
+        Args:
+            mode: ``training``, ``validation`` or ``prediction``. If it has no fields yet, they are
+                inferred from the rows.
+            rows: Field name to array of shape (n, *field shape), as for `append`; of no fields if
+                there are no rows.
+            episodes: The episodes, or parts of them, that the rows belong to, in order. The first
+                ones of a dataset determine which parameters all must have.
+            checked: Whether the rows are known to be finite, as in `append`.
+
+        Raises:
+            SampleError: If a field or a parameter is missing, unknown, of the wrong shape, type or
+                length, or holds NaN or infinity. Nothing is stored.
+            ConfigError: If the mode cannot hold episodes.
+            DatasetError: If the disk is full or fails; rows stored before stay.
+            UsageError: If the episodes have another number of rows, if a part does not follow the
+                one before, or if the dataset is closed, open for reading only, or shared.
+        """
+        self._as_only_writer("store episodes")
+        self._for_writing().append_episodes(mode, rows, episodes, checked=checked)
 
     def stripes(self, mode: str, count: int) -> Stripes:
         """Let `count` other processes write the rows of a mode from now on, in turn.
@@ -430,6 +513,7 @@ class Dataset(Closeable):
             UsageError: If the dataset is closed, open for reading only, or shared.
             DatasetError: If the folder cannot be written.
         """
+        self._check_ordinary(mode)
         return self._as_only_writer("let others write stripes").stripes(mode, count)
 
     def append_sample(self, mode: str, sample: Mapping[str, Any]) -> None:
@@ -444,6 +528,7 @@ class Dataset(Closeable):
             DatasetError: If pending samples cannot be stored because the disk is full or fails.
             UsageError: If the dataset is closed or open for reading only.
         """
+        self._check_ordinary(mode)
         self._for_writing().append_sample(mode, sample)
 
     def flush(self) -> None:
@@ -491,16 +576,21 @@ class Dataset(Closeable):
             DatasetError: If the disk fails, or a partition is damaged.
             UsageError: If the dataset is closed, open for reading only, or shared.
         """
+        self._check_ordinary(mode)
         writer = self._as_only_writer("update rows")
         fields, total = self._reader.mode(mode).fields, self._reader.rows(mode)
         numbers = row_numbers(index, total)
         single = not isinstance(index, slice) and np.ndim(index) == 0
         values = check_update(fields, numbers, rows, single=single)
+        stored = self._reader.index(mode)
+        numbers = numbers if stored is None else stored[numbers]
         with files.storing(f"{len(numbers)} updated rows of mode {mode!r}"):
             writer.update(mode, numbers, values)
 
     def merge(self, directory: str | Path) -> None:
         """Append either all rows or none of another dataset; that one is not changed.
+
+        The other's campaigns of episodes follow the dataset's own.
 
         Args:
             directory: The other dataset's folder, or the session's folder that holds it.
@@ -519,14 +609,18 @@ class Dataset(Closeable):
         recovery.count_rows(source, given, thorough=True)
         if given.problems:
             raise next(iter(given.problems.values()))
+        if has_table(given) or has_table(self._manifest):
+            self._as_only_writer("merge episodes")
         with files.storing(f"The rows of {source}"):
             appender.define_modes({n: mode.fields.values() for n, mode in given.modes.items()})
-            for name in given.modes:
+            for name in given.modes.keys() | {EPISODES}:
                 appender.writer.finish(name)
             add_partitions(appender.writer, source, given)
 
     def remove_partition(self, mode: str, index: int, session: str | None = None) -> int:
         """Remove a partition with all its rows and files; the rows after it move up.
+
+        Episodes that lack rows then do not count any more, as if they had not been computed.
 
         Args:
             mode: Name of the mode.
@@ -542,6 +636,7 @@ class Dataset(Closeable):
         """
         writer = self._as_only_writer("remove partitions")
         self._reader.mode(mode)
+        self._check_ordinary(mode)
         with files.storing(f"Mode {mode!r} without partition {index}"):
             return drop_partition(writer, mode, session, index)
 
@@ -591,6 +686,18 @@ class Dataset(Closeable):
             raise UsageError(f"The dataset in {self.directory} is closed.")
         if self._appender is not None:
             self._appender.flush()
+
+    def _look_for_writer(self) -> None:
+        """Find out whether another process is writing, so that only complete numbers count."""
+        if self._appender is None and EPISODES in self._manifest.modes:
+            self._reader.orders.until_gap = locks.is_written(self.directory)
+
+    def _check_ordinary(self, mode: str) -> None:
+        """Check that a mode is not the table of episodes, which says which rows count."""
+        if mode == EPISODES and has_table(self._manifest):
+            raise UsageError(
+                f'Mode "{EPISODES}" is the table of episodes: only append_episodes() changes it.'
+            )
 
     def _for_writing(self) -> Appender:
         """Return the appender, if the dataset is open for writing."""

@@ -8,29 +8,36 @@ from pathlib import Path
 import numpy as np
 
 from physx_core import files
+from physx_core.dataset.read.order.order import Order, Orders
 from physx_core.dataset.store import manifest_file
+from physx_core.dataset.store.episode_table import EPISODES
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition.commits import name_rows
 from physx_core.dataset.store.partition.format import inspect
 from physx_core.dataset.store.partition.segment import BLOCK, RowsCheck, Segment, rows_per_block
 from physx_core.errors import DatasetError, listed, nearest
 from physx_core.fields import Field
-from physx_core.typing import Array
+from physx_core.typing import Array, Index
 
 
 class Reader:
     """Reads the committed rows that a manifest lists.
+
+    The rows of a mode are its *stored* rows, as they were written, unless the table of episodes has
+    records about it: see `order`. Reading is by stored row.
 
     Reading raises a `DatasetError` if a partition is missing, truncated or damaged.
 
     Attributes:
         directory: The dataset's folder.
         manifest: The manifest; rows added to it later can be read too.
+        orders: The orders of the modes with records.
     """
 
     def __init__(self, directory: Path, manifest: Manifest) -> None:
         self.directory = directory
         self.manifest = manifest
+        self.orders = Orders(manifest, self._read_table)
 
     def mode(self, mode: str) -> Mode:
         """Return a mode.
@@ -62,9 +69,26 @@ class Reader:
             )
         return fields[name]
 
-    def rows(self, mode: str) -> int:
-        """Return the number of committed rows of a mode."""
+    def stored_rows(self, mode: str) -> int:
+        """Return the number of stored rows of a mode."""
         return self.mode(mode).rows
+
+    def rows(self, mode: str) -> int:
+        """Return the number of rows of a mode."""
+        order = self.order(mode)
+        return self.mode(mode).rows if order is None else order.rows
+
+    def order(self, mode: str) -> Order | None:
+        """Return which stored rows are those of a mode; None if all are, as they were stored."""
+        if EPISODES in self.manifest.modes:
+            return self.orders.of(mode)
+        self.mode(mode)
+        return None
+
+    def index(self, mode: str) -> Index | None:
+        """Return the stored row of each row of a mode; None if they are the first stored rows."""
+        order = self.order(mode)
+        return None if order is None else order.index
 
     def segments(self, mode: str, name: str) -> list[Segment]:
         """Return where the rows of a field are stored, in order."""
@@ -87,7 +111,7 @@ class Reader:
     def check(self, mode: str, name: str, start: int = 0, stop: int | None = None) -> None:
         """Check that the files are long enough before memory is allocated for their rows."""
         for segment in self.segments(mode, name):
-            if segment.span.inside(start, self.rows(mode) if stop is None else stop)[1]:
+            if segment.span.inside(start, self.stored_rows(mode) if stop is None else stop)[1]:
                 segment.open()[0].close()
 
     def read_into(
@@ -144,7 +168,7 @@ class Reader:
             start: First row.
             stop: Row before which to stop; None: after the last row committed so far.
         """
-        field, end = self.field(mode, name), self.rows(mode) if stop is None else stop
+        field, end = self.field(mode, name), self.stored_rows(mode) if stop is None else stop
         count = rows_per_block(field.nbytes)
         buffer = np.empty((min(count, max(0, end - start)), *(field.shape or ())), field.dtype)
         checks: dict[int, RowsCheck] = {}
@@ -152,6 +176,9 @@ class Reader:
             block = buffer[: end - first]
             self.read_into(block, mode, name, first, checks)
             yield block
+
+    def _read_table(self, name: str) -> Array:
+        return self.read(EPISODES, name, 0, self.stored_rows(EPISODES))
 
     def _read_part(
         self, out: Array, mode: str, segment: Segment, first: int, checks: dict[int, RowsCheck]

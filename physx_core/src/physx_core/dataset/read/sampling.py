@@ -13,6 +13,7 @@ from numpy.typing import DTypeLike
 
 from physx_core.dataset.read.strategies.cache import ColumnCache, MemoryColumn, converted_dtype
 from physx_core.dataset.read.strategies.disk import DiskColumn
+from physx_core.dataset.read.strategies.ordered import in_order, ordered_rows, shuffled_rows
 from physx_core.dataset.read.strategies.prefetch import ExactEpoch
 from physx_core.dataset.read.strategies.strategy import Choice, Strategy, check_strategy
 from physx_core.dataset.read.strategies.windows import WindowedEpoch
@@ -109,15 +110,23 @@ class BatchReader:
 
     def _begin(self, strategy: Strategy) -> Epoch:
         mode, names, dtype, random = self._mode, self._names, self._dtype, self._random
+        reader = self._columns.reader
         if strategy == "memory":
             loaded = [self._columns.load(mode, name, dtype) for name in names]
-            return MemoryEpoch(loaded, random, self._subset)
+            return MemoryEpoch(loaded, self._order(), reader.rows(mode))
         for name in names:
-            self._columns.reader.check(mode, name)
+            reader.check(mode, name)
         if strategy == "disk exact" and random is not None:
             return ExactEpoch(self._columns, mode, names, dtype, random, self._subset)
-        disk = [DiskColumn(self._columns.reader, mode, name, dtype) for name in names]
+        disk = [in_order(reader, mode, DiskColumn(reader, mode, name, dtype)) for name in names]
         return WindowedEpoch(disk, random, self._subset, self._block)
+
+    def _order(self) -> Index | None:
+        """Return the stored rows of an epoch; None for the first stored rows."""
+        reader, mode = self._columns.reader, self._mode
+        if self._random is None:
+            return ordered_rows(reader, mode, self._subset)
+        return shuffled_rows(reader, mode, self._subset, self._random)
 
     def _new_batch(self, size: int) -> Batch:
         if self._buffers is None:
@@ -158,18 +167,18 @@ class MemoryEpoch:
         rows: Number of rows.
     """
 
-    def __init__(
-        self,
-        columns: list[MemoryColumn],
-        random: np.random.Generator | None,
-        subset: Index | None = None,
-    ) -> None:
-        self.rows = columns[0].shape[0] if subset is None else len(subset)
+    def __init__(self, columns: list[MemoryColumn], order: Index | None, rows: int) -> None:
+        """Begin a pass.
+
+        Args:
+            columns: The fields.
+            order: The stored rows to read; None: the first `rows`.
+            rows: Number of rows of the mode.
+        """
+        self.rows = rows if order is None else len(order)
         self._arrays = [column.array for column in columns]
         self._takes = [array.take for array in self._arrays]
-        self._order = subset
-        if random is not None:
-            self._order = random.permutation(self.rows if subset is None else subset)
+        self._order = order
 
     def fill(self, start: int, batch: Batch) -> None:
         """Copy the next rows: see `Epoch`."""

@@ -8,11 +8,12 @@ from typing import Any, Unpack
 import numpy as np
 
 from physx_core.dataset.read.episodes import find_episodes
+from physx_core.dataset.read.order.order import Order
 from physx_core.dataset.read.sampling import BatchOptions, BatchReader
 from physx_core.dataset.read.views import FieldView, ModeView
 from physx_core.dataset.store.manifest import has_statistics
 from physx_core.dataset.store.partition.segment import rows_per_block
-from physx_core.errors import ConfigError
+from physx_core.errors import ConfigError, DatasetError
 from physx_core.fields import Field
 from physx_core.statistics import Normalization, RunningStatistics
 from physx_core.typing import Array, Batch, Index
@@ -56,12 +57,27 @@ class Subset:
 
     Attributes:
         mode: Name of the mode.
-        rows: Numbers of the rows in the mode, ascending.
     """
 
     def __init__(self, view: ModeView, rows: Index) -> None:
-        self.mode, self.rows = view.mode, rows
-        self._view = view
+        self.mode, self._rows = view.mode, rows
+        self._view, self._reader = view, view.columns.reader
+        self._order = self._reader.order(self.mode)
+
+    @property
+    def rows(self) -> Index:
+        """Numbers of the rows in the mode, ascending, shape (rows,).
+
+        They change when an earlier independent episode is stored.
+
+        Raises:
+            DatasetError: If some of the rows belong to an episode that was replaced.
+        """
+        order = self._reader.order(self.mode)
+        if order is not self._order:
+            self._rows = _renumbered(self._rows, self._order, order)
+            self._order = order
+        return self._rows
 
     @property
     def num_samples(self) -> int:
@@ -171,3 +187,23 @@ def _shuffle_episodes(
         counts.append(min(max(nearest, (counts or [0])[-1] + 1), most))
     rows = np.concatenate([episodes[number].rows for number in order])
     return rows, [int(ends[count - 1]) for count in counts]
+
+
+def _renumbered(rows: Index, before: Order | None, now: Order | None) -> Index:
+    """Return the numbers that rows have in another order of the same stored rows."""
+    stored = rows if before is None or before.index is None else before.index[rows]
+    if now is None or now.index is None:
+        total = len(rows) if now is None else now.rows
+        found, known = stored, stored
+        is_there = bool((stored < total).all()) if now is not None else True
+    else:
+        places = np.argsort(now.index)
+        found = places[np.minimum(np.searchsorted(now.index, stored, sorter=places), now.rows - 1)]
+        known = now.index[found]
+        is_there = bool((known == stored).all())
+    if not is_there:
+        raise DatasetError(
+            "Some of these rows belong to episodes that were replaced since the mode was split: "
+            "split it again."
+        )
+    return np.sort(found)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Iterator
 from typing import Any
 
@@ -9,6 +10,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from physx_core.dataset.read.strategies.cache import ColumnCache
+from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.fields import Field
 from physx_core.typing import Array, Index
 
@@ -62,8 +64,15 @@ class FieldView:
         )
 
     def __iter__(self) -> Iterator[Any]:
-        for block in self._reader.blocks(self._mode, self.field.name):
-            yield from block.copy()
+        if self._reader.order(self._mode) is None:
+            for block in self._reader.blocks(self._mode, self.field.name):
+                yield from block.copy()
+            return
+        stored, total = self._reader.index(self._mode), len(self)
+        step = rows_per_block(self.field.nbytes)
+        for start in range(0, total, step):
+            rows = np.arange(start, min(start + step, total))
+            yield from self._take(rows if stored is None else stored[rows])
 
     def __array__(self, dtype: DTypeLike | None = None, copy: bool | None = None) -> Array:
         if copy is False:
@@ -76,9 +85,20 @@ class FieldView:
         return f"<{self._mode}/{self.field.name}: {self.shape} {self.dtype}{unit}>"
 
     def _read(self, start: int, stop: int) -> Array:
+        order = self._reader.order(self._mode)
+        if order is not None:
+            pieces = list(itertools.islice(order.pieces(start, stop), 2))
+            if len(pieces) > 1:
+                return self._gather(np.arange(start, stop))
+            start, stop = (pieces[0][0], sum(pieces[0])) if pieces else (0, 0)
         return self._reader.read(self._mode, self.field.name, start, stop)
 
-    def _gather(self, index: Index) -> Array:
+    def _gather(self, rows: Index) -> Array:
+        stored = self._reader.index(self._mode)
+        return self._take(rows if stored is None else stored[rows])
+
+    def _take(self, index: Index) -> Array:
+        """Return stored rows."""
         column = self._columns.map(self._mode, self.field.name)
         column.check()
         out = np.empty((len(index), *column.shape[1:]), column.dtype)

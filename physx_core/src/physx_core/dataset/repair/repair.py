@@ -9,6 +9,7 @@ from pathlib import Path
 from physx_core import files
 from physx_core.dataset.read.mode_statistics import compute_statistics
 from physx_core.dataset.read.reader import Reader
+from physx_core.dataset.read.virtual_index import write_index
 from physx_core.dataset.repair import recovery
 from physx_core.dataset.repair.quarantine import set_aside, unused
 from physx_core.dataset.repair.report import (
@@ -17,9 +18,9 @@ from physx_core.dataset.repair.report import (
     find_statistics_problem,
 )
 from physx_core.dataset.store import locks, manifest_file, statistics_file
+from physx_core.dataset.store.episode_table import EPISODES, LOST
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition.file import copy
-from physx_core.dataset.store.virtual_index import write_index
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
 
@@ -31,6 +32,9 @@ def repair(folder: Path) -> list[str]:
         for mode in manifest.modes.values():
             for partition in list(mode.partitions):
                 done += _repair_partition(folder, mode, partition)
+                if partition not in mode.partitions and mode is manifest.modes.get(EPISODES):
+                    manifest.info[LOST] = True
+                    done.append("These rows were records of episodes, which no longer count.")
         manifest.problems.clear()
         recovery.count_rows(folder, manifest)  # a damaged partition may have hidden later ones
         done += recovery.recover(folder, manifest)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from physx_core.dataset.store import manifest_file, statistics_file
+from physx_core.dataset.store.episode_table import LOST
 from physx_core.dataset.store.manifest import Manifest, Partition
 from physx_core.dataset.store.partition.commits import Kept, name_rows
 from physx_core.dataset.store.partition.format import Inspection
@@ -15,8 +17,14 @@ from physx_core.errors import DatasetError
 from physx_core.fields import Field
 
 
-def summarize(manifest: Manifest) -> list[dict[str, Any]]:
-    """Return a table with one row for each field of each mode: see `Dataset.describe`."""
+def summarize(manifest: Manifest, rows_of: Callable[[str], int]) -> list[dict[str, Any]]:
+    """Return a table with one row for each field of each mode: see `Dataset.describe`.
+
+    Args:
+        manifest: The manifest.
+        rows_of: Returns the number of rows of a mode.
+    """
+    counts = {mode_name: rows_of(mode_name) for mode_name in manifest.modes}
     return [
         {
             "mode": mode_name,
@@ -25,9 +33,9 @@ def summarize(manifest: Manifest) -> list[dict[str, Any]]:
             "dtype": np.dtype(field.dtype).name,
             "shape": field.shape,
             "unit": field.unit,
-            "samples": mode.rows,
+            "samples": counts[mode_name],
             "partitions": len(mode.partitions),
-            "bytes": mode.rows * field.nbytes,
+            "bytes": counts[mode_name] * field.nbytes,
         }
         for mode_name, mode in manifest.modes.items()
         for field in mode.fields.values()
@@ -41,6 +49,11 @@ def find_problems(directory: Path, manifest: Manifest, content: bool = True) -> 
         One message per problem; empty for a sound dataset.
     """
     found = find_partition_problems(directory, manifest, content)
+    if manifest.info.get(LOST):
+        found.append(
+            f"Records of episodes in {directory} were lost: no row of a mode without records "
+            f"counts. Restore them from a backup, or let all rows count: update_info({LOST}=None)."
+        )
     problem = find_statistics_problem(directory)
     return found if problem is None else [*found, problem]
 

@@ -10,8 +10,8 @@ from pathlib import Path
 from physx_core import files
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
-from physx_core.dataset.store.partition.commits import Range, merge_ranges, within
-from physx_core.dataset.store.partition.file import copy
+from physx_core.dataset.store.partition.commits import Range, merge_ranges
+from physx_core.dataset.store.partition.file import complement, copy
 from physx_core.dataset.store.sealing import scan
 
 
@@ -21,8 +21,9 @@ def seal_without_damage(
     """Replace open partitions by sealed copies without the rows that are damaged in any of them.
 
     The copies are new partitions: were the files replaced one by one, the rows of some fields would
-    be shifted against those of others if the process died in between. The originals become dropped
-    partitions; their files remain until the manifest is stored.
+    be shifted against those of others if the process died in between. There is one for each run of
+    sound rows, whose places stay those that the table of episodes speaks of. The originals become
+    dropped partitions; their files remain until the manifest is stored.
 
     Args:
         directory: The dataset's folder.
@@ -31,42 +32,45 @@ def seal_without_damage(
         group: Partitions that have stripes of the same rows, or a single one.
     """
     damaged = merge_ranges(chain.from_iterable(partition.damaged for partition in group))
-    copies = [_reserve(directory, mode, old, damaged) for old in group]
+    runs = complement(max(partition.rows for partition in group), damaged)
+    pairs = [
+        (old, run, _reserve(directory, mode, old, run))
+        for run in runs
+        for old in group
+        if old.rows > run[0]
+    ]
     manifest_file.save(directory, manifest)  # whoever comes next removes incomplete copies
-    pairs = [(old, new) for old, new in zip(group, copies, strict=True) if new.rows]
-    for old, new in pairs:
+    for old, (start, stop), new in pairs:
         for name, field in mode.fields.items():
             offset = old.inspect(directory, field).data_offset
             path, target = old.path(directory, name), new.path(directory, name)
-            without = within(damaged, old.rows)
-            new.offsets[name], _ = copy(
-                path, offset, target, new.identity(field), old.rows, without
-            )
+            others = [(0, start), (min(stop, old.rows), old.rows)]
+            new.offsets[name], _ = copy(path, offset, target, new.identity(field), old.rows, others)
     files.sync_folder(directory)
+    copies = [new for _, _, new in pairs]
     keys = {new.key for new in copies}
     mode.dropped = [partition for partition in mode.dropped if partition.key not in keys]
-    for old, new in pairs:
-        sealed = scan(directory, mode.fields, replace(new, sealed=True))
-        mode.partitions.insert(mode.place(old), sealed)
+    place = mode.place(group[0])
+    mode.partitions[place:place] = [
+        scan(directory, mode.fields, replace(new, sealed=True)) for new in copies
+    ]
     for old in group:
         del mode.partitions[mode.place(old)]
         mode.dropped.append(old)
 
 
-def _reserve(
-    directory: Path, mode: Mode, partition: Partition, damaged: Sequence[Range]
-) -> Partition:
-    """List the copy of a partition as dropped, with the next number without files."""
+def _reserve(directory: Path, mode: Mode, partition: Partition, run: Range) -> Partition:
+    """List the copy of some rows of a partition as dropped, with the next number without files."""
     listed = (*mode.partitions, *mode.dropped)
     used = [each.index for each in listed if each.session == partition.session]
     index = max(*used, mode.removed.get(partition.session, -1)) + 1
-    lost = sum(stop - start for start, stop in within(damaged, partition.rows))
+    start, stop = run
     new = Partition(
         partition.mode,
         partition.session,
         index,
-        partition.first_row,
-        rows=partition.rows - lost,
+        partition.first_row + start * (partition.stripe.of if partition.stripe else 1),
+        rows=min(stop, partition.rows) - start,
         stripe=partition.stripe,
     )
     while any(new.path(directory, name).exists() for name in mode.fields):

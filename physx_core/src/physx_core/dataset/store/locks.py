@@ -33,11 +33,12 @@ def lock(directory: Path, patience: float = _MOMENT) -> files.FileLock:
         DatasetLockedError: If there is another writer.
     """
     lock = files.FileLock(directory / LOCK)
-    until = time.monotonic() + patience
+    until, looked = time.monotonic() + patience, False
     try:
         while not lock.acquire():
-            if time.monotonic() > until or _owner_runs(lock):
+            if looked and (time.monotonic() > until or _owner_runs(lock)):
                 raise _locked(directory, lock)
+            looked = True  # the first time it may have been a reader that asks: see `is_written`
             time.sleep(_PAUSE)
         files.resize(lock.descriptor, 0)
         files.write_at(lock.descriptor, str(os.getpid()).encode(), 0)
@@ -66,6 +67,24 @@ def lock_shared(directory: Path) -> tuple[files.FileLock, bool]:
         lock_of_several.close()
         raise
     return lock_of_several, False
+
+
+def is_written(directory: Path) -> bool:
+    """Return whether another process has locked a dataset as its only writer; changes nothing."""
+    try:
+        descriptor = files.open_regular(directory / LOCK)
+    except OSError:
+        return False
+    try:
+        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return os.pread(descriptor, 20, 0) != str(os.getpid()).encode()
+    except OSError:  # a file system without locks
+        return False
+    else:
+        return False
+    finally:
+        files.close(descriptor)
 
 
 def share(directory: Path, lock: files.FileLock) -> None:

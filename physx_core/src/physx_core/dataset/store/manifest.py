@@ -198,6 +198,8 @@ class Mode:
             being removed, or copied from another dataset.
         removed: Largest number of a removed partition, by session. It is never reused, so that a
             reader that still lists the removed partition cannot mistake new rows for its rows.
+        recorded: End of the rows that the table of episodes speaks of, even if some are lost; their
+            places are never used again: see `physx_core.dataset.store.episode_table`. Not stored.
     """
 
     fields: dict[str, Field]
@@ -205,6 +207,7 @@ class Mode:
     statistics: dict[str, RunningStatistics] | None = field(default_factory=dict)
     dropped: list[Partition] = field(default_factory=list)
     removed: dict[str, int] = field(default_factory=dict)
+    recorded: int = 0
 
     @property
     def rows(self) -> int:
@@ -215,7 +218,7 @@ class Mode:
     def next_row(self) -> int:
         """First row of the next partition, larger than that of any earlier one."""
         before = (p.first_row + max(1, p.rows) for p in (*self.partitions, *self.dropped))
-        return max(self.rows, *before, 0)
+        return max(self.rows, *before, self.recorded)
 
     @property
     def counted_fields(self) -> dict[str, Field]:
@@ -277,6 +280,7 @@ class Mode:
             None if self.statistics is None else dict(self.statistics),
             list(self.dropped),
             dict(self.removed),
+            self.recorded,
         )
 
     def to_dict(self) -> dict[str, Any]:

@@ -67,7 +67,7 @@ class Syncer:
             self._paths.clear()
         try:
             for file in chain.from_iterable(partition.files.values() for partition in opened):
-                _sync_marked(file)
+                sync_marked(file)
             for path in paths:
                 with contextlib.suppress(FileNotFoundError):  # its partition was removed
                     files.sync_file(path)
@@ -96,7 +96,7 @@ class Syncer:
         self.sync()
 
 
-def _sync_marked(file: PartitionFile) -> None:
+def sync_marked(file: PartitionFile) -> None:
     """Sync a partition file with a mark of its newest commit."""
     descriptor = file.mark()
     if descriptor < 0:

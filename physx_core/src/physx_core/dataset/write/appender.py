@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 from physx_core import files
 from physx_core.dataset.store.definitions import compare_fields, complete_shapes
+from physx_core.dataset.store.episode_table import EPISODES, TABLE_FIELDS, has_table
 from physx_core.dataset.store.manifest import Mode
+from physx_core.dataset.write.recording import EpisodeRecord, table_rows
 from physx_core.dataset.write.row_validation import check_rows, count_rows, infer_fields
 from physx_core.dataset.write.writer import Writer
-from physx_core.errors import ConfigError, listed
+from physx_core.errors import ConfigError, UsageError, listed
 from physx_core.fields import Field
 from physx_core.rows import RowBuffer, infer_shapes
+from physx_core.typing import Batch
 
 
 class Appender:
@@ -62,12 +65,56 @@ class Appender:
                 self._flush(mode)
             self.writer.append(mode, dict(rows), count)
             return
+        block, count = self._check_rows(mode, rows, checked=checked)
+        self._flush(mode)
+        self.writer.append(mode, block, count)
+
+    def _check_rows(
+        self, mode: str, rows: Mapping[str, Any], *, checked: bool
+    ) -> tuple[Batch, int]:
+        """Return rows of a mode as they are stored, and their number; define missing shapes."""
+        known = self._manifest.modes.get(mode)
         fields = known.fields if known else {field.name: field for field in infer_fields(rows)}
         block, count = check_rows(fields, rows, checked=checked)
-        self._flush(mode)
         if not self._is_settled(mode):
             self.define_fields(mode, infer_shapes(fields.values(), block, axes=1))
-        self.writer.append(mode, block, count)
+        return block, count
+
+    def append_episodes(
+        self,
+        mode: str,
+        rows: Mapping[str, Any],
+        episodes: Sequence[EpisodeRecord],
+        *,
+        checked: bool = False,
+    ) -> None:
+        """Store rows with the records that commit them: see `Dataset.append_episodes`."""
+        recorder = self.writer.recorder
+        self.writer.check_alone([mode, EPISODES])
+        recorder.check(mode, episodes)
+        table = self._check_table(mode, episodes)
+        block, count = self._check_rows(mode, rows, checked=checked) if rows else ({}, 0)
+        total = sum(each.rows for each in episodes)
+        if total != count:
+            raise UsageError(f"{count} rows are given, but the episodes have {total}.")
+        self._flush(mode)
+        if episodes:
+            recorder.append(mode, block, count, episodes, table)
+
+    def _check_table(self, mode: str, episodes: Sequence[EpisodeRecord]) -> Batch:
+        """Return the records of a mode for the table of episodes, which is defined if needed."""
+        own = {field.name: field for field in TABLE_FIELDS}
+        known, fields = self._manifest.modes.get(EPISODES), own
+        if known is not None and not has_table(self._manifest):
+            compare_fields(f'Mode "{EPISODES}" of the dataset', known.fields, own)
+        if known is not None:
+            fields = known.fields
+        elif episodes:
+            fields = {f.name: f for f in infer_fields(episodes[0].parameters, axes=0)} | own
+        table, _ = check_rows(fields, table_rows(mode, fields, episodes))
+        if not self._is_settled(EPISODES):
+            self.define_fields(EPISODES, infer_shapes(fields.values(), table, axes=1))
+        return table
 
     def append_sample(self, mode: str, sample: Mapping[str, Any]) -> None:
         """Buffer one sample: see `Dataset.append_sample`."""

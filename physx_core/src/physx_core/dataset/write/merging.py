@@ -13,9 +13,11 @@ from pathlib import Path
 from physx_core import files
 from physx_core.dataset.read.mode_statistics import add_counted
 from physx_core.dataset.store import statistics_file
+from physx_core.dataset.store.episode_table import EPISODES, has_table
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition.file import copy
-from physx_core.dataset.store.sealing import remove_files
+from physx_core.dataset.store.sealing import remove_files, seal
+from physx_core.dataset.write.merged_records import MergedRecords
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
@@ -33,20 +35,29 @@ def add_partitions(writer: Writer, source: Path, given: Manifest) -> None:
         given: Manifest of the other dataset.
     """
     statistics_file.load(source, given)
+    records = MergedRecords(writer.recorder, source, given)
     pairs = _reserve(writer, given)
+    table = _reserve_table(writer, records)
     try:
         for name, partitions in pairs.items():
             for old, new in partitions:
                 _copy_files(writer.store.directory, source, given.modes[name].fields, old, new)
+        sealed = [_write_table(writer, records, entry) for entry in table]
         files.sync_folder(writer.store.directory)
         with writer.store.change() as manifest:
             statistics_file.load(writer.store.directory, manifest)
             for name, partitions in pairs.items():
                 _accept(manifest, manifest.modes[name], given.modes[name], partitions)
+            for entry in sealed:
+                mode = manifest.modes[EPISODES]
+                mode.dropped = [p for p in mode.dropped if p.key != entry.key]
+                mode.partitions.append(entry)
     except BaseException:
         with contextlib.suppress(OSError):  # the next writer removes what is left
-            _forget(writer, {name: [new for _, new in found] for name, found in pairs.items()})
+            found = {name: [new for _, new in found] for name, found in pairs.items()}
+            _forget(writer, {**found, **({EPISODES: table} if table else {})})
         raise
+    records.take_effect()
 
 
 def drop_partition(writer: Writer, mode_name: str, session: str | None, index: int) -> int:
@@ -63,6 +74,7 @@ def drop_partition(writer: Writer, mode_name: str, session: str | None, index: i
             mode.forget_statistics()
     writer.store.manifest.generation += 1
     _forget(writer, {mode_name: [found]})
+    writer.recorder.load()
     return found.rows
 
 
@@ -84,16 +96,43 @@ def _reserve(writer: Writer, given: Manifest) -> dict[str, Pairs]:
     pairs: dict[str, Pairs] = {}
     with writer.store.change() as manifest:
         for name, other in given.modes.items():
+            if name == EPISODES and has_table(given):
+                continue  # its records are written anew
             mode, found = manifest.modes[name], pairs.setdefault(name, [])
-            for group in other.groups:
-                first = mode.next_row
-                for old in (partition for partition in group if partition.rows):
-                    new = writer.new_partition(name, mode)
-                    new.rows, new.stripe = old.rows, old.stripe
-                    new.first_row = first + (0 if old.stripe is None else old.stripe.place)
-                    mode.dropped.append(new)
-                    found.append((old, new))
+            first = mode.next_row
+            for old in (partition for partition in other.partitions if partition.rows):
+                new = writer.new_partition(name, mode)
+                new.rows, new.stripe = old.rows, old.stripe
+                new.first_row = first + old.first_row
+                mode.dropped.append(new)
+                found.append((old, new))
     return pairs
+
+
+def _reserve_table(writer: Writer, records: MergedRecords) -> list[Partition]:
+    """List the partition of the merged records, if there are any, as dropped."""
+    if not records.count:
+        return []
+    with writer.store.change() as manifest:
+        mode = manifest.modes[EPISODES]
+        entry = writer.new_partition(EPISODES, mode)
+        entry.rows = records.count
+        mode.dropped.append(entry)
+    return [entry]
+
+
+def _write_table(writer: Writer, records: MergedRecords, entry: Partition) -> Partition:
+    """Write the merged records to their partition and return it, sealed."""
+    fields = writer.store.manifest.modes[EPISODES].fields
+    for name, field in fields.items():
+        file = writer.create_file(entry, field, records.count)
+        try:
+            file.append(0, records.rows[name], records.count, durable=True)
+            file.sync()
+            file.publish()
+        finally:
+            file.close()
+    return seal(writer.store.directory, fields, entry)
 
 
 def _copy_files(

@@ -9,12 +9,12 @@ from pathlib import Path
 from typing import Any
 
 from physx_core import files
+from physx_core.dataset.read.virtual_index import write_index
 from physx_core.dataset.repair import recovery
 from physx_core.dataset.store import locks, manifest_file, statistics_file
 from physx_core.dataset.store.manifest import Manifest, to_plain_info
 from physx_core.dataset.store.manifest_store import ManifestStore
 from physx_core.dataset.store.validation import SESSION
-from physx_core.dataset.store.virtual_index import write_index
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import ConfigError, DatasetError
 
@@ -85,6 +85,7 @@ def extend(folder: Path, options: WriterOptions) -> Writer:
                 statistics_file.clear(folder, manifest.statistics_checksum)
                 if options.shared:
                     locks.share(folder, lock)
+            writer.recorder.load()
         except BaseException:
             lock.close()
             raise

@@ -16,6 +16,7 @@ from typing import Protocol
 
 from physx_core import files
 from physx_core.dataset.read.mode_statistics import count_sealed
+from physx_core.dataset.read.virtual_index import write_index
 from physx_core.dataset.repair import recovery
 from physx_core.dataset.store.definitions import compare_fields
 from physx_core.dataset.store.manifest import (
@@ -29,7 +30,6 @@ from physx_core.dataset.store.manifest_store import ManifestStore
 from physx_core.dataset.store.partition.file import PartitionFile
 from physx_core.dataset.store.partition.format import Stripe
 from physx_core.dataset.store.sealing import remove_files, seal
-from physx_core.dataset.store.virtual_index import write_index
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
 from physx_core.statistics import RunningStatistics

@@ -13,14 +13,15 @@ from typing import Any
 from physx_core import files
 from physx_core.dataset.read.mode_statistics import compute_statistics, count_sealed
 from physx_core.dataset.read.reader import Reader
+from physx_core.dataset.read.virtual_index import write_index
 from physx_core.dataset.repair import recovery
 from physx_core.dataset.store import locks, manifest_file
 from physx_core.dataset.store.manifest import Mode, Partition
 from physx_core.dataset.store.manifest_store import ManifestStore
 from physx_core.dataset.store.partition.file import PartitionFile
 from physx_core.dataset.store.sealing import remove_files, seal
-from physx_core.dataset.store.syncing import Syncer
-from physx_core.dataset.store.virtual_index import write_index
+from physx_core.dataset.store.syncing import Syncer, sync_marked
+from physx_core.dataset.write.recording import Recorder
 from physx_core.dataset.write.stripes import Stripes
 from physx_core.dataset.write.updating import update_rows
 from physx_core.errors import DatasetError, UsageError
@@ -102,6 +103,7 @@ class Writer:
     Attributes:
         store: The manifest, kept up to date in memory and on disk.
         session: Name of the session that writes.
+        recorder: Writes the table of episodes.
     """
 
     def __init__(
@@ -137,6 +139,8 @@ class Writer:
         self._sealed: list[Partition] = []
         self._sealer: Helper[Partition] = helper("physx-seal")
         self._stripes: dict[str, Stripes] = {}
+        self.recorder = Recorder(self, self._reader)
+        self._recorded = self.recorder.recorded
 
     @property
     def is_own(self) -> bool:
@@ -146,6 +150,8 @@ class Writer:
     def stripes(self, mode_name: str, count: int) -> Stripes:
         """Let other processes write a mode's rows from now on: see `Dataset.stripes`."""
         self.finish(mode_name)
+        if mode_name in self._recorded:
+            self.recorder.begin_stream(mode_name)
         found = self._stripes[mode_name] = Stripes(self, mode_name, count)
         return found
 
@@ -169,6 +175,8 @@ class Writer:
         done, syncer = 0, self._syncer
         if self._stripes:
             self.check_alone([mode_name])
+        if self._recorded and count and mode_name in self._recorded:
+            self.recorder.begin_stream(mode_name)
         try:
             if self.store.failure is not None or (syncer is not None and syncer.error is not None):
                 self._check()
@@ -206,10 +214,7 @@ class Writer:
             opened = self._open.get(mode_name)
             updated = update_rows(self.store, mode_name, index, rows, opened)
             for path in updated:
-                if self._syncer is not None:
-                    self._syncer.note_path(path)
-                else:
-                    files.sync_file(path)
+                self.note_path(path)
 
     def refresh(self) -> None:
         """Load what other writers have committed."""
@@ -223,6 +228,21 @@ class Writer:
         if mode_name in self._open:
             self._retire(mode_name)
         self.wait()
+
+    def sync(self, mode_name: str) -> None:
+        """Wait until all rows of a mode are on the disk."""
+        self.wait()
+        with self.store.syncing():
+            opened = self._open.get(mode_name)
+            for file in opened.files.values() if opened is not None else ():
+                sync_marked(file)
+
+    def note_path(self, path: Path) -> None:
+        """Have a file on the disk soon; at once if each commit waits for the disk."""
+        if self._syncer is not None:
+            self._syncer.note_path(path)
+        else:
+            files.sync_file(path)
 
     def wait(self) -> None:
         """Wait until all full partitions are sealed."""

@@ -15,7 +15,7 @@ from physx_core.typing import Array, Index
 
 
 class MemoryColumn:
-    """A field in memory, in the requested type.
+    """The stored rows of a field in memory, in the requested type.
 
     Attributes:
         shape: (rows, *field shape).
@@ -55,7 +55,7 @@ class MemoryColumn:
 
 
 class ColumnCache:
-    """The columns of a dataset, kept between uses until stored rows change.
+    """The columns of a dataset by stored row, kept between uses until stored rows change.
 
     Attributes:
         reader: Reads the rows.
@@ -88,7 +88,7 @@ class ColumnCache:
         column = self._loaded.get(key)
         if column is None:
             column = self._loaded[key] = MemoryColumn(self.reader, mode, field, key[2])
-        rows = self.reader.rows(mode)
+        rows = self.reader.stored_rows(mode)
         if column.shape[0] != rows:
             self.reader.check(mode, name, column.shape[0])
             column.extend(rows)
@@ -97,7 +97,7 @@ class ColumnCache:
     def map(self, mode: str, name: str) -> MappedColumn:
         """Map all currently committed rows of a field into the address space and return them."""
         self._drop_stale()
-        field, rows = self.reader.field(mode, name), self.reader.rows(mode)
+        field, rows = self.reader.field(mode, name), self.reader.stored_rows(mode)
         column = self._mapped.get((mode, name))
         if column is None or column.shape[0] != rows:
             column = MappedColumn(self.reader.segments(mode, name), field)
@@ -110,7 +110,7 @@ class ColumnCache:
         field = self.reader.field(mode, name)
         kind = converted_dtype(field, dtype)
         loaded = self._loaded.get((mode, name, kind))
-        rows = self.reader.rows(mode) - (loaded.shape[0] if loaded else 0)
+        rows = self.reader.stored_rows(mode) - (loaded.shape[0] if loaded else 0)
         return rows * (field.nbytes // np.dtype(field.dtype).itemsize) * kind.itemsize
 
     def clear(self) -> None:

@@ -20,7 +20,7 @@ _OPEN_FILES = 64
 
 
 class DiskColumn:
-    """A field on disk; close it after use.
+    """The stored rows of a field on disk; close it after use.
 
     Rows are read with system calls, not through mapped memory: a file that becomes shorter raises
     an error instead of killing the process, and the memory of the process does not grow. Reading
@@ -42,7 +42,7 @@ class DiskColumn:
             dtype: Type that floating-point rows are converted to; None: no conversion.
         """
         field = reader.field(mode, name)
-        self.shape: tuple[int, ...] = (reader.rows(mode), *(field.shape or ()))
+        self.shape: tuple[int, ...] = (reader.stored_rows(mode), *(field.shape or ()))
         self.dtype = converted_dtype(field, dtype)
         self.row_nbytes = field.nbytes
         self._own = np.dtype(field.dtype)

@@ -9,6 +9,7 @@ import numpy as np
 
 from physx_core.dataset.read.strategies.cache import ColumnCache, MemoryColumn
 from physx_core.dataset.read.strategies.disk import DiskColumn
+from physx_core.dataset.read.strategies.ordered import shuffled_rows
 from physx_core.dataset.read.strategies.strategy import LARGE_ROW, memory_budget
 from physx_core.typing import Batch, Index
 
@@ -43,7 +44,7 @@ class ExactEpoch:
             random: Draws the permutation.
             subset: Numbers of the rows to read; None: all.
         """
-        self._order = random.permutation(columns.reader.rows(mode) if subset is None else subset)
+        self._order = shuffled_rows(columns.reader, mode, subset, random)
         self.rows = len(self._order)
         small = _small(columns, mode, names, dtype)
         self._columns: list[MemoryColumn | DiskColumn] = [

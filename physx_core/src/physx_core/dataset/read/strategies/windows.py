@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from physx_core.dataset.read.strategies.disk import DiskColumn
+from physx_core.dataset.read.strategies.ordered import OrderedColumn
+from physx_core.errors import DatasetError
 from physx_core.typing import Batch, Index
 
 # The order depends on these sizes, not on the free memory, so a seed reproduces it on any machine.
@@ -31,7 +35,7 @@ class WindowedEpoch:
 
     def __init__(
         self,
-        columns: list[DiskColumn],
+        columns: Sequence[DiskColumn | OrderedColumn],
         random: np.random.Generator | None,
         subset: Index | None = None,
         block: int | None = None,
@@ -84,6 +88,8 @@ class WindowedEpoch:
 
     def _read_window(self) -> None:
         """Read the next window and announce the one after it."""
+        if self._next_block >= len(self._blocks):
+            raise DatasetError("Rows were removed since it was chosen which ones to read.")
         held = 0
         for start, count in self._next_window():
             for column, window in zip(self._columns, self._windows, strict=True):

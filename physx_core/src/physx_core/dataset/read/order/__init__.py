@@ -1,0 +1,1 @@
+"""Which rows of a mode count, and in which order, by the table of episodes."""

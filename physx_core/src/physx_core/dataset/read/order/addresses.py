@@ -1,0 +1,41 @@
+"""Addresses: numbers of stored rows that never change, though rows before them may be removed."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from physx_core.dataset.store.manifest import Mode
+from physx_core.typing import Index
+
+
+class Addresses:
+    """Where the rows with given addresses are stored in a mode now.
+
+    Attributes:
+        end: Address after the last stored row.
+        rows: Number of stored rows.
+    """
+
+    def __init__(self, mode: Mode) -> None:
+        """Look at the mode's partitions as they are now."""
+        groups = [group for group in mode.groups if any(part.rows for part in group)]
+        rows = [sum(part.rows for part in group) for group in groups]
+        first = [g[0].first_row - (g[0].stripe.place if g[0].stripe else 0) for g in groups]
+        self._first, self._rows = np.array(first, np.int64), np.array(rows, np.int64)
+        self._starts = np.cumsum(self._rows) - self._rows
+        self.end = int((self._first + self._rows).max(initial=0))
+        self.rows = int(self._rows.sum())
+
+    def stored_before(self, addresses: Index) -> Index:
+        """Return the number of stored rows before each address."""
+        if not len(self._first):
+            return np.zeros(len(addresses), np.int64)
+        group = np.maximum(self._first.searchsorted(addresses, "right") - 1, 0)
+        inside = np.clip(addresses - self._first[group], 0, self._rows[group])
+        found: Index = self._starts[group] + inside
+        return found
+
+    def has_all(self, first: int, count: int) -> bool:
+        """Return whether there are rows with all `count` addresses from the first on."""
+        begin, end = self.stored_before(np.array([first, first + count]))
+        return bool(end - begin == count)

@@ -1,0 +1,105 @@
+"""Writes the virtual index ``<session>.h5``: all sealed rows in one file, for other tools.
+
+It holds ``/<mode>/<field>`` as virtual datasets that refer to the partitions in the same folder. If
+several sessions wrote the dataset, there is one index named after each, and each shows all rows.
+The rows of a mode with episodes are in order of campaign and number; if they lie in too many pieces
+for a virtual dataset, the mode has no fields, and its attribute ``pieces`` says in how many.
+physx itself never reads them.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physx_core import files
+from physx_core.dataset.read.order.order import Order
+from physx_core.dataset.read.reader import Reader
+from physx_core.dataset.store.manifest import Manifest, Mode, Partition
+from physx_core.dataset.store.partition.spans import FlatIndex
+from physx_core.fields import Field
+
+FORMAT = "physx index"
+
+_MOST_PIECES = 4096
+
+Piece = tuple[Partition, slice, slice]
+"""A partition, some of its rows, and their places in the mode."""
+
+
+def write_index(directory: Path, session: str, manifest: Manifest, *, wait: bool = False) -> None:
+    """Write the index of all sealed rows.
+
+    Args:
+        directory: The dataset's folder.
+        session: Session that writes it; it gets an index even if it has no rows yet.
+        manifest: The dataset's manifest.
+        wait: Whether to wait for the disk.
+    """
+    import h5py
+
+    image, reader = io.BytesIO(), Reader(directory, manifest)
+    with h5py.File(image, "w") as file:
+        file.attrs["format"], file.attrs["format_version"] = FORMAT, 1
+        for name in manifest.modes:
+            _add_mode(file.create_group(name), reader.mode(name), reader.order(name))
+    for name in {session, *manifest.sessions}:
+        files.replace(directory / f"{name}.h5", image.getvalue(), wait=wait)
+
+
+def _add_mode(group: Any, mode: Mode, order: Order | None) -> None:
+    if order is not None and len(order.places.rows) > _MOST_PIECES:
+        group.attrs["pieces"] = len(order.places.rows)
+        return
+    pieces = list(_stored_pieces(mode) if order is None else _pieces(mode, order))
+    for field in mode.fields.values():
+        if field.shape is not None:
+            _add(group, field, pieces)
+
+
+def _stored_pieces(mode: Mode) -> Iterator[Piece]:
+    """Yield all rows of the sealed partitions, as they are stored."""
+    sealed = Mode(mode.fields, [partition for partition in mode.partitions if partition.sealed])
+    for partition, span in zip(sealed.partitions, sealed.spans, strict=True):
+        yield partition, slice(0, span.rows), span.among(0, span.rows, 0)
+
+
+def _pieces(mode: Mode, order: Order) -> Iterator[Piece]:
+    """Yield the rows of the sealed partitions in order."""
+    done, spans = 0, mode.spans
+    index = FlatIndex(spans)
+    for first, rows in order.pieces(0, order.rows):
+        found, number, piece = 0, index.find(first)[0], (first, first + rows)
+        number -= spans[number].place
+        while number < len(spans) and spans[number].start < first + rows:
+            partition, (begin, count) = mode.partitions[number], spans[number].inside(*piece)
+            if count and not partition.sealed:
+                break
+            if count:
+                where = spans[number].among(begin, count, first - done)
+                yield partition, slice(begin, begin + count), where
+            found, number = found + count, number + 1
+        done += found
+
+
+def _add(group: Any, field: Field, pieces: list[Piece]) -> None:
+    import h5py
+
+    rows = sum(part.stop - part.start for _, part, _ in pieces)
+    shape, dtype = (rows, *(field.shape or ())), np.dtype(field.dtype)
+    if not rows or not field.nbytes:
+        entry = group.create_dataset(field.name, shape, dtype)
+    else:
+        layout = h5py.VirtualLayout(shape, dtype)
+        for partition, part, where in pieces:
+            source_shape = (partition.rows, *shape[1:])
+            source_file = partition.file_name(field.name)
+            source = h5py.VirtualSource(source_file, "data", source_shape, dtype)
+            layout[where] = source if part.stop - part.start == partition.rows else source[part]
+        missing = np.nan if dtype.kind == "f" else None  # value of rows of a lost partition
+        entry = group.create_virtual_dataset(field.name, layout, fillvalue=missing)
+    entry.attrs["unit"], entry.attrs["role"] = field.unit, field.role

@@ -1,0 +1,323 @@
+"""Writes the table of episodes: see `physx_core.dataset.store.episode_table`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from physx_core import files
+from physx_core.checks import store_declared
+from physx_core.config import MODES
+from physx_core.dataset.read.order.addresses import Addresses
+from physx_core.dataset.read.reader import Reader
+from physx_core.dataset.store import failure_file
+from physx_core.dataset.store.episode_table import (
+    EPISODES,
+    OPEN,
+    TABLE_FIELDS,
+    EpisodeStatus,
+    has_table,
+    mode_index,
+)
+from physx_core.dataset.store.failure_file import FailedEpisode
+from physx_core.dataset.store.manifest import Manifest, Mode
+from physx_core.dataset.store.manifest_store import ManifestStore
+from physx_core.errors import ConfigError, DatasetError, UsageError
+from physx_core.fields import Field
+from physx_core.rows import check_names
+from physx_core.typing import Batch
+
+
+@dataclass(frozen=True, kw_only=True)
+class EpisodeRecord:
+    """What is recorded of an episode, or of a range of them, with rows that are stored at once.
+
+    Attributes:
+        episode: Its number in the campaign, counted from 0; the first one of a range.
+        rows: How many of the rows are its own.
+        campaign: Number of the campaign in the mode, counted from 0.
+        count: Number of episodes, of one row each and without parameters, in order.
+        part: Which part of the episode the rows are, counted from 0. Part 0 begins it anew; what
+            was recorded before stays until the last part is recorded.
+        status: ``FINISHED``, ``CUT``, ``FAILED`` (without rows), or ``MORE`` if parts follow.
+        seconds: What it cost, in s.
+        parameters: Values of the environment's parameters by name.
+        reason: Why it failed.
+    """
+
+    episode: int
+    rows: int
+    campaign: int = 0
+    count: int = 1
+    part: int = 0
+    status: EpisodeStatus = EpisodeStatus.FINISHED
+    seconds: float = 0.0
+    parameters: Mapping[str, Any] = field(default_factory=dict)
+    reason: str = ""
+
+    def __post_init__(self) -> None:
+        """Check the values, and store the numbers as declared.
+
+        Raises:
+            ConfigError: If a number is of another type, or they contradict one another.
+        """
+        store_declared("EpisodeRecord.", self)
+        least = min(self.episode, self.rows, self.campaign, self.part, self.count - 1)
+        several = self.count == 1 or (
+            self.rows == self.count
+            and not self.part
+            and not self.parameters
+            and self.status is EpisodeStatus.FINISHED
+        )
+        failed = self.status is not EpisodeStatus.FAILED or not self.rows
+        known = isinstance(self.status, EpisodeStatus) and self.status is not EpisodeStatus.STREAM
+        most = max(self.episode + self.count, self.rows, self.campaign, self.part)
+        if least < 0 or most >= OPEN or not (several and failed and known):
+            raise ConfigError(f"There can be no such episode: {self}.")
+
+
+class Storing(Protocol):
+    """Stores rows; implemented by the dataset's writer.
+
+    Attributes:
+        store: The manifest.
+    """
+
+    store: ManifestStore
+
+    def append(self, mode_name: str, rows: Batch, count: int) -> None:
+        """Store and commit rows."""
+
+    def sync(self, mode_name: str) -> None:
+        """Wait until all rows of a mode are on the disk."""
+
+    def note_path(self, path: Path) -> None:
+        """Have a file on the disk soon."""
+
+
+class Recorder:
+    """Writes records, and those of streams before and after episodes.
+
+    Attributes:
+        recorded: Modes in which the next rows count only with a record.
+    """
+
+    def __init__(self, writer: Storing, reader: Reader) -> None:
+        """Start without records; call `load` if there may be some."""
+        self.recorded: set[str] = set()
+        self._writer, self._reader = writer, reader
+        self._streams: dict[str, tuple[int, int]] = {}  # campaign and first row of open ones
+        self._campaigns: dict[str, int] = {}  # the last one
+        self._parts: dict[tuple[str, int, int], int] = {}  # the next one of unfinished episodes
+
+    def load(self) -> None:
+        """Look at the records that there are; unfinished episodes that lack rows begin anew.
+
+        Raises:
+            DatasetError: If the table of episodes cannot be read.
+        """
+        if not has_table(self.manifest):
+            return
+        total = self._reader.stored_rows(EPISODES)
+        columns = [self._reader.read(EPISODES, f.name, 0, total).tolist() for f in _OWN]
+        places = {mode: Addresses(self.manifest.modes.get(mode, Mode({}))) for mode in MODES}
+        for about, campaign, episode, first, rows, part, status in zip(*columns, strict=True):
+            if 0 <= about < len(MODES):
+                mode = MODES[about]
+                self._note(mode, campaign, episode, first, rows, part, status)
+                if status == EpisodeStatus.MORE and not places[mode].has_all(first, rows):
+                    self._parts.pop((mode, campaign, episode), None)
+
+    def append(
+        self, mode: str, rows: Batch, count: int, episodes: Sequence[EpisodeRecord], table: Batch
+    ) -> None:
+        """Store rows and then the records that commit them.
+
+        Args:
+            mode: Name of a mode whose fields all have shapes.
+            rows: Field name to checked rows.
+            count: Number of rows.
+            episodes: The records.
+            table: Their rows in the table, checked, but for the first rows.
+        """
+        self._end_stream(mode)
+        if count:
+            self.recorded.discard(mode)
+            try:
+                self._writer.append(mode, rows, count)
+            finally:
+                self.recorded.add(mode)
+            first = _first_of_last(self.manifest.modes[mode], count)
+            table["first_row"] = first + np.cumsum(table["rows"]) - table["rows"]
+        self.store_reasons(
+            FailedEpisode(mode, each.campaign, each.episode, each.reason)
+            for each in episodes
+            if each.status is EpisodeStatus.FAILED
+        )
+        self._writer.append(EPISODES, table, len(episodes))
+        for each, at in zip(episodes, table["first_row"].tolist(), strict=True):
+            self._note(mode, each.campaign, each.episode, at, each.rows, each.part, each.status)
+
+    def store_reasons(self, failures: Iterable[FailedEpisode]) -> None:
+        """Store why episodes failed."""
+        new, directory = list(failures), self._writer.store.directory
+        if new:
+            with files.storing("The reasons of failed episodes"), self._writer.store.syncing():
+                failure_file.append(directory, new)
+                self._writer.note_path(directory / failure_file.FILE)
+
+    def check(self, mode: str, episodes: Iterable[EpisodeRecord]) -> None:
+        """Check that the parts of each episode follow one another.
+
+        Raises:
+            UsageError: If not.
+        """
+        parts = dict(self._parts)
+        for each in episodes:
+            key = mode, each.campaign, each.episode
+            if each.part and parts.get(key) != each.part:
+                raise UsageError(
+                    f"Part {each.part} of episode {each.episode} cannot be stored: the next one "
+                    f"is {parts.get(key, 0)}."
+                )
+            parts[key] = each.part + 1 if each.status is EpisodeStatus.MORE else 0
+
+    def begin_stream(self, mode: str) -> None:
+        """Let the next rows of a mode with records count without records of their own.
+
+        Raises:
+            UsageError: If the dataset is shared.
+        """
+        if self._writer.store.shared:
+            raise UsageError(
+                f'Mode "{mode}" holds episodes, to which only a dataset\'s sole writer can add '
+                "rows: open it without shared=True."
+            )
+        known = self.manifest.modes[mode]
+        first = max(Addresses(known).end, known.recorded)
+        self._store_stream(mode, self._campaigns[mode] + 1, first, OPEN)
+
+    @property
+    def manifest(self) -> Manifest:
+        """The dataset's contents."""
+        return self._writer.store.manifest
+
+    def has_records(self, mode: str) -> bool:
+        """Return whether there are records about a mode."""
+        return mode in self._campaigns
+
+    def next_campaign(self, mode: str) -> int:
+        """Return the number of the campaign after all rows of a mode."""
+        known = self.manifest.modes.get(mode)
+        has_rows = known is not None and known.rows > 0
+        return self._campaigns[mode] + 1 if mode in self._campaigns else int(has_rows)
+
+    def ended_stream(self, mode: str) -> tuple[int, int, int] | None:
+        """Return what ends the stream that takes a mode's rows: campaign, first row, and rows.
+
+        None if no stream takes them.
+        """
+        if mode in self.recorded:
+            return None
+        campaign, first = self._streams.get(mode, (0, 0))
+        known = self.manifest.modes.get(mode)
+        end = 0 if known is None else Addresses(known).end
+        return campaign, first, max(0, end - first)
+
+    def _end_stream(self, mode: str) -> None:
+        """Let the next rows of a mode count only with a record."""
+        if (stream := self.ended_stream(mode)) is not None:
+            self._store_stream(mode, *stream)
+
+    def _store_stream(self, mode: str, campaign: int, first: int, rows: int) -> None:
+        """Store the record of a stream and wait until it is on the disk."""
+        fields = self.manifest.modes[EPISODES].fields
+        self._writer.append(EPISODES, stream_record(fields, mode, campaign, first, rows), 1)
+        self._writer.sync(EPISODES)
+        self._note(mode, campaign, -1, first, rows, 0, EpisodeStatus.STREAM)
+
+    def _note(
+        self, mode: str, campaign: int, episode: int, first: int, rows: int, part: int, status: int
+    ) -> None:
+        """Take note of a record."""
+        self._campaigns[mode] = max(campaign, self._campaigns.get(mode, 0))
+        known = self.manifest.modes.get(mode)
+        is_open = status == EpisodeStatus.STREAM and rows == OPEN
+        if known is not None:
+            known.recorded = max(known.recorded, first + (0 if is_open else rows))
+        if status == EpisodeStatus.STREAM:
+            self._streams.pop(mode, None)
+            self.recorded.add(mode)
+            if is_open:
+                self._streams[mode] = campaign, first
+                self.recorded.discard(mode)
+            return
+        key = mode, campaign, episode
+        before = self._parts.pop(key, 0)
+        if status == EpisodeStatus.MORE and part in (0, before):
+            self._parts[key] = part + 1
+
+
+_OWN = [
+    next(field for field in TABLE_FIELDS if field.name == name)
+    for name in ("mode_index", "campaign", "episode", "first_row", "rows", "part", "status")
+]
+
+
+def table_rows(
+    mode: str, fields: Mapping[str, Field], episodes: Sequence[EpisodeRecord]
+) -> dict[str, Any]:
+    """Return the rows of the table for records, not yet checked and without their first rows.
+
+    Args:
+        mode: Name of the mode they speak of.
+        fields: The fields of the table.
+        episodes: The records.
+    """
+    own = [field.name for field in TABLE_FIELDS]
+    parameters = {name: field for name, field in fields.items() if name not in own}
+    for each in episodes:
+        if each.parameters or parameters:
+            check_names(parameters, each.parameters)
+    fixed = {"mode_index": mode_index(mode), "first_row": 0}
+    found: dict[str, Any] = {
+        name: np.array([fixed.get(name, getattr(each, name, 0)) for each in episodes], of.dtype)
+        for name, of in fields.items()
+        if name in own
+    }
+    return found | {name: [each.parameters[name] for each in episodes] for name in parameters}
+
+
+def stream_record(
+    fields: Mapping[str, Field], mode: str, campaign: int, first: int, rows: int
+) -> Batch:
+    """Return the row of the table for a stream."""
+    values = {
+        "mode_index": mode_index(mode),
+        "campaign": campaign,
+        "episode": -1,
+        "count": 1,
+        "first_row": first,
+        "rows": rows,
+        "status": EpisodeStatus.STREAM,
+    }
+    return {
+        name: np.full((1, *(field.shape or ())), values.get(name, 0), field.dtype)
+        for name, field in fields.items()
+    }
+
+
+def _first_of_last(mode: Mode, count: int) -> int:
+    """Return the address of the first one of the last `count` rows."""
+    last = mode.partitions[-1]
+    first = last.first_row + last.rows - count
+    if first < last.first_row and not Addresses(mode).has_all(first, count):
+        raise DatasetError(
+            "Episodes could not be stored in one piece because removed partitions are left over. "
+            "Store them again."
+        )
+    return first
