@@ -42,6 +42,7 @@ docs: .venv/tools
 bench: .venv/packages
 	$(BIN)/python benchmarks/calls.py
 	$(BIN)/python benchmarks/generation.py
+	$(BIN)/python benchmarks/campaign.py
 	$(BIN)/python benchmarks/training.py
 	$(BIN)/python benchmarks/prediction.py
 	$(BIN)/python benchmarks/transport.py

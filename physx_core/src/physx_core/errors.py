@@ -217,6 +217,25 @@ class NotFiniteError(SampleError):
     """A value contains NaN or infinity."""
 
 
+class FailedEpisodesError(PhysxError):
+    """Too many independent episodes failed.
+
+    Attributes:
+        failed: How many have failed in this run.
+        episode: Number of the last one.
+    """
+
+    def __init__(self, failed: int, episode: int, reason: str) -> None:
+        self.failed, self.episode = failed, episode
+        first, _, rest = reason.partition("\n")
+        count = "An episode" if failed == 1 else f"{failed} episodes"
+        super().__init__(
+            f"{count} failed, the last one number {episode}: {first} What has been simulated is "
+            "stored. To go on with the others: --resume, and --max-failed for more failures."
+            + (f"\n{rest}" if rest else "")
+        )
+
+
 class WrongSamplesError(SampleError):
     """`check_sample` rejected more consecutive samples than the configuration allows."""
 

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from physx_core.cli.output import show, show_table, width
-from physx_core.dataset import Dataset
+from physx_core.dataset import EPISODES, Dataset, EpisodeStatus, RecordedEpisodes
 from physx_core.dataset.read.episodes import episode_lengths
 from physx_core.errors import DatasetError
 from physx_core.statistics import Normalization
@@ -92,19 +92,34 @@ def _print_mode(dataset: Dataset, mode: str, rows: Sequence[dict[str, Any]]) -> 
         ],
         indent=2,
     )
-    if stored:
+    if stored and mode != EPISODES:
         _print_normalization(dataset, mode)
 
 
 def _print_episodes(dataset: Dataset, mode: str, samples: int) -> None:
     view = dataset[mode]
-    if "step" not in view and "episode" not in view:
+    if mode == EPISODES or ("step" not in view and "episode" not in view):
         return
+    recorded = dataset.recorded_episodes(mode)
+    if recorded is not None:
+        _print_recorded(recorded)
     lengths, instances = episode_lengths(view, samples)
     least, most = lengths.min(), lengths.max()
     steps = f"{least:,}" if least == most else f"{least:,} to {most:,}"
     of = count(instances, "instance")
     show(f"  trajectories: {len(lengths):,} of {of}, {steps} samples each")
+
+
+def _print_recorded(episodes: RecordedEpisodes) -> None:
+    """Print how the independent episodes of each campaign ended."""
+    for campaign in np.unique(episodes.campaign[episodes.episode >= 0]).tolist():
+        chosen = episodes.campaign == campaign
+        ends = {
+            status.name.lower(): int(episodes.numbers[chosen & (episodes.status == status)].sum())
+            for status in (EpisodeStatus.FINISHED, EpisodeStatus.FAILED, EpisodeStatus.CUT)
+        }
+        counts = ", ".join(f"{number:,} {name}" for name, number in ends.items() if number)
+        show(f"  independent episodes of campaign {campaign}: {counts}")
 
 
 def _print_normalization(dataset: Dataset, mode: str) -> None:

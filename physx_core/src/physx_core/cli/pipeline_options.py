@@ -22,6 +22,7 @@ from physx_core.cli.arguments import argument_registry, take_changes
 from physx_core.config import configuration_in, from_plain, read_toml, set_option
 from physx_core.errors import ConfigFileError, UnknownOptionError, UsageError, listed
 from physx_core.pipelines.pipeline import Pipeline
+from physx_core.session import Session
 
 P = TypeVar("P", bound=Pipeline)
 
@@ -126,6 +127,23 @@ def take_session(words: Sequence[str]) -> tuple[Path | None, list[str]]:
     folder = folder if folder.name not in ("", "..") else folder.resolve()
     named = ["--session-dir", str(folder.parent), "--session-name", folder.name]
     return folder, [*words[1:], *named]
+
+
+def resumed(words: Sequence[str]) -> list[str]:
+    """Return the words of a command that resumes the session that the first of them names.
+
+    Args:
+        words: The words after the command, one of which is ``--resume``.
+
+    Raises:
+        SessionError: If the session does not exist.
+    """
+    session, words = take_session(words)
+    if session is None:
+        return list(words)
+    Session.existing(session.parent, session.name)
+    given = [] if "--config" in words else ["--config", str(session)]
+    return [*given, *words]
 
 
 def _take_file(make: type[Pipeline], words: list[str]) -> tuple[dict[str, Any], list[str]]:

@@ -170,6 +170,7 @@ class Environment(Closeable):
         self._has_begun_episodes = False
         self._episode_is_over = True  # there is no episode that a step can continue
         self._earlier_steps = 0  # of the episodes before this one
+        self._numbering = instance_id - 1, instance_nb  # of episodes: the first, and the distance
         self._replayed: tuple[int, dict[str, Any]] | None = None  # index of a set, and its values
 
     # What a subclass implements -------------------------------------------------------------
@@ -443,7 +444,8 @@ class Environment(Closeable):
         if self._replayed is not None:
             self.reset_parameters(**self._replayed[1])
             return
-        number = self.episode_index * self.instance_nb + self.instance_id - 1
+        first, distance = self._numbering
+        number = first + self.episode_index * distance
         values: Mapping[str, Any] = {}
         if self._defined_parameters and self._choose_parameters is not None:
             values = self._choose_parameters(self.episode_index)

@@ -98,6 +98,10 @@ class Kind(enum.IntEnum):
     """Server: order to stop generating and seal the last partition [total rows to keep]."""
     SEALED = 37
     """Client: a partition is sealed; its checksums and statistics [its number]."""
+    LEASE = 38
+    """Server: numbers of episodes to simulate, with their parameters [how many]."""
+    EPISODES = 39
+    """Client: what became of episodes, after their rows [number of these rows]."""
 
 
 _KINDS = {int(kind): kind for kind in Kind}

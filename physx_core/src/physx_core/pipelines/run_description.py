@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 
 from physx_core.config import SETS, EnvironmentConfig, to_plain
-from physx_core.dataset import Dataset
+from physx_core.dataset import EPISODES, Dataset
 from physx_core.errors import PhysxError
 from physx_core.pipelines.learning.learner import Learner
 from physx_core.sources.source import Source
@@ -59,7 +59,8 @@ def describe_samples(directory: Path) -> str:
     """Return a line with the number of samples of each mode of a dataset."""
     try:
         with Dataset.open(directory) as dataset:
-            counts = [f"{dataset.num_samples(mode):,} {mode}" for mode in dataset.modes]
+            modes = [mode for mode in dataset.modes if mode != EPISODES]
+            counts = [f"{dataset.num_samples(mode):,} {mode}" for mode in modes]
     except PhysxError as error:  # the run's own error matters more
         return f"samples: {error}"
     return f"samples: {', '.join(counts) or 'none'} in {directory}"

@@ -167,6 +167,22 @@ def check_client_writers(config: EnvironmentConfig) -> None:
         )
 
 
+def check_episodes(config: EnvironmentConfig, dataset_config: DatasetConfig) -> None:
+    """Check that a data generation of independent episodes has no options of streams."""
+    reject_client_writers(dataset_config, "a generation of independent episodes")
+    advice = {
+        "redraw": "use max_failed",
+        "restarts": "lost clients are replaced; DataGeneration.retries is for their episodes",
+        "record_wrong_samples": "rejected samples of episodes are not kept",
+    }
+    for option, instead in advice.items():
+        if getattr(config, option):
+            raise ConfigError(
+                f"EnvironmentConfig.{option} is for streams, not for episodes: leave it out "
+                f"({instead})."
+            )
+
+
 def reject_client_writers(config: DatasetConfig, what: str) -> None:
     """Reject the option that clients write their own rows if the run itself needs the rows."""
     if config.writers != "server":

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 from physx_core.dataset import Dataset
 from physx_core.errors import DatasetError, listed
 from physx_core.pipelines.storage import other_samples
-from physx_core.pipelines.stored_sets import StoredSets, has_sets
+from physx_core.pipelines.stored_sets import find_sets
 from physx_core.typing import Batch
 
 _AHEAD = 1 << 22
@@ -48,7 +48,7 @@ class StoredRows:
                 f"{other_samples(dataset.directory, mode)}"
             )
         self._view = dataset[mode]
-        self._sets = StoredSets(dataset, mode) if has_sets(dataset, mode) else None
+        self._sets = find_sets(dataset, mode)
         self._rows = np.arange(dataset.num_samples(mode)) if rows is None else rows
         self.count = len(self._rows)
         self._random = random

@@ -1,4 +1,4 @@
-"""StoredSets: the sets of parameters that stored rows were generated with."""
+"""Finds the sets of parameters that stored rows were generated with."""
 
 from __future__ import annotations
 
@@ -6,7 +6,13 @@ import numpy as np
 
 from physx_core.components.parameter import SET_FIELDS
 from physx_core.config import MODES, SETS
-from physx_core.dataset import Dataset
+from physx_core.dataset import (
+    EPISODES,
+    TABLE_FIELDS,
+    Dataset,
+    EpisodeStatus,
+    RecordedEpisodes,
+)
 from physx_core.errors import DatasetError
 from physx_core.typing import Array, Batch, Index
 from physx_core.workers.instance import PARAMETER, SET
@@ -77,11 +83,52 @@ class StoredSets:
 _OWN = {field.name for field in SET_FIELDS}
 
 
-def has_sets(dataset: Dataset, mode: str) -> bool:
-    """Return whether a dataset records the parameters that a mode's rows were generated with."""
-    if mode not in MODES or not dataset.num_samples(SETS):
-        return False
-    return bool((dataset[SETS]["mode_index"][:] == MODES.index(mode)).any())
+class RecordedSets:
+    """Finds the set of each row of an independent episode in the table of episodes."""
+
+    def __init__(self, dataset: Dataset, mode: str, episodes: RecordedEpisodes) -> None:
+        """Read the parameters.
+
+        Args:
+            dataset: Contains the rows and the table.
+            mode: The rows' mode.
+            episodes: The episodes of this mode.
+        """
+        view = dataset[EPISODES]
+        own = {field.name for field in TABLE_FIELDS}
+        self._episodes = episodes
+        self._values = {name: view[name][:] for name in dataset.fields(EPISODES) if name not in own}
+        stream = view["status"][:] == EpisodeStatus.STREAM
+        places = np.flatnonzero((view["mode_index"][:] == MODES.index(mode)) & ~stream)[::-1]
+        campaign, episode = (view[name][:][places] for name in ("campaign", "episode"))
+        self._base = int(episode.max(initial=0)) + 1
+        self._known, newest = np.unique(campaign * self._base + episode, return_index=True)
+        self._places = places[newest]
+
+    def of(self, index: Index, rows: Batch) -> Batch:
+        """Return the parameters of some rows: see `StoredSets.of`."""
+        known = self._episodes
+        entry = np.searchsorted(known.first, index, "right") - 1
+        keys = known.campaign[entry] * self._base + known.episode[entry]
+        found = np.minimum(np.searchsorted(self._known, keys), len(self._known) - 1)
+        places = self._places[found]
+        is_known = (self._known[found] == keys) & (known.status[entry] != EpisodeStatus.STREAM)
+        values = {PARAMETER + name: values[places] for name, values in self._values.items()}
+        return {SET: np.where(is_known, places, -1), **values}
+
+
+def find_sets(dataset: Dataset, mode: str) -> StoredSets | RecordedSets | None:
+    """Return what finds the parameters of a mode's rows; None if a dataset records none."""
+    if mode not in MODES:
+        return None
+    episodes = dataset.recorded_episodes(mode)
+    if episodes is not None:
+        has_parameters = len(dataset.fields(EPISODES)) > len(TABLE_FIELDS)
+        return RecordedSets(dataset, mode, episodes) if has_parameters else None
+    if not dataset.num_samples(SETS):
+        return None
+    is_about = dataset[SETS]["mode_index"][:] == MODES.index(mode)
+    return StoredSets(dataset, mode) if is_about.any() else None
 
 
 def _runs(first: Index, order: Array, count: int) -> Index:

@@ -167,6 +167,7 @@ class Instance(Closeable):
         self._first_step, self._next_episode = first_step, first_episode
         self._rows = 0  # of this episode
         self._counts = False  # whether rows are counted, or must be read
+        self._is_numbered = False  # whether `begin` begins each episode
         self._simulate: Callable[[], Any] = self._alive
         self._draws = False
         self._runner: Any = None
@@ -277,8 +278,32 @@ class Instance(Closeable):
             )
         environment.independent_episodes = True
 
+    def begin(self, number: int) -> None:
+        """Begin an episode of a campaign, whatever this instance has simulated before.
+
+        Args:
+            number: Its number, from which its parameters and its random stream follow.
+
+        Raises:
+            UsageError: If the environment's episodes are not independent.
+            PhysxError: If the environment fails.
+        """
+        environment = self._alive()
+        if not environment.independent_episodes:
+            raise UsageError(
+                f"{type(environment).__name__} is a stream, which has no episodes to count: set "
+                "episode_steps, or independent_episodes = True and call end_episode(), or give "
+                "batch_nb and batch_size instead of episodes."
+            )
+        self._is_numbered, environment._numbering = True, (0, 1)
+        self._counts = self._episode_steps is not None
+        self._next_episode, environment._episode_is_over = number, True
+        self._begin_episode(environment)
+
     def step(self, stored: Sample | None = None) -> dict[str, Any]:
         """Simulate until `check_sample` accepts a sample; return it without further checks.
+
+        After the end of an episode that `begin` has begun, return an empty dictionary.
 
         Args:
             stored: A stored row for the environment to replay, or None. If the parameters that it
@@ -293,8 +318,9 @@ class Instance(Closeable):
             EnvironmentFailedError: If the environment raises.
         """
         environment = self.environment or self._alive()
-        if stored is not environment._sample or environment._episode_is_over:
-            self._prepare(environment, stored)
+        is_new = stored is not environment._sample or environment._episode_is_over
+        if is_new and not self._prepare(environment, stored):
+            return {}
         wrong = empty = 0
         while True:
             method = "step"
@@ -322,8 +348,8 @@ class Instance(Closeable):
                     return sample
                 wrong += 1
                 self._reject(sample, wrong)
-            if environment._episode_is_over:
-                self._prepare(environment, stored)
+            if environment._episode_is_over and not self._prepare(environment, stored):
+                return {}
 
     def apply(self, prediction: Sample) -> None:
         """Pass a prediction in physical units to the environment.
@@ -350,16 +376,26 @@ class Instance(Closeable):
                 self._runner.close()
                 self._runner = None
 
-    def _prepare(self, environment: Environment, stored: Sample | None) -> None:
-        """Give the environment a stored row and its parameters, and begin its first episode."""
+    def _prepare(self, environment: Environment, stored: Sample | None) -> bool:
+        """Give the environment a stored row and its parameters, or begin its next episode.
+
+        Returns:
+            Whether there is an episode to go on with; if not, `begin` begins the next one.
+        """
         environment.sample = stored
         if stored is not None and SET in stored:
             self._replay(environment, stored)
-        self._counts = stored is not None or self._episode_steps is not None
         if environment._episode_is_over:
-            self._rows = 0
-            self._call("reset_parameters", environment.begin_episode, self._next_episode)
-            self._next_episode = environment.episode_index + 1
+            if self._is_numbered:
+                return False
+            self._begin_episode(environment)
+        self._counts = stored is not None or self._episode_steps is not None
+        return True
+
+    def _begin_episode(self, environment: Environment) -> None:
+        self._rows = 0
+        self._call("reset_parameters", environment.begin_episode, self._next_episode)
+        self._next_episode = environment.episode_index + 1
 
     def _replay(self, environment: Environment, stored: Sample) -> None:
         """Give the environment a stored row, and the parameters that it was generated with."""
@@ -432,9 +468,11 @@ class Instance(Closeable):
 
     def _failure(self, method: str, error: Exception) -> Exception:
         """Return the error to raise: physx errors get a note, others are wrapped."""
-        step = self.environment._step_count if self.environment is not None else -1
-        if method not in _STEPPING:
+        environment = self.environment
+        if environment is None or method not in _STEPPING:
             step = -1
+        else:
+            step = environment.step_index if self._is_numbered else environment._step_count
         if isinstance(error, PhysxError):
             if method != "import":
                 error.add_note(f"in {method}() of instance {self.instance_id}")

@@ -222,6 +222,14 @@ class ParameterSets:
         batch = bisect_right(range(end), row, key=needed)
         return max(0, batch - sampler.delay)
 
+    def values_of(self, number: int) -> dict[str, Any]:
+        """Return the values of the parameters for an episode of a campaign; empty without any.
+
+        Raises:
+            ConfigError: If the sampler fails, or what it chooses does not fit the parameters.
+        """
+        return self._ask(number, 0) if self.parameters else {}
+
     def choose(self, instance_id: int, episode: int, row: int) -> dict[str, Any]:
         """Return the values of the parameters for an episode of an instance.
 

@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from physx_core.cli.pipeline_options import pipeline_from, take_session
+from physx_core.cli.pipeline_options import pipeline_from, resumed
 from physx_core.pipelines.training import Training
-from physx_core.session import Session
 
 
 def run(words: Sequence[str]) -> None:
@@ -15,11 +14,7 @@ def run(words: Sequence[str]) -> None:
     With ``--resume``, the first word is a session instead; its ``config.toml`` gives the options.
     """
     if "--resume" in words and "--session-name" not in words:
-        session, words = take_session(words)
-        if session is not None:
-            Session.existing(session.parent, session.name)
-            given = [] if "--config" in words else ["--config", str(session)]
-            words = [*given, *words]
+        words = resumed(words)
     pipeline_from(
         Training,
         "train",

@@ -7,7 +7,7 @@ import os
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from physx_core.components.scene.event import Event
 from physx_core.errors import PhysxError
@@ -23,6 +23,9 @@ from physx_core.workers.client.link import RunEnded, ServerGone, WorkerLink
 from physx_core.workers.client.producer import Producer
 from physx_core.workers.client.row_sinks import RowSink, SentRows
 from physx_core.workers.instance import Instance
+
+if TYPE_CHECKING:
+    from physx_core.workers.client.episode_producer import EpisodeProducer
 
 
 def run_client(
@@ -98,7 +101,10 @@ def run_instance(
         + (f"; {again} stored rows are generated again" if again else "")
     )
     link.spins = has_core_for_each(setup["instance_nb"])
+    is_campaign = setup.pop("campaign", False)
     client = _Client(link, Instance(**setup), sink, skip.pop("shown"), skip)
+    if is_campaign:
+        client.lease()
     try:
         client.live(draw)
     finally:
@@ -142,18 +148,28 @@ class _Client:
         self._link, self._instance, self._sink = link, instance, sink
         self._producer = Producer(link, instance, sink, **skip)
         self._services = RemoteServices(link, self._producer, shown)
+        self._leased: EpisodeProducer | None = None
+
+    def lease(self) -> None:
+        """Simulate the episodes that the server leases, instead of a stream."""
+        # Importing datasets takes a quarter of a client's start time, and streams need none.
+        from physx_core.workers.client.episode_producer import EpisodeProducer
+
+        self._leased = EpisodeProducer(self._link, self._instance)
 
     def live(self, draw: bool) -> None:
         """Open the environment and generate rows until the run ends or the environment fails."""
         try:
             self._producer.open()
-            self._instance.open(self._services, draw, self._services.choose)
+            leased = self._leased
+            choose = self._services.choose if leased is None else leased.choose
+            self._instance.open(self._services, draw, choose)
             parameters = [parameter.to_dict() for parameter in self._instance.parameters]
             if parameters:
                 self._link.send(pack(Kind.PARAMETERS, encode(parameters)))
             fields = [field.to_dict() for field in self._instance.fields]
             self._link.send(pack(Kind.READY, encode(fields)))
-            self._producer.run()
+            (leased or self._producer).run()
         except RunEnded as end:
             self.is_forsaken = isinstance(end, ServerGone)
             if self._producer.failure is not None:

@@ -32,6 +32,7 @@ from physx_core.workers.launchers import describe_states, stop
 from physx_core.workers.parameter_sets import ParameterSets, next_step
 from physx_core.workers.server.client_errors import exit_error, timeout_error
 from physx_core.workers.server.client_pool import ClientPool
+from physx_core.workers.server.leases import Leases
 from physx_core.workers.server.pace import Laggards
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.server import Server
@@ -66,6 +67,7 @@ class ClientGroup:
         skip: Skip = NOTHING,
         total: int | None = None,
         written: WrittenRows | None = None,
+        leases: Leases | None = None,
         transport: Transport = SOCKETS,
     ) -> None:
         """Store the arguments; `open` starts the clients.
@@ -79,10 +81,11 @@ class ClientGroup:
             skip: What an earlier run already got: clients generate it again, but do not send it.
             total: Number of rows of the whole run, including those to skip; None: unknown.
             written: Counts the rows that the clients write themselves; None: they send them.
+            leases: Gives clients the episodes of a campaign; None: each runs a stream.
             transport: What connects the clients, and the clock that the run follows.
         """
         self._clock = transport.clock
-        self._written = written
+        self._written, self._leases = written, leases
         self.config = config
         self._seed, self._sets = list(seed), sets
         self._accepts_all, self._skip = accept_all, skip
@@ -101,9 +104,12 @@ class ClientGroup:
         self._queued: dict[int, float] = {}
         self._exits: dict[int, float] = {}
         self._restarts: Counter[int] = Counter()
+        self._idle_losses = 0
         self._checked = self._served = self._said = self._began = self._looked = 0.0
         self._closing = False
         self._host: str | None = None
+        special = written or leases
+        dispatch = {} if special is None else special.dispatch
         self.server = Server(
             config.ip_address,
             config.port,
@@ -116,7 +122,7 @@ class ClientGroup:
             1e9 * config.journal_size,
             skip,
             self._pool,
-            written,
+            dispatch,
             transport,
         )
 
@@ -153,10 +159,14 @@ class ClientGroup:
         Args:
             missing: Returns the instances to wait for; called after each round.
         """
-        began = self._began = self._clock.monotonic()
-        if began - self._served > _BUSY:  # what arrived meanwhile may have waited to be read
+        began = self._clock.monotonic()
+        was_busy = began - self._served > _BUSY
+        if was_busy:  # what arrived meanwhile may have waited to be read
             for each in self.server.peers.values():
                 each.pace.leave_out()
+        if self._leases is not None and not was_busy:
+            began = self._began  # others' episodes end this wait, but not that for a silent client
+        self._began = began
         if began - self._served > _TICK / 10:
             self._serve(0.0)
         while waited := missing():
@@ -357,6 +367,8 @@ class ClientGroup:
 
     def _replaces(self, number: int, error: PhysxError | None) -> bool:
         """Return whether another client replaces one that failed, or left without an error."""
+        if self._leases is not None:
+            return False  # it does not go on where the other one ended
         if self._given_up(number):  # the next one can only start with other parameters
             return not isinstance(error, ClientError) and self._redraws_after(number, error)
         if error is None and (self._is_by_hand or self.config.redraw or self._pool is not None):
@@ -392,6 +404,9 @@ class ClientGroup:
         """
         if self._pool is not None and self._pool.is_lost(number):
             return  # noticed while its error was being determined
+        if self._leases is not None:
+            self._lose_leased(number, error, self._leases)
+            return
         absent = self._is_by_hand and self._pool is None and self._find_peer(number) is None
         if absent or not self._replaces(number, None if left else error):
             self._sets.fail(number, self._episode(number), error)
@@ -405,6 +420,24 @@ class ClientGroup:
         _LOG.warning("%s. %s%s", text.rstrip("."), follows, details and "\n" + details)
         closes = not isinstance(error, ClientError)  # which takes a moment
         self._replace(number, self._handles.pop(number, None), _GRACE if closes else 0.0)
+
+    def _lose_leased(self, number: int, error: PhysxError, leases: Leases) -> None:
+        """Start another client for a lost one of a campaign; others get its episodes, too."""
+        peer = self._find_peer(number)
+        if peer is None or not peer.fields or not isinstance(error, ClientError):
+            raise error  # its environment was not ready, so the next one may end likewise
+        held = number in leases.holders
+        self._idle_losses += not held
+        if self._idle_losses > len(self._numbers):
+            raise error
+        text, _, details = str(error).partition("\n")
+        failed = leases.lose(number)
+        follows = "Its episode is simulated once more." if held else "It had no episode."
+        if failed is not None:
+            leases.fail(failed, text)
+            follows = f"Episode {failed} has failed."
+        _LOG.warning("%s. %s%s", text.rstrip("."), follows, details and "\n" + details)
+        self._replace(number, self._handles.pop(number, None))
 
     def _replace(self, number: int, former: ClientHandle | None, patience: float = 0.0) -> None:
         """End an instance's former client, and start another one in its place."""
@@ -525,6 +558,9 @@ class ClientGroup:
         first: dict[str, Any] = {"first_step": origin.step, "first_episode": origin.episode}
         if self._written is not None:
             first["stripes"] = self._written.describe(peer)
+        if self._leases is not None:
+            skip = dict.fromkeys(skip, 0)
+            first["campaign"] = True
         return self._encode(peer.instance_id, skip=skip, **first)
 
     def _encode(self, instance_id: int, **progress: Any) -> bytes:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import selectors
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping
+from types import MappingProxyType
 
 from physx_core.components.environment import Services
 from physx_core.errors import (
@@ -34,7 +35,6 @@ from physx_core.workers.server.validation import (
     parse_fields,
     parse_parameters,
 )
-from physx_core.workers.server.written_rows import WrittenRows
 from physx_core.workers.tickets import is_ticket
 
 _HANDSHAKE_TIME = 5.0
@@ -66,7 +66,7 @@ class Server:
         journal_size: float,
         skip: Skip = NOTHING,
         pool: ClientPool | None = None,
-        written: WrittenRows | None = None,
+        dispatch: Mapping[Kind, Callable[[Peer, Frame], None]] = MappingProxyType({}),
         transport: Transport = SOCKETS,
     ) -> None:
         """Store the arguments; `open` starts listening.
@@ -84,7 +84,8 @@ class Server:
             journal_size: Largest size in bytes of an instance's journal.
             skip: What an earlier run already got from the instances.
             pool: The clients, if they run workers for several instances; None: each runs one.
-            written: Counts the rows that the clients write themselves; None: they send them.
+            dispatch: Handles the messages about rows, by their kind, if clients do not just send
+                rows of streams.
             transport: What connects the clients, and the clock that the server follows.
         """
         self.peers: dict[int, Peer] = {}
@@ -112,7 +113,7 @@ class Server:
             Kind.BYE: self._take_bye,
             Kind.AGAIN: _take_again,
             **dict.fromkeys(_REQUESTS, self._requests.take),
-            **({Kind.ROWS: _take_rows} if written is None else written.dispatch),
+            **(dispatch or {Kind.ROWS: _take_rows}),
         }
 
     def open(self, host: str | None = None) -> None:

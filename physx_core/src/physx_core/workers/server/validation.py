@@ -182,6 +182,16 @@ def check_rows(block: Batch, fields: Sequence[Field], instance_id: int, last_ste
         raise ConnectionRefusedByPeerError("It sent rows of another instance.")
     if steps[0] <= last_step or (several and (steps[1:] <= steps[:-1]).any()):
         raise ConnectionRefusedByPeerError("It sent rows whose steps do not increase.")
+    check_values(block, fields, instance_id)
+    return int(steps[-1])
+
+
+def check_values(block: Batch, fields: Sequence[Field], instance_id: int) -> None:
+    """Check the values of received rows, as the client should have done before sending them.
+
+    Raises:
+        NotFiniteError: If one is NaN or infinity.
+    """
     for field in fields:
         values = block[field.name]
         kind = values.dtype.kind
@@ -191,5 +201,4 @@ def check_rows(block: Batch, fields: Sequence[Field], instance_id: int, last_ste
             )
         bad = first_not_finite(values) if kind in "fc" else None
         if bad is not None:
-            raise field.not_finite(instance_id=instance_id, step=int(steps[bad]))
-    return int(steps[-1])
+            raise field.not_finite(instance_id=instance_id, step=int(block["step"][bad]))

@@ -1,0 +1,77 @@
+"""EpisodeProducer: simulates the episodes that the server leases, and sends what became of them."""
+
+from __future__ import annotations
+
+from collections import deque
+from typing import Any
+
+from physx_core.dataset import EpisodeRecord, EpisodeStatus
+from physx_core.errors import ConnectionRefusedByPeerError
+from physx_core.net.frames import Frame, Kind, pack
+from physx_core.net.values import decode, encode
+from physx_core.workers.client.link import RunEnded, WorkerLink
+from physx_core.workers.episode_runner import EpisodeBlock, EpisodeRunner
+from physx_core.workers.instance import Instance
+from physx_core.workers.row_codec import pack_rows
+
+
+class EpisodeProducer:
+    """Runs an instance for a campaign."""
+
+    def __init__(self, link: WorkerLink, instance: Instance) -> None:
+        """Store what simulates the episodes and sends their rows."""
+        self._link, self._instance = link, instance
+        self._leased: deque[int] = deque()
+        self._values: dict[int, dict[str, Any]] = {}
+        self._announced = False
+
+    def choose(self, number: int) -> dict[str, Any]:
+        """Return the parameters of an episode, which came with its lease."""
+        return dict(self._values[number])
+
+    def run(self) -> None:
+        """Simulate episodes until the server ends the run."""
+        runner = EpisodeRunner(self._instance, self._take, self._link.clock)
+        while True:
+            block = runner.run()
+            if block.records:
+                self._send(block, runner)
+            while not (self._leased or runner.is_busy) or self._link.has_message():
+                self._obey(self._link.receive())
+
+    def _take(self) -> int | None:
+        return self._leased.popleft() if self._leased else None
+
+    def _send(self, block: EpisodeBlock, runner: EpisodeRunner) -> None:
+        count = len(block.rows.get("step", ()))
+        if count and not self._announced:
+            self._announced = True
+            table = [field.to_dict() for field in runner.fields]
+            self._link.send(pack(Kind.FIELDS, encode(table)))
+        if count:
+            self._link.send_parts(pack_rows(block.rows, count))
+        records = [_plain(record) for record in block.records]
+        self._link.send(pack(Kind.EPISODES, encode(records), count))
+        for record in block.records:
+            if record.status is not EpisodeStatus.MORE:
+                for number in range(record.episode, record.episode + record.count):
+                    self._values.pop(number, None)
+
+    def _obey(self, frame: Frame) -> None:
+        if frame.kind is Kind.LEASE:
+            leases = decode(frame.payload)
+            for number, values in leases:
+                self._leased.append(number)
+                self._values[number] = values
+        elif frame.kind is Kind.CLOSE:
+            raise RunEnded
+        elif frame.kind not in (Kind.ANSWER, Kind.REFUSAL):  # to an abandoned request
+            raise ConnectionRefusedByPeerError(
+                f"The server sent {frame.kind.name}, which only a client sends."
+            )
+
+
+def _plain(record: EpisodeRecord) -> tuple[int | float | str, ...]:
+    """Return what the server cannot know of an episode."""
+    numbers = record.episode, record.count, record.rows, record.part, int(record.status)
+    return (*numbers, record.seconds, record.reason)
