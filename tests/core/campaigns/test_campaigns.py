@@ -293,7 +293,7 @@ def test_another_campaign_has_other_rows():
         known = dataset.recorded_episodes("training")
         found = dataset["training"]["x"][:].tolist()
     assert sorted(set(known.campaign.tolist())) == [0, 1]
-    rows = [rows_of(number, [SEED, campaign]) for campaign in (0, 1) for number in range(5)]
+    rows = [rows_of(number, [SEED, 0, campaign]) for campaign in (0, 1) for number in range(5)]
     assert found == list(itertools.chain(*rows))
 
 
@@ -399,10 +399,12 @@ def test_elastic_clients_are_not_for_episodes():
         DataGeneration(config, episodes=3).execute()
 
 
-@pytest.mark.parametrize("option", [{"restarts": 1}, {"record_wrong_samples": True}])
-def test_options_of_streams_do_not_change_episodes(option):
-    generate("run", 6, dataclasses.replace(LOCAL, **option))
-    check_rows("run", 6)
+@pytest.mark.parametrize(
+    ("option", "value"), [("restarts", 1), ("redraw", 1), ("record_wrong_samples", True)]
+)
+def test_options_of_streams_are_not_for_episodes(option, value):
+    with pytest.raises(ConfigError, match=f"{option} is for streams"):
+        generate("run", 6, dataclasses.replace(LOCAL, **{option: value}))
 
 
 def test_resumed_session_must_exist_and_have_episodes():
