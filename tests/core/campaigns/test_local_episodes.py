@@ -52,6 +52,7 @@ def test_each_number_has_its_rows_or_has_failed(total, recorded, troubles, has_p
     assert all((set(each) == {"height"}) == has_parameters for each in results.parameters.values())
 
 
+@pytest.mark.slow
 @given(TROUBLES, st.integers(0, 3))
 @settings(max_examples=sizes.size(40, 10))
 def test_blocks_of_few_rows_hold_parts(troubles, long):

@@ -18,6 +18,8 @@ from physx_core.errors import PhysxError
 from physx_core.sources.client_episodes import ClientEpisodes
 from physx_core.workers.episode_queue import EpisodeQueue
 
+pytestmark = pytest.mark.slow
+
 SEED = [5, 2]
 SIMULATED = {"phases": [Phase.explicit, Phase.generate]}
 

@@ -438,6 +438,7 @@ class Machine(RuleBasedStateMachine):
         self.dataset = Dataset.open(self.folder, writable=True, **self.options)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(trials(12, 6)))
 def test_episodes_behave_like_lists(number):
     run_machine(seed(number)(Machine), settings=QUICK)

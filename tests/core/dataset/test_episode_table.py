@@ -206,6 +206,7 @@ def test_asking_for_a_writer_changes_nothing_and_stops_none(folder):
 # The same rows, wherever they are stored --------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_statistics_are_bit_equal_for_any_order_and_any_partitions(tmp_path):
     random = np.random.default_rng(0)
     lengths = random.integers(1, 90, 300)
