@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shlex
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import ClassVar
 
@@ -19,6 +19,7 @@ from physx_core.pipelines.run_description import (
     describe_failed_sets,
     describe_samples,
 )
+from physx_core.pipelines.services import RunServices
 from physx_core.pipelines.storage import (
     check_client_writers,
     check_episodes,
@@ -29,7 +30,7 @@ from physx_core.pipelines.storage import (
     store_sets,
 )
 from physx_core.session import Session
-from physx_core.sources.episode_source import EpisodeSource
+from physx_core.sources.episode_source import EpisodeSource, LocalEpisodes
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 from physx_core.workers.episode_queue import EpisodeQueue
@@ -275,8 +276,16 @@ class DataGeneration(NewSessionPipeline):
         known = campaign.simulated(self.dataset).tolist()
         self._queue = EpisodeQueue(episodes, known, self.retries)
         if not self._queue.is_done:
-            source = self._make_episode_source(config, campaign.seed, self._queue)
-            self._episodes = resources.enter_context(source)
+            self._episodes = resources.enter_context(self._make_episodes(config, campaign.seed))
+
+    def _make_episodes(self, config: EnvironmentConfig, seed: Sequence[int]) -> EpisodeSource:
+        """Return what simulates the numbers of the queue, in this process or in clients."""
+        services = RunServices(self.session.dataset_dir, self.observers.events, None)
+        if not config.as_tcp_ip_client:
+            return LocalEpisodes(config, services, seed, self._queue)
+        from physx_core.sources.client_episodes import ClientEpisodes
+
+        return ClientEpisodes(config, services, seed, self._queue)
 
     def _results(self, error: BaseException | None) -> Iterable[str]:
         duration = self._duration

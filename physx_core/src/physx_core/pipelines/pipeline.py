@@ -31,9 +31,7 @@ from physx_core.processes import (
     raised_at_sigterm,
 )
 from physx_core.session import Session
-from physx_core.sources.episode_source import EpisodeSource, LocalEpisodes
 from physx_core.sources.source import Source
-from physx_core.workers.episode_queue import EpisodeQueue
 from physx_core.workers.instance import NOTHING, Skip
 
 _STREAMS = {"training": 0, "validation": 1, "prediction": 2}
@@ -334,23 +332,6 @@ class Pipeline(ABC):
                 stripes=stripes,
             )
         return resources.enter_context(source)
-
-    def _make_episode_source(
-        self, config: EnvironmentConfig, seed: Sequence[int], queue: EpisodeQueue
-    ) -> EpisodeSource:
-        """Return what simulates the episodes of a campaign, in this process or in clients.
-
-        Args:
-            config: The environment, and how its instances run.
-            seed: Seed of the campaign.
-            queue: The numbers to simulate.
-        """
-        services = RunServices(self.session.dataset_dir, self.observers.events, None)
-        if not config.as_tcp_ip_client:
-            return LocalEpisodes(config, services, seed, queue)
-        from physx_core.sources.client_episodes import ClientEpisodes
-
-        return ClientEpisodes(config, services, seed, queue)
 
     def _record_config(self, seed: int) -> None:
         """Write the options and the actual seed to the session."""

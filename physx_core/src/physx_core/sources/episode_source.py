@@ -2,26 +2,24 @@
 
 from __future__ import annotations
 
-import contextlib
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Sequence
 from dataclasses import replace
-from types import TracebackType
-from typing import Any, Self
+from typing import Any
 
 from physx_core.components.environment import Services
 from physx_core.components.parameter import Parameter
 from physx_core.config import EnvironmentConfig
 from physx_core.dataset import EpisodeStatus
-from physx_core.errors import PhysxError
 from physx_core.fields import Field
+from physx_core.sources.source import Opened
 from physx_core.workers.episode_queue import EpisodeQueue
 from physx_core.workers.episode_runner import EpisodeBlock, EpisodeRunner
 from physx_core.workers.instance import Instance, instance_arguments
 from physx_core.workers.parameter_sets import ParameterSets
 
 
-class EpisodeSource(ABC):
+class EpisodeSource(Opened):
     """Simulates the numbers of a queue, in any order; a context manager.
 
     The rows of a number depend on the seed and the number alone.
@@ -72,7 +70,9 @@ class EpisodeSource(ABC):
         """Close the environments, and end their clients. Calling it again does nothing."""
 
     def _choose(self, number: int) -> dict[str, Any]:
-        """Return the parameters of a number."""
+        """Return the parameters of a number; empty if there are none."""
+        if not self.parameters:
+            return {}
         if number not in self._values:
             self._values[number] = self._sets.values_of(number)
         return dict(self._values[number])
@@ -87,26 +87,6 @@ class EpisodeSource(ABC):
                 self._queue.finish(record.count)
                 self._values.pop(record.episode, None)
         return EpisodeBlock(block.rows, records)
-
-    def __enter__(self) -> Self:
-        """Open the source; if that fails, errors from closing the environments are suppressed."""
-        try:
-            self.open()
-        except BaseException:
-            with contextlib.suppress(PhysxError):
-                self.close()
-            raise
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the source; after an error, errors from closing are suppressed."""
-        with contextlib.suppress(PhysxError) if kind is not None else contextlib.nullcontext():
-            self.close()
 
 
 class LocalEpisodes(EpisodeSource):

@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import contextlib
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from types import TracebackType
 from typing import Self
 
+from physx_core.closeable import Closeable
 from physx_core.errors import PhysxError, UsageError
 from physx_core.fields import Field
 from physx_core.typing import Batch
@@ -17,7 +18,39 @@ class Canceled(BaseException):
     """A call to `Source.batch` was canceled: the run is over, and nothing is kept."""
 
 
-class Source(ABC):
+class Opened(Closeable):
+    """A context manager that opens environments, and closes them again."""
+
+    @abstractmethod
+    def open(self) -> None:
+        """Create the environments.
+
+        Raises:
+            PhysxError: If an environment or client fails.
+        """
+
+    def __enter__(self) -> Self:
+        """Open the source; if that fails, errors from closing the environments are suppressed."""
+        try:
+            self.open()
+        except BaseException:
+            with contextlib.suppress(PhysxError):
+                self.close()
+            raise
+        return self
+
+    def __exit__(
+        self,
+        kind: type[BaseException] | None,
+        error: BaseException | None,
+        trace: TracebackType | None,
+    ) -> None:
+        """Close the source; after an error, errors from closing are suppressed."""
+        with contextlib.suppress(PhysxError) if kind is not None else contextlib.nullcontext():
+            self.close()
+
+
+class Source(Opened):
     """Generates batches of samples with the instances of one environment.
 
     Row r, counted from 0 over all batches, comes from instance ``r % instance_nb`` (from 0 here),
@@ -46,14 +79,6 @@ class Source(ABC):
 
         Shapes that the environment does not define are None until it has set the data of a step
         and asks for a prediction, or until the first batch. Empty before `open`.
-        """
-
-    @abstractmethod
-    def open(self) -> None:
-        """Create the instances' environments.
-
-        Raises:
-            PhysxError: If an environment or client fails.
         """
 
     @abstractmethod
@@ -98,26 +123,6 @@ class Source(ABC):
     @abstractmethod
     def close(self) -> None:
         """Close the environments, and end their clients. Calling it again does nothing."""
-
-    def __enter__(self) -> Self:
-        """Open the source; if that fails, errors from closing the environments are suppressed."""
-        try:
-            self.open()
-        except BaseException:
-            with contextlib.suppress(PhysxError):
-                self.close()
-            raise
-        return self
-
-    def __exit__(
-        self,
-        kind: type[BaseException] | None,
-        error: BaseException | None,
-        trace: TracebackType | None,
-    ) -> None:
-        """Close the source; after an error, errors from closing are suppressed."""
-        with contextlib.suppress(PhysxError) if kind is not None else contextlib.nullcontext():
-            self.close()
 
 
 def check_stored(stored: Batch, size: int) -> None:

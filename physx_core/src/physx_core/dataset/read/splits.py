@@ -192,18 +192,13 @@ def _shuffle_episodes(
 def _renumbered(rows: Index, before: Order | None, now: Order | None) -> Index:
     """Return the numbers that rows have in another order of the same stored rows."""
     stored = rows if before is None or before.index is None else before.index[rows]
-    if now is None or now.index is None:
-        total = len(rows) if now is None else now.rows
-        found, known = stored, stored
-        is_there = bool((stored < total).all()) if now is not None else True
-    else:
-        places = np.argsort(now.index)
-        found = places[np.minimum(np.searchsorted(now.index, stored, sorter=places), now.rows - 1)]
-        known = now.index[found]
-        is_there = bool((known == stored).all())
-    if not is_there:
+    if now is None:
+        return np.sort(stored)
+    index = np.arange(now.rows) if now.index is None else now.index
+    if not np.isin(stored, index).all():
         raise DatasetError(
             "Some of these rows belong to episodes that were replaced since the mode was split: "
             "split it again."
         )
-    return np.sort(found)
+    places = np.argsort(index)
+    return np.sort(places[np.searchsorted(index, stored, sorter=places)])

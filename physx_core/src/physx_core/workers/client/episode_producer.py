@@ -59,10 +59,9 @@ class EpisodeProducer:
 
     def _obey(self, frame: Frame) -> None:
         if frame.kind is Kind.LEASE:
-            leases = decode(frame.payload)
-            for number, values in leases:
-                self._leased.append(number)
-                self._values[number] = values
+            numbers, values = decode(frame.payload)
+            self._leased.extend(numbers)
+            self._values.update(zip(numbers, values, strict=bool(values)))
         elif frame.kind is Kind.CLOSE:
             raise RunEnded
         elif frame.kind not in (Kind.ANSWER, Kind.REFUSAL):  # to an abandoned request

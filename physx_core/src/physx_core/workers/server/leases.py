@@ -69,7 +69,7 @@ class Leases:
         wanted = self._wanted(peer.instance_id, clients)
         if len(leased) > wanted // 2 or not self._suspects.isdisjoint(leased):
             return
-        new: list[tuple[int, dict[str, Any]]] = []
+        new: list[int] = []
         while len(leased) < wanted and (number := self._queue.take()) is not None:
             if number in self._suspects:
                 wanted = 0
@@ -77,18 +77,20 @@ class Leases:
                     self._queue.put_back(number)
                     break
             leased[number] = 0
-            new.append((number, self._choose(number)))
+            new.append(number)
         if new:
-            peer.send(pack(Kind.LEASE, encode(new), len(new)))
+            values = [self._choose(number) for number in new] if peer.parameters else []
+            peer.send(pack(Kind.LEASE, encode([new, values]), len(new)))
             peer.pace.go_on()
 
     def lose(self, instance_id: int) -> int | None:
         """Return a lost client's numbers to the queue.
 
-        Only the number that it was simulating, its first one, counts as lost.
+        Only a number that it held alone counts as lost: of several, any may be the cause, so each
+        is leased alone from then on.
 
         Returns:
-            That number if it was lost too often, so that it has failed; else None.
+            The number that was lost too often, so that it has failed; else None.
         """
         self._rows.pop(instance_id, None)
         leased = list(self._leased.pop(instance_id, {}))
