@@ -5,11 +5,14 @@ Nothing of this uses what it is compared with.
 
 from __future__ import annotations
 
+import contextlib
 from pathlib import Path
 
 import numpy as np
 
 from physx_core.dataset import EpisodeStatus
+from physx_core.net.link import SOCKETS
+from physx_core.sources import ClientSource, LocalSource
 
 ENVS = Path(__file__).parents[1] / "core" / "programs" / "campaign_envs.py"
 TROUBLED = f"{ENVS}:Troubled"
@@ -100,3 +103,14 @@ class Results:
         if record.status is EpisodeStatus.FINISHED:
             self.rows[number] = [row for part in self._parts.pop(number) for row in part]
             self.parameters[number] = dict(record.parameters)
+
+
+@contextlib.contextmanager
+def leased(config, seed, queue, services=None, transport=SOCKETS):
+    """Simulate the numbers of a queue, in this process or in clients, as configured."""
+    if config.as_tcp_ip_client:
+        source = ClientSource(config, services, seed, transport=transport)
+    else:
+        source = LocalSource(config, services, seed)
+    with source:
+        yield source.lease(queue)

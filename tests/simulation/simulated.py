@@ -260,7 +260,7 @@ class Client(ClientHandle):
         try:
             self.link, setup = join(*self._arguments, transport=self.clock)
             try:
-                del setup["path"], setup["directory"]
+                del setup["path"], setup["directory"], setup["heartbeat"]
                 self._status = run_instance(self.link, setup)
             finally:
                 self.link.close()

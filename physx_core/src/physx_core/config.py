@@ -172,16 +172,15 @@ class EnvironmentConfig:
     as_tcp_ip_client: bool = True
     """Run each instance in a separate process; otherwise run all in this process."""
     num_clients: int = at_least(1, 1)
-    """Number of instances. The same seed and the same number of instances give the same samples,
-    regardless of the processes."""
+    """Number of instances, each in a client of its own. Streams give the same samples with the same
+    seed and the same number of instances; independent episodes do so with any number."""
     min_clients: int | None = at_least(1, None)
-    """Makes the run elastic: clients may join and leave at any time, and a client runs several
-    instances if there are fewer clients than instances. The run starts with this many clients, and
-    pauses while there are fewer. None: 1 if `max_clients` is set; otherwise one client for each
-    instance."""
+    """For independent episodes: start as soon as this many clients are ready, and end the run if
+    there are fewer for `timeout` seconds. None: 1 if `max_clients` is set; otherwise start with all
+    clients."""
     max_clients: int | None = at_least(1, None)
-    """Makes the run elastic, with at most this many clients. None: `num_clients`, or `min_clients`
-    if that is larger."""
+    """For independent episodes: how many clients there may be, those that join a run included.
+    None: `num_clients`, which the launcher starts."""
     ip_address: str = "127.0.0.1"
     """Address of the server."""
     port: int = field(default=0, metadata={"minimum": 0, "maximum": 65535})
@@ -224,7 +223,12 @@ class EnvironmentConfig:
     seed: int | None = None
     """Seed of all instances' random streams; None: a random seed, recorded in the session."""
     timeout: float = at_least(0.1, 60.0)
-    """Longest time in s that a client may be silent while the server waits for it."""
+    """Longest time in s that a client may be silent while the server waits for it. In a step of an
+    independent episode it is not silent unless it is stopped, or the step never lets other threads
+    of Python run."""
+    episode_timeout: float | None = at_least(0.1, None)
+    """Longest time in s that an independent episode may take; its client is ended then, and the
+    episode counts as lost. None: any time."""
     restarts: int = at_least(0, 0)
     """Number of times that each client is restarted after a failure; the samples are the same as
     without the failure."""
@@ -243,8 +247,13 @@ class EnvironmentConfig:
 
     @property
     def is_elastic(self) -> bool:
-        """Whether clients may join and leave during a run."""
+        """Whether the run starts without waiting for all of its clients."""
         return self.min_clients is not None or self.max_clients is not None
+
+    @property
+    def places(self) -> int:
+        """How many clients there may be at a time."""
+        return self.num_clients if self.max_clients is None else self.max_clients
 
 
 @configuration

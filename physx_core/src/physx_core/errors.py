@@ -269,8 +269,6 @@ class ClientError(PhysxError):
         instance_id: Number of the client's environment instance, from 1.
         exit_status: Exit status of the process, negative for a signal, None while it runs.
         stderr: Last lines of its standard error.
-        client: In an elastic run, a description of the client that ran the instance, and of its
-            machine.
     """
 
     def __init__(
@@ -280,21 +278,14 @@ class ClientError(PhysxError):
         *,
         exit_status: int | None = None,
         stderr: str = "",
-        client: str = "",
     ) -> None:
         self.instance_id, self.exit_status, self.stderr = instance_id, exit_status, stderr
-        self.client = client
-        name = (
-            f"The worker of instance {instance_id} ({client})"
-            if client
-            else f"Client {instance_id}"
-        )
         tail = f"\nLast lines of its standard error:\n{stderr}" if stderr else ""
-        super().__init__(f"{name} {message}{tail}")
+        super().__init__(f"Client {instance_id} {message}{tail}")
 
 
 class TooFewClientsError(PhysxError):
-    """An elastic run has had fewer clients than it needs for too long.
+    """A run of independent episodes has had fewer clients than it needs for too long.
 
     Attributes:
         clients: Number of clients.

@@ -17,6 +17,7 @@ from physx_core import Dataset
 
 PROGRAMS = Path(__file__).parents[1] / "programs"
 WALK = f"{PROGRAMS / 'cluster_envs.py'}:Walk"
+TRIPS = f"{PROGRAMS / 'cluster_envs.py'}:Trips"
 
 
 class Runs:
@@ -28,7 +29,9 @@ class Runs:
         self.count = 0
         self.log = folder / "log"
 
-    def start(self, *words, clients=2, batches=4, pace=0.0, fail_at=-1, **environment):
+    def start(
+        self, *words, clients=2, batches=4, pace=0.0, fail_at=-1, program=WALK, **environment
+    ):
         """Start a run; what it prints goes into `log`."""
         self.count += 1
         self.session = self.folder / "sessions" / f"run{self.count}"
@@ -40,7 +43,15 @@ class Runs:
         ]
         with self.log.open("wb") as log:
             return subprocess.Popen(
-                [sys.executable, "-m", "physx_core", "generate", WALK, *map(str, options), *words],
+                [
+                    sys.executable,
+                    "-m",
+                    "physx_core",
+                    "generate",
+                    program,
+                    *map(str, options),
+                    *words,
+                ],
                 cwd=self.folder,
                 env={**os.environ, **environment},
                 stdin=subprocess.DEVNULL,
@@ -102,16 +113,25 @@ def is_running(pid):
 def local_rows(tmp_path_factory):
     """A function that returns the first rows of a run on this machine alone.
 
-    A longer run begins with the rows of a shorter one, so one is made for each number of clients.
+    A longer run begins with the rows of a shorter one, so one is made for each program and number
+    of clients.
     """
     made = {}
 
-    def first(clients=2, batches=4):
-        if clients not in made:
-            made[clients] = Runs(tmp_path_factory.mktemp("local")).rows(clients=clients, batches=30)
-        return {name: values[: 10 * batches] for name, values in made[clients].items()}
+    def first(clients=2, batches=4, program=WALK):
+        kind = program, clients
+        if kind not in made:
+            options = {"program": program, "clients": clients, "batches": 30}
+            made[kind] = Runs(tmp_path_factory.mktemp("local")).rows(**options)
+        return {name: values[: 10 * batches] for name, values in made[kind].items()}
 
     return first
+
+
+@pytest.fixture
+def trips():
+    """Return the program of independent episodes."""
+    return TRIPS
 
 
 @pytest.fixture

@@ -69,17 +69,19 @@ def test_killed_ray_node_restarts_client_with_same_rows(runs, local_rows, ray_cl
 
 
 @pytest.mark.faults
-def test_elastic_ray_run_survives_lost_node(runs, local_rows, ray_cluster, eventually):
+def test_campaign_on_ray_survives_lost_node(runs, local_rows, ray_cluster, eventually, trips):
     """Of four clients two find a place, of which one is lost with its node."""
-    expected = local_rows(batches=30)
+    expected = local_rows(batches=30, program=trips)
     lost = ray_cluster.nodes.pop()
     hold = runs.folder / "hold"  # else the first client may be done before there is a second
     hold.touch()
     process = runs.start(
         *on(ray_cluster, "num_cpus=1"),
-        *("--environment.min-clients", "1", "--environment.max-clients", "4"),
+        *("--environment.min-clients", "1"),
+        clients=4,
         batches=30,
         pace=0.05,
+        program=trips,
         **ray_cluster.variables,
     )
     node = str(ray_cluster.raylet_of(lost))
@@ -90,7 +92,7 @@ def test_elastic_ray_run_survives_lost_node(runs, local_rows, ray_cluster, event
     status, said = runs.finish(process)
     ray_cluster.nodes.append(ray_cluster.add_node())
     assert status == 0, said
-    assert "another client takes over" in said
+    assert "Its episode is simulated once more" in said
     assert runs.same(runs.stored(), expected)
     eventually(runs.nothing_is_left)
 

@@ -270,7 +270,8 @@ def test_options_are_checked_before_anything_is_started(
 
 
 @pytest.mark.faults
-def test_clients_of_an_elastic_run_are_jobs_too(runs, local_rows, eventually):
-    expected = local_rows(clients=4)
-    assert runs.same(runs.rows(*LOCAL, "--environment.max-clients", "2", clients=4), expected)
+def test_clients_of_a_campaign_are_jobs(runs, local_rows, eventually, trips):
+    expected = local_rows(program=trips)
+    options = {"clients": 4, "program": trips}
+    assert runs.same(runs.rows(*LOCAL, "--environment.min-clients", "1", **options), expected)
     eventually(runs.nothing_is_left)

@@ -46,3 +46,12 @@ class Walk(Environment):
     def close(self):
         self.child.kill()
         self.child.wait()
+
+
+class Trips(Walk):
+    """Independent random walks of ten steps."""
+
+    episode_steps = 10
+
+    def reset_parameters(self):
+        self.position = np.zeros(3)

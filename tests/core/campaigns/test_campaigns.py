@@ -288,12 +288,14 @@ def test_changed_option_is_named(change, name):
 
 def test_another_campaign_has_other_rows():
     generate("run", 5)
+    with Dataset.open("sessions/run") as dataset:
+        before = dataset.num_samples("training")
     generate("run", 5, new_session=False)
     with Dataset.open("sessions/run") as dataset:
         known = dataset.recorded_episodes("training")
         found = dataset["training"]["x"][:].tolist()
     assert sorted(set(known.campaign.tolist())) == [0, 1]
-    rows = [rows_of(number, [SEED, 0, campaign]) for campaign in (0, 1) for number in range(5)]
+    rows = [rows_of(number, [SEED, 0, offset]) for offset in (0, before) for number in range(5)]
     assert found == list(itertools.chain(*rows))
 
 
@@ -371,12 +373,18 @@ def test_either_batches_or_episodes(options):
         DataGeneration(LOCAL, **options)
 
 
-@pytest.mark.parametrize(
-    ("options", "name"), [({"resume": True}, "resume"), ({"max_failed": 1}, "max_failed")]
-)
-def test_options_of_episodes_need_episodes(options, name):
-    with pytest.raises(ConfigError, match=rf"{name} is for episodes"):
-        DataGeneration(LOCAL, batch_nb=1, batch_size=1, **options)
+def test_option_of_episodes_is_not_for_streams():
+    config = EnvironmentConfig("toy/spring", as_tcp_ip_client=False)
+    with pytest.raises(ConfigError, match=r"max_failed is for independent episodes.*spring"):
+        DataGeneration(config, batch_nb=1, batch_size=1, max_failed=1).execute()
+
+
+def test_stream_cannot_be_resumed():
+    config = EnvironmentConfig("toy/spring", as_tcp_ip_client=False)
+    options = {"session_name": "run", "batch_nb": 1, "batch_size": 1}
+    DataGeneration(config, **options).execute()
+    with pytest.raises(ConfigError, match="no episodes .* to go on with"):
+        DataGeneration(config, resume=True, **options).execute()
 
 
 @pytest.mark.parametrize("option", [{"episodes": 0}, {"episodes": 2, "max_failed": -1}])
@@ -390,13 +398,6 @@ def test_stream_has_no_episodes(clients):
     config = EnvironmentConfig("toy/spring", seed=1)
     with pytest.raises(UsageError, match="is a stream, which has no episodes to count"):
         generate("run", 3, config, clients=clients)
-
-
-def test_elastic_clients_are_not_for_episodes():
-    config = dataclasses.replace(LOCAL, min_clients=1, max_clients=2, as_tcp_ip_client=True,
-                                 num_clients=2)  # fmt: skip
-    with pytest.raises(ConfigError, match="min_clients and max_clients are not for episodes"):
-        DataGeneration(config, episodes=3).execute()
 
 
 @pytest.mark.parametrize(

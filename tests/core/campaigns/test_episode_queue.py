@@ -7,6 +7,7 @@ import sizes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from physx_core.dataset import EpisodeRecord
 from physx_core.workers.episode_queue import EpisodeQueue
 
 
@@ -62,7 +63,7 @@ def test_numbers_come_in_order_and_those_that_came_back_first(total, recorded, r
         elif held:
             number = held.pop(which % len(held))
             if operation == "finish":
-                queue.finish(1)
+                queue.note(EpisodeRecord(episode=number, rows=2))
                 model.finished += 1
             elif operation == "put back":
                 queue.put_back(number)
@@ -81,7 +82,8 @@ def test_numbers_beyond_the_total_are_no_episodes_of_it():
     queue = EpisodeQueue(3, [1, 3, 7])
     assert (queue.finished, queue.is_done) == (1, False)
     assert [queue.take() for _ in range(3)] == [0, 2, None]
-    queue.finish(2)
+    for number in (0, 2):
+        queue.note(EpisodeRecord(episode=number, rows=1))
     assert queue.is_done
 
 

@@ -6,14 +6,14 @@ import itertools
 
 import pytest
 import sizes
-from campaigns import FAILS, TROUBLED, Results, rows_of
+from campaigns import FAILS, TROUBLED, Results, leased, rows_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from physx_core import EnvironmentConfig
 from physx_core.dataset import EpisodeStatus
 from physx_core.errors import MissingFieldError, UsageError
-from physx_core.sources.episode_source import LocalEpisodes
+from physx_core.sources import LocalSource
 from physx_core.workers.episode_queue import EpisodeQueue
 
 SEED = [5, 2]
@@ -22,8 +22,8 @@ SEED = [5, 2]
 def simulate(total, env_kwargs, recorded=(), **options):
     """Return what a source in this process has simulated."""
     queue = EpisodeQueue(total, recorded)
-    config = EnvironmentConfig(TROUBLED, env_kwargs=env_kwargs, **options)
-    with LocalEpisodes(config, None, SEED, queue) as source:
+    config = EnvironmentConfig(TROUBLED, as_tcp_ip_client=False, env_kwargs=env_kwargs, **options)
+    with leased(config, SEED, queue) as source:
         return Results().take_all(source, queue)
 
 
@@ -78,8 +78,8 @@ def test_failed_episode_leaves_no_rows_of_its_parts(at):
     for kind in ("raises", "is not finite"):
         queue = EpisodeQueue(4)
         kwargs = {"troubles": {"1": [kind, at]}, "least": 9000, "most": 9000, "width": 1}
-        config = EnvironmentConfig(TROUBLED, env_kwargs=kwargs)
-        with LocalEpisodes(config, None, SEED, queue) as source:
+        config = EnvironmentConfig(TROUBLED, as_tcp_ip_client=False, env_kwargs=kwargs)
+        with leased(config, SEED, queue) as source:
             results = Results().take_all(source, queue)
         assert list(results.failed) == [1]
         assert sorted(results.rows) == [0, 2, 3]
@@ -155,19 +155,17 @@ def test_reasons_name_what_happened():
 def test_mistake_of_all_episodes_ends_the_campaign(mistake, error, said):
     queue = EpisodeQueue(5)
     kwargs = {"troubles": {"2": [mistake, 0]}, "least": 1}
-    config = EnvironmentConfig(TROUBLED, env_kwargs=kwargs)
+    config = EnvironmentConfig(TROUBLED, as_tcp_ip_client=False, env_kwargs=kwargs)
     with (
-        LocalEpisodes(config, None, SEED, queue) as source,
+        leased(config, SEED, queue) as source,
         pytest.raises(error, match=said),
     ):
         Results().take_all(source, queue)
 
 
 def test_stream_has_no_episodes_to_count():
-    queue = EpisodeQueue(2)
-    config = EnvironmentConfig("toy/spring")
     with (
-        LocalEpisodes(config, None, SEED, queue) as source,
+        LocalSource(EnvironmentConfig("toy/spring"), None, SEED) as source,
         pytest.raises(UsageError, match="is a stream, which has no episodes to count"),
     ):
-        source.take()
+        source.check_independent()

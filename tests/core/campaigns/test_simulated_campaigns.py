@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import pytest
 import sizes
-from campaigns import FAILS, TROUBLED, Results, rows_of
+from campaigns import FAILS, TROUBLED, Results, leased, rows_of
 from fated import Fate, Fates
 from hypothesis import Phase, given, settings
 from hypothesis import strategies as st
@@ -15,7 +15,6 @@ from simulated import Simulation, drawn
 
 from physx_core import EnvironmentConfig
 from physx_core.errors import PhysxError
-from physx_core.sources.client_episodes import ClientEpisodes
 from physx_core.workers.episode_queue import EpisodeQueue
 
 pytestmark = pytest.mark.slow
@@ -31,7 +30,7 @@ def simulate(simulation, total, count, *, fates=None, recorded=(), env_kwargs=No
     kwargs = env_kwargs or {}
     config = EnvironmentConfig(TROUBLED, num_clients=count, env_kwargs=kwargs, **options)
     queue = EpisodeQueue(total, recorded)
-    with ClientEpisodes(config, None, SEED, queue, transport=simulation) as source:
+    with leased(config, SEED, queue, transport=simulation) as source:
         idle = [fate for each in (fates or {}).values() for fate in each if fate.state == "idle"]
         return Taking(simulation, idle).take_all(source, queue)
 

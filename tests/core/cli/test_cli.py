@@ -147,7 +147,7 @@ def test_help_shows_the_arguments_without_names_and_examples(verb, arguments, ca
 @pytest.mark.parametrize(
     ("verb", "text"),
     [
-        ("generate", "None: `num_clients`, or `min_clients` if that is larger."),
+        ("generate", "None: `num_clients`, which the launcher starts."),
         ("train", "if the dataset has a validation mode or `validation_split` holds samples back;"),
     ],
 )

@@ -202,17 +202,6 @@ def test_client_writers_killed_at_random_moments(nothing_stays_behind, process_i
     assert_same(rows(folder), wanted)
 
 
-@pytest.mark.faults
-def test_elastic_client_writer_is_replaced(nothing_stays_behind, process_ids):
-    wanted = rows(generate("server", "server", batches=20, num_clients=4))
-    clients = threading.Timer(1.5, lambda: os.kill(process_ids()[1], signal.SIGKILL))
-    clients.start()
-    options = {"num_clients": 4, "min_clients": 1, "max_clients": 2, "restarts": 3}
-    folder = generate("clients", batches=20, env_kwargs={"delay": 0.03}, **options)
-    clients.join()
-    assert_same(rows(folder), wanted)
-
-
 def test_full_disk_of_client_writers_keeps_committed_rows(small_disk, nothing_stays_behind):
     with (
         pytest.raises(DatasetError, match="the disk is full"),

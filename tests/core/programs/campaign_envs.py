@@ -69,6 +69,12 @@ class Troubled(Environment):
             raise RuntimeError(f"no more beans for {self.episode_index}")
         if now and self.kind == "ends the process":
             self.leave()
+        if now and self.kind in ("hangs", "sleeps long"):
+            time.sleep(100 if self.kind == "hangs" else 3)
+        if now and self.kind == "is busy long":
+            until = time.monotonic() + 3
+            while time.monotonic() < until:
+                pass
         if now and self.kind == "asks for the wrong":
             self.new_episode()
         self.left -= 1

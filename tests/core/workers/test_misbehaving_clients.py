@@ -116,7 +116,6 @@ LATER = {
     "credit": (pack(Kind.CREDIT, number=9), "CREDIT, which a client may not send"),
     "hello again": (pack(Kind.HELLO, bytes(44)), "HELLO, which a client may not send"),
     "proof again": (pack(Kind.PROOF, bytes(32), 1), "PROOF, which a client may not send"),
-    "the end": (pack(Kind.BYE), "nobody ended the run"),
     "an unknown kind": (HEADER.pack(0, 999, 0, 0), "not a physx message"),
     "a longer message than there can be": (HEADER.pack(2**32 - 1, 8, 0, 1), "not a physx message"),
     "a spare that is used": (HEADER.pack(0, 8, 1, 0), "not a physx message"),

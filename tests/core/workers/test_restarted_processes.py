@@ -3,15 +3,12 @@
 from __future__ import annotations
 
 import hashlib
-import os
-import signal
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from physx_core import DataGeneration, Dataset, EnvironmentConfig
-from physx_core.errors import ClientError
 
 pytestmark = pytest.mark.processes
 
@@ -64,19 +61,6 @@ def test_a_pipeline_stores_the_same_rows_whatever_happens(nothing_stays_behind):
         for note in notes:
             note.unlink()
     assert len(sums) == 1
-
-
-def test_an_instance_of_an_elastic_run_does_not_move_beyond_the_limit_of_its_journal(
-    clients, batch_services, process_ids
-):
-    options = {"min_clients": 1, "max_clients": 2, "restarts": 2, "journal_size": 2e-6, **ASKS}
-    with clients(WANDERER, run_ahead=0, **options) as source:
-        source.batch(60)
-        os.kill(os.getpgid(process_ids()[2]), signal.SIGKILL)
-        with pytest.raises(ClientError) as caught:
-            for _ in range(20):
-                source.batch(60)
-    assert "journal_size" in caught.value.__notes__[0]
 
 
 def digest(batches):

@@ -99,8 +99,7 @@ class Launcher(Closeable):
         Called again, with a single instance, to restart a client.
 
         Args:
-            instances: Numbers of the instances, from 1. In an elastic run, numbers of the clients,
-                1 to `EnvironmentConfig.max_clients`; some may join later or never.
+            instances: Numbers of the instances, from 1; if `elastic`, some may join later or never.
             address: ``HOST:PORT`` of the server. If the server listens at all addresses of its
                 machine, the host is the one that `open` returned, or else the loopback address.
             token: Secret of the run.

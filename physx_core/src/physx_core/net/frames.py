@@ -29,11 +29,12 @@ class Kind(enum.IntEnum):
     CHALLENGE = 2
     """Server: magic, version, challenge, proof [1: no proof before the connection is encrypted]."""
     PROOF = 3
-    """Client: proof [number of the instance to run or ticket for it, 0: any]."""
+    """Client: proof [number of the instance to run, 0: any]."""
     SETUP = 4
     """Server: the arguments of the instance."""
     READY = 5
-    """Client: the environment is ready; its fields, whose shapes may still be undefined."""
+    """Client: the environment is ready; its fields, whose shapes may still be undefined [1: its
+    episodes are independent]."""
     FIELDS = 6
     """Client: the fields with the shapes of the first sample."""
     CREDIT = 7
@@ -57,9 +58,9 @@ class Kind(enum.IntEnum):
     ERROR = 16
     """Either: an error that ends the client [row that could not be generated, 0: no row]."""
     CLOSE = 17
-    """Server: order to close the environment and exit [for HOST: time for it, in ms]."""
+    """Server: order to close the environment and exit."""
     BYE = 18
-    """Client: the environment is closed."""
+    """Client: the environment is closed, or the client leaves the run."""
     STORED = 19
     """Server: stored rows from which to generate the next rows [number of rows]."""
     WRONG = 20
@@ -78,29 +79,21 @@ class Kind(enum.IntEnum):
     """Client, before READY: the parameters that its environment defines, if any."""
     CHOOSE = 27
     """Client: request for the parameters of an episode [number of the request]."""
-    HOST = 28
-    """Server: run workers on request instead of an instance. Client: the name of its machine."""
-    START = 29
-    """Server: start a worker [its ticket]."""
-    STOP = 30
-    """Server: end a worker, immediately if the payload is not empty [its ticket]."""
-    ENDED = 31
-    """Client: exit status and last output of a worker that ended [its ticket]."""
-    PING = 32
-    """Server: liveness check. Client: its reply."""
-    FOLDER = 33
+    PING = 28
+    """Client: it is alive, though it has nothing to send."""
+    FOLDER = 29
     """Client that writes partitions: what it read in the dataset's folder."""
-    PARTITION = 34
+    PARTITION = 30
     """Server: a partition that the client writes its rows to [its number among the client's]."""
-    WRITTEN = 35
+    WRITTEN = 31
     """Client: rows have been written to its partitions [their total number since the start]."""
-    SEAL = 36
+    SEAL = 32
     """Server: order to stop generating and seal the last partition [total rows to keep]."""
-    SEALED = 37
+    SEALED = 33
     """Client: a partition is sealed; its checksums and statistics [its number]."""
-    LEASE = 38
+    LEASE = 34
     """Server: numbers of episodes to simulate, with their parameters [how many]."""
-    EPISODES = 39
+    EPISODES = 35
     """Client: what became of episodes, after their rows [number of these rows]."""
 
 

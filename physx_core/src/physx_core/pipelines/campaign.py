@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
 import numpy as np
 
 from physx_core.config import EnvironmentConfig
-from physx_core.dataset import Dataset, EpisodeStatus
+from physx_core.dataset import Dataset, EpisodeRecord, EpisodeStatus
 from physx_core.errors import ConfigError, DatasetError
-from physx_core.pipelines.pipeline import choose_seed, derive_seed
 from physx_core.pipelines.storage import describe_environment
 from physx_core.typing import Index
 
@@ -30,37 +30,41 @@ class Campaign:
     Attributes:
         mode: Mode of their rows.
         number: Number of the campaign in this mode, counted from 0.
-        environment: Describes the environment, with the seed: see `describe_environment`.
+        environment: Describes the environment, with the run's seed: see `describe_environment`.
+        seed: Seed of its episodes.
     """
 
     mode: str
     number: int
     environment: dict[str, Any]
+    seed: list[int]
 
-    @property
-    def seed(self) -> list[int]:
-        """The seed of its episodes."""
-        return derive_seed(self.environment["seed"], self.mode, self.number)
+    @staticmethod
+    def count(dataset: Dataset, mode: str) -> int:
+        """Return how many campaigns a mode of a dataset has."""
+        return sum(each.mode == mode for each in _recorded(dataset))
 
     @classmethod
-    def begin(cls, dataset: Dataset, mode: str, config: EnvironmentConfig) -> Self:
+    def begin(
+        cls, dataset: Dataset, mode: str, config: EnvironmentConfig, run_seed: int, seed: list[int]
+    ) -> Self:
         """Return a new campaign, recorded in a dataset.
 
         Args:
             dataset: The dataset, open for writing.
             mode: Mode of the rows.
-            config: The environment; its seed is random if it is None.
+            config: The environment.
+            run_seed: Seed of the run.
+            seed: Seed of the episodes.
         """
-        known = _recorded(dataset)
-        number = sum(each.mode == mode for each in known)
-        described = describe_environment(config, choose_seed(config.seed))
-        campaign = cls(mode, number, described)
+        known, number = _recorded(dataset), cls.count(dataset, mode)
+        campaign = cls(mode, number, describe_environment(config, run_seed), seed)
         recorded = [asdict(each) for each in known]
         dataset.update_info(**{CAMPAIGNS: [*recorded, asdict(campaign)]})
         return campaign
 
     @classmethod
-    def last(cls, dataset: Dataset, mode: str, config: EnvironmentConfig) -> Self:
+    def last(cls, dataset: Dataset, mode: str, config: EnvironmentConfig) -> Campaign:
         """Return the last campaign of a mode, which a configuration continues.
 
         Raises:
@@ -83,18 +87,65 @@ class Campaign:
                     f"{before!r} and is now {after!r}, so the rows of an episode would differ. Use "
                     "the same value, or leave resume out for other episodes."
                 )
-        return cls(former.mode, former.number, former.environment)
+        return former
 
     def simulated(self, dataset: Dataset) -> Index:
         """Return the numbers that have ended, shape (n,), without those that were cut."""
-        known = dataset.recorded_episodes(self.mode) if self.mode in dataset.modes else None
-        if known is None:
-            return np.zeros(0, np.int64)
-        ended = (known.status == EpisodeStatus.FINISHED) | (known.status == EpisodeStatus.FAILED)
-        chosen = ended & (known.campaign == self.number)
-        first, count = known.episode[chosen], known.numbers[chosen]
+        first, count, _ = self._ended(dataset)
         begins = np.repeat(first - np.cumsum(count) + count, count)
         return begins + np.arange(count.sum())
+
+    def records(self, dataset: Dataset) -> list[EpisodeRecord]:
+        """Return what is recorded of the numbers that have ended, without those that were cut."""
+        columns = (each.tolist() for each in self._ended(dataset))
+        return [EpisodeRecord(episode=e, count=n, rows=r) for e, n, r in zip(*columns, strict=True)]
+
+    def _ended(self, dataset: Dataset) -> tuple[Index, Index, Index]:
+        """Return the first number, the number of episodes and that of rows of each entry."""
+        known = dataset.recorded_episodes(self.mode) if self.mode in dataset.modes else None
+        if known is None:
+            return (np.zeros(0, np.int64),) * 3
+        ended = (known.status == EpisodeStatus.FINISHED) | (known.status == EpisodeStatus.FAILED)
+        chosen = ended & (known.campaign == self.number)
+        return known.episode[chosen], known.numbers[chosen], known.rows[chosen]
+
+    def cut(
+        self, dataset: Dataset, surplus: int, parameters: Callable[[int], Mapping[str, Any]]
+    ) -> None:
+        """Leave out the last rows: the episodes that they belong to are recorded as cut.
+
+        Args:
+            dataset: The dataset, open for writing.
+            surplus: How many rows to leave out.
+            parameters: Returns the parameters of a number.
+        """
+        known = dataset.recorded_episodes(self.mode)
+        assert known is not None
+        columns = known.first, known.rows, known.episode, known.numbers
+        own = np.flatnonzero((known.campaign == self.number) & (known.rows > 0))
+        for place in own[::-1].tolist():
+            first, rows, number, count = (int(column[place]) for column in columns)
+            left_out = min(surplus, rows)
+            if count > 1:  # of one row each
+                kept, cut = 0, range(number + count - left_out, number + count)
+            else:
+                kept, cut = rows - left_out, range(number, number + 1)
+            records = [self._cut_record(each, kept, parameters(each)) for each in cut]
+            mode = dataset[self.mode]
+            stored = {name: mode[name][first : first + kept] for name in mode} if kept else {}
+            dataset.append_episodes(self.mode, stored, records, checked=True)
+            surplus -= left_out
+            if not surplus:
+                return
+
+    def _cut_record(self, number: int, rows: int, parameters: Mapping[str, Any]) -> EpisodeRecord:
+        return EpisodeRecord(
+            episode=number,
+            rows=rows,
+            campaign=self.number,
+            status=EpisodeStatus.CUT,
+            parameters=parameters,
+        )
 
 
 def _recorded(dataset: Dataset) -> list[Campaign]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import shlex
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import ClassVar
 
@@ -19,7 +19,6 @@ from physx_core.pipelines.run_description import (
     describe_failed_sets,
     describe_samples,
 )
-from physx_core.pipelines.services import RunServices
 from physx_core.pipelines.storage import (
     check_client_writers,
     check_episodes,
@@ -28,12 +27,14 @@ from physx_core.pipelines.storage import (
     open_own,
     record_beside_rows,
     store_sets,
+    stream_options,
 )
 from physx_core.session import Session
-from physx_core.sources.episode_source import EpisodeSource, LocalEpisodes
+from physx_core.sources.episode_source import EpisodeSource
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 from physx_core.workers.episode_queue import EpisodeQueue
+from physx_core.workers.row_queue import RowQueue
 
 
 @options
@@ -41,14 +42,15 @@ from physx_core.workers.episode_queue import EpisodeQueue
 class DataGeneration(NewSessionPipeline):
     """Generates samples and stores them in its session.
 
-    These are ``batch_nb`` batches of ``batch_size`` samples of streams, or the samples of a
-    number of independent ``episodes``. Each episode is stored when it ends, and what has been
-    stored is never simulated again.
+    These are ``batch_nb`` batches of ``batch_size`` samples, or the samples of a number of
+    independent ``episodes``. If the environment's episodes are independent, each is stored when it
+    ends, and what has been stored is never simulated again. The samples of batches are then those
+    of as many episodes as they need, of which the last one may be cut.
 
     Attributes:
         dataset: The session's dataset, open for writing.
         source: The environments.
-        batch: The last batch; empty if the clients write their own rows.
+        batch: The last batch of a stream; empty if the clients write their own rows.
         batch_id: Number of stored batches.
     """
 
@@ -71,7 +73,8 @@ class DataGeneration(NewSessionPipeline):
     max_failed: int = at_least(0, 0)
     """Number of episodes that may fail before the run fails."""
     resume: bool = field(default=False, metadata={"recorded": False})
-    """Go on with the episodes of an existing session: simulate those that it does not have."""
+    """Go on with the independent episodes of an existing session: simulate those that it does not
+    have."""
     mode: str | None = field(default=None, metadata={"choices": MODES})
     """Mode to store the samples in; None: `DatasetConfig.mode`."""
 
@@ -82,9 +85,10 @@ class DataGeneration(NewSessionPipeline):
     batch_id: int = field(init=False, repr=False, default=0)
     _seed: int = field(init=False, repr=False, default=0)
     _mode: str = field(init=False, repr=False, default="")
-    _campaign: Campaign = field(init=False, repr=False)
-    _queue: EpisodeQueue = field(init=False, repr=False)
+    _campaign: Campaign | None = field(init=False, repr=False, default=None)
+    _queue: EpisodeQueue | None = field(init=False, repr=False, default=None)
     _episodes: EpisodeSource = field(init=False, repr=False)
+    _first_row: int = field(init=False, repr=False, default=0)
     _failed: int = field(init=False, repr=False, default=0)
 
     def __post_init__(self) -> None:
@@ -99,9 +103,6 @@ class DataGeneration(NewSessionPipeline):
                 "DataGeneration needs either batch_nb and batch_size, or episodes: the number of "
                 "independent episodes."
             )
-        if self.episodes is None and (self.resume or self.max_failed):
-            option = "resume" if self.resume else "max_failed"
-            raise ConfigError(f"DataGeneration.{option} is for episodes: give their number.")
 
     def execute(self) -> None:
         """Generate all batches, or simulate all episodes.
@@ -115,15 +116,16 @@ class DataGeneration(NewSessionPipeline):
             self.data_generation_begin()
             if self.episodes is None:
                 self._generate_batches()
-            else:
-                while not self._queue.is_done:
-                    self._store_episodes()
+            while self._queue is not None and not self._queue.is_done:
+                self._store_episodes(self._queue)
+            self._cut()
             self.data_generation_end()
 
     def _amount(self) -> tuple[int, str]:
         """Return how much there is to generate, and its unit."""
         if self.episodes is not None:
-            return self.episodes - self._queue.finished, "episodes"
+            known = 0 if self._queue is None else self._queue.finished
+            return self.episodes - known, "episodes"
         return (self.batch_nb or 0) * (self.batch_size or 0), "samples"
 
     def _generate_batches(self) -> None:
@@ -138,19 +140,40 @@ class DataGeneration(NewSessionPipeline):
             self.batch_end()
         self._check_condition(more, "batch_condition")
 
-    def _store_episodes(self) -> None:
+    def _store_episodes(self, queue: EpisodeQueue) -> None:
         """Store the episodes that end next; fail if too many of this run failed."""
-        before, campaign = self._queue.finished, self._campaign.number
+        assert self._campaign is not None
+        before, campaign = queue.finished, self._campaign.number
         rows, records = self._episodes.take()
         if self._mode not in self.dataset.modes:
             self.dataset.define_fields(self._mode, self._episodes.fields)
         records = [replace(record, campaign=campaign) for record in records]
         self.dataset.append_episodes(self._mode, rows, records, checked=True)
-        self.observers.advance(self._queue.finished - before)
+        if self.episodes is not None:
+            self.observers.advance(queue.finished - before)
         failed = [record for record in records if record.status is EpisodeStatus.FAILED]
         self._failed += len(failed)
         if failed and self._failed > self.max_failed:
             raise FailedEpisodesError(self._failed, failed[-1].episode, failed[-1].reason)
+
+    def _store_rows(self, queue: RowQueue) -> None:
+        """Store episodes until there are enough rows for the batch."""
+        wanted = self._first_row + (self.batch_id + 1) * (self.batch_size or 0)
+        queue.goal = max(queue.goal, wanted)
+        while queue.rows < wanted:
+            self._store_episodes(queue)
+
+    def _cut(self) -> None:
+        """Leave out what the last episodes have more than the batches."""
+        if self._campaign is None or self.episodes is not None:
+            return
+        wanted = self._first_row + self.batch_id * (self.batch_size or 0)
+        known = self.dataset.recorded_episodes(self._mode)
+        surplus = 0
+        if known is not None:
+            surplus = int(known.rows[known.campaign == self._campaign.number].sum()) - wanted
+        if surplus > 0:
+            self._campaign.cut(self.dataset, surplus, self.source.sets.values_of)
 
     def data_generation_begin(self) -> None:
         """Called before the first batch."""
@@ -168,6 +191,9 @@ class DataGeneration(NewSessionPipeline):
         With ``record_wrong_samples``, the samples that `check_sample` rejected are stored too, in
         the mode "wrong".
         """
+        if isinstance(self._queue, RowQueue):
+            self._store_rows(self._queue)
+            return
         source, dataset, mode = self.source, self.dataset, self._mode
         with record_beside_rows(source, dataset, mode):
             self.batch = source.batch(self.batch_size or 0)
@@ -206,7 +232,10 @@ class DataGeneration(NewSessionPipeline):
         """Called after the last batch."""
 
     def _begin(self) -> None:
+        self._first_row += self.batch_id * (self.batch_size or 0)
         self.batch_id = self._failed = 0
+        if isinstance(self._queue, RowQueue):
+            self._queue.goal = self._first_row + self._amount()[0]
         end_generation(self.dataset)
 
     def _open(self, resources: contextlib.ExitStack) -> None:
@@ -223,7 +252,7 @@ class DataGeneration(NewSessionPipeline):
                 "DataGeneration generates new samples, so load_samples cannot be set: it works in "
                 "Training, Prediction and Replay."
             )
-        if self.episodes is not None:
+        if self.episodes is not None or self.resume:
             check_episodes(config, dataset_config)
         if dataset_config.writers == "clients":
             check_client_writers(config)
@@ -237,72 +266,90 @@ class DataGeneration(NewSessionPipeline):
         else:
             self.session = self._create_session()
         self.dataset = resources.enter_context(open_own(self.session, dataset_config))
-        if self.episodes is None:
-            self._open_batches(resources, config, dataset_config)
-        else:
-            self._open_episodes(resources, config, self.episodes)
+        self._campaign, self._queue, self._first_row = None, None, 0
+        if self.resume:
+            self._campaign = Campaign.last(self.dataset, self._mode, config)
+        self._open_environments(resources, config, dataset_config)
 
-    def _open_batches(
+    def _open_environments(
         self,
         resources: contextlib.ExitStack,
         config: EnvironmentConfig,
         dataset_config: DatasetConfig,
     ) -> None:
-        offset = self.dataset.num_samples(self._mode)
-        self._seed = seed = choose_seed(config.seed)
-        self._record_config(seed)
+        """Open the environments, unless there is nothing left to simulate."""
+        campaign = self._campaign
+        if campaign is None:
+            self._seed = choose_seed(config.seed)
+            seed = derive_seed(self._seed, self._mode, self._offset())
+        else:
+            self._seed, seed = campaign.environment["seed"], campaign.seed
+        self._record_config(self._seed)
         self._observe(resources, config)
+        if campaign is not None:
+            self._queue = self._make_queue(campaign)
+            if self._queue.is_done and self.episodes is not None:
+                return
         stripes = None
         if dataset_config.writers == "clients":
             stripes = self.dataset.stripes(self._mode, config.num_clients)
-        self.source = self._open_source(
-            resources,
-            config,
-            derive_seed(seed, self._mode, offset),
-            total=self._amount()[0],
-            stripes=stripes,
+        total = None if self.episodes is not None else self._amount()[0]
+        self.source = self._open_source(resources, config, seed, total=total, stripes=stripes)
+        if campaign is None and not self._simulates_episodes(dataset_config):
+            if self.max_failed:
+                raise ConfigError(
+                    "DataGeneration.max_failed is for independent episodes, but "
+                    f"{describe_environment_config(config)} is a stream: leave it out."
+                )
+        elif campaign is None:
+            self.source.check_independent()
+            self._campaign = campaign = Campaign.begin(
+                self.dataset, self._mode, config, self._seed, seed
+            )
+            self._queue = self._make_queue(campaign)
+        if self._queue is not None:
+            self._describe()
+            self._episodes = self.source.lease(self._queue)
+
+    def _offset(self) -> int:
+        """Return how many rows or campaigns there are already, which get other random numbers."""
+        return max(self.dataset.num_samples(self._mode), Campaign.count(self.dataset, self._mode))
+
+    def _make_queue(self, campaign: Campaign) -> EpisodeQueue:
+        if self.episodes is None:
+            return RowQueue(self._amount()[0], campaign.records(self.dataset), self.retries)
+        return EpisodeQueue(self.episodes, campaign.simulated(self.dataset).tolist(), self.retries)
+
+    def _simulates_episodes(self, dataset_config: DatasetConfig) -> bool:
+        """Return whether episodes are simulated by number, instead of streams."""
+        config = self.environment_config
+        return self.episodes is not None or (
+            self.source.is_independent
+            and self._is_own(DataGeneration.batch_produce)
+            and not self.source.sets.learns
+            and not stream_options(config, dataset_config)
         )
-
-    def _open_episodes(
-        self, resources: contextlib.ExitStack, config: EnvironmentConfig, episodes: int
-    ) -> None:
-        """Open the environments, unless there is nothing left to simulate."""
-        make = Campaign.last if self.resume else Campaign.begin
-        self._campaign = campaign = make(self.dataset, self._mode, config)
-        self._seed = campaign.environment["seed"]
-        self._record_config(self._seed)
-        self._observe(resources, config)
-        self._describe()
-        known = campaign.simulated(self.dataset).tolist()
-        self._queue = EpisodeQueue(episodes, known, self.retries)
-        if not self._queue.is_done:
-            self._episodes = resources.enter_context(self._make_episodes(config, campaign.seed))
-
-    def _make_episodes(self, config: EnvironmentConfig, seed: Sequence[int]) -> EpisodeSource:
-        """Return what simulates the numbers of the queue, in this process or in clients."""
-        services = RunServices(self.session.dataset_dir, self.observers.events, None)
-        if not config.as_tcp_ip_client:
-            return LocalEpisodes(config, services, seed, self._queue)
-        from physx_core.sources.client_episodes import ClientEpisodes
-
-        return ClientEpisodes(config, services, seed, self._queue)
 
     def _results(self, error: BaseException | None) -> Iterable[str]:
         duration = self._duration
         if self.episodes is not None:
+            finished = 0 if self._queue is None else self._queue.finished
             failed = f", of which {self._failed} failed" if self._failed else ""
-            yield f"{self._queue.finished} of {self.episodes} episodes{failed} in {duration:.2f} s"
+            yield f"{finished} of {self.episodes} episodes{failed} in {duration:.2f} s"
             yield describe_samples(self.dataset.directory)
             return
         count = self.batch_id
         rate = count * (self.batch_size or 0) / duration
         yield f"{count} of {self.batch_nb} batches in {duration:.2f} s, {rate:.0f} samples/s"
         yield describe_samples(self.dataset.directory)
-        yield from describe_failed_sets(self.source)
+        if self._campaign is None:
+            yield from describe_failed_sets(self.source)
+        elif self._failed:
+            yield f"{self._failed} episodes failed"
 
     def _next(self, error: BaseException | None) -> Iterable[str]:
         path = shlex.quote(str(self.session.path))
-        if error is not None and self.episodes is not None:
+        if error is not None and self._campaign is not None:
             yield f"physx generate {path} --resume"
         yield f"physx info {path}"
         if error is None and self._mode == "training":

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from types import TracebackType
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -30,6 +31,10 @@ from physx_core.workers.row_codec import row_bytes
 from physx_core.workers.server.client_group import ClientGroup
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.written_rows import WrittenRows
+
+if TYPE_CHECKING:
+    from physx_core.sources.client_episodes import ClientEpisodes
+    from physx_core.workers.episode_queue import EpisodeQueue
 
 _AHEAD_BYTES = 4 << 20
 _AHEAD_ROWS = 1 << 16
@@ -77,6 +82,9 @@ class ClientSource(Source):
             transport: What connects the clients, and the clock that the run follows.
         """
         self._written = None if stripes is None else WrittenRows(stripes)
+        self._name = getattr(config.environment, "__name__", str(config.environment))
+        self._clock = transport.clock
+        self._episodes: ClientEpisodes | None = None
         self.instance_nb = config.num_clients
         self.sets = ParameterSets(config, seed, skip)
         self._group = ClientGroup(
@@ -121,11 +129,11 @@ class ClientSource(Source):
         """
         try:
             self._group.open()
-            first = self._group.peer(1).fields
-            for number in range(2, self.instance_nb + 1):
-                self._agree(number, first, self._group.peer(number).fields)
-            peers = map(self._group.peer, range(1, self.instance_nb + 1))
-            parameters = [peer.parameters for peer in peers]
+            first, *others = self._group.ready
+            self._opened = [*first.fields, *ROW_FIELDS]
+            for peer in others:
+                self._agree(peer.instance_id, first.fields, peer.fields)
+            parameters = [peer.parameters for peer in (first, *others)]
             if self._written is not None and any(parameters):
                 raise ConfigError(
                     "The environment has parameters, and the run records which ones each row was "
@@ -133,10 +141,26 @@ class ClientSource(Source):
                 )
             self.sets.begin(parameters)
             self.is_plain = not (self.sets.parameters or self._rejections)
+            self.is_independent = first.is_independent
+            if self._group.config.is_elastic:
+                self.check_independent()
         except BaseException:
             self._failed = True
             raise
-        self._opened = [*first, *ROW_FIELDS]
+
+    def lease(self, queue: EpisodeQueue) -> ClientEpisodes:
+        """Simulate independent episodes: see `Source.lease`."""
+        from physx_core.sources.client_episodes import ClientEpisodes  # streams need no records
+
+        self._episodes = ClientEpisodes(
+            self._group, self.sets, queue, self._check_guest, self._clock
+        )
+        return self._episodes
+
+    def _check_guest(self, peer: Peer) -> None:
+        """Check that a client that has joined the run runs the same environment as the others."""
+        self._agree(peer.instance_id, self._opened[: -len(ROW_FIELDS)], peer.fields)
+        self.sets.check_same(peer.instance_id, peer.parameters)
 
     def batch(self, size: int, stored: Batch | None = None) -> Batch:
         """Return the next rows: see `Source.batch`.
@@ -210,12 +234,15 @@ class ClientSource(Source):
         if self._closed:
             return
         self._closed = True
-        self._group.close(orderly=not self._failed)
+        goes_on = self._episodes is not None and self._episodes.is_busy
+        self._group.close(orderly=not (self._failed or goes_on))
         if self._failed:
             return
         for number, peer in sorted(self._group.server.peers.items()):
             if peer.failure is not None and (
-                self._run_ahead == 0 or peer.failed_row < self._wanted(number, self._asked)
+                self._run_ahead == 0
+                or self._episodes is not None
+                or peer.failed_row < self._wanted(number, self._asked)
             ):
                 raise peer.failure
 

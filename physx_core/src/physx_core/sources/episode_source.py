@@ -2,58 +2,38 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from collections.abc import Sequence
+from abc import ABC, abstractmethod
 from dataclasses import replace
 from typing import Any
 
-from physx_core.components.environment import Services
-from physx_core.components.parameter import Parameter
-from physx_core.config import EnvironmentConfig
 from physx_core.dataset import EpisodeStatus
 from physx_core.fields import Field
-from physx_core.sources.source import Opened
 from physx_core.workers.episode_queue import EpisodeQueue
 from physx_core.workers.episode_runner import EpisodeBlock, EpisodeRunner
-from physx_core.workers.instance import Instance, instance_arguments
+from physx_core.workers.instance import Instance
 from physx_core.workers.parameter_sets import ParameterSets
 
 
-class EpisodeSource(Opened):
-    """Simulates the numbers of a queue, in any order; a context manager.
+class EpisodeSource(ABC):
+    """Simulates the numbers of a queue, in any order: what `Source.lease` returns.
 
     The rows of a number depend on the seed and the number alone.
     """
 
-    def __init__(self, config: EnvironmentConfig, seed: Sequence[int], queue: EpisodeQueue) -> None:
+    def __init__(self, sets: ParameterSets, queue: EpisodeQueue) -> None:
         """Store what is simulated.
 
         Args:
-            config: The environment, and its sampler.
-            seed: Seed of the campaign.
+            sets: Chooses the parameters of each number.
             queue: The numbers to simulate.
         """
-        self._config, self._seed, self._queue = config, list(seed), queue
-        self._sets = ParameterSets(config, seed)
+        self._sets, self._queue = sets, queue
         self._values: dict[int, dict[str, Any]] = {}  # of the numbers that are being simulated
 
     @property
     @abstractmethod
     def fields(self) -> list[Field]:
         """Fields of the rows; shapes may be open before the first block."""
-
-    @property
-    def parameters(self) -> list[Parameter]:
-        """The parameters of the environment."""
-        return self._sets.parameters
-
-    @abstractmethod
-    def open(self) -> None:
-        """Create the environments.
-
-        Raises:
-            PhysxError: If an environment or client fails, or its episodes are not independent.
-        """
 
     @abstractmethod
     def take(self) -> EpisodeBlock:
@@ -65,13 +45,9 @@ class EpisodeSource(Opened):
             PhysxError: If an environment or client fails in a way that concerns all episodes.
         """
 
-    @abstractmethod
-    def close(self) -> None:
-        """Close the environments, and end their clients. Calling it again does nothing."""
-
     def _choose(self, number: int) -> dict[str, Any]:
         """Return the parameters of a number; empty if there are none."""
-        if not self.parameters:
+        if not self._sets.parameters:
             return {}
         if number not in self._values:
             self._values[number] = self._sets.values_of(number)
@@ -80,11 +56,11 @@ class EpisodeSource(Opened):
     def _settled(self, block: EpisodeBlock) -> EpisodeBlock:
         """Add the parameters to a block's records, and tell the queue which numbers it ends."""
         records = block.records
-        if self.parameters:
+        if self._sets.parameters:
             records = [replace(each, parameters=self._choose(each.episode)) for each in records]
         for record in records:
+            self._queue.note(record)
             if record.status is not EpisodeStatus.MORE:
-                self._queue.finish(record.count)
                 self._values.pop(record.episode, None)
         return EpisodeBlock(block.rows, records)
 
@@ -92,43 +68,23 @@ class EpisodeSource(Opened):
 class LocalEpisodes(EpisodeSource):
     """Simulates the numbers one after another in this process, with one environment."""
 
-    def __init__(
-        self,
-        config: EnvironmentConfig,
-        services: Services,
-        seed: Sequence[int],
-        queue: EpisodeQueue,
-    ) -> None:
-        """Prepare the environment; see `EpisodeSource` for the arguments.
+    def __init__(self, instance: Instance, sets: ParameterSets, queue: EpisodeQueue) -> None:
+        """Prepare the simulation.
 
         Args:
-            config: The environment, and its sampler.
-            services: Serves the environment's requests.
-            seed: Seed of the campaign.
+            instance: Simulates the episodes; open.
+            sets: Chooses the parameters of each number.
             queue: The numbers to simulate.
         """
-        super().__init__(config, seed, queue)
-        self._services = services
-        self._instance = Instance(**instance_arguments(config, 1, seed, accept_all=False))
-        self._runner: EpisodeRunner | None = None
+        super().__init__(sets, queue)
+        instance.choose_by(self._choose)
+        self._runner = EpisodeRunner(instance, queue.take)
 
     @property
     def fields(self) -> list[Field]:
         """Fields of the rows: see `EpisodeSource.fields`."""
-        return [] if self._runner is None else self._runner.fields
-
-    def open(self) -> None:
-        """Create the environment: see `EpisodeSource.open`."""
-        draw = self._config.visualizer is not None
-        self._instance.open(self._services, draw, self._choose)
-        self._sets.begin([self._instance.parameters])
-        self._runner = EpisodeRunner(self._instance, self._queue.take)
+        return self._runner.fields
 
     def take(self) -> EpisodeBlock:
         """Simulate the next episodes: see `EpisodeSource.take`."""
-        assert self._runner is not None
         return self._settled(self._runner.run())
-
-    def close(self) -> None:
-        """Close the environment: see `EpisodeSource.close`."""
-        self._instance.close()

@@ -6,7 +6,7 @@ import contextlib
 import logging
 from collections.abc import Sequence
 from functools import partial
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from physx_core.components.environment import Services
 from physx_core.config import EnvironmentConfig
@@ -17,6 +17,10 @@ from physx_core.sources.source import Source, check_stored
 from physx_core.typing import Batch
 from physx_core.workers.instance import NOTHING, Instance, Skip, instance_arguments
 from physx_core.workers.parameter_sets import ParameterSets, next_step
+
+if TYPE_CHECKING:
+    from physx_core.sources.episode_source import LocalEpisodes
+    from physx_core.workers.episode_queue import EpisodeQueue
 
 _LOG = logging.getLogger("physx")
 
@@ -52,6 +56,7 @@ class LocalSource(Source):
                 "environment of a prediction): leave them out."
             )
         self.instance_nb = config.num_clients
+        self._name = getattr(config.environment, "__name__", str(config.environment))
         self._services = services
         self._config = config
         self._arguments = [
@@ -81,6 +86,7 @@ class LocalSource(Source):
             self._open(instance)
         self.ignores_predictions = all(instance.ignores_predictions for instance in self._instances)
         self.sets.begin([instance.parameters for instance in self._instances])
+        self.is_independent = self._instances[0].is_independent
         self.is_plain = not (self.sets.parameters or self._config.record_wrong_samples)
 
     def batch(self, size: int, stored: Batch | None = None) -> Batch:
@@ -101,6 +107,12 @@ class LocalSource(Source):
         if not self.is_plain:
             self.sets.note(rows)
         return rows
+
+    def lease(self, queue: EpisodeQueue) -> LocalEpisodes:
+        """Simulate independent episodes: see `Source.lease`."""
+        from physx_core.sources.episode_source import LocalEpisodes  # streams need no records
+
+        return LocalEpisodes(self._instances[0], self.sets, queue)
 
     def _open(self, instance: Instance) -> None:
         draw = self._config.visualizer is not None

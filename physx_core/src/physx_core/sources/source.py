@@ -5,13 +5,17 @@ from __future__ import annotations
 import contextlib
 from abc import abstractmethod
 from types import TracebackType
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 from physx_core.closeable import Closeable
 from physx_core.errors import PhysxError, UsageError
 from physx_core.fields import Field
 from physx_core.typing import Batch
 from physx_core.workers.parameter_sets import ParameterSets
+
+if TYPE_CHECKING:
+    from physx_core.sources.episode_source import EpisodeSource
+    from physx_core.workers.episode_queue import EpisodeQueue
 
 
 class Canceled(BaseException):
@@ -62,6 +66,8 @@ class Source(Opened):
         sets: The sets of parameters that the instances get; those whose first rows are in the last
             batch can be taken from it.
         ignores_predictions: Whether `apply` is known to have no effect; unknown for clients.
+        is_independent: Whether the environment's episodes are independent, so that `lease` can be
+            used; known once the source is open.
         is_plain: Whether all that an open source produces are rows: there are no parameters, and
             rejected samples are not recorded.
     """
@@ -69,8 +75,10 @@ class Source(Opened):
     instance_nb: int
     sets: ParameterSets
     ignores_predictions = False
+    is_independent = False
     is_plain = False
     _is_canceled = False
+    _name = ""
 
     @property
     @abstractmethod
@@ -111,6 +119,27 @@ class Source(Opened):
     @abstractmethod
     def apply(self, prediction: Batch) -> None:
         """Pass row i of a prediction to the instance that generated row i of the last batch."""
+
+    @abstractmethod
+    def lease(self, queue: EpisodeQueue) -> EpisodeSource:
+        """Simulate independent episodes by number, instead of streams: do not call `batch` then.
+
+        Args:
+            queue: The numbers to simulate.
+        """
+
+    def check_independent(self) -> None:
+        """Check that the environment's episodes are independent.
+
+        Raises:
+            UsageError: If not.
+        """
+        if not self.is_independent:
+            raise UsageError(
+                f"{self._name} is a stream, which has no episodes to count: set episode_steps, or "
+                "independent_episodes = True and call end_episode(), or give batch_nb and "
+                "batch_size instead of episodes, without min_clients and max_clients."
+            )
 
     def cancel(self) -> None:
         """Make a call to `batch` in another thread end soon, with `Canceled`; then call `close`.

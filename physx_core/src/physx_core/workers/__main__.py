@@ -17,12 +17,11 @@ def main() -> int:
     parser = argparse.ArgumentParser(prog="python -m physx_core.workers", description=__doc__)
     parser.add_argument("--connect", metavar="HOST:PORT", required=True, help="the server")
     parser.add_argument("--instance", type=int, help="number of the instance; any by default")
-    parser.add_argument("--ticket", type=int, help="ticket for the instance, in an elastic run")
     options = parser.parse_args()
     prepare_worker()
     token = os.environ.pop(TOKEN_VARIABLE, "")
     try:
-        return run_client(options.connect, token, options.ticket or options.instance)
+        return run_client(options.connect, token, options.instance)
     except PhysxError as error:
         sys.stderr.write(f"physx client: {error}\n")
         return 1

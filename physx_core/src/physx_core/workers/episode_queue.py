@@ -6,6 +6,8 @@ import heapq
 from collections import Counter
 from collections.abc import Collection
 
+from physx_core.dataset import EpisodeRecord, EpisodeStatus
+
 
 class EpisodeQueue:
     """Gives out each number once; one whose simulation was lost is given out again, and first.
@@ -46,9 +48,10 @@ class EpisodeQueue:
                 return number
         return None
 
-    def finish(self, count: int) -> None:
-        """Note that so many more numbers are recorded."""
-        self.finished += count
+    def note(self, record: EpisodeRecord) -> None:
+        """Note what became of a number, or of several."""
+        if record.status is not EpisodeStatus.MORE:
+            self.finished += record.count
 
     @property
     def waiting(self) -> int:

@@ -183,6 +183,11 @@ class Instance(Closeable):
         return type(self._alive()).apply_prediction is Environment.apply_prediction
 
     @property
+    def is_independent(self) -> bool:
+        """Whether the environment's episodes are independent."""
+        return self._alive().independent_episodes
+
+    @property
     def has_ended(self) -> bool:
         """Whether the last sample is the last one of its episode, which is independent."""
         environment = self._alive()
@@ -231,6 +236,10 @@ class Instance(Closeable):
             environment.factory = Factory()
             self._call("init_visualization", environment.init_visualization)
             environment.update_visualization()
+
+    def choose_by(self, choose: Choose) -> None:
+        """Use another function than that of `open` to choose the parameters of an episode."""
+        self._alive()._choose_parameters = choose
 
     def _create(self) -> Environment:
         """Create the environment, and check that its constructor passed on its arguments."""
@@ -285,16 +294,9 @@ class Instance(Closeable):
             number: Its number, from which its parameters and its random stream follow.
 
         Raises:
-            UsageError: If the environment's episodes are not independent.
             PhysxError: If the environment fails.
         """
         environment = self._alive()
-        if not environment.independent_episodes:
-            raise UsageError(
-                f"{type(environment).__name__} is a stream, which has no episodes to count: set "
-                "episode_steps, or independent_episodes = True and call end_episode(), or give "
-                "batch_nb and batch_size instead of episodes."
-            )
         self._is_numbered, environment._numbering = True, (0, 1)
         self._counts = self._episode_steps is not None
         self._next_episode, environment._episode_is_over = number, True

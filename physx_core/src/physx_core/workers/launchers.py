@@ -34,7 +34,6 @@ class ClientProcess(ClientHandle):
         address: str,
         token: str,
         core: int | None = None,
-        ticket: int | None = None,
         detached: bool = False,
     ) -> None:
         """Store the arguments of the process.
@@ -44,7 +43,6 @@ class ClientProcess(ClientHandle):
             address: The server's ``HOST:PORT``.
             token: Token of the run.
             core: The only processor core that it may use; None: all that this process may use.
-            ticket: Ticket that it presents to run the instance, in an elastic run.
             detached: Whether it outlives this process; it ends with its connection to the server.
         """
         self.instance_id = instance_id
@@ -52,7 +50,6 @@ class ClientProcess(ClientHandle):
         self._command = [
             *(sys.executable, "-P", "-m", "physx_core.workers"),
             *("--connect", address, "--instance", str(instance_id)),
-            *(() if ticket is None else ("--ticket", str(ticket))),
         ]
         self._variables = {TOKEN_VARIABLE: token, **worker_variables()}
         self._process: ChildProcess | None = None

@@ -101,20 +101,9 @@ class ParameterSets:
             ConfigError: If there is a sampler but no parameter, or the sampler cannot choose them.
             FieldsMismatchError: If the instances define different parameters.
         """
-        first = list(definitions[0])
+        self.parameters = first = list(definitions[0])
         for number, other in enumerate(definitions[1:], 2):
-            if list(other) != first:
-                mine, theirs = ({p.name: p for p in one} for one in (first, other))
-                raise FieldsMismatchError(
-                    f"Instances 1 and {number} define different parameters",
-                    {
-                        name: f"{mine.get(name, 'not defined')} and "
-                        f"{theirs.get(name, 'not defined')}"
-                        for name in {**mine, **theirs}
-                        if mine.get(name) != theirs.get(name)
-                    }
-                    or {"order": f"{list(mine)} and {list(theirs)}"},
-                )
+            self.check_same(number, other)
         if not first and (self._config.sampler is not None or self._config.redraw):
             option = "sampler" if self._config.sampler is not None else "redraw"
             raise ConfigError(
@@ -122,12 +111,30 @@ class ParameterSets:
                 "call define_parameters() in its create() and implement reset_parameters(), or "
                 f"leave {option} out."
             )
-        self.parameters = first
         if first:
             self._sampler = self._sampler or _make_sampler(self._config, _DEFAULT)
             self._sampler.begin(first, self._seed)
         if self.learns:
             self._values = {int(number): self._read(row) for number, row in self._recorded.items()}
+
+    def check_same(self, number: int, other: Sequence[Parameter]) -> None:
+        """Check that an instance defines the same parameters as the first one.
+
+        Raises:
+            FieldsMismatchError: If not.
+        """
+        if list(other) == self.parameters:
+            return
+        mine, theirs = ({p.name: p for p in one} for one in (self.parameters, other))
+        raise FieldsMismatchError(
+            f"Instances 1 and {number} define different parameters",
+            {
+                name: f"{mine.get(name, 'not defined')} and {theirs.get(name, 'not defined')}"
+                for name in {**mine, **theirs}
+                if mine.get(name) != theirs.get(name)
+            }
+            or {"order": f"{list(mine)} and {list(theirs)}"},
+        )
 
     @property
     def fields(self) -> list[Field]:

@@ -24,15 +24,14 @@ class Client:
     """Run one instance of an environment for a run that waits for clients, until the run ends.
 
     The run has launcher = "physx/manual" and prints its address. The token is in the environment
-    variable PHYSX_TOKEN, or in a file that only you can read. A run with min_clients or max_clients
-    decides how many of its instances this client runs, each in a separate process.
+    variable PHYSX_TOKEN, or in a file that only you can read. Ctrl-C leaves the run; other clients
+    simulate an independent episode that this one has begun.
     """
 
     connect: Annotated[str, tyro.conf.arg(metavar="HOST:PORT")]
     """Address of the run."""
     instance: int | None = None
-    """Number of the instance to run, from 1; by default any instance without a client. In a run
-    with min_clients or max_clients: number of the client."""
+    """Number of the instance to run, from 1; by default any instance without a client."""
     token_file: Annotated[str | None, tyro.conf.arg(metavar="FILE")] = None
     """File with the token, readable only by you."""
     patience: float = PATIENCE

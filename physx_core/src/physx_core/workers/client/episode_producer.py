@@ -31,6 +31,7 @@ class EpisodeProducer:
 
     def run(self) -> None:
         """Simulate episodes until the server ends the run."""
+        self._link.beat()
         runner = EpisodeRunner(self._instance, self._take, self._link.clock)
         while True:
             block = runner.run()

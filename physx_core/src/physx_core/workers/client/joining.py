@@ -28,7 +28,7 @@ def join(
     patience: float = PATIENCE,
     answer_time: float | None = None,
     transport: Transport = SOCKETS,
-) -> tuple[WorkerLink, dict[str, Any] | None]:
+) -> tuple[WorkerLink, dict[str, Any]]:
     """Connect to a server and receive what to run.
 
     Retries if nothing listens, or if the server closes the connection during the handshake, as it
@@ -37,17 +37,17 @@ def join(
     Args:
         address: ``HOST:PORT``.
         token: Token of the run.
-        instance: Number of the instance to run or a ticket for it, 0 for any that is free.
+        instance: Number of the instance to run, 0 for any that is free.
         patience: How long to retry, in s.
         answer_time: How long a server that accepted the connection may take to answer, in s; None:
             without limit, as its run may be busy, for example with a long validation.
         transport: What connects the client, and the clock that it follows.
 
     Returns:
-        The connection, and the arguments of the instance; None: the client hosts workers.
+        The connection, and the arguments of the instance.
     """
 
-    def attempt(seconds: float) -> tuple[WorkerLink, dict[str, Any] | None]:
+    def attempt(seconds: float) -> tuple[WorkerLink, dict[str, Any]]:
         try:
             return _try_to_join(transport, address, token, instance, answer_time)
         except PlainRefusedError:
@@ -64,7 +64,7 @@ def _try_to_join(
     answer_time: float | None,
     *,
     encrypted: bool = False,
-) -> tuple[WorkerLink, dict[str, Any] | None]:
+) -> tuple[WorkerLink, dict[str, Any]]:
     connection = _connect(transport, address)
     try:
         prepare_connection(connection)
@@ -94,15 +94,13 @@ def _connect(transport: Transport, address: str) -> Link:
         raise UnansweredError(f"{what}: {error}. {advice}") from error
 
 
-def _receive_setup(link: WorkerLink) -> dict[str, Any] | None:
+def _receive_setup(link: WorkerLink) -> dict[str, Any]:
     try:
         frame = link.receive()
     except RunEnded:
         raise UnansweredError("The server ended the connection.") from None
     if frame.kind is Kind.ERROR:
         raise decode_error(frame.payload)
-    if frame.kind is Kind.HOST:
-        return None
     if frame.kind is not Kind.SETUP:
         raise ConnectionRefusedByPeerError(f"The server started with {frame.kind.name}.")
     setup: dict[str, Any] = decode(frame.payload)

@@ -12,7 +12,7 @@ from collections import deque
 from collections.abc import Collection, Sequence
 from typing import Any
 
-from physx_core.net.frames import Frame, FrameReader, Kind
+from physx_core.net.frames import Frame, FrameReader, Kind, pack
 from physx_core.net.link import SOCKETS, Link, Transport
 from physx_core.net.liveness import poll_peer
 from physx_core.net.remote_errors import decode_error
@@ -40,6 +40,8 @@ class WorkerLink:
     Attributes:
         clock: The clock that the client follows.
         spins: Whether to spin-wait for an answer for up to 0.2 ms.
+        heartbeat: How often to tell the server, while `beat` is in effect, that this process is
+            alive, in s; None: never.
     """
 
     def __init__(
@@ -53,7 +55,9 @@ class WorkerLink:
             transport: What the link belongs to.
         """
         self.clock, self.spins = transport.clock, False
+        self.heartbeat: float | None = None
         self._transport = transport
+        self._sending = threading.Lock()
         self._connection = connection
         self._reader = reader
         self._buffered: Collection[Any] = getattr(connection, "buffered", ())  # see SecureSocket
@@ -70,10 +74,16 @@ class WorkerLink:
         """
         BackgroundThread(self._watch, "physx-orders").start()
 
+    def beat(self) -> None:
+        """Send signs of life from now on, in a thread, also during a long step."""
+        if self.heartbeat is not None:
+            BackgroundThread(self._beat, "physx-heartbeat").start()
+
     def send(self, message: bytes) -> None:
         """Send a message."""
         try:
-            self._connection.sendall(message)
+            with self._sending:
+                self._connection.sendall(message)
         except OSError as error:
             raise ServerGone from error
 
@@ -85,12 +95,13 @@ class WorkerLink:
         """
         waiting = [memoryview(part) for part in parts if len(part)]
         try:
-            while waiting:
-                sent = self._connection.sendmsg(waiting[:_MOST_PARTS])
-                while waiting and sent >= len(waiting[0]):
-                    sent -= len(waiting.pop(0))
-                if sent:
-                    waiting[0] = waiting[0][sent:]
+            with self._sending:
+                while waiting:
+                    sent = self._connection.sendmsg(waiting[:_MOST_PARTS])
+                    while waiting and sent >= len(waiting[0]):
+                        sent -= len(waiting.pop(0))
+                    if sent:
+                        waiting[0] = waiting[0][sent:]
         except OSError as error:
             raise ServerGone from error
 
@@ -168,6 +179,11 @@ class WorkerLink:
         if frame is None:  # does not happen with a blocking socket
             raise ServerGone
         return frame
+
+    def _beat(self) -> None:
+        with contextlib.suppress(ServerGone):
+            while not self._over.wait(self.heartbeat):
+                self.send(pack(Kind.PING))
 
     def _watch(self) -> None:
         try:

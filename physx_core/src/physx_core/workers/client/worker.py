@@ -15,9 +15,8 @@ from physx_core.net.frames import Kind, pack
 from physx_core.net.remote_errors import encode_error
 from physx_core.net.spin_wait import has_core_for_each
 from physx_core.net.values import encode
-from physx_core.processes import CLIENT_VARIABLE
+from physx_core.processes import CLIENT_VARIABLE, Terminated
 from physx_core.typing import Sample
-from physx_core.workers.client.hosting import host_workers
 from physx_core.workers.client.joining import PATIENCE, join
 from physx_core.workers.client.link import RunEnded, ServerGone, WorkerLink
 from physx_core.workers.client.producer import Producer
@@ -39,13 +38,10 @@ def run_client(
 ) -> int:
     """Run one instance of the environment for a server until it ends the run.
 
-    In an elastic run it runs as many instances as the server assigns, each in its own process.
-
     Args:
         address: The server's ``HOST:PORT``.
         token: Token of the run.
-        instance: Number of the instance to run, counted from 1, or a ticket for it; None: any that
-            is free. In an elastic run, the number of the client.
+        instance: Number of the instance to run, counted from 1; None: any that is free.
         patience: How long to retry if nothing listens, in s.
         answer_time: How long to wait for the answer of a server that listens, in s; None: without
             limit.
@@ -59,10 +55,8 @@ def run_client(
     link, setup = join(address, token, instance or 0, patience, answer_time)
     link.exit_if_lost()
     try:
-        if setup is None:
-            host_workers(link, address, token, say)
-            return 0
         os.environ[CLIENT_VARIABLE] = "1"
+        link.heartbeat = setup.pop("heartbeat")
         _take_place(setup.pop("path"), setup.pop("directory"))
         return run_instance(link, setup, say)
     except RunEnded:
@@ -101,10 +95,7 @@ def run_instance(
         + (f"; {again} stored rows are generated again" if again else "")
     )
     link.spins = has_core_for_each(setup["instance_nb"])
-    is_campaign = setup.pop("campaign", False)
     client = _Client(link, Instance(**setup), sink, skip.pop("shown"), skip)
-    if is_campaign:
-        client.lease()
     try:
         client.live(draw)
     finally:
@@ -150,32 +141,41 @@ class _Client:
         self._services = RemoteServices(link, self._producer, shown)
         self._leased: EpisodeProducer | None = None
 
-    def lease(self) -> None:
-        """Simulate the episodes that the server leases, instead of a stream."""
-        # Importing datasets takes a quarter of a client's start time, and streams need none.
-        from physx_core.workers.client.episode_producer import EpisodeProducer
-
-        self._leased = EpisodeProducer(self._link, self._instance)
-
     def live(self, draw: bool) -> None:
         """Open the environment and generate rows until the run ends or the environment fails."""
         try:
             self._producer.open()
-            leased = self._leased
-            choose = self._services.choose if leased is None else leased.choose
-            self._instance.open(self._services, draw, choose)
+            self._instance.open(self._services, draw, self._choose)
             parameters = [parameter.to_dict() for parameter in self._instance.parameters]
             if parameters:
                 self._link.send(pack(Kind.PARAMETERS, encode(parameters)))
             fields = [field.to_dict() for field in self._instance.fields]
-            self._link.send(pack(Kind.READY, encode(fields)))
-            (leased or self._producer).run()
+            self._link.send(pack(Kind.READY, encode(fields), int(self._instance.is_independent)))
+            self._run()
+        except (KeyboardInterrupt, Terminated):
+            with contextlib.suppress(ServerGone):
+                self._link.send(pack(Kind.BYE))  # others go on with its episodes
+            raise
         except RunEnded as end:
             self.is_forsaken = isinstance(end, ServerGone)
             if self._producer.failure is not None:
                 self._report(self._producer.failure, self._producer.made)
         except PhysxError as error:
             self._report(error, self._producer.made)
+
+    def _run(self) -> None:
+        """Generate a stream, or simulate the episodes that the server leases if it does."""
+        first = self._link.receive()
+        self._link.put_back(first)
+        if first.kind is Kind.LEASE:
+            # Importing datasets takes a quarter of a client's start time; streams need none.
+            from physx_core.workers.client.episode_producer import EpisodeProducer
+
+            self._leased = EpisodeProducer(self._link, self._instance)
+        (self._leased or self._producer).run()
+
+    def _choose(self, number: int) -> dict[str, Any]:
+        return (self._leased or self._services).choose(number)
 
     def close(self) -> None:
         """Close the environment, and the files that it writes."""

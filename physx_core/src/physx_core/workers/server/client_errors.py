@@ -13,23 +13,20 @@ _LAST_WORDS_TIME = 0.3  # for a hung client to write where it hangs
 _LEAVE_TIME = 0.8  # a process that loses its connection exits a little later
 
 
-def exit_error(
-    number: int, peer: Peer | None, handle: ClientHandle | None, place: str = ""
-) -> ClientError:
+def exit_error(number: int, peer: Peer | None, handle: ClientHandle | None) -> ClientError:
     """Return the error for a client that is gone.
 
     Args:
         number: Its instance.
         peer: Its connection; None: it has not connected yet.
         handle: Its process; None if it was started by hand.
-        place: In an elastic run, the client that ran the instance, and its machine.
     """
     if peer is not None and peer.offense:
         if handle is not None:
             handle.wait(handle.clock.monotonic() + _LINES_TIME)
         stderr = "" if handle is None else handle.stderr()
         what = f"was cut off after {peer.received} rows. {peer.offense}"
-        return ClientError(number, what, stderr=stderr, client=place)
+        return ClientError(number, what, stderr=stderr)
     made = 0 if peer is None else peer.received
     when = "before it connected" if peer is None else f"after {made} rows"
     if peer is not None and peer.has_vanished:
@@ -45,7 +42,6 @@ def exit_error(
         "(--environment.no-as-tcp-ip-client).",
         exit_status=status,
         stderr=handle.stderr(),
-        client=place,
     )
 
 
@@ -54,7 +50,6 @@ def timeout_error(
     peer: Peer | None,
     handle: ClientHandle | None,
     timeout: float,
-    place: str = "",
 ) -> ClientError:
     """Return the error for a client that kept the server waiting too long.
 
@@ -63,7 +58,6 @@ def timeout_error(
         peer: Its current or last connection; None: it has not connected.
         handle: Its process; None if it was started by hand.
         timeout: How long the server waited, in s.
-        place: In an elastic run, the client that ran the instance, and its machine.
     """
     state = "" if handle is None else handle.state()
     waited = f"for {timeout:g} s while the server waited for it" + (state and f": {state}")
@@ -74,12 +68,32 @@ def timeout_error(
         how = f"{lost}, and no other took its place {waited}. If a start takes"
     else:
         how = f"sent nothing {waited}. If its steps take"
-    if handle is not None:
-        handle.terminate()  # it writes where it hung
-        handle.wait(handle.clock.monotonic() + _LAST_WORDS_TIME)
-    return ClientError(
-        number,
-        f"{how} that long, raise EnvironmentConfig.timeout.",
-        client=place,
-        stderr="" if handle is None else handle.stderr(),
+    text = f"{how} that long, raise EnvironmentConfig.timeout."
+    return ClientError(number, text, stderr=_last_words(handle))
+
+
+def overdue_error(
+    number: int, handle: ClientHandle | None, episode: int, seconds: float
+) -> ClientError:
+    """Return the error for a client whose episode takes too long.
+
+    Args:
+        number: Its instance.
+        handle: Its process; None if it was started by hand.
+        episode: Number of the episode.
+        seconds: How long it has simulated this, in s.
+    """
+    text = (
+        f"has simulated episode {episode} for {seconds:.3g} s. If it takes that long, raise "
+        "EnvironmentConfig.episode_timeout."
     )
+    return ClientError(number, text, stderr=_last_words(handle))
+
+
+def _last_words(handle: ClientHandle | None) -> str:
+    """Make a client end, and return the last lines of its standard error: where it hung."""
+    if handle is None:
+        return ""
+    handle.terminate()
+    handle.wait(handle.clock.monotonic() + _LAST_WORDS_TIME)
+    return handle.stderr()

@@ -30,8 +30,8 @@ from physx_core.plugins.references import locate
 from physx_core.workers.instance import NOTHING, Skip, instance_arguments
 from physx_core.workers.launchers import describe_states, stop
 from physx_core.workers.parameter_sets import ParameterSets, next_step
-from physx_core.workers.server.client_errors import exit_error, timeout_error
-from physx_core.workers.server.client_pool import ClientPool
+from physx_core.workers.server.client_errors import exit_error, overdue_error, timeout_error
+from physx_core.workers.server.episode_pool import EpisodePool
 from physx_core.workers.server.leases import Leases
 from physx_core.workers.server.pace import Laggards
 from physx_core.workers.server.peer import Peer
@@ -67,7 +67,6 @@ class ClientGroup:
         skip: Skip = NOTHING,
         total: int | None = None,
         written: WrittenRows | None = None,
-        leases: Leases | None = None,
         transport: Transport = SOCKETS,
     ) -> None:
         """Store the arguments; `open` starts the clients.
@@ -81,39 +80,31 @@ class ClientGroup:
             skip: What an earlier run already got: clients generate it again, but do not send it.
             total: Number of rows of the whole run, including those to skip; None: unknown.
             written: Counts the rows that the clients write themselves; None: they send them.
-            leases: Gives clients the episodes of a campaign; None: each runs a stream.
             transport: What connects the clients, and the clock that the run follows.
         """
         self._clock = transport.clock
-        self._written, self._leases = written, leases
+        self._written = written
         self.config = config
         self._seed, self._sets = list(seed), sets
         self._accepts_all, self._skip = accept_all, skip
         self._total = total
-        launcher = _make_launcher(config)
+        self._launcher = launcher = _make_launcher(config)
+        launcher.elastic = config.is_elastic
         token = choose_token(config, launcher.by_hand, launcher.elsewhere)
-        self._pool: ClientPool | None = None
-        if config.is_elastic:
-            is_known = find_token(config.token_file) is not None
-            self._pool = ClientPool(config, launcher, is_open=is_known, clock=self._clock)
-        self._is_by_hand = launcher.by_hand
-        self._launcher: Launcher = self._pool or launcher
+        self._pool = self._make_pool() if config.is_elastic else None
         self._laggards, self._named = Laggards(self._clock), set[str]()
         self._handles: dict[int, ClientHandle] = {}
         self._launched: dict[int, float] = {}
         self._queued: dict[int, float] = {}
         self._exits: dict[int, float] = {}
         self._restarts: Counter[int] = Counter()
-        self._idle_losses = 0
         self._checked = self._served = self._said = self._began = self._looked = 0.0
         self._closing = False
         self._host: str | None = None
-        special = written or leases
-        dispatch = {} if special is None else special.dispatch
         self.server = Server(
             config.ip_address,
             config.port,
-            config.num_clients,
+            config.places,
             services,
             self._encode_setup,
             token,
@@ -121,8 +112,8 @@ class ClientGroup:
             self._replaces,
             1e9 * config.journal_size,
             skip,
-            self._pool,
-            dispatch,
+            self._reserved,
+            {} if written is None else written.dispatch,
             transport,
         )
 
@@ -131,27 +122,47 @@ class ClientGroup:
         self._encode(1)  # raise for arguments that cannot be sent before anything is started
         self._host = self._launcher.open()
         self.server.open(self._host if is_loopback(self.config.ip_address) else None)
-        numbers = list(self._numbers)
-        if self._pool is not None:
-            address, public = self._address(), self._public_address()
-            self._pool.begin(address, public, self.server)
-        self._launch(numbers)
-        if self._is_by_hand:
-            count = len(numbers) if self._pool is None else self._pool.least
+        self._launch(range(1, self.config.num_clients + 1))
+        if self._launcher.by_hand:
+            count = self.config.num_clients if self._pool is None else self._pool.least
+            most = "" if self._pool is None else f" (at most {self.config.places} may join)"
             _LOG.warning(
                 "The run waits for %d %s%s. Start each with: physx client --connect %s "
                 "(and the token in %s, or in a file with --token-file)",
                 count,
                 "clients" if count > 1 else "client",
-                "" if self._pool is None else f" (at most {self._pool.most} may join)",
+                most,
                 self._public_address(),
                 TOKEN_VARIABLE,
             )
-        self.wait(lambda: [number for number in numbers if not self._is_ready(number)])
+        self.wait(self._starting)
+
+    def lease(self, leases: Leases) -> None:
+        """Have the clients, which are ready, simulate episodes instead of streams."""
+        self._pool = self._pool or self._make_pool()
+        self._pool.leases = leases
+        self.server.dispatch.update(leases.dispatch)
+
+    def refuse(self, peer: Peer, error: PhysxError) -> None:
+        """Do without a client that joined the run, or fail if the run started it."""
+        if peer.instance_id in self._handles:
+            raise error
+        self._lose(peer.instance_id, error)
+
+    @property
+    def ready(self) -> list[Peer]:
+        """The connections of the clients whose environments are ready, in order of instances."""
+        return [self.peer(number) for number in self._numbers if self._is_ready(number)]
 
     def peer(self, instance_id: int) -> Peer:
         """Return the connection of an instance's current or last client."""
         return self.server.peers[instance_id]
+
+    @property
+    def absent(self) -> list[int]:
+        """The instances that have no client that is ready."""
+        ready = {peer.instance_id for peer in self.ready}
+        return [number for number in self._numbers if number not in ready]
 
     def wait(self, missing: Callable[[], Sequence[int]]) -> None:
         """Serve the clients until no instance is missing.
@@ -164,7 +175,7 @@ class ClientGroup:
         if was_busy:  # what arrived meanwhile may have waited to be read
             for each in self.server.peers.values():
                 each.pace.leave_out()
-        if self._leases is not None and not was_busy:
+        if self._pool is not None and not was_busy:
             began = self._began  # others' episodes end this wait, but not that for a silent client
         self._began = began
         if began - self._served > _TICK / 10:
@@ -179,9 +190,7 @@ class ClientGroup:
                 self._serve(0.0)  # an answer may have arrived while others were served
                 for number in self._find_silent(waited, began):
                     peer, handle = self.server.peers.get(number), self._handles.get(number)
-                    if self._pool is None or not self._pool.suspects(number, began):
-                        place, timeout = self._place(number), self.config.timeout
-                        self._lose(number, timeout_error(number, peer, handle, timeout, place))
+                    self._lose(number, timeout_error(number, peer, handle, self.config.timeout))
 
     def close(self, *, orderly: bool) -> None:
         """Make the clients close their environments, then end them; no process is left behind.
@@ -206,10 +215,7 @@ class ClientGroup:
                 patience = 0.0 if self._unfinished() else _GRACE
         finally:
             try:
-                if self._pool is not None:
-                    self._pool.end(patience)
-                else:
-                    stop(self._handles.values(), patience)
+                stop(self._handles.values(), patience)
             finally:
                 self._handles = {}
                 self.server.close()
@@ -217,7 +223,21 @@ class ClientGroup:
 
     @property
     def _numbers(self) -> range:
-        return range(1, self.config.num_clients + 1)
+        return range(1, self.config.places + 1)
+
+    def _make_pool(self) -> EpisodePool:
+        is_known = find_token(self.config.token_file) is not None
+        is_open = self._launcher.by_hand or is_known
+        return EpisodePool(self.config, self._clock, is_open=is_open)
+
+    def _starting(self) -> list[int]:
+        """Return the instances that the run waits for before it begins."""
+        is_enough = self._pool is not None and len(self.ready) >= self._pool.least
+        return [] if is_enough else self.absent
+
+    def _reserved(self) -> set[int]:
+        """Return the instances for which the launcher has started a client that has not joined."""
+        return {number for number in self._handles if self._find_peer(number) is None}
 
     def _launch(self, numbers: Sequence[int]) -> None:
         now = self._clock.monotonic()
@@ -275,14 +295,13 @@ class ClientGroup:
         peer = self._find_peer(number)
         if peer is not None and peer.failure is not None:
             raise peer.failure
-        return peer is not None and bool(peer.fields)
+        return peer is not None and bool(peer.fields) and not peer.closed
 
     def _check_ended(self, now: float, listened_since: float) -> None:
-        self._check_clients(now)
+        if self._pool is not None and not self._closing:
+            self._check_pool(self._pool)
         for number in self._numbers:
             handle, peer = self._handles.get(number), self._find_peer(number)
-            if self._pool is not None and self._pool.is_lost(number):
-                continue  # another client starts it at the next check
             if peer is not None and peer.failure is not None:
                 if self._replaces(number, peer.failure):
                     self._lose(number, peer.failure)
@@ -290,88 +309,60 @@ class ClientGroup:
             if peer is not None and peer.finished:
                 continue
             if peer is not None and peer.closed:
-                left = handle is None and not peer.offense
-                if self._pool is not None and peer.has_vanished:
-                    self._pool.cut_off(number)
-                    continue
-                self._lose(number, self._exit_error(number, peer, handle), left=left)
+                left = peer.has_left or (handle is None and not peer.offense)
+                self._lose(number, exit_error(number, peer, handle), left=left)
             elif handle is not None and handle.exit_status() is not None:
                 # What it sent before it ended may still be in transit or unread.
                 since = self._exits.setdefault(number, now)
                 if peer is None or (now - since > 2 * _TICK and peer.heard < listened_since):
-                    self._lose(number, self._exit_error(number, peer, handle))
+                    self._lose(number, exit_error(number, peer, handle))
 
-    def _exit_error(
-        self, number: int, peer: Peer | None, handle: ClientHandle | None
-    ) -> ClientError:
-        return exit_error(number, peer, handle, self._place(number))
-
-    # Clients of an elastic run -----------------------------------------------------------
-
-    def _check_clients(self, now: float) -> None:
-        """Give the instances of clients that are lost or run too many to other clients."""
-        if self._pool is None:
-            return
-        for number in self._pool.check(now, self._began, ending=self._closing):
-            if self._given_up(number) and not self._closing:
-                place = self._place(number)
-                raise self._final(number, ClientError(number, "lost its client.", client=place))
-            self._replace(number, self._handles.pop(number, None))
-        while not self._closing:
-            moved = self._pool.find_move(self._progress, lambda n: not self._given_up(n))
-            if moved is None:
-                break
-            handle = self._handles.pop(moved)
-            handle.kill()
-            self._replace(moved, handle)
-
-    def _progress(self, number: int) -> tuple[int, int | None]:
-        peer = self.server.peers.get(number)
-        made = 0 if peer is None else peer.received
-        if self._total is None:
-            return made, None
-        mine = (self._total - number + self.config.num_clients) // self.config.num_clients
-        return made, mine - made
-
-    def _place(self, number: int) -> str:
-        """Return an instance's client and its machine; empty if each instance has its own."""
-        return "" if self._pool is None else self._pool.place(number)
+    def _check_pool(self, pool: EpisodePool) -> None:
+        """End clients whose episode takes too long, and the run if there are too few clients."""
+        for number, episode, seconds in pool.find_overdue():
+            self._lose(number, overdue_error(number, self._handles.get(number), episode, seconds))
+        for number in self._numbers if pool.leases is not None else ():
+            peer = self._find_peer(number)
+            is_guest = peer is not None and not peer.fields and number not in self._handles
+            if is_guest and peer is not None and peer.failure is not None:
+                self._lose(number, peer.failure)
+        ready = [number for number in self._numbers if self._is_ready(number)]
+        absent = [h for n, h in self._handles.items() if n not in ready]
+        pool.check_count(ready, absent, self._began)
 
     def _look_for_laggards(self, waited: Sequence[int]) -> None:
         """Report clients that the run waits for because they are much slower than the others."""
         now = self._served
-        if len(self._numbers) < 2 or now - self._looked < _TICK:
+        if self._pool is not None or len(self._numbers) < 2 or now - self._looked < _TICK:
             return
         self._looked = now
         late = self.server.holding_up(waited)
         self._laggards.note(late if 2 * len(late) <= len(self._numbers) else (), now)
         peers = self.server.peers
         paces = {n: peer.pace.per_row for n, peer in peers.items() if peer.pace.per_row}
-        loads = {n: 1 if self._pool is None else self._pool.load(n) for n in self._numbers}
-        for number, per_row, median in self._laggards.find(paces, loads):
-            place = self._place(number) or f"its client at {peers[number].name}"
+        for number, per_row, median in self._laggards.find(paces):
+            place = f"its client at {peers[number].name}"
             if place in self._named:
                 continue
             self._named.add(place)
             _LOG.warning(
                 "The run waits for instance %d: %s takes %.3g ms for a row, %.1f times as long as "
-                "the median of the instances%s.",
+                "the median of the instances.",
                 number,
                 place,
                 1000 * per_row,
                 per_row / median,
-                f", and runs {loads[number]} of them" if loads[number] > 1 else "",
             )
 
     # Replacing clients -----------------------------------------------------------------
 
     def _replaces(self, number: int, error: PhysxError | None) -> bool:
         """Return whether another client replaces one that failed, or left without an error."""
-        if self._leases is not None:
+        if self._pool is not None:
             return False  # it does not go on where the other one ended
         if self._given_up(number):  # the next one can only start with other parameters
             return not isinstance(error, ClientError) and self._redraws_after(number, error)
-        if error is None and (self._is_by_hand or self.config.redraw or self._pool is not None):
+        if error is None and (self._launcher.by_hand or self.config.redraw):
             return True
         return self._restarts_after(number, error) or self._redraws_after(number, error)
 
@@ -402,12 +393,10 @@ class ClientGroup:
             error: How it was lost.
             left: Whether it closed the connection, as clients that were started by hand may.
         """
-        if self._pool is not None and self._pool.is_lost(number):
-            return  # noticed while its error was being determined
-        if self._leases is not None:
-            self._lose_leased(number, error, self._leases)
+        if self._pool is not None:
+            self._lose_any(number, error, self._pool)
             return
-        absent = self._is_by_hand and self._pool is None and self._find_peer(number) is None
+        absent = self._launcher.by_hand and self._find_peer(number) is None
         if absent or not self._replaces(number, None if left else error):
             self._sets.fail(number, self._episode(number), error)
             raise self._final(number, error)
@@ -421,31 +410,29 @@ class ClientGroup:
         closes = not isinstance(error, ClientError)  # which takes a moment
         self._replace(number, self._handles.pop(number, None), _GRACE if closes else 0.0)
 
-    def _lose_leased(self, number: int, error: PhysxError, leases: Leases) -> None:
-        """Start another client for a lost one of a campaign; others get its episodes, too."""
-        peer = self._find_peer(number)
-        if peer is None or not peer.fields or not isinstance(error, ClientError):
-            raise error  # its environment was not ready, so the next one may end likewise
-        held = number in leases.holders
-        self._idle_losses += not held
-        if self._idle_losses > len(self._numbers):
-            raise error
-        text, _, details = str(error).partition("\n")
-        failed = leases.lose(number)
-        follows = "Its episode is simulated once more." if held else "It had no episode."
-        if failed is not None:
-            leases.fail(failed, text)
-            follows = f"Episode {failed} has failed."
-        _LOG.warning("%s. %s%s", text.rstrip("."), follows, details and "\n" + details)
-        self._replace(number, self._handles.pop(number, None))
+    def _lose_any(self, number: int, error: PhysxError, pool: EpisodePool) -> None:
+        """Do without a client of which others can simulate the episodes, or start another one."""
+        peer, handle = self._find_peer(number), self._handles.pop(number, None)
+        if peer is not None and peer.has_left:
+            pool.leave(number)
+            again = False
+        else:
+            ready = peer is not None and bool(peer.fields)
+            again = pool.lose(number, error, ready=ready, launched=handle is not None)
+        self._vacate(number, handle)
+        if again and not self._closing:
+            self._launch([number])
 
     def _replace(self, number: int, former: ClientHandle | None, patience: float = 0.0) -> None:
         """End an instance's former client, and start another one in its place."""
+        self._vacate(number, former, patience)
+        if not self._closing:
+            self._launch([number])
+
+    def _vacate(self, number: int, former: ClientHandle | None, patience: float = 0.0) -> None:
         self.server.vacate(number)
         stop([] if former is None else [former], patience)
         self._exits.pop(number, None)
-        if not self._closing:
-            self._launch([number])
 
     def _given_up(self, number: int) -> str:
         """Return why an instance cannot be restarted although it could before; empty if it can."""
@@ -489,7 +476,7 @@ class ClientGroup:
         if self._closing:
             return "The run was ending, and it has all its rows."
         text = "Another client takes its place."
-        if self._is_by_hand and self._pool is None:
+        if self._launcher.by_hand:
             text = (
                 f"The run waits up to {self.config.timeout:g} s for another client to take its "
                 f"place, at {self._public_address()}."
@@ -523,14 +510,15 @@ class ClientGroup:
 
     def _heard(self, number: int) -> float:
         peer = self.server.peers.get(number)
-        started = 0.0 if self._pool is None else self._pool.started(number)
-        launched = max(self._launched.get(number, 0.0), started)
-        return max(launched, peer.heard if peer is not None else 0.0)
+        return max(self._launched.get(number, 0.0), peer.heard if peer is not None else 0.0)
 
     def _with_client(self, numbers: Iterable[int]) -> list[int]:
-        """Return the instances that do not wait for a client; the pool reports those that do."""
-        pool = self._pool
-        return sorted(n for n in numbers if pool is None or not pool.waits(n))
+        """Return the instances that have a client, or need one before the run can go on."""
+        return sorted(
+            n
+            for n in numbers
+            if self._pool is None or n in self._handles or self._find_peer(n) is not None
+        )
 
     def _find_silent(self, waited: Sequence[int], began: float) -> list[int]:
         """Return the instances that have kept the server waiting too long."""
@@ -556,11 +544,11 @@ class ClientGroup:
             "slow_until": peer.slow_until,
         }
         first: dict[str, Any] = {"first_step": origin.step, "first_episode": origin.episode}
+        first["heartbeat"] = min(_SAY_EVERY, self.config.timeout / 4)
         if self._written is not None:
             first["stripes"] = self._written.describe(peer)
-        if self._leases is not None:
+        if self._pool is not None:
             skip = dict.fromkeys(skip, 0)
-            first["campaign"] = True
         return self._encode(peer.instance_id, skip=skip, **first)
 
     def _encode(self, instance_id: int, **progress: Any) -> bytes:

@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from physx_core.clock import SYSTEM_CLOCK, Clock
 from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
 from physx_core.net.frames import Frame, Kind, pack
@@ -35,13 +36,20 @@ class Leases:
         dispatch: Handles the messages of a client, by their kind.
     """
 
-    def __init__(self, queue: EpisodeQueue, choose: Callable[[int], dict[str, Any]]) -> None:
+    def __init__(
+        self,
+        queue: EpisodeQueue,
+        choose: Callable[[int], dict[str, Any]],
+        clock: Clock = SYSTEM_CLOCK,
+    ) -> None:
         """Store what is simulated.
 
         Args:
             queue: The numbers.
             choose: Returns the parameters of a number.
+            clock: Tells how long episodes take.
         """
+        self._clock = clock
         self.blocks: deque[EpisodeBlock] = deque()
         self.dispatch: dict[Kind, Callable[[Peer, Frame], None]] = {
             Kind.ROWS: self._take_rows,
@@ -52,6 +60,7 @@ class Leases:
         self._rows: dict[int, Batch] = {}  # instance to rows whose record has not arrived
         self._suspects: set[int] = set()  # numbers, one of which ended a client; leased alone
         self._pace: dict[int, float] = {}  # instance to the seconds of one of its episodes
+        self._since: dict[int, float] = {}  # instance to when it began its present episode
 
     @property
     def holders(self) -> list[int]:
@@ -79,6 +88,8 @@ class Leases:
             leased[number] = 0
             new.append(number)
         if new:
+            if len(leased) == len(new):
+                self._since[peer.instance_id] = self._clock.monotonic()
             values = [self._choose(number) for number in new] if peer.parameters else []
             peer.send(pack(Kind.LEASE, encode([new, values]), len(new)))
             peer.pace.go_on()
@@ -100,6 +111,21 @@ class Leases:
                 self._queue.put_back(number)
             return None
         return None if not leased or self._queue.give_back(leased[0]) else leased[0]
+
+    def release(self, instance_id: int) -> None:
+        """Return the numbers of a client that leaves to the queue."""
+        self._rows.pop(instance_id, None)
+        for number in self._leased.pop(instance_id, {}):
+            self._queue.put_back(number)
+
+    def simulated(self) -> list[tuple[int, int, float]]:
+        """Return what clients simulate: an instance, its episode, and for how long, in s."""
+        now = self._clock.monotonic()
+        return [
+            (instance, next(iter(leased)), now - self._since[instance])
+            for instance, leased in self._leased.items()
+            if leased
+        ]
 
     def fail(self, number: int, reason: str) -> None:
         """Record that a number has failed."""
@@ -129,6 +155,8 @@ class Leases:
         leased = self._leased.get(peer.instance_id, {})
         for record in records:
             _settle(leased, record)
+            if record.status is not EpisodeStatus.MORE:
+                self._since[peer.instance_id] = self._clock.monotonic()
         _check_rows(rows, records)
         if rows:
             check_values(rows, peer.row_fields, peer.instance_id)

@@ -91,25 +91,21 @@ class Laggards:
         for number in waited:
             self._held[number] += elapsed
 
-    def find(self, paces: Mapping[int, float], loads: Mapping[int, int]) -> list[Laggard]:
+    def find(self, paces: Mapping[int, float]) -> list[Laggard]:
         """Return the instances that have held up the run since they were last returned.
 
-        An instance is slow if its time per row is at least twice the median; the limit grows in
-        proportion if its client runs more instances than others do.
+        An instance is slow if its time per row is at least twice the median.
 
         Args:
             paces: Instance to time per row, in s.
-            loads: Instance to number of instances that its client runs.
         """
         held = [number for number, seconds in self._held.items() if seconds >= _HELD]
         if not held or len(paces) < 2:
             return []
         median = statistics.median_low(paces.values())
-        usual = statistics.median_low(loads.values())
         found = []
         for number in held:
-            fair = max(1.0, loads.get(number, 1) / usual)
-            if paces.get(number, 0.0) >= _SLOW * fair * median:
+            if paces.get(number, 0.0) >= _SLOW * median:
                 del self._held[number]
                 found.append(Laggard(number, paces[number], median))
         return found

@@ -44,8 +44,8 @@ class Peer(Connection):
     Attributes:
         reader: Reads its frames.
         instance_id: Number of its instance, counted from 1; 0 while it is a stranger.
-        client: Number of a client that runs workers, counted from 1; 0 for all others.
         fields: The environment's fields; empty before it is ready.
+        is_independent: Whether the environment's episodes are independent.
         row_fields: Fields of its rows, all shapes known; empty before the first sample.
         rows: Rows that arrived.
         received: How many rows arrived in total.
@@ -58,6 +58,7 @@ class Peer(Connection):
         last_step: Step of its last row, -1 before the first.
         offense: The protocol violation for which it was cut off; empty if there is none.
         has_vanished: Whether its machine no longer answers.
+        has_left: Whether it left the run on purpose.
         finished: Whether it reported that its environment is closed.
         vacant: Whether another client may take the instance's place.
         has_told_fields: Whether it sent the fields of its rows.
@@ -82,8 +83,9 @@ class Peer(Connection):
             clock: Tells how long the client takes.
         """
         super().__init__(link, FrameReader(HANDSHAKE_LIMIT), name, clock)
-        self.instance_id = self.client = 0
+        self.instance_id = 0
         self.fields: list[Field] = []
+        self.is_independent = False
         self.row_fields: list[Field] = []
         self.rows = RowQueue()
         self.received = self.granted = self.wanted = 0
@@ -93,7 +95,8 @@ class Peer(Connection):
         self.failed_row = 0
         self.last_step = -1
         self.offense = ""
-        self.has_vanished = self.finished = self.vacant = self.has_told_fields = False
+        self.has_vanished = self.has_left = self.finished = self.vacant = False
+        self.has_told_fields = False
         self.requests = self.shown = 0
         self.journal: Journal | None = None
         self.parameters: list[Parameter] = []

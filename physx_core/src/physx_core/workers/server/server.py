@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import selectors
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from types import MappingProxyType
 
 from physx_core.components.environment import Services
@@ -24,7 +24,6 @@ from physx_core.net.spin_wait import has_core_for_each
 from physx_core.workers.instance import NOTHING, Skip
 from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.row_codec import unpack_rows
-from physx_core.workers.server.client_pool import ClientPool
 from physx_core.workers.server.journal import Journal
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.service_requests import ServiceRequests
@@ -35,7 +34,6 @@ from physx_core.workers.server.validation import (
     parse_fields,
     parse_parameters,
 )
-from physx_core.workers.tickets import is_ticket
 
 _HANDSHAKE_TIME = 5.0
 _SPIN_TIME = 5e-5  # for the next requests of clients that were just answered
@@ -51,6 +49,7 @@ class Server:
     Attributes:
         peers: Instance number to the connection of its client.
         token: Secret of the run.
+        dispatch: Handles the messages of clients, by their kind.
     """
 
     def __init__(
@@ -65,7 +64,7 @@ class Server:
         replaces: Callable[[int, PhysxError | None], bool],
         journal_size: float,
         skip: Skip = NOTHING,
-        pool: ClientPool | None = None,
+        reserved: Callable[[], Collection[int]] = tuple,
         dispatch: Mapping[Kind, Callable[[Peer, Frame], None]] = MappingProxyType({}),
         transport: Transport = SOCKETS,
     ) -> None:
@@ -83,7 +82,7 @@ class Server:
                 error, or left without one.
             journal_size: Largest size in bytes of an instance's journal.
             skip: What an earlier run already got from the instances.
-            pool: The clients, if they run workers for several instances; None: each runs one.
+            reserved: Returns the instances that only clients that ask for them may run.
             dispatch: Handles the messages about rows, by their kind, if clients do not just send
                 rows of streams.
             transport: What connects the clients, and the clock that the server follows.
@@ -96,7 +95,7 @@ class Server:
         self._requests = ServiceRequests(services, sets)
         self._setup, self._replaces, self._skip = setup, replaces, skip
         self._journal_size = journal_size
-        self._pool = pool
+        self._reserved = reserved
         self._ending = self._has_news = False
         self._listener = Listener[Peer](
             self._meet, self._give_up, encrypts=True, transport=transport
@@ -104,14 +103,15 @@ class Server:
         self._strangers = Handshakes[Peer](
             token, _HANDSHAKE_TIME, _MAX_STRANGERS, self._drop, self._listener.timers
         )
-        self._dispatch: dict[Kind, Callable[[Peer, Frame], None]] = {
+        self.dispatch: dict[Kind, Callable[[Peer, Frame], None]] = {
             Kind.PARAMETERS: _take_parameters,
             Kind.READY: _take_ready,
             Kind.FIELDS: _take_fields,
             Kind.WRONG: _take_wrong,
             Kind.ERROR: _take_error,
             Kind.BYE: self._take_bye,
-            Kind.AGAIN: _take_again,
+            Kind.AGAIN: _take_sign_of_life,
+            Kind.PING: _take_sign_of_life,
             **dict.fromkeys(_REQUESTS, self._requests.take),
             **(dispatch or {Kind.ROWS: _take_rows}),
         }
@@ -203,8 +203,6 @@ class Server:
             self._drop(peer)
             if peer.journal is not None:
                 peer.journal.close()
-        for peer in self._pool.peers if self._pool is not None else ():
-            self._drop(peer)
         self._strangers.drop_all()
         self._listener.close()
 
@@ -254,7 +252,7 @@ class Server:
             while not peer.closed:
                 turns += 1
                 frame = peer.reader.read(peer.link)
-                if peer.instance_id or peer.client:
+                if peer.instance_id:
                     peer.hear(whole=frame is not None)
                 if frame is not None:
                     self._take(peer, frame)
@@ -276,13 +274,11 @@ class Server:
             self._drop(peer)
 
     def _take(self, peer: Peer, frame: Frame) -> None:
-        if peer.client and self._pool is not None:
-            self._pool.take(peer, frame)
-        elif not peer.instance_id:
+        if not peer.instance_id:
             self._greet(peer, frame)
-        elif frame.kind in self._dispatch:
+        elif frame.kind in self.dispatch:
             self._has_news |= frame.kind is not Kind.PREDICT
-            self._dispatch[frame.kind](peer, frame)
+            self.dispatch[frame.kind](peer, frame)
         else:
             raise ConnectionRefusedByPeerError(
                 f"It sent {frame.kind.name}, which a client may not send now."
@@ -293,13 +289,10 @@ class Server:
         peer.send(answer)
         if wanted is None:
             return
-        if self._pool is not None:
-            if not is_ticket(wanted):
-                self._pool.admit(peer, wanted)
-                return
-            wanted = self._pool.redeem(wanted)
         numbers = range(1, self._instance_nb + 1)
         free = [n for n in numbers if n not in self.peers or self.peers[n].vacant]
+        if not wanted:
+            free = [number for number in free if number not in self._reserved()]
         if not free or (wanted and wanted not in free):
             name = f"instance {wanted}" if wanted else "another client"
             refusal = ConnectionRefusedByPeerError(
@@ -336,9 +329,8 @@ class Server:
     # Messages of clients -----------------------------------------------------------------------
 
     def _take_bye(self, peer: Peer, frame: Frame) -> None:
-        if not (self._ending or peer.failure):
-            raise ConnectionRefusedByPeerError("It reported its end, but nobody ended the run.")
-        peer.finished = peer.failure is None
+        peer.has_left = not (self._ending or peer.failure)
+        peer.finished = self._ending and peer.failure is None
         self._drop(peer)  # it waits for this
 
 
@@ -353,7 +345,7 @@ def _take_ready(peer: Peer, frame: Frame) -> None:
     if peer.fields:
         raise ConnectionRefusedByPeerError("It defined its fields twice.")
     check_environment_fields(fields)
-    peer.fields = fields
+    peer.fields, peer.is_independent = fields, bool(frame.number)
 
 
 def _take_fields(peer: Peer, frame: Frame) -> None:
@@ -388,8 +380,8 @@ def _take_wrong(peer: Peer, frame: Frame) -> None:
     peer.rejected.append(block, count)
 
 
-def _take_again(peer: Peer, frame: Frame) -> None:
-    """Do nothing: the message is a sign of life from a client that has no rows to send."""
+def _take_sign_of_life(peer: Peer, frame: Frame) -> None:
+    """Do nothing: the client is alive, but has no rows to send."""
 
 
 def _take_error(peer: Peer, frame: Frame) -> None:

@@ -21,7 +21,6 @@ from physx_core.rows import ROW_FIELDS
 from physx_core.typing import Batch
 
 _DTYPE = re.compile(r"[<>|=]?[biufc]\d{1,2}")
-_HOST = re.compile(r"[\w.:-]{1,255}")
 _ROLES = ("training", "additional")
 _MOST_PARAMETERS = 4096
 _MOST_EPISODES = 2**48
@@ -118,24 +117,6 @@ def check_row_fields(fields: Sequence[Field], environment: Sequence[Field]) -> N
         raise ConnectionRefusedByPeerError(
             f"Its rows have {size} bytes; the limit is {MAX_PAYLOAD}."
         )
-
-
-def parse_host(payload: bytes | bytearray) -> str:
-    """Return the machine name that a message contains."""
-    name = decode(payload)
-    if not isinstance(name, str) or not _HOST.fullmatch(name):
-        raise ConnectionRefusedByPeerError("It did not report the name of its machine.")
-    return name
-
-
-def parse_end(payload: bytes | bytearray) -> tuple[int, str]:
-    """Return the exit status and last output of a worker that a message reports."""
-    plain = decode(payload)
-    given = plain if isinstance(plain, dict) else {}
-    status, stderr = given.get("status"), given.get("stderr")
-    if type(status) is not int or type(stderr) is not str:
-        raise ConnectionRefusedByPeerError("It did not report how a worker ended.")
-    return status, stderr
 
 
 def parse_values(payload: bytes | bytearray) -> dict[str, Any]:
