@@ -297,6 +297,20 @@ class TooFewClientsError(PhysxError):
         super().__init__(message)
 
 
+class DependentEpisodeError(PhysxError):
+    """An episode that is said to be independent had other rows when it was simulated again.
+
+    Attributes:
+        episode: Its number.
+        field: Name of a field that differs; empty if the number of rows does.
+        row: Number of the first such row in the episode.
+    """
+
+    def __init__(self, episode: int, field: str, row: int, message: str) -> None:
+        self.episode, self.field, self.row = episode, field, row
+        super().__init__(message)
+
+
 class ProgramError(PhysxError):
     """A program that generates an environment's samples failed, hung, or violated the protocol.
 

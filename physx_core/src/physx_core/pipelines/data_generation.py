@@ -12,6 +12,7 @@ from physx_core.config import MODES, WRONG, DatasetConfig, EnvironmentConfig, at
 from physx_core.dataset import Dataset, EpisodeStatus
 from physx_core.errors import ConfigError, FailedEpisodesError, listed
 from physx_core.pipelines.campaign import Campaign
+from physx_core.pipelines.independence import IndependenceProof
 from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
 from physx_core.pipelines.run_description import (
     describe_dataset,
@@ -72,6 +73,9 @@ class DataGeneration(NewSessionPipeline):
     failed."""
     max_failed: int = at_least(0, 0)
     """Number of episodes that may fail before the run fails."""
+    prove_independence: bool = True
+    """Simulate one of the independent episodes again at the end, if that costs less than 1 % of the
+    run, and fail if its samples differ in any bit."""
     resume: bool = field(default=False, metadata={"recorded": False})
     """Go on with the independent episodes of an existing session: simulate those that it does not
     have."""
@@ -87,9 +91,10 @@ class DataGeneration(NewSessionPipeline):
     _mode: str = field(init=False, repr=False, default="")
     _campaign: Campaign | None = field(init=False, repr=False, default=None)
     _queue: EpisodeQueue | None = field(init=False, repr=False, default=None)
-    _episodes: EpisodeSource = field(init=False, repr=False)
+    _episodes: EpisodeSource | None = field(init=False, repr=False, default=None)
     _first_row: int = field(init=False, repr=False, default=0)
     _failed: int = field(init=False, repr=False, default=0)
+    _proof: IndependenceProof = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check that the options ask for batches or for episodes.
@@ -118,6 +123,7 @@ class DataGeneration(NewSessionPipeline):
                 self._generate_batches()
             while self._queue is not None and not self._queue.is_done:
                 self._store_episodes(self._queue)
+            self._prove_independence()
             self._cut()
             self.data_generation_end()
 
@@ -143,11 +149,14 @@ class DataGeneration(NewSessionPipeline):
     def _store_episodes(self, queue: EpisodeQueue) -> None:
         """Store the episodes that end next; fail if too many of this run failed."""
         assert self._campaign is not None
+        assert self._episodes is not None
         before, campaign = queue.finished, self._campaign.number
-        rows, records = self._episodes.take()
+        block = self._episodes.take()
+        self._proof.note(block)
+        rows = block.rows
         if self._mode not in self.dataset.modes:
             self.dataset.define_fields(self._mode, self._episodes.fields)
-        records = [replace(record, campaign=campaign) for record in records]
+        records = [replace(record, campaign=campaign) for record in block.records]
         self.dataset.append_episodes(self._mode, rows, records, checked=True)
         if self.episodes is not None:
             self.observers.advance(queue.finished - before)
@@ -174,6 +183,12 @@ class DataGeneration(NewSessionPipeline):
             surplus = int(known.rows[known.campaign == self._campaign.number].sum()) - wanted
         if surplus > 0:
             self._campaign.cut(self.dataset, surplus, self.source.sets.values_of)
+
+    def _prove_independence(self) -> None:
+        """Simulate an episode again, if that costs little, and compare its rows."""
+        if self._campaign and self._episodes and self.prove_independence:
+            number = self._campaign.number
+            self._proof.check(self._episodes, self.dataset, self._mode, number)
 
     def data_generation_begin(self) -> None:
         """Called before the first batch."""
@@ -267,6 +282,7 @@ class DataGeneration(NewSessionPipeline):
             self.session = self._create_session()
         self.dataset = resources.enter_context(open_own(self.session, dataset_config))
         self._campaign, self._queue, self._first_row = None, None, 0
+        self._proof, self._episodes = IndependenceProof(), None
         if self.resume:
             self._campaign = Campaign.last(self.dataset, self._mode, config)
         self._open_environments(resources, config, dataset_config)

@@ -63,6 +63,18 @@ class ClientEpisodes(EpisodeSource):
             return EpisodeBlock({}, [])
         return self._settled(self._leases.blocks.popleft())
 
+    def _take_again(self, instance_id: int) -> EpisodeBlock:
+        def missing() -> list[int]:
+            ready = self._group.ready
+            others = [peer for peer in ready if peer.instance_id != instance_id]
+            for peer in others or ready:
+                self._leases.grant(peer, len(ready))
+            return [] if self._leases.blocks else self._leases.holders or self._group.absent
+
+        if not self._leases.blocks:
+            self._group.wait(missing)
+        return self._leases.blocks.popleft()
+
     def _busy(self) -> list[int]:
         """Give free clients numbers; return those to wait for, none if something has ended."""
         ready = self._group.ready

@@ -8,6 +8,8 @@ from typing import Any
 
 from physx_core.dataset import EpisodeStatus
 from physx_core.fields import Field
+from physx_core.rows import concatenate
+from physx_core.typing import Batch
 from physx_core.workers.episode_queue import EpisodeQueue
 from physx_core.workers.episode_runner import EpisodeBlock, EpisodeRunner
 from physx_core.workers.instance import Instance
@@ -62,7 +64,38 @@ class EpisodeSource(ABC):
             self._queue.note(record)
             if record.status is not EpisodeStatus.MORE:
                 self._values.pop(record.episode, None)
-        return EpisodeBlock(block.rows, records)
+        return block._replace(records=records)
+
+    def repeat(self, number: int, instance_id: int) -> Batch:
+        """Simulate a number again once the queue is done, by another instance if there is one.
+
+        Args:
+            number: The number, which has finished.
+            instance_id: The instance that has simulated it.
+
+        Returns:
+            Its rows; of no fields if it fails now.
+
+        Raises:
+            PhysxError: See `take`.
+        """
+        self._queue.put_back(number)
+        parts: list[Batch] = []
+        while True:
+            block = self._take_again(instance_id)
+            begin = 0
+            for record in block.records:
+                end = begin + record.rows
+                if record.episode == number:
+                    part = {name: rows[begin:end].copy() for name, rows in block.rows.items()}
+                    parts = [*parts, part] if record.part else [part]
+                    if record.status is not EpisodeStatus.MORE:
+                        return concatenate([part for part in parts if part])
+                begin = end
+
+    @abstractmethod
+    def _take_again(self, instance_id: int) -> EpisodeBlock:
+        """Return what becomes of a number in the queue, given to another instance if possible."""
 
 
 class LocalEpisodes(EpisodeSource):
@@ -88,3 +121,6 @@ class LocalEpisodes(EpisodeSource):
     def take(self) -> EpisodeBlock:
         """Simulate the next episodes: see `EpisodeSource.take`."""
         return self._settled(self._runner.run())
+
+    def _take_again(self, instance_id: int) -> EpisodeBlock:
+        return self._runner.run()

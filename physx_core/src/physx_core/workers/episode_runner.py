@@ -33,10 +33,12 @@ class EpisodeBlock(NamedTuple):
         rows: Field name to array of shape (n, *field shape), valid until the next block; of no
             fields if there are no rows.
         records: The episodes, or parts of them, that the rows belong to, in order.
+        instance_id: The instance that has simulated them.
     """
 
     rows: Batch
     records: list[EpisodeRecord]
+    instance_id: int = 1
 
 
 @dataclass(slots=True)

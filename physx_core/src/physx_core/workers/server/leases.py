@@ -162,7 +162,7 @@ class Leases:
             check_values(rows, peer.row_fields, peer.instance_id)
         peer.received += len(rows.get("step", ()))
         self._note_pace(peer.instance_id, records)
-        self.blocks.append(EpisodeBlock(rows, records))
+        self.blocks.append(EpisodeBlock(rows, records, peer.instance_id))
 
     def _note_pace(self, instance_id: int, records: list[EpisodeRecord]) -> None:
         count = sum(each.count for each in records if each.status is not EpisodeStatus.MORE)
