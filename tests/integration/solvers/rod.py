@@ -76,7 +76,8 @@ class Rod(Environment):
             self.time = self.stepper.step(self.simulator, self.time, INTERVAL / self.steps)
         position, velocity = self.rod.position_collection.T, self.rod.velocity_collection.T
         self.set_training_data(given=self.given, position=position, velocity=velocity)
-        if self.step_index + 1 == self.length or (self.time > 0.1 and np.abs(velocity).max() < 0.02):
+        has_settled = self.time > 0.1 and np.abs(velocity).max() < 0.02
+        if has_settled or self.step_index + 1 == self.length:
             note(self, "ends")
             self.end_episode()
 

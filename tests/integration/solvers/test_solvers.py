@@ -70,10 +70,12 @@ class Solver:
         pytest.skip(f"{self.needs} is not installed: it is in {self.package}")
 
 
+PATIENT = ("--environment.timeout", "300")
+"""Numba compiles for half a minute when it is first used."""
 SOLVERS = {
     "scikit-fem": Solver("Heat", "skfem", "scikit-fem", 40, fails=True),
     "CalculiX": Solver("Beam", "ccx", "Debian's calculix-ccx", 30),
-    "PyElastica": Solver("Rod", "elastica", "pyelastica", 20),
+    "PyElastica": Solver("Rod", "elastica", "pyelastica", 20, PATIENT),
 }
 FAULTS = '{3 = "hangs", 7 = "crashes", 11 = "is silent"}'
 
@@ -196,7 +198,7 @@ def working_folders():
     for process in Path("/proc").glob("[0-9]*"):
         try:
             if int(process.name) != os.getpid():
-                yield os.fsencode(os.readlink(process / "cwd"))
+                yield os.fsencode((process / "cwd").readlink())
         except OSError:
             continue
 
@@ -288,7 +290,7 @@ def test_campaign_on_a_full_disk_is_resumed(small_disk, tmp_path):
     solver = SOLVERS["scikit-fem"]
     solver.require()
     ballast = small_disk / "ballast"
-    ballast.write_bytes(bytes(shutil.disk_usage(small_disk).free - (300 << 10)))
+    ballast.write_bytes(bytes(shutil.disk_usage(small_disk).free - (700 << 10)))
     run = Run(solver, tmp_path / "cut", small_disk)
     process = run.start()
     said, _ = process.communicate(timeout=60)
