@@ -39,7 +39,7 @@ class ClientEpisodes(EpisodeSource):
             transport: What connects the clients, and the clock that the run follows.
         """
         super().__init__(config, seed, queue)
-        self._leases = Leases(queue, self._choose)
+        self._leases = Leases(queue, self._sets.values_of)
         self._group = ClientGroup(
             config, services, seed, self._sets, leases=self._leases, transport=transport
         )

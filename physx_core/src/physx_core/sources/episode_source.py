@@ -4,8 +4,6 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Sequence
-from dataclasses import replace
-from typing import Any
 
 from physx_core.components.environment import Services
 from physx_core.components.parameter import Parameter
@@ -16,6 +14,7 @@ from physx_core.sources.source import Opened
 from physx_core.workers.episode_queue import EpisodeQueue
 from physx_core.workers.episode_runner import EpisodeBlock, EpisodeRunner
 from physx_core.workers.instance import Instance, instance_arguments
+from physx_core.workers.lease import MOST, Lease
 from physx_core.workers.parameter_sets import ParameterSets
 
 
@@ -35,7 +34,6 @@ class EpisodeSource(Opened):
         """
         self._config, self._seed, self._queue = config, list(seed), queue
         self._sets = ParameterSets(config, seed)
-        self._values: dict[int, dict[str, Any]] = {}  # of the numbers that are being simulated
 
     @property
     @abstractmethod
@@ -69,24 +67,12 @@ class EpisodeSource(Opened):
     def close(self) -> None:
         """Close the environments, and end their clients. Calling it again does nothing."""
 
-    def _choose(self, number: int) -> dict[str, Any]:
-        """Return the parameters of a number; empty if there are none."""
-        if not self.parameters:
-            return {}
-        if number not in self._values:
-            self._values[number] = self._sets.values_of(number)
-        return dict(self._values[number])
-
     def _settled(self, block: EpisodeBlock) -> EpisodeBlock:
-        """Add the parameters to a block's records, and tell the queue which numbers it ends."""
-        records = block.records
-        if self.parameters:
-            records = [replace(each, parameters=self._choose(each.episode)) for each in records]
-        for record in records:
+        """Tell the queue which numbers a block ends."""
+        for record in block.records:
             if record.status is not EpisodeStatus.MORE:
                 self._queue.finish(record.count)
-                self._values.pop(record.episode, None)
-        return EpisodeBlock(block.rows, records)
+        return block
 
 
 class LocalEpisodes(EpisodeSource):
@@ -111,6 +97,7 @@ class LocalEpisodes(EpisodeSource):
         self._services = services
         self._instance = Instance(**instance_arguments(config, 1, seed, accept_all=False))
         self._runner: EpisodeRunner | None = None
+        self._leased = 0
 
     @property
     def fields(self) -> list[Field]:
@@ -120,14 +107,20 @@ class LocalEpisodes(EpisodeSource):
     def open(self) -> None:
         """Create the environment: see `EpisodeSource.open`."""
         draw = self._config.visualizer is not None
-        self._instance.open(self._services, draw, self._choose)
+        self._instance.open(self._services, draw)
         self._sets.begin([self._instance.parameters])
-        self._runner = EpisodeRunner(self._instance, self._queue.take)
+        self._runner = EpisodeRunner(self._instance, self._lease)
 
     def take(self) -> EpisodeBlock:
         """Simulate the next episodes: see `EpisodeSource.take`."""
         assert self._runner is not None
         return self._settled(self._runner.run())
+
+    def _lease(self) -> Lease | None:
+        """Return the next numbers: at most twice as many as before, as sampling may be slow."""
+        numbers = self._queue.take_range(min(1 + self._leased, MOST))
+        self._leased += len(numbers)
+        return Lease(numbers, self._sets.values_of(numbers)) if numbers else None
 
     def close(self) -> None:
         """Close the environment: see `EpisodeSource.close`."""

@@ -46,6 +46,17 @@ class EpisodeQueue:
                 return number
         return None
 
+    def take_range(self, most: int) -> range:
+        """Return the next numbers that follow one another, at most so many; empty if none waits."""
+        is_new, first = not self._returned, self.take()
+        if first is None:
+            return range(0)
+        if not is_new:
+            return range(first, first + 1)
+        end = min(first + most, self.total)
+        self._next = next(filter(self._recorded.__contains__, range(first + 1, end)), end)
+        return range(first, self._next)
+
     def finish(self, count: int) -> None:
         """Note that so many more numbers are recorded."""
         self.finished += count

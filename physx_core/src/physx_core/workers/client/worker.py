@@ -161,15 +161,13 @@ class _Client:
         """Open the environment and generate rows until the run ends or the environment fails."""
         try:
             self._producer.open()
-            leased = self._leased
-            choose = self._services.choose if leased is None else leased.choose
-            self._instance.open(self._services, draw, choose)
+            self._instance.open(self._services, draw, self._services.choose)
             parameters = [parameter.to_dict() for parameter in self._instance.parameters]
             if parameters:
                 self._link.send(pack(Kind.PARAMETERS, encode(parameters)))
             fields = [field.to_dict() for field in self._instance.fields]
             self._link.send(pack(Kind.READY, encode(fields)))
-            (leased or self._producer).run()
+            (self._leased or self._producer).run()
         except RunEnded as end:
             self.is_forsaken = isinstance(end, ServerGone)
             if self._producer.failure is not None:
