@@ -102,7 +102,8 @@ class Results:
         assert columns.get("episode", []) == [number] * len(parts[-1])
         if record.status is EpisodeStatus.FINISHED:
             self.rows[number] = [row for part in self._parts.pop(number) for row in part]
-            self.parameters[number] = dict(record.parameters)
+            own = () if record.count == 1 else number - record.episode
+            self.parameters[number] = {n: np.asarray(v)[own] for n, v in record.parameters.items()}
 
 
 @contextlib.contextmanager

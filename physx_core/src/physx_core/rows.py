@@ -159,6 +159,18 @@ class RowBuffer:
             self.count = self._finite = count
             raise wrong.not_finite(instance_id=instance_id, step=step)
 
+    def remove(self, first: int, size: int, count: int) -> None:
+        """Remove rows of the first `count`, which then are what the buffer holds.
+
+        Args:
+            first: The first one to remove.
+            size: How many.
+            count: How many rows there are, after an error of `take` as well.
+        """
+        self.count, self._finite = count - size, min(self._finite, first)
+        for array in self._arrays.values():
+            array[first : self.count] = array[first + size : count]
+
     def clear(self) -> None:
         """Discard all rows."""
         self.count = self._finite = 0

@@ -36,7 +36,9 @@ class Model:
 
 
 OPERATIONS = st.lists(
-    st.tuples(st.sampled_from(["take", "take", "finish", "put back", "give back"]), st.integers()),
+    st.tuples(
+        st.sampled_from(["take", "take several", "finish", "put back", "give back"]), st.integers()
+    ),
     max_size=60,
 )
 
@@ -60,6 +62,13 @@ def test_numbers_come_in_order_and_those_that_came_back_first(total, recorded, r
             number = queue.take()
             assert number == model.take()
             held += [] if number is None else [number]
+        elif operation == "take several":
+            returned = bool(model.back)
+            numbers = list(queue.take_range(1 + which % 5))
+            assert numbers == [model.take() for _ in numbers]
+            assert len(numbers) == 1 or not returned
+            assert bool(numbers) == bool(numbers or model.back or model.fresh)
+            held += numbers
         elif held:
             number = held.pop(which % len(held))
             if operation == "finish":

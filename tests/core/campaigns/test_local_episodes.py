@@ -100,9 +100,9 @@ def test_records_of_one_row_are_joined(recorded, troubles):
                                                            results.records} | {0}  # fmt: skip
 
 
-def test_records_with_parameters_are_not_joined():
+def test_joined_records_hold_the_parameters_of_each():
     results = simulate(20, {"least": 1, "parameters": True}, episode_steps=1, sampler="physx/sobol")
-    assert [record.count for record in results.records] == [1] * 20
+    assert len(results.records) < 10
     heights = [results.parameters[number]["height"] for number in range(20)]
     assert len(set(heights)) == 20
     parts = [simulate(20, {"least": 1, "parameters": True}, recorded, episode_steps=1,

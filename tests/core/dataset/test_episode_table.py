@@ -251,6 +251,26 @@ def test_ranges_of_episodes_with_one_row_cost_one_record(folder):
 # Files ------------------------------------------------------------------------------------------
 
 
+def test_ranges_with_parameters_have_a_row_of_the_table_for_each_number(folder):
+    with Dataset.create(folder) as dataset:
+        values = {"mass": np.arange(3.0), "at": np.arange(6.0).reshape(3, 2)}
+        store(dataset, 5, 1, 2, 3, count=3, parameters=values, seconds=0.75)
+        store(dataset, 2, 4, parameters={"mass": 9.0, "at": [1.0, 2.0]}, seconds=0.5)
+        for wrong in (np.zeros(2), 1.0):
+            with pytest.raises(ConfigError):
+                store(dataset, 8, 5, 6, 7, count=3, parameters={**values, "mass": wrong})
+    with Dataset.open(folder) as dataset:
+        table = dataset[EPISODES]
+        found = {name: table[name][1:].tolist() for name in table}  # the first is of the stream
+        assert dataset["training"]["x"][:].tolist() == [4, 1, 2, 3]
+    assert found["episode"] == [5, 6, 7, 2]
+    assert found["count"] == found["rows"] == [1] * 4
+    assert found["first_row"] == [0, 1, 2, 3]
+    assert found["seconds"] == [0.25, 0.25, 0.25, 0.5]
+    assert found["mass"] == [0, 1, 2, 9]
+    assert found["at"] == [[0, 1], [2, 3], [4, 5], [1, 2]]
+
+
 def test_a_torn_reason_costs_only_itself(folder):
     with Dataset.create(folder) as dataset:
         store(dataset, 0, status=FAILED, reason="first\nline")

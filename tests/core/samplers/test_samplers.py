@@ -7,10 +7,13 @@ import sys
 
 import numpy as np
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from physx_core import Parameter
 from physx_core.errors import ConfigError, MissingLibraryError
 from physx_core.plugins import resolve
+from physx_core.random_streams import first_numbers
 
 PARAMETERS = [
     Parameter("k", 10.0, 40.0),
@@ -57,6 +60,58 @@ def test_a_set_is_the_same_whatever_was_asked_for_before(make):
     chosen = {number: flat(first.ask(number)) for number in numbers}
     for number in reversed(numbers):
         assert flat(make().ask(number)) == chosen[number]
+
+
+def test_several_sets_are_those_asked_for_one_by_one(make):
+    for first, count in [(0, 1), (5, 3), (1020, 10), (2046, 3000), (99, 102), (3, 4)]:
+        sets = [make().ask(number) for number in (first, first + count - 1)]
+        several = make().ask_many(first, count)
+        for place, one in zip((0, -1), sets, strict=True):
+            assert flat({name: values[place] for name, values in several.items()}) == flat(one)
+        one_by_one, sampler = [], make()
+        for number in range(first, first + min(count, 20)):
+            one_by_one.append(flat(sampler.ask(number)))
+        columns = {name: values[: len(one_by_one)] for name, values in several.items()}
+        assert [
+            flat({name: values[place] for name, values in columns.items()})
+            for place in range(len(one_by_one))
+        ] == one_by_one
+
+
+@given(
+    st.sampled_from(["uniform", "log_uniform", "normal", "truncated", "integer"]),
+    st.integers(0, 10**12),
+    st.integers(1, 40),
+    st.lists(st.integers(0, 2**70), min_size=1, max_size=6),
+)
+def test_several_sets_have_the_bits_of_single_ones(distribution, first, count, seed):
+    options = {"low": 1, "high": 30} if distribution != "normal" else {}
+    if distribution in ("normal", "truncated"):
+        options |= {"distribution": "normal", "mean": [3.0, 4.0], "deviation": 2.0}
+    else:
+        options |= {"distribution": distribution}
+    sampler = begun("uniform", [Parameter("a", shape=(2,), **options)], seed)
+    singles = [sampler.ask(number)["a"] for number in range(first, first + count)]
+    several = sampler.ask_many(first, count)["a"]
+    assert several.dtype == singles[0].dtype
+    assert several.tobytes() == np.array(singles).tobytes()
+
+
+@given(
+    st.one_of(
+        st.integers(0, 2**200),
+        st.lists(st.integers(0, 2**70), min_size=1, max_size=6),
+    ),
+    st.sampled_from([0, 1, 2**31, 2**32 - 3, 2**32, 2**40]),
+    st.integers(0, 2**32 - 1),
+    st.integers(0, 5),
+)
+def test_first_numbers_are_those_of_new_generators(entropy, first, stream, size):
+    numbers = range(first, first + 5)
+    keys = [np.random.SeedSequence(entropy, spawn_key=(number, stream)) for number in numbers]
+    expected = [np.random.default_rng(key).random(size) for key in keys]
+    found = first_numbers(entropy, numbers, stream, size)
+    assert found.tobytes() == np.array(expected).tobytes()
 
 
 def test_values_lie_within_the_bounds_and_have_their_types(make):

@@ -412,6 +412,19 @@ class Environment(Closeable):
             self.episode_index = self.episode_index if episode is None else episode
             self._reset_with_parameters()
 
+    def begin_number(self, number: int, values: Mapping[str, Any]) -> None:
+        """Begin an independent episode with its parameters, after any other; physx calls it.
+
+        Args:
+            number: Number of the episode in its campaign.
+            values: The values of the parameters.
+        """
+        self._earlier_steps += self.step_index
+        self.step_index, self.episode_index = 0, number
+        self._has_begun_episodes, self._episode_is_over = True, False
+        self._seek_stream(number)
+        self.reset_parameters(**values)
+
     def replay_episode(self, place: int, values: Mapping[str, Any]) -> None:
         """Prepare the episode of a stored row with its parameters; physx calls it before the step.
 

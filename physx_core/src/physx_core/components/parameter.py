@@ -15,6 +15,7 @@ import numpy as np
 from physx_core import checks
 from physx_core.errors import ConfigError
 from physx_core.fields import RESERVED, Field
+from physx_core.random_streams import first_numbers
 from physx_core.typing import Array
 
 if TYPE_CHECKING:
@@ -148,17 +149,19 @@ class Parameter:
         return Field(self.name, self.shape, dtype, self.unit)
 
     def quantile(self, point: Point) -> Any:
-        """Return the value with given cumulative probabilities.
+        """Return the value with given cumulative probabilities, or several.
 
         Args:
-            point: The probabilities, from 0 to 1, shape (size,).
+            point: The probabilities, from 0 to 1, shape (size,), or (n, size) for n values.
 
         Returns:
-            An array of the parameter's shape, or a number if that is ``()``.
+            An array of the parameter's shape, or a number if that is ``()``; for several values an
+            array with one more axis, the first.
         """
         low, high = np.asarray(self.low), np.asarray(self.high)
         if self.distribution == "normal":
-            flat = np.array([self._normal(n, share) for n, share in enumerate(point.tolist())])
+            shares = point.reshape(-1, self.size).tolist()
+            flat = np.array([[self._normal(n, s) for n, s in enumerate(one)] for one in shares])
         elif self.distribution == "log_uniform":
             flat = np.exp(np.log(low) + point * (np.log(high) - np.log(low)))
         elif self.distribution == "integer":
@@ -167,7 +170,8 @@ class Parameter:
             flat = low + point * (high - low)
         if self.distribution == "log_uniform":  # rounding may exceed the bounds
             flat = np.clip(flat, low, high)
-        return flat.reshape(self.shape) if self.shape else flat.item()
+        shape = point.shape[:-1] + self.shape
+        return flat.reshape(shape) if shape else flat.item()
 
     def _normal(self, element: int, share: float) -> float:
         mean, deviation = self.mean[element], self.deviation[element]
@@ -264,15 +268,15 @@ def as_parameters(given: Parameter | Iterable[Parameter]) -> list[Parameter]:
 
 
 def values_at(parameters: Sequence[Parameter], point: Point) -> dict[str, Any]:
-    """Return the parameters' values at a point of the unit cube, by name.
+    """Return the parameters' values at a point of the unit cube, or at several, by name.
 
     Args:
         parameters: The parameters.
-        point: Shape (elements of all parameters,).
+        point: Shape (elements of all parameters,), or with one more axis, the first, for several.
     """
     values, first = {}, 0
     for parameter in parameters:
-        values[parameter.name] = parameter.quantile(point[first : first + parameter.size])
+        values[parameter.name] = parameter.quantile(point[..., first : first + parameter.size])
         first += parameter.size
     return values
 
@@ -300,6 +304,20 @@ def draw(
     """
     size = sum(parameter.size for parameter in parameters)
     return values_at(parameters, random_of(entropy, number, 1).random(size))
+
+
+def draw_many(
+    parameters: Sequence[Parameter], entropy: int | Sequence[int], numbers: range
+) -> dict[str, Any]:
+    """Return what `draw` returns for each of several sets, as arrays with one more axis, the first.
+
+    Args:
+        parameters: The parameters.
+        entropy: Seed of the run.
+        numbers: Numbers of the sets.
+    """
+    size = sum(parameter.size for parameter in parameters)
+    return values_at(parameters, first_numbers(entropy, numbers, 1, size))
 
 
 @functools.cache

@@ -4,13 +4,15 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar
 
 import numpy as np
 
 from physx_core.components.parameter import Parameter, Point, random_of, values_at
 from physx_core.errors import ConfigError
-from physx_core.typing import Array, Index
+from physx_core.fields import Field, is_finite
+from physx_core.typing import Array, Batch, Index
 
 
 class Sampler(ABC):
@@ -55,13 +57,25 @@ class Sampler(ABC):
             number: Number of the set, from 0.
         """
 
+    def ask_many(self, first: int, count: int) -> Mapping[str, Any]:
+        """Return the values of consecutive sets, the same as of `ask`, by the parameters' names.
+
+        Override it if that is faster than one by one.
+
+        Args:
+            first: Number of the first set.
+            count: Number of sets, at least 1; shape of each array: (count, *parameter's shape).
+        """
+        sets = [checked(self.parameters, self.ask(first + place)) for place in range(count)]
+        return {p.name: np.array([one[p.name] for one in sets]) for p in self.parameters}
+
     def values(self, point: Point) -> dict[str, Any]:
-        """Return the parameters' values at a point of the unit cube.
+        """Return the parameters' values at a point of the unit cube, or at several.
 
         A uniformly distributed point yields values from the parameters' distributions.
 
         Args:
-            point: Shape (size,), each from 0 to 1.
+            point: Shape (size,), each from 0 to 1; (n, size) for arrays of n values.
         """
         return values_at(self.parameters, point)
 
@@ -135,23 +149,43 @@ class LearningSampler(Sampler):
         """
 
 
+def checked_many(parameters: Sequence[Parameter], values: Mapping[str, Any], count: int) -> Batch:
+    """Return the values that a sampler chose for several sets, as `checked` does for one.
+
+    Args:
+        parameters: The parameters.
+        values: Name to an array of shape (count, *parameter's shape).
+        count: Number of sets.
+
+    Raises:
+        ConfigError: If a value is missing, unknown, not finite, or of another shape or type.
+    """
+    stacked = {p.name: replace(p.field, shape=(count, *p.shape)) for p in parameters}
+    return _fitting(stacked, values)
+
+
 def checked(parameters: Sequence[Parameter], values: Mapping[str, Any]) -> dict[str, Any]:
     """Return the values that a sampler chose, after checking that they fit the parameters.
 
     Raises:
         ConfigError: If a value is missing, unknown, not finite, or of another shape or type.
     """
-    names = [parameter.name for parameter in parameters]
-    if not isinstance(values, Mapping) or set(values) != set(names):
+    fitting = _fitting({parameter.name: parameter.field for parameter in parameters}, values)
+    return {name: array if array.ndim else array.item() for name, array in fitting.items()}
+
+
+def _fitting(fields: Mapping[str, Field], values: Mapping[str, Any]) -> Batch:
+    """Return values as arrays of their fields' types."""
+    if not isinstance(values, Mapping) or set(values) != set(fields):
         given = list(values) if isinstance(values, Mapping) else values
-        raise ConfigError(f"The sampler chose {given}, but the parameters are {names}.")
-    fitting: dict[str, Any] = {}
-    for parameter in parameters:
+        raise ConfigError(f"The sampler chose {given}, but the parameters are {list(fields)}.")
+    fitting: Batch = {}
+    for name, field in fields.items():
         try:
-            array: Array = parameter.field.convert(values[parameter.name])
+            array: Array = field.convert(values[name])
         except Exception as error:
             raise ConfigError(f"The sampler's choice does not fit: {error}") from error
-        if not np.isfinite(array).all():
-            raise ConfigError(f'The sampler chose "{parameter.name}" = {array}: not finite.')
-        fitting[parameter.name] = array if parameter.shape else array.item()
+        if not is_finite(array):
+            raise ConfigError(f'The sampler chose "{name}" = {array}: not finite.')
+        fitting[name] = array
     return fitting

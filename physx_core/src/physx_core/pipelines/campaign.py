@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
@@ -13,6 +12,8 @@ from physx_core.dataset import Dataset, EpisodeRecord, EpisodeStatus
 from physx_core.errors import ConfigError, DatasetError
 from physx_core.pipelines.storage import describe_environment
 from physx_core.typing import Index
+from physx_core.workers.lease import Lease
+from physx_core.workers.parameter_sets import ParameterSets
 
 CAMPAIGNS = "campaigns"
 """Entry in a dataset's info: what its campaigns simulated, in order."""
@@ -109,15 +110,13 @@ class Campaign:
         chosen = ended & (known.campaign == self.number)
         return known.episode[chosen], known.numbers[chosen], known.rows[chosen]
 
-    def cut(
-        self, dataset: Dataset, surplus: int, parameters: Callable[[int], Mapping[str, Any]]
-    ) -> None:
+    def cut(self, dataset: Dataset, surplus: int, sets: ParameterSets) -> None:
         """Leave out the last rows: the episodes that they belong to are recorded as cut.
 
         Args:
             dataset: The dataset, open for writing.
             surplus: How many rows to leave out.
-            parameters: Returns the parameters of a number.
+            sets: Chooses the parameters of each number.
         """
         known = dataset.recorded_episodes(self.mode)
         assert known is not None
@@ -130,22 +129,23 @@ class Campaign:
                 kept, cut = 0, range(number + count - left_out, number + count)
             else:
                 kept, cut = rows - left_out, range(number, number + 1)
-            records = [self._cut_record(each, kept, parameters(each)) for each in cut]
+            lease = Lease(cut, sets.values_of(cut))
+            records = [
+                EpisodeRecord(
+                    episode=each,
+                    rows=kept,
+                    campaign=self.number,
+                    status=EpisodeStatus.CUT,
+                    parameters=lease.parameters(each, 1),
+                )
+                for each in cut
+            ]
             mode = dataset[self.mode]
             stored = {name: mode[name][first : first + kept] for name in mode} if kept else {}
             dataset.append_episodes(self.mode, stored, records, checked=True)
             surplus -= left_out
             if not surplus:
                 return
-
-    def _cut_record(self, number: int, rows: int, parameters: Mapping[str, Any]) -> EpisodeRecord:
-        return EpisodeRecord(
-            episode=number,
-            rows=rows,
-            campaign=self.number,
-            status=EpisodeStatus.CUT,
-            parameters=parameters,
-        )
 
 
 def _recorded(dataset: Dataset) -> list[Campaign]:

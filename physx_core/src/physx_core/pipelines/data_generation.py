@@ -182,7 +182,7 @@ class DataGeneration(NewSessionPipeline):
         if known is not None:
             surplus = int(known.rows[known.campaign == self._campaign.number].sum()) - wanted
         if surplus > 0:
-            self._campaign.cut(self.dataset, surplus, self.source.sets.values_of)
+            self._campaign.cut(self.dataset, surplus, self.source.sets)
 
     def _prove_independence(self) -> None:
         """Simulate an episode again, if that costs little, and compare its rows."""

@@ -31,11 +31,22 @@ class _Blocks(Sampler):
     def ask(self, number: int) -> dict[str, Any]:
         """Return the values of a set."""
         index, place = divmod(number, self.block)
+        return self.values(self._block(index)[place])
+
+    def ask_many(self, first: int, count: int) -> dict[str, Any]:
+        """Return the values of consecutive sets."""
+        end = first + count
+        indexes = range(first // self.block, (end - 1) // self.block + 1)
+        points = np.concatenate([self._block(index) for index in indexes])
+        begin = indexes[0] * self.block
+        return self.values(points[first - begin : end - begin])
+
+    def _block(self, index: int) -> Array:
         if index not in self._blocks:
             while len(self._blocks) >= _KEPT:
                 del self._blocks[min(self._blocks)]
             self._blocks[index] = self._points(index)
-        return self.values(self._blocks[index][place])
+        return self._blocks[index]
 
     @abstractmethod
     def _points(self, index: int) -> Array:
@@ -53,6 +64,7 @@ class Sobol(_Blocks):
     def begin(self, parameters: Sequence[Parameter], seed: Sequence[int]) -> None:
         """Take the parameters: see `Sampler.begin`."""
         super().begin(parameters, seed)
+        self._engine: Any = None  # goes on where the last block ended
         most = _qmc().Sobol.MAXDIM
         if self.size > most:
             raise ConfigError(
@@ -62,10 +74,12 @@ class Sobol(_Blocks):
 
     def _points(self, index: int) -> Array:
         first = index * _BLOCK % _LONGEST
-        engine = _qmc().Sobol(self.size, scramble=True, rng=self.random(0))
-        if first:  # it does not accept 0
-            engine.fast_forward(first)
-        points: Array = engine.random(_BLOCK)
+        if self._engine is None or self._engine.num_generated > first:
+            self._engine = _qmc().Sobol(self.size, scramble=True, rng=self.random(0))
+        ahead = first - self._engine.num_generated
+        if ahead:  # it does not accept 0
+            self._engine.fast_forward(ahead)
+        points: Array = self._engine.random(_BLOCK)
         return points
 
 

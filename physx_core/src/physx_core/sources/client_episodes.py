@@ -40,7 +40,7 @@ class ClientEpisodes(EpisodeSource):
         super().__init__(sets, queue)
         self._group, self._check = group, check
         self._checked: set[Peer] = set()
-        self._leases = Leases(queue, self._choose, clock)
+        self._leases = Leases(queue, sets.values_of, clock)
         group.lease(self._leases)
 
     @property

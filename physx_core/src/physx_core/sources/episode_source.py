@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from dataclasses import replace
-from typing import Any
 
 from physx_core.dataset import EpisodeStatus
 from physx_core.fields import Field
@@ -13,6 +11,7 @@ from physx_core.typing import Batch
 from physx_core.workers.episode_queue import EpisodeQueue
 from physx_core.workers.episode_runner import EpisodeBlock, EpisodeRunner
 from physx_core.workers.instance import Instance
+from physx_core.workers.lease import MOST, Lease
 from physx_core.workers.parameter_sets import ParameterSets
 
 
@@ -30,7 +29,6 @@ class EpisodeSource(ABC):
             queue: The numbers to simulate.
         """
         self._sets, self._queue = sets, queue
-        self._values: dict[int, dict[str, Any]] = {}  # of the numbers that are being simulated
 
     @property
     @abstractmethod
@@ -47,24 +45,11 @@ class EpisodeSource(ABC):
             PhysxError: If an environment or client fails in a way that concerns all episodes.
         """
 
-    def _choose(self, number: int) -> dict[str, Any]:
-        """Return the parameters of a number; empty if there are none."""
-        if not self._sets.parameters:
-            return {}
-        if number not in self._values:
-            self._values[number] = self._sets.values_of(number)
-        return dict(self._values[number])
-
     def _settled(self, block: EpisodeBlock) -> EpisodeBlock:
-        """Add the parameters to a block's records, and tell the queue which numbers it ends."""
-        records = block.records
-        if self._sets.parameters:
-            records = [replace(each, parameters=self._choose(each.episode)) for each in records]
-        for record in records:
+        """Tell the queue which numbers a block ends."""
+        for record in block.records:
             self._queue.note(record)
-            if record.status is not EpisodeStatus.MORE:
-                self._values.pop(record.episode, None)
-        return block._replace(records=records)
+        return block
 
     def repeat(self, number: int, instance_id: int) -> Batch:
         """Simulate a number again once the queue is done, by another instance if there is one.
@@ -110,8 +95,8 @@ class LocalEpisodes(EpisodeSource):
             queue: The numbers to simulate.
         """
         super().__init__(sets, queue)
-        instance.choose_by(self._choose)
-        self._runner = EpisodeRunner(instance, queue.take)
+        self._runner = EpisodeRunner(instance, self._lease)
+        self._leased = 0
 
     @property
     def fields(self) -> list[Field]:
@@ -124,3 +109,9 @@ class LocalEpisodes(EpisodeSource):
 
     def _take_again(self, instance_id: int) -> EpisodeBlock:
         return self._runner.run()
+
+    def _lease(self) -> Lease | None:
+        """Return the next numbers: at most twice as many as before, as sampling may be slow."""
+        numbers = self._queue.take_range(min(1 + self._leased, MOST))
+        self._leased += len(numbers)
+        return Lease(numbers, self._sets.values_of(numbers)) if numbers else None

@@ -53,6 +53,17 @@ class EpisodeQueue:
         if record.status is not EpisodeStatus.MORE:
             self.finished += record.count
 
+    def take_range(self, most: int) -> range:
+        """Return the next numbers that follow one another, at most so many; empty if none waits."""
+        is_new, first = not self._returned, self.take()
+        if first is None:
+            return range(0)
+        if not is_new:
+            return range(first, first + 1)
+        end = min(first + most, self.total)
+        self._next = next(filter(self._recorded.__contains__, range(first + 1, end)), end)
+        return range(first, self._next)
+
     @property
     def waiting(self) -> int:
         """How many numbers wait, at most."""

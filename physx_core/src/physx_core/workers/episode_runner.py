@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from collections import deque
-from collections.abc import Callable
-from dataclasses import dataclass
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 from physx_core.clock import SYSTEM_CLOCK, Clock
@@ -20,10 +19,11 @@ from physx_core.fields import Field
 from physx_core.rows import ROW_FIELDS, RowBuffer, infer_shapes
 from physx_core.typing import Batch
 from physx_core.workers.instance import Instance
+from physx_core.workers.lease import AIM, Lease
 
 OF_EPISODES = (EnvironmentFailedError, ProgramError, NotFiniteError, WrongSamplesError)
 """Errors that end an episode; others end the run."""
-_BLOCK_TIME = 20e-3
+_FINISHED, _MORE = EpisodeStatus.FINISHED, EpisodeStatus.MORE  # looking members up takes long
 
 
 class EpisodeBlock(NamedTuple):
@@ -48,10 +48,21 @@ class _Part:
     episode: int
     rows: int
     seconds: float
-    part: int = 0
+    part: int
+    lease: Lease
     count: int = 1
     status: EpisodeStatus = EpisodeStatus.FINISHED
     reason: str = ""
+
+    def some(self, first: int, count: int) -> _Part:
+        """Return some of its episodes, counted from 0, which have one row each."""
+        seconds = self.seconds * count / self.count
+        return replace(self, episode=self.episode + first, rows=count, seconds=seconds, count=count)
+
+    def failed(self, at: int, reason: str) -> _Part:
+        """Return what is noted if one of its episodes, counted from 0, has failed."""
+        seconds, status = self.seconds / self.count, EpisodeStatus.FAILED
+        return _Part(self.episode + at, 0, seconds, 0, self.lease, status=status, reason=reason)
 
 
 class EpisodeRunner:
@@ -62,35 +73,31 @@ class EpisodeRunner:
 
     Attributes:
         fields: Fields of the rows; shapes may be open before the first one.
-        failures: The errors of the episodes that failed, in order.
+        is_busy: Whether it may go on with numbers that it has taken.
     """
 
     def __init__(
-        self, instance: Instance, take: Callable[[], int | None], clock: Clock = SYSTEM_CLOCK
+        self, instance: Instance, take: Callable[[], Lease | None], clock: Clock = SYSTEM_CLOCK
     ) -> None:
         """Store what simulates.
 
         Args:
             instance: Simulates the episodes; open.
-            take: Returns the next number; None: there is none now.
+            take: Returns the next numbers; None: there are none now.
             clock: Tells what an episode costs.
         """
         self.fields: list[Field] = [*instance.fields, *ROW_FIELDS]
-        self.failures: list[PhysxError] = []
-        self._instance, self._take, self._clock = instance, take, clock
-        self._joins = not instance.parameters  # one record may stand for several episodes
-        self._buffer: RowBuffer | None = None
-        self._parts: list[_Part] = []
-        self._again: deque[int] = deque()
+        self.is_busy = False
+        self._instance, self._take, self._now = instance, take, clock.monotonic
+        self._lease = Lease(range(0), {})
+        self._episodes = self._lease.episodes()
         self._number: int | None = None  # of the episode that is being simulated
         self._part = self._step = 0
-        self._first = 0  # row of the buffer with which its part begins
+        self._buffer: RowBuffer | None = None
+        self._parts: list[_Part] = []
+        self._joined: _Part | None = None  # the last part, if an episode of one row can be added
+        self._first = 0  # row of the buffer with which the episode's part begins
         self._began = 0.0
-
-    @property
-    def is_busy(self) -> bool:
-        """Whether it goes on with numbers that it has taken."""
-        return self._number is not None or bool(self._again)
 
     def run(self) -> EpisodeBlock:
         """Simulate until rows fill a block, episodes took 20 ms, or no number is left.
@@ -98,10 +105,13 @@ class EpisodeRunner:
         Raises:
             PhysxError: If the environment fails in a way that concerns all episodes.
         """
-        until = self._clock.monotonic() + _BLOCK_TIME
-        while self._number is not None or self._begin():
+        self._began = self._now()
+        until = self._began + AIM
+        while True:
             try:
-                self._advance()
+                if self._number is None and not self._begin():
+                    break
+                self._make_row()
             except OF_EPISODES as error:
                 self._fail(error)
             if self._number is None and self._began >= until:
@@ -109,112 +119,97 @@ class EpisodeRunner:
             if self._buffer is not None and self._buffer.full:
                 break
         if self._number is not None:
-            self._end(EpisodeStatus.MORE)
+            self._end(_MORE)
         return self._take_block()
 
     def _begin(self) -> bool:
-        """Take the next number; return whether there is one."""
-        number = self._again.popleft() if self._again else self._take()
-        if number is None:
+        """Begin the next number; return whether there is one."""
+        following = next(self._episodes, None) or self._take_more()
+        if following is None:
             return False
-        self._number, self._part, self._step = number, 0, -1
-        self._began = self._clock.monotonic()
+        self._number, values = following
+        self._part = self._step = 0
+        self._instance.begin(self._number, values)
         return True
 
-    def _advance(self) -> None:
-        """Begin the episode, or simulate its next row."""
-        assert self._number is not None
-        if self._step < 0:
-            self._step = 0
-            self._instance.begin(self._number)
+    def _take_more(self) -> tuple[int, Mapping[str, Any]] | None:
+        """Take numbers and return the first one with its parameters; None if there are none."""
+        lease = self._take()
+        self.is_busy, self._joined = lease is not None, None
+        if lease is None:
+            return None
+        self._lease, self._episodes = lease, lease.episodes()
+        return next(self._episodes)
+
+    def _make_row(self) -> None:
+        """Simulate the next row of the episode, which may be its last."""
         sample = self._instance.step()
         if sample:
-            self._put(sample)
+            buffer = self._buffer or self._make_buffer(sample)
+            buffer.put(sample, 0, self._number or 0, self._step)
+            self._step += 1
         if not sample or self._instance.has_ended:
-            self._end(EpisodeStatus.FINISHED)
+            self._end(_FINISHED)
             self._number = None
 
-    def _put(self, sample: dict[str, Any]) -> None:
-        if self._buffer is None:
-            self._buffer = RowBuffer(infer_shapes(self._instance.fields, sample))
-            self.fields = self._buffer.fields
-        self._buffer.put(sample, 0, self._number or 0, self._step)
-        self._step += 1
+    def _make_buffer(self, sample: dict[str, Any]) -> RowBuffer:
+        buffer = self._buffer = RowBuffer(infer_shapes(self._instance.fields, sample))
+        self.fields = buffer.fields
+        return buffer
 
     def _end(self, status: EpisodeStatus) -> None:
         """Note the rows of the episode since its last part, which ends with this status."""
         end = 0 if self._buffer is None else self._buffer.count
         rows, self._first = end - self._first, end
-        seconds, self._began = self._clock.monotonic() - self._began, self._clock.monotonic()
+        now = self._now()
+        seconds, self._began = now - self._began, now
+        is_single, joined = rows == 1 and not self._part and status is _FINISHED, self._joined
+        if is_single and joined is not None:
+            joined.count += 1
+            joined.rows += 1
+            joined.seconds += seconds
+            return
         assert self._number is not None
-        part = _Part(self._number, rows, seconds, self._part, status=status)
-        last = self._parts[-1] if self._parts else None
-        if last is not None and self._joins and _follows(part, last):
-            last.count, last.rows, last.seconds = (
-                last.count + 1,
-                last.rows + 1,
-                last.seconds + seconds,
-            )
-        else:
-            self._parts.append(part)
+        part = _Part(self._number, rows, seconds, self._part, self._lease, status=status)
+        self._parts.append(part)
+        self._joined = part if is_single else None
         self._part += 1
 
     def _fail(self, error: PhysxError) -> None:
         """Note that the episode has failed, without its rows."""
-        assert self._number is not None
-        number, self._number = self._number, None
         if self._buffer is not None:
             self._buffer.count = self._first
-        self._note_failure(number, error)
-
-    def _note_failure(self, number: int, error: PhysxError) -> None:
-        seconds = self._clock.monotonic() - self._began
-        failed = _Part(number, 0, seconds, status=EpisodeStatus.FAILED, reason=str(error))
-        self._parts.append(failed)
-        self.failures.append(error)
+        self._part = 0
+        self._end(EpisodeStatus.FAILED)
+        self._parts[-1].reason, self._number = str(error), None
 
     def _take_block(self) -> EpisodeBlock:
         rows: Batch = {}
-        if self._buffer is not None and self._buffer.count:
+        while not rows and self._buffer is not None and (count := self._buffer.count):
             try:
                 rows = self._buffer.take()
             except NotFiniteError as error:
-                self._leave_out(self._buffer.count, error)
-                rows = self._buffer.take() if self._buffer.count else {}
-        parts, self._parts, self._first = self._parts, [], 0
+                self._leave_out(self._buffer, self._buffer.count, count, str(error))
+        parts, self._parts, self._first, self._joined = self._parts, [], 0, None
         return EpisodeBlock(rows, [_record(part) for part in parts])
 
-    def _leave_out(self, row: int, error: PhysxError) -> None:
-        """Note that the episode of an invalid row has failed; simulate those after it once more."""
-        start, kept = 0, list[_Part]()
-        parts = iter(self._parts)
-        for part in parts:
-            if start + part.rows > row:
-                break
-            start += part.rows
-            kept.append(part)
+    def _leave_out(self, buffer: RowBuffer, row: int, count: int, reason: str) -> None:
+        """Note that the episode of an invalid row, of `count`, has failed, without its rows."""
+        start, place = 0, 0
+        while start + self._parts[place].rows <= row:
+            start += self._parts[place].rows
+            place += 1
+        part = self._parts[place]
         good = row - start if part.count > 1 else 0
-        number = part.episode + good
+        found = [part.failed(good, reason)]
         if good:
-            kept.append(_Part(part.episode, good, part.seconds, count=good))
-        numbers = list(range(number + 1, part.episode + part.count))
-        for later in parts:
-            if later.status is EpisodeStatus.FAILED:
-                kept.append(later)
-            else:
-                numbers += range(later.episode, later.episode + later.count)
-        assert self._buffer is not None
-        self._buffer.count = start + good
-        self._parts, self._number = kept, None
-        self._again.extend(numbers)
-        self._note_failure(number, error)
-
-
-def _follows(part: _Part, last: _Part) -> bool:
-    """Return whether an episode of one row can be added to a part, as the next number."""
-    finished = part.status is last.status is EpisodeStatus.FINISHED
-    single = part.rows == 1 and not part.part and last.rows == last.count and not last.part
-    return finished and single and last.episode + last.count == part.episode
+            found.insert(0, part.some(0, good))
+        if good + 1 < part.count:
+            found.append(part.some(good + 1, part.count - good - 1))
+        self._parts[place : place + 1] = found
+        if part.status is EpisodeStatus.MORE:
+            self._number = None
+        buffer.remove(start + good, 1 if part.count > 1 else part.rows, count)
 
 
 def _record(part: _Part) -> EpisodeRecord:
@@ -225,5 +220,6 @@ def _record(part: _Part) -> EpisodeRecord:
         part=part.part,
         status=part.status,
         seconds=part.seconds,
+        parameters=part.lease.parameters(part.episode, part.count),
         reason=part.reason,
     )

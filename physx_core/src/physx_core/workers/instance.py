@@ -38,6 +38,8 @@ PARAMETER = "parameters/"
 name has this prefix."""
 SET = PARAMETER + "/"
 """Name of the entry with the index of the set in the dataset's record; -1: unknown."""
+NO_VALUES: Mapping[str, Any] = {}
+"""For an episode without parameters; never changed. A dict is unpacked faster than a view."""
 _MOST_EMPTY = 1000
 """Number of episodes in a row that may end without a row."""
 _STEPPING = ("reset_parameters", "step", "check_sample", "apply_prediction", "close")
@@ -189,9 +191,9 @@ class Instance(Closeable):
 
     @property
     def has_ended(self) -> bool:
-        """Whether the last sample is the last one of its episode, which is independent."""
-        environment = self._alive()
-        return environment._episode_is_over and environment.independent_episodes
+        """Whether the last sample is the last one of the episode that `begin` has begun."""
+        environment = self.environment or self._alive()
+        return environment._episode_is_over
 
     @property
     def parameters(self) -> list[Parameter]:
@@ -236,10 +238,6 @@ class Instance(Closeable):
             environment.factory = Factory()
             self._call("init_visualization", environment.init_visualization)
             environment.update_visualization()
-
-    def choose_by(self, choose: Choose) -> None:
-        """Use another function than that of `open` to choose the parameters of an episode."""
-        self._alive()._choose_parameters = choose
 
     def _create(self) -> Environment:
         """Create the environment, and check that its constructor passed on its arguments."""
@@ -287,20 +285,28 @@ class Instance(Closeable):
             )
         environment.independent_episodes = True
 
-    def begin(self, number: int) -> None:
+    def begin(self, number: int, values: Mapping[str, Any] = NO_VALUES) -> None:
         """Begin an episode of a campaign, whatever this instance has simulated before.
 
         Args:
-            number: Its number, from which its parameters and its random stream follow.
+            number: Its number, from which its random stream follows.
+            values: The values of its parameters.
 
         Raises:
             PhysxError: If the environment fails.
         """
-        environment = self._alive()
-        self._is_numbered, environment._numbering = True, (0, 1)
-        self._counts = self._episode_steps is not None
-        self._next_episode, environment._episode_is_over = number, True
-        self._begin_episode(environment)
+        environment = self.environment or self._alive()
+        if not self._is_numbered:
+            self._count_episodes(environment)
+        self._rows = 0
+        try:
+            environment.begin_number(number, values)
+        except Exception as error:
+            raise self._failure("reset_parameters", error) from error
+
+    def _count_episodes(self, environment: Environment) -> None:
+        """Let `begin` begin all episodes."""
+        self._is_numbered, self._counts = True, self._episode_steps is not None
 
     def step(self, stored: Sample | None = None) -> dict[str, Any]:
         """Simulate until `check_sample` accepts a sample; return it without further checks.

@@ -2,17 +2,18 @@
 
 from __future__ import annotations
 
+import contextlib
 import inspect
 import threading
 from bisect import bisect_right
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from physx_core.components.environment import options_of
 from physx_core.components.parameter import SET_FIELDS, Parameter
-from physx_core.components.sampler import LearningSampler, Sampler, checked
+from physx_core.components.sampler import LearningSampler, Sampler, checked, checked_many
 from physx_core.config import MODES, EnvironmentConfig
 from physx_core.errors import (
     ClientError,
@@ -229,13 +230,24 @@ class ParameterSets:
         batch = bisect_right(range(end), row, key=needed)
         return max(0, batch - sampler.delay)
 
-    def values_of(self, number: int) -> dict[str, Any]:
-        """Return the values of the parameters for an episode of a campaign; empty without any.
+    def values_of(self, numbers: range) -> Batch:
+        """Return the values of the parameters for episodes of a campaign; empty without any.
+
+        Args:
+            numbers: Numbers of the episodes, at least one.
+
+        Returns:
+            Name to array of shape (numbers, *parameter's shape).
 
         Raises:
             ConfigError: If the sampler fails, or what it chooses does not fit the parameters.
         """
-        return self._ask(number, 0) if self.parameters else {}
+        if not self.parameters:
+            return {}
+        assert self._sampler is not None
+        with self._naming(f"{numbers[0]} and later ones" if len(numbers) > 1 else numbers[0]):
+            values = self._sampler.ask_many(numbers[0], len(numbers))
+            return checked_many(self.parameters, values, len(numbers))
 
     def choose(self, instance_id: int, episode: int, row: int) -> dict[str, Any]:
         """Return the values of the parameters for an episode of an instance.
@@ -262,7 +274,7 @@ class ParameterSets:
     def _ask(self, number: int, row: int) -> dict[str, Any]:
         sampler = self._sampler
         assert sampler is not None
-        try:
+        with self._naming(number):
             if not isinstance(sampler, LearningSampler):
                 return checked(self.parameters, sampler.ask(number))
             if number in self._recorded:
@@ -275,12 +287,18 @@ class ParameterSets:
                 values = checked(self.parameters, sampler.ask_after(number, batches))
                 self._values[number] = values
                 return values
+
+    @contextlib.contextmanager
+    def _naming(self, which: int | str) -> Iterator[None]:
+        """Raise an error of the sampler as a `ConfigError` that names the sets."""
+        try:
+            yield
         except PhysxError:
             raise
         except Exception as error:
-            name = type(sampler).__name__
+            name = type(self._sampler).__name__
             raise ConfigError(
-                f"The sampler {name} raised for set {number}: {type(error).__name__}: {error}."
+                f"The sampler {name} raised for set {which}: {type(error).__name__}: {error}."
             ) from error
 
     def can_redraw(self, instance_id: int, error: PhysxError) -> bool:

@@ -64,6 +64,12 @@ class RowQueue(EpisodeQueue):
         self._taken += number is not None
         return number
 
+    def take_range(self, most: int) -> range:
+        """Return the next numbers that follow one another, at most so many; empty if none waits."""
+        found = super().take_range(min(most, max(1, self.waiting)))
+        self._taken += max(0, len(found) - 1)  # the first one was taken by `take`
+        return found
+
     def note(self, record: EpisodeRecord) -> None:
         """Note what became of a number, or of several.
 

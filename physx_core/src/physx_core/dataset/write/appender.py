@@ -110,7 +110,8 @@ class Appender:
         if known is not None:
             fields = known.fields
         elif episodes:
-            fields = {f.name: f for f in infer_fields(episodes[0].parameters, axes=0)} | own
+            axes = int(episodes[0].count > 1)
+            fields = {f.name: f for f in infer_fields(episodes[0].parameters, axes)} | own
         table, _ = check_rows(fields, table_rows(mode, fields, episodes))
         if not self._is_settled(EPISODES):
             self.define_fields(EPISODES, infer_shapes(fields.values(), table, axes=1))

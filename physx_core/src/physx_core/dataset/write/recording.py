@@ -40,12 +40,13 @@ class EpisodeRecord:
         episode: Its number in the campaign, counted from 0; the first one of a range.
         rows: How many of the rows are its own.
         campaign: Number of the campaign in the mode, counted from 0.
-        count: Number of episodes, of one row each and without parameters, in order.
+        count: Number of episodes, of one row each, in order.
         part: Which part of the episode the rows are, counted from 0. Part 0 begins it anew; what
             was recorded before stays until the last part is recorded.
         status: ``FINISHED``, ``CUT``, ``FAILED`` (without rows), or ``MORE`` if parts follow.
         seconds: What it cost, in s.
-        parameters: Values of the environment's parameters by name.
+        parameters: Values of the environment's parameters by name; of several episodes, arrays
+            with one more axis, the first, which has one entry for each.
         reason: Why it failed.
     """
 
@@ -70,7 +71,7 @@ class EpisodeRecord:
         several = self.count == 1 or (
             self.rows == self.count
             and not self.part
-            and not self.parameters
+            and all(np.shape(each)[:1] == (self.count,) for each in self.parameters.values())
             and self.status is EpisodeStatus.FINISHED
         )
         failed = self.status is not EpisodeStatus.FAILED or not self.rows
@@ -145,6 +146,7 @@ class Recorder:
             table: Their rows in the table, checked, but for the first rows.
         """
         self._end_stream(mode)
+        first = 0
         if count:
             self.recorded.discard(mode)
             try:
@@ -158,9 +160,10 @@ class Recorder:
             for each in episodes
             if each.status is EpisodeStatus.FAILED
         )
-        self._writer.append(EPISODES, table, len(episodes))
-        for each, at in zip(episodes, table["first_row"].tolist(), strict=True):
-            self._note(mode, each.campaign, each.episode, at, each.rows, each.part, each.status)
+        self._writer.append(EPISODES, table, len(table["rows"]))
+        for each in episodes:
+            self._note(mode, each.campaign, each.episode, first, each.rows, each.part, each.status)
+            first += each.rows
 
     def store_reasons(self, failures: Iterable[FailedEpisode]) -> None:
         """Store why episodes failed."""
@@ -289,7 +292,31 @@ def table_rows(
         for name, of in fields.items()
         if name in own
     }
-    return found | {name: [each.parameters[name] for each in episodes] for name in parameters}
+    if parameters and any(each.count > 1 for each in episodes):
+        found = _one_by_one(found)
+    return found | {name: _values(name, of, episodes) for name, of in parameters.items()}
+
+
+def _one_by_one(table: Batch) -> Batch:
+    """Return rows of the table with one for each number."""
+    count = table["count"]
+    found = {name: np.repeat(values, count) for name, values in table.items()}
+    begins = np.repeat(np.cumsum(count) - count, count)
+    found["episode"] += np.arange(len(begins)) - begins
+    found["seconds"] /= np.repeat(count, count)
+    found["rows"][np.repeat(count > 1, count)] = 1
+    found["count"][:] = 1
+    return found
+
+
+def _values(name: str, field: Field, episodes: Sequence[EpisodeRecord]) -> Any:
+    """Return the values of a parameter for each number."""
+    if all(each.count == 1 for each in episodes):
+        return [each.parameters[name] for each in episodes]
+    given = [
+        each.parameters[name] if each.count > 1 else [each.parameters[name]] for each in episodes
+    ]
+    return np.concatenate([field.convert(values, axes=1) for values in given])
 
 
 def stream_record(

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any
 
-from physx_core.dataset import EpisodeRecord, EpisodeStatus
+from physx_core.dataset import EpisodeRecord
 from physx_core.errors import ConnectionRefusedByPeerError
 from physx_core.net.frames import Frame, Kind, pack
 from physx_core.net.values import decode, encode
 from physx_core.workers.client.link import RunEnded, WorkerLink
 from physx_core.workers.episode_runner import EpisodeBlock, EpisodeRunner
 from physx_core.workers.instance import Instance
+from physx_core.workers.lease import Lease
 from physx_core.workers.row_codec import pack_rows
 
 
@@ -21,13 +21,8 @@ class EpisodeProducer:
     def __init__(self, link: WorkerLink, instance: Instance) -> None:
         """Store what simulates the episodes and sends their rows."""
         self._link, self._instance = link, instance
-        self._leased: deque[int] = deque()
-        self._values: dict[int, dict[str, Any]] = {}
+        self._leased: deque[Lease] = deque()
         self._announced = False
-
-    def choose(self, number: int) -> dict[str, Any]:
-        """Return the parameters of an episode, which came with its lease."""
-        return dict(self._values[number])
 
     def run(self) -> None:
         """Simulate episodes until the server ends the run."""
@@ -40,7 +35,7 @@ class EpisodeProducer:
             while not (self._leased or runner.is_busy) or self._link.has_message():
                 self._obey(self._link.receive())
 
-    def _take(self) -> int | None:
+    def _take(self) -> Lease | None:
         return self._leased.popleft() if self._leased else None
 
     def _send(self, block: EpisodeBlock, runner: EpisodeRunner) -> None:
@@ -53,16 +48,11 @@ class EpisodeProducer:
             self._link.send_parts(pack_rows(block.rows, count))
         records = [_plain(record) for record in block.records]
         self._link.send(pack(Kind.EPISODES, encode(records), count))
-        for record in block.records:
-            if record.status is not EpisodeStatus.MORE:
-                for number in range(record.episode, record.episode + record.count):
-                    self._values.pop(number, None)
 
     def _obey(self, frame: Frame) -> None:
         if frame.kind is Kind.LEASE:
-            numbers, values = decode(frame.payload)
-            self._leased.extend(numbers)
-            self._values.update(zip(numbers, values, strict=bool(values)))
+            first, values = decode(frame.payload)
+            self._leased.append(Lease(range(first, first + frame.number), values))
         elif frame.kind is Kind.CLOSE:
             raise RunEnded
         elif frame.kind not in (Kind.ANSWER, Kind.REFUSAL):  # to an abandoned request

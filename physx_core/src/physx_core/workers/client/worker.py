@@ -145,7 +145,7 @@ class _Client:
         """Open the environment and generate rows until the run ends or the environment fails."""
         try:
             self._producer.open()
-            self._instance.open(self._services, draw, self._choose)
+            self._instance.open(self._services, draw, self._services.choose)
             parameters = [parameter.to_dict() for parameter in self._instance.parameters]
             if parameters:
                 self._link.send(pack(Kind.PARAMETERS, encode(parameters)))
@@ -173,9 +173,6 @@ class _Client:
 
             self._leased = EpisodeProducer(self._link, self._instance)
         (self._leased or self._producer).run()
-
-    def _choose(self, number: int) -> dict[str, Any]:
-        return (self._leased or self._services).choose(number)
 
     def close(self) -> None:
         """Close the environment, and the files that it writes."""

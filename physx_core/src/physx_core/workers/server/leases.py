@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -13,15 +14,14 @@ from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
 from physx_core.net.frames import Frame, Kind, pack
 from physx_core.net.values import decode, encode
-from physx_core.typing import Batch
+from physx_core.typing import Batch, Index
 from physx_core.workers.episode_queue import EpisodeQueue
 from physx_core.workers.episode_runner import EpisodeBlock
+from physx_core.workers.lease import AIM, MOST, Lease
 from physx_core.workers.row_codec import unpack_rows
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.validation import check_values
 
-_AIM = 20e-3
-_MOST = 4096
 _STATUS = (EpisodeStatus.FINISHED, EpisodeStatus.FAILED, EpisodeStatus.MORE)
 
 
@@ -39,14 +39,14 @@ class Leases:
     def __init__(
         self,
         queue: EpisodeQueue,
-        choose: Callable[[int], dict[str, Any]],
+        choose: Callable[[range], Batch],
         clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         """Store what is simulated.
 
         Args:
             queue: The numbers.
-            choose: Returns the parameters of a number.
+            choose: Returns the parameters of numbers: see `ParameterSets.values_of`.
             clock: Tells how long episodes take.
         """
         self._clock = clock
@@ -56,16 +56,13 @@ class Leases:
             Kind.EPISODES: self._take_episodes,
         }
         self._queue, self._choose = queue, choose
-        self._leased: dict[int, dict[int, int]] = {}  # instance to its numbers, with their parts
-        self._rows: dict[int, Batch] = {}  # instance to rows whose record has not arrived
+        self._held: dict[int, _Held] = {}  # by instance
         self._suspects: set[int] = set()  # numbers, one of which ended a client; leased alone
-        self._pace: dict[int, float] = {}  # instance to the seconds of one of its episodes
-        self._since: dict[int, float] = {}  # instance to when it began its present episode
 
     @property
     def holders(self) -> list[int]:
         """The instances whose clients simulate something."""
-        return [number for number, leased in self._leased.items() if leased]
+        return [instance_id for instance_id, held in self._held.items() if held.numbers]
 
     def grant(self, peer: Peer, clients: int) -> None:
         """Give a client numbers if it has few.
@@ -74,25 +71,25 @@ class Leases:
             peer: The client; its environment is ready.
             clients: How many clients there are; the last numbers are shared among them.
         """
-        leased = self._leased.setdefault(peer.instance_id, {})
-        wanted = self._wanted(peer.instance_id, clients)
-        if len(leased) > wanted // 2 or not self._suspects.isdisjoint(leased):
+        held = self._held.setdefault(peer.instance_id, _Held())
+        wanted = max(1, min(held.wanted, self._queue.waiting // (2 * clients)))
+        if len(held.numbers) > wanted // 2 or not self._suspects.isdisjoint(held.numbers):
             return
-        new: list[int] = []
-        while len(leased) < wanted and (number := self._queue.take()) is not None:
-            if number in self._suspects:
-                wanted = 0
-                if leased:
-                    self._queue.put_back(number)
-                    break
-            leased[number] = 0
-            new.append(number)
-        if new:
-            if len(leased) == len(new):
-                self._since[peer.instance_id] = self._clock.monotonic()
-            values = [self._choose(number) for number in new] if peer.parameters else []
-            peer.send(pack(Kind.LEASE, encode([new, values]), len(new)))
-            peer.pace.go_on()
+        while len(held.numbers) < wanted:
+            numbers = self._queue.take_range(wanted - len(held.numbers))
+            is_suspect = not self._suspects.isdisjoint(numbers)
+            if is_suspect and held.numbers:
+                self._queue.put_back(numbers[0])
+            elif numbers:
+                self._lease(peer, numbers)
+            if is_suspect or not numbers:
+                return
+
+    def _lease(self, peer: Peer, numbers: range) -> None:
+        values = self._choose(numbers) if peer.parameters else {}
+        self._held[peer.instance_id].add(Lease(numbers, values), self._clock.monotonic())
+        peer.send(pack(Kind.LEASE, encode([numbers[0], values]), len(numbers)))
+        peer.pace.go_on()
 
     def lose(self, instance_id: int) -> int | None:
         """Return a lost client's numbers to the queue.
@@ -103,91 +100,128 @@ class Leases:
         Returns:
             The number that was lost too often, so that it has failed; else None.
         """
-        self._rows.pop(instance_id, None)
-        leased = list(self._leased.pop(instance_id, {}))
-        if len(leased) > 1:  # any of them may be the cause
-            self._suspects.update(leased)
-            for number in leased:
+        held = self._held.pop(instance_id, _Held())
+        if len(held.numbers) > 1:  # any of them may be the cause
+            self._suspects |= held.numbers
+            for number in held.numbers:
                 self._queue.put_back(number)
             return None
-        return None if not leased or self._queue.give_back(leased[0]) else leased[0]
+        lost = next(iter(held.numbers), None)
+        return None if lost is None or self._queue.give_back(lost) else lost
 
     def release(self, instance_id: int) -> None:
         """Return the numbers of a client that leaves to the queue."""
-        self._rows.pop(instance_id, None)
-        for number in self._leased.pop(instance_id, {}):
+        for number in self._held.pop(instance_id, _Held()).numbers:
             self._queue.put_back(number)
 
     def simulated(self) -> list[tuple[int, int, float]]:
         """Return what clients simulate: an instance, its episode, and for how long, in s."""
         now = self._clock.monotonic()
         return [
-            (instance, next(iter(leased)), now - self._since[instance])
-            for instance, leased in self._leased.items()
-            if leased
+            (instance_id, min(held.numbers), now - held.since)
+            for instance_id, held in self._held.items()
+            if held.numbers
         ]
 
     def fail(self, number: int, reason: str) -> None:
         """Record that a number has failed."""
-        failed = EpisodeRecord(episode=number, rows=0, status=EpisodeStatus.FAILED, reason=reason)
+        alone = range(number, number + 1)
+        failed = EpisodeRecord(
+            episode=number,
+            rows=0,
+            status=EpisodeStatus.FAILED,
+            parameters=Lease(alone, self._choose(alone)).parameters(number, 1),
+            reason=reason,
+        )
         self.blocks.append(EpisodeBlock({}, [failed]))
 
-    def _wanted(self, instance_id: int, clients: int) -> int:
-        """Return how many numbers a client should have."""
-        pace = self._pace.get(instance_id)
-        if pace is None or pace > _AIM:
-            return 1
-        several = 2 * int(_AIM / max(pace, _AIM / _MOST))
-        return max(1, min(several, self._queue.waiting // (2 * clients)))
-
     def _take_rows(self, peer: Peer, frame: Frame) -> None:
-        count = frame.number
-        if not peer.row_fields or count < 1 or peer.instance_id in self._rows:
+        held, count = self._held.get(peer.instance_id), frame.number
+        if held is None or not peer.row_fields or count < 1 or held.rows:
             raise ConnectionRefusedByPeerError(f"It sent {count} rows that belong to no episode.")
-        self._rows[peer.instance_id] = unpack_rows(frame.payload, peer.row_fields, count)
+        held.rows = unpack_rows(frame.payload, peer.row_fields, count)
 
     def _take_episodes(self, peer: Peer, frame: Frame) -> None:
-        rows = self._rows.pop(peer.instance_id, {})
+        held = self._held.get(peer.instance_id, _Held())
+        rows, held.rows = held.rows, {}
         try:
             records = [_parse(plain) for plain in decode(frame.payload)]
         except (TypeError, ValueError, ConfigError) as error:
             raise ConnectionRefusedByPeerError(f"It sent impossible episodes: {error}.") from error
-        leased = self._leased.get(peer.instance_id, {})
-        for record in records:
-            _settle(leased, record)
-            if record.status is not EpisodeStatus.MORE:
-                self._since[peer.instance_id] = self._clock.monotonic()
+        before = len(held.numbers)
+        records = [held.settled(record) for record in records]
+        if len(held.numbers) < before:
+            held.since = self._clock.monotonic()
         _check_rows(rows, records)
         if rows:
             check_values(rows, peer.row_fields, peer.instance_id)
         peer.received += len(rows.get("step", ()))
-        self._note_pace(peer.instance_id, records)
+        held.note_pace(records)
         self.blocks.append(EpisodeBlock(rows, records, peer.instance_id))
 
-    def _note_pace(self, instance_id: int, records: list[EpisodeRecord]) -> None:
+
+class _Held:
+    """What a client has leased.
+
+    Attributes:
+        numbers: The numbers that have not ended.
+        rows: Rows whose record has not arrived.
+        since: When it began its present episode, in monotonic s.
+    """
+
+    def __init__(self) -> None:
+        self.numbers: set[int] = set()
+        self.rows: Batch = {}
+        self.since = 0.0
+        self._leases: list[Lease] = []
+        self._parts: dict[int, int] = {}  # number of an episode that has begun to its next part
+        self._pace: float | None = None  # seconds of an episode
+
+    @property
+    def wanted(self) -> int:
+        """How many numbers it should have: the next 20 ms, and as much for the meantime."""
+        pace = self._pace
+        return 1 if pace is None or pace > AIM else 2 * int(AIM / max(pace, AIM / MOST))
+
+    def note_pace(self, records: list[EpisodeRecord]) -> None:
+        """Take note of what episodes have cost."""
         count = sum(each.count for each in records if each.status is not EpisodeStatus.MORE)
         pace = sum(each.seconds for each in records) / max(1, count)
-        self._pace[instance_id] = 0.5 * (pace + self._pace.get(instance_id, pace))
+        self._pace = 0.5 * (pace + (pace if self._pace is None else self._pace))
 
+    def add(self, lease: Lease, now: float) -> None:
+        """Give it more numbers."""
+        self.since = self.since if self.numbers else now
+        kept = [each for each in self._leases if not self.numbers.isdisjoint(each.numbers)]
+        self._leases = [*kept, lease]
+        self.numbers.update(lease.numbers)
 
-def _settle(leased: dict[int, int], record: EpisodeRecord) -> None:
-    """Check that a client has the numbers of a record, and take those that have ended from it.
+    def settled(self, record: EpisodeRecord) -> EpisodeRecord:
+        """Return a record with its parameters, and take the numbers that have ended.
 
-    Args:
-        leased: The numbers that it has, each with its next part.
-        record: The record.
-    """
-    for number in range(record.episode, record.episode + record.count):
-        if number not in leased:
-            raise ConnectionRefusedByPeerError(f"It sent episode {number}, which it does not have.")
-        if record.rows and record.part != leased[number]:
+        Raises:
+            ConnectionRefusedByPeerError: If the client does not have the numbers of the record, or
+                it is not about the next part.
+        """
+        first, ended = record.episode, range(record.episode, record.episode + record.count)
+        lease = next((each for each in self._leases if first in each.numbers), None)
+        if lease is None or ended[-1] not in lease.numbers or not self.numbers.issuperset(ended):
             raise ConnectionRefusedByPeerError(
-                f"It sent part {record.part} of episode {number} instead of {leased[number]}."
+                f"It sent episode {first}, which it does not have, or those that follow it."
+            )
+        part = self._parts.get(first, 0)
+        if record.rows and record.part != part:
+            raise ConnectionRefusedByPeerError(
+                f"It sent part {record.part} of episode {first} instead of {part}."
             )
         if record.status is EpisodeStatus.MORE:
-            leased[number] += 1
+            self._parts[first] = part + 1
         else:
-            del leased[number]
+            self._parts.pop(first, None)
+            self.numbers.difference_update(ended)
+        if not lease.values:
+            return record
+        return replace(record, parameters=lease.parameters(first, record.count))
 
 
 def _check_rows(rows: Batch, records: list[EpisodeRecord]) -> None:
@@ -197,17 +231,17 @@ def _check_rows(rows: Batch, records: list[EpisodeRecord]) -> None:
         raise ConnectionRefusedByPeerError("It sent another number of rows than episodes have.")
     if not count:
         return
-    numbers = [
-        number
-        for record in records
-        for number in (
-            range(record.episode, record.episode + record.count)
-            if record.count > 1
-            else [record.episode] * record.rows
-        )
-    ]
+    numbers = np.concatenate([_numbers(record) for record in records])
     if rows["env_id"].any() or not np.array_equal(rows["episode"], numbers):
         raise ConnectionRefusedByPeerError("It sent rows of other episodes.")
+
+
+def _numbers(record: EpisodeRecord) -> Index:
+    """Return the number of the episode of each row of a record."""
+    first = record.episode
+    if record.count > 1:
+        return np.arange(first, first + record.count)
+    return np.full(record.rows, first)
 
 
 def _parse(plain: Any) -> EpisodeRecord:

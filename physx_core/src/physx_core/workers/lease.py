@@ -1,0 +1,42 @@
+"""Lease: consecutive numbers of a campaign that one instance simulates."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Iterator, Mapping
+from typing import Any, NamedTuple
+
+from physx_core.typing import Batch
+from physx_core.workers.instance import NO_VALUES
+
+AIM = 20e-3
+"""Time in s that the numbers of a lease should take; also the time after which rows are sent."""
+MOST = 4096
+"""Number of rows, and of numbers, that are handled at once if they take less than that."""
+
+
+class Lease(NamedTuple):
+    """Numbers to simulate, with their parameters.
+
+    Attributes:
+        numbers: The numbers; at least one.
+        values: Name of a parameter to its values, an array of shape (numbers, *parameter's shape);
+            empty if there are no parameters.
+    """
+
+    numbers: range
+    values: Batch
+
+    def episodes(self) -> Iterator[tuple[int, Mapping[str, Any]]]:
+        """Return each number with the values of its parameters, for `Instance.begin`."""
+        if not self.values:
+            return zip(self.numbers, itertools.repeat(NO_VALUES))
+        names, columns = self.values.keys(), self.values.values()
+        lists = [each.copy() if each.ndim > 1 else each.tolist() for each in columns]
+        return zip(self.numbers, (dict(zip(names, each)) for each in zip(*lists)))  # noqa: B905
+
+    def parameters(self, first: int, count: int) -> dict[str, Any]:
+        """Return the parameters of some of the numbers as `EpisodeRecord` has them."""
+        start = first - self.numbers.start
+        which: Any = start if count == 1 else slice(start, start + count)
+        return {name: values[which] for name, values in self.values.items()}
