@@ -223,16 +223,17 @@ class FailedEpisodesError(PhysxError):
     Attributes:
         failed: How many have failed in this run.
         episode: Number of the last one.
+        remote_traceback: Where the environment raised, as text; empty if it did not raise.
     """
 
     def __init__(self, failed: int, episode: int, reason: str) -> None:
         self.failed, self.episode = failed, episode
-        first, _, rest = reason.partition("\n")
+        first, _, self.remote_traceback = reason.partition("\n")
         count = "An episode" if failed == 1 else f"{failed} episodes"
         super().__init__(
-            f"{count} failed, the last one number {episode}: {first} What has been simulated is "
-            "stored. To go on with the others: --resume, and --max-failed for more failures."
-            + (f"\n{rest}" if rest else "")
+            f"{count} failed, the last one number {episode}: {first.rstrip('.')}. What has been "
+            "simulated is stored. To go on with the others: --resume, and --max-failed for more "
+            "failures; --retry-failed simulates those that failed again."
         )
 
 

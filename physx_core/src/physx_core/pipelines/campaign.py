@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import json
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, Self
 
 import numpy as np
 
+from physx_core.components.parameter import Parameter
 from physx_core.config import EnvironmentConfig
 from physx_core.dataset import Dataset, EpisodeRecord, EpisodeStatus
-from physx_core.errors import ConfigError, DatasetError
+from physx_core.errors import ConfigError, DatasetError, listed
 from physx_core.pipelines.storage import describe_environment
 from physx_core.typing import Index
 from physx_core.workers.lease import Lease
@@ -47,7 +50,13 @@ class Campaign:
 
     @classmethod
     def begin(
-        cls, dataset: Dataset, mode: str, config: EnvironmentConfig, run_seed: int, seed: list[int]
+        cls,
+        dataset: Dataset,
+        mode: str,
+        config: EnvironmentConfig,
+        run_seed: int,
+        seed: list[int],
+        parameters: Sequence[Parameter],
     ) -> Self:
         """Return a new campaign, recorded in a dataset.
 
@@ -57,9 +66,12 @@ class Campaign:
             config: The environment.
             run_seed: Seed of the run.
             seed: Seed of the episodes.
+            parameters: The parameters that the environment defines.
         """
         known, number = _recorded(dataset), cls.count(dataset, mode)
-        campaign = cls(mode, number, describe_environment(config, run_seed), seed)
+        described = describe_environment(config, run_seed)
+        described["parameters"] = _plain(parameters)
+        campaign = cls(mode, number, described, seed)
         recorded = [asdict(each) for each in known]
         dataset.update_info(**{CAMPAIGNS: [*recorded, asdict(campaign)]})
         return campaign
@@ -90,24 +102,47 @@ class Campaign:
                 )
         return former
 
-    def simulated(self, dataset: Dataset) -> Index:
-        """Return the numbers that have ended, shape (n,), without those that were cut."""
-        first, count, _ = self._ended(dataset)
+    def check_parameters(self, parameters: Sequence[Parameter]) -> None:
+        """Check that the environment defines the same parameters as when the campaign began.
+
+        Raises:
+            ConfigError: If not, so that an episode would get other values.
+        """
+        before, now = self.environment["parameters"], _plain(parameters)
+        if before == now:
+            return
+        changed = [each for each in before if each not in now]
+        changed += [each for each in now if each not in before]
+        names = sorted({each["name"] for each in changed or before})
+        raise ConfigError(
+            "The campaign cannot be continued: the environment's parameters have changed since it "
+            f"began ({listed(names)}), so episodes would get other values. Restore their "
+            "definitions, or leave resume out for other episodes."
+        )
+
+    def simulated(self, dataset: Dataset, *, failed: bool = True) -> Index:
+        """Return the numbers that have ended, shape (n,), without those that were cut.
+
+        Args:
+            dataset: The dataset.
+            failed: Whether those that failed are among them.
+        """
+        first, count, _ = self._ended(dataset, failed)
         begins = np.repeat(first - np.cumsum(count) + count, count)
         return begins + np.arange(count.sum())
 
-    def records(self, dataset: Dataset) -> list[EpisodeRecord]:
-        """Return what is recorded of the numbers that have ended, without those that were cut."""
-        columns = (each.tolist() for each in self._ended(dataset))
+    def records(self, dataset: Dataset, *, failed: bool = True) -> list[EpisodeRecord]:
+        """Return what is recorded of those numbers: see `simulated`."""
+        columns = (each.tolist() for each in self._ended(dataset, failed))
         return [EpisodeRecord(episode=e, count=n, rows=r) for e, n, r in zip(*columns, strict=True)]
 
-    def _ended(self, dataset: Dataset) -> tuple[Index, Index, Index]:
+    def _ended(self, dataset: Dataset, failed: bool) -> tuple[Index, Index, Index]:
         """Return the first number, the number of episodes and that of rows of each entry."""
         known = dataset.recorded_episodes(self.mode) if self.mode in dataset.modes else None
         if known is None:
             return (np.zeros(0, np.int64),) * 3
-        ended = (known.status == EpisodeStatus.FINISHED) | (known.status == EpisodeStatus.FAILED)
-        chosen = ended & (known.campaign == self.number)
+        status = [EpisodeStatus.FINISHED, *([EpisodeStatus.FAILED] if failed else [])]
+        chosen = np.isin(known.status, status) & (known.campaign == self.number)
         return known.episode[chosen], known.numbers[chosen], known.rows[chosen]
 
     def cut(self, dataset: Dataset, surplus: int, sets: ParameterSets) -> None:
@@ -146,6 +181,11 @@ class Campaign:
             surplus -= left_out
             if not surplus:
                 return
+
+
+def _plain(parameters: Sequence[Parameter]) -> Any:
+    """Return parameters as a dataset's info has them."""
+    return json.loads(json.dumps([each.to_dict() for each in parameters]))
 
 
 def _recorded(dataset: Dataset) -> list[Campaign]:

@@ -6,6 +6,7 @@ import contextlib
 import shlex
 from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
+from pathlib import Path
 from typing import ClassVar
 
 from physx_core.config import MODES, WRONG, DatasetConfig, EnvironmentConfig, at_least, options
@@ -79,6 +80,9 @@ class DataGeneration(NewSessionPipeline):
     resume: bool = field(default=False, metadata={"recorded": False})
     """Go on with the independent episodes of an existing session: simulate those that it does not
     have."""
+    retry_failed: bool = field(default=False, metadata={"recorded": False})
+    """With `resume`: also simulate the episodes again that failed, for example because of a mistake
+    that has been mended."""
     mode: str | None = field(default=None, metadata={"choices": MODES})
     """Mode to store the samples in; None: `DatasetConfig.mode`."""
 
@@ -320,9 +324,11 @@ class DataGeneration(NewSessionPipeline):
         elif campaign is None:
             self.source.check_independent()
             self._campaign = campaign = Campaign.begin(
-                self.dataset, self._mode, config, self._seed, seed
+                self.dataset, self._mode, config, self._seed, seed, self.source.sets.parameters
             )
             self._queue = self._make_queue(campaign)
+        else:
+            campaign.check_parameters(self.source.sets.parameters)
         if self._queue is not None:
             self._describe()
             self._episodes = self.source.lease(self._queue)
@@ -332,9 +338,12 @@ class DataGeneration(NewSessionPipeline):
         return max(self.dataset.num_samples(self._mode), Campaign.count(self.dataset, self._mode))
 
     def _make_queue(self, campaign: Campaign) -> EpisodeQueue:
+        failed = not self.retry_failed
         if self.episodes is None:
-            return RowQueue(self._amount()[0], campaign.records(self.dataset), self.retries)
-        return EpisodeQueue(self.episodes, campaign.simulated(self.dataset).tolist(), self.retries)
+            known = campaign.records(self.dataset, failed=failed)
+            return RowQueue(self._amount()[0], known, self.retries)
+        numbers = campaign.simulated(self.dataset, failed=failed).tolist()
+        return EpisodeQueue(self.episodes, numbers, self.retries)
 
     def _simulates_episodes(self, dataset_config: DatasetConfig) -> bool:
         """Return whether episodes are simulated by number, instead of streams."""
@@ -345,6 +354,11 @@ class DataGeneration(NewSessionPipeline):
             and not self.source.sets.learns
             and not stream_options(config, dataset_config)
         )
+
+    def _plan(self) -> Iterable[str]:
+        former = Path(self.session_dir) / self.session_name
+        if self._campaign is not None and self.session.is_new and former != self.session.path:
+            yield f"to go on with the episodes of {former}: --resume"
 
     def _results(self, error: BaseException | None) -> Iterable[str]:
         duration = self._duration

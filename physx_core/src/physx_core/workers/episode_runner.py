@@ -24,6 +24,7 @@ from physx_core.workers.lease import AIM, Lease
 OF_EPISODES = (EnvironmentFailedError, ProgramError, NotFiniteError, WrongSamplesError)
 """Errors that end an episode; others end the run."""
 _FINISHED, _MORE = EpisodeStatus.FINISHED, EpisodeStatus.MORE  # looking members up takes long
+_PART_TIME = 10.0  # s
 
 
 class EpisodeBlock(NamedTuple):
@@ -102,6 +103,8 @@ class EpisodeRunner:
     def run(self) -> EpisodeBlock:
         """Simulate until rows fill a block, episodes took 20 ms, or no number is left.
 
+        A part of a long episode is returned after 10 s, so that it is on the disk.
+
         Raises:
             PhysxError: If the environment fails in a way that concerns all episodes.
         """
@@ -117,6 +120,8 @@ class EpisodeRunner:
             if self._number is None and self._began >= until:
                 break
             if self._buffer is not None and self._buffer.full:
+                break
+            if self._number is not None and self._now() - self._began >= _PART_TIME:
                 break
         if self._number is not None:
             self._end(_MORE)
@@ -181,7 +186,7 @@ class EpisodeRunner:
             self._buffer.count = self._first
         self._part = 0
         self._end(EpisodeStatus.FAILED)
-        self._parts[-1].reason, self._number = str(error), None
+        self._parts[-1].reason, self._number = _reason(error), None
 
     def _take_block(self) -> EpisodeBlock:
         rows: Batch = {}
@@ -210,6 +215,14 @@ class EpisodeRunner:
         if part.status is EpisodeStatus.MORE:
             self._number = None
         buffer.remove(start + good, 1 if part.count > 1 else part.rows, count)
+
+
+def _reason(error: PhysxError) -> str:
+    """Return why an episode failed, whichever instance has simulated it, and then where."""
+    if not isinstance(error, EnvironmentFailedError):
+        return str(error)
+    at = f" at step {error.step}" if error.step >= 0 else ""
+    return f"{error.method}(){at}: {error.summary}\n{error.remote_traceback}"
 
 
 def _record(part: _Part) -> EpisodeRecord:
