@@ -422,7 +422,8 @@ class Environment(Closeable):
         self._earlier_steps += self.step_index
         self.step_index, self.episode_index = 0, number
         self._has_begun_episodes, self._episode_is_over = True, False
-        self._seek_stream(number)
+        self._check_generator()
+        self._episode_streams.seek(number)
         self.reset_parameters(**values)
 
     def replay_episode(self, place: int, values: Mapping[str, Any]) -> None:
@@ -465,20 +466,20 @@ class Environment(Closeable):
         elif self._defined_parameters:
             values = draw(self._defined_parameters, self._seed_entropy, number)
         if self.independent_episodes:
-            self._seek_stream(number)
+            self._check_generator()
+            self._episode_streams.seek(number)
         else:
             fresh = random_of(self._seed_entropy, number, 0).bit_generator.state
             self.rng.bit_generator.state = fresh  # in place: others may hold the generator
         self.reset_parameters(**values)
 
-    def _seek_stream(self, number: int) -> None:
-        """Set `rng` to the random stream of an independent episode."""
+    def _check_generator(self) -> None:
+        """Check that the numbers of an independent episode come from its random stream."""
         if self.rng is not self._episode_streams.generator:
             raise UsageError(
                 f"{type(self).__name__} has replaced self.rng, but its episodes are independent: "
                 "the numbers of an episode must come from the generator that physx sets."
             )
-        self._episode_streams.seek(number)
 
     def _lacks(self, method: str) -> UsageError:
         own = [name for name in dir(type(self)) if not hasattr(Environment, name)]

@@ -113,6 +113,7 @@ class Instance(Closeable):
         last_step: Number of the step that generated the last sample, counted from 0 over all
             episodes.
         last_episode: Number of the trajectory that the last sample belongs to, counted from 0.
+        has_ended: Whether the last sample is the last one of the episode that `begin` has begun.
         rejected: The samples that `check_sample` rejected, if they are recorded; else None.
     """
 
@@ -154,6 +155,7 @@ class Instance(Closeable):
         self.environment: Environment | None = None
         self.last_step = -1
         self.last_episode = 0
+        self.has_ended = False
         self.rejected = RejectedSamples() if record_wrong else None
         self._reference = environment
         self._arguments: dict[str, Any] = {
@@ -188,12 +190,6 @@ class Instance(Closeable):
     def is_independent(self) -> bool:
         """Whether the environment's episodes are independent."""
         return self._alive().independent_episodes
-
-    @property
-    def has_ended(self) -> bool:
-        """Whether the last sample is the last one of the episode that `begin` has begun."""
-        environment = self.environment or self._alive()
-        return environment._episode_is_over
 
     @property
     def parameters(self) -> list[Parameter]:
@@ -353,6 +349,7 @@ class Instance(Closeable):
                 if accepted is True or self._accepts(accepted):
                     if self._counts:
                         self._count(environment)
+                    self.has_ended = environment._episode_is_over
                     return sample
                 wrong += 1
                 self._reject(sample, wrong)

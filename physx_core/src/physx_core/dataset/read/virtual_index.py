@@ -94,12 +94,26 @@ def _add(group: Any, field: Field, pieces: list[Piece]) -> None:
     if not rows or not field.nbytes:
         entry = group.create_dataset(field.name, shape, dtype)
     else:
-        layout = h5py.VirtualLayout(shape, dtype)
+        layout = h5py.h5p.create(h5py.h5p.DATASET_CREATE)
+        if dtype.kind == "f":
+            layout.set_fill_value(np.array(np.nan, dtype))  # of rows of a lost partition
+        space = h5py.h5s.create_simple(shape)
         for partition, part, where in pieces:
-            source_shape = (partition.rows, *shape[1:])
-            source_file = partition.file_name(field.name)
-            source = h5py.VirtualSource(source_file, "data", source_shape, dtype)
-            layout[where] = source if part.stop - part.start == partition.rows else source[part]
-        missing = np.nan if dtype.kind == "f" else None  # value of rows of a lost partition
-        entry = group.create_virtual_dataset(field.name, layout, fillvalue=missing)
+            source = h5py.h5s.create_simple((partition.rows, *shape[1:]))
+            _select(source, part)
+            _select(space, where)
+            file = partition.file_name(field.name).encode()
+            layout.set_virtual(space, file, b"data", source)
+        space.select_all()
+        kind = h5py.h5t.py_create(dtype, logical=True)
+        h5py.h5d.create(group.id, field.name.encode(), kind, space, layout)
+        entry = group[field.name]
     entry.attrs["unit"], entry.attrs["role"] = field.unit, field.role
+
+
+def _select(space: Any, rows: slice) -> None:
+    """Select some rows of a space; h5py's own layouts take eight times as long for each piece."""
+    others = space.shape[1:]
+    count = len(range(rows.start, rows.stop, rows.step or 1))
+    start, stride = (rows.start, *(0 for _ in others)), (rows.step or 1, *(1 for _ in others))
+    space.select_hyperslab(start, (count, *others), stride)
