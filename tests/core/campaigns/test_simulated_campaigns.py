@@ -201,3 +201,12 @@ def test_episodes_of_several_parts_do_not_depend_on_who_is_lost(choose, count, f
     met = [fate for each in given.values() for fate in each if fate.began is not None]
     check(results, 6, troubles=troubles, lost=range(6), **size)
     assert len(results.failed) <= len(met) // 2
+
+
+def test_long_episode_is_sent_in_parts_every_ten_seconds():
+    with Simulation() as simulation:
+        kwargs = {"pace": 3.0, "troubles": {"1": ["is long", 20]}}
+        results = simulate(simulation, 3, 2, env_kwargs=kwargs, timeout=300.0)
+    check(results, 3, troubles={"1": ["is long", 20]})
+    parts = [record.rows for record in results.records if record.episode == 1]
+    assert parts == [4, 4, 4, 4, 4, 0]
