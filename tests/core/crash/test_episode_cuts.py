@@ -14,6 +14,7 @@ from physx_core import Dataset
 from physx_core.dataset import EpisodeRecord, EpisodeStatus
 
 STEPS = 14
+WHAT = ["part", "part", "part", "range", "stream", "tick", "seal", "compact"]
 
 
 def rows(campaign, episode, count, attempt):
@@ -31,8 +32,12 @@ class History:
         self.kept = [(0, set())]  # from which operation on which episodes are on the disk
 
     def step(self, dataset, stage, journal):
-        what = self.chance.choice(["part", "part", "part", "range", "stream", "tick", "seal"])
-        if what == "tick":
+        what = self.chance.choice(WHAT)
+        if what == "compact":
+            dataset.compact()
+            self.open.clear()
+            self.kept.append((len(journal), set(self.finished)))
+        elif what == "tick":
             for syncer in stage.syncers:
                 syncer.sync()
             self.kept.append((len(journal), set(self.finished)))

@@ -114,6 +114,28 @@ EPISODE = st.tuples(
 STRATEGIES = st.sampled_from(["memory", "disk exact", "disk windowed"])
 
 
+def look(dataset, mode):
+    """Return rows, episodes number by number, reasons and statistics: what compaction keeps."""
+    if mode not in dataset:
+        return None
+    known = dataset.recorded_episodes(mode)
+    each = np.repeat(np.arange(len(known.rows)), known.numbers)
+    place = np.arange(len(each)) - np.repeat(np.cumsum(known.numbers), known.numbers)
+    place += known.numbers[each]
+    is_range = known.numbers[each] > 1
+    numbers = known.campaign[each], known.episode[each] + place, known.status[each]
+    rows = np.where(is_range, 1, known.rows[each])
+    return (
+        [column.tolist() for column in (*numbers, rows)],
+        {name: dataset[mode][name][:].tobytes() for name in dataset[mode]},
+        dataset.failed_episodes(mode),
+        {
+            name: [array.tobytes() for array in each.arrays().values()]
+            for name, each in dataset.normalization_of(mode).items()
+        },
+    )
+
+
 class Machine(RuleBasedStateMachine):
     """A dataset with one writer, and a reader beside it."""
 
@@ -237,6 +259,40 @@ class Machine(RuleBasedStateMachine):
                 )  # fmt: skip
                 self.dataset.append_episodes(self.mode, self.block([]), [record])
 
+    @rule(again=st.booleans())
+    def compact(self, again):
+        if self.turn % 3 or EPISODES not in self.dataset.modes:
+            return
+        before = look(self.dataset, self.mode)
+        self.dataset.compact()
+        if again:
+            assert self.dataset.compact(self.mode) == 0
+        assert look(self.dataset, self.mode) == before
+        model = self.model
+        for key, computed in list(model.episodes.items()):
+            left = [each for each in computed if each[2] <= set(model.stored)][-1:]
+            model.episodes[key] = [(status, rows, set(rows)) for status, rows, _ in left]
+            if not left:
+                del model.episodes[key]
+        known = self.dataset.recorded_episodes(self.mode)
+        for which in np.flatnonzero(known.numbers > 1):  # they still count together
+            first = int(known.episode[which])
+            numbers = range(first, first + int(known.numbers[which]))
+            each = [model.episodes[int(known.campaign[which]), number] for number in numbers]
+            rows = {row for computed in each for row in computed[-1][1]}
+            for computed in each:
+                computed[-1] = (*computed[-1][:2], rows)
+        model.stored = model.rows()
+        stored = sum(p.rows for p in self.dataset._manifest.modes[self.mode].partitions)
+        assert stored == len(model.stored)
+        for key in list(model.parts):
+            del model.parts[key]
+            with pytest.raises(UsageError):
+                record = EpisodeRecord(
+                    campaign=key[0], episode=key[1], rows=0, part=self.counts.pop(key)
+                )  # fmt: skip
+                self.dataset.append_episodes(self.mode, self.block([]), [record])
+
     @rule(before=st.integers(0, 4), after=st.integers(0, 4), capacity=st.integers(1, 9),
           drawn=st.lists(EPISODE, max_size=4))  # fmt: skip
     def merge(self, before, after, capacity, drawn):
@@ -260,7 +316,8 @@ class Machine(RuleBasedStateMachine):
             rows = self.draw(after)
             given.append(self.mode, self.block(rows))
             where = other.last_campaign() + 1 if drawn else 0
-            other.streams.setdefault(where, []).extend(rows)
+            if rows or not drawn:
+                other.streams.setdefault(where, []).extend(rows)
             other.stored += rows
             self.dataset.merge(folder)
         self.take(other, bool(drawn))

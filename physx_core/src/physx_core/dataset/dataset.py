@@ -14,6 +14,7 @@ from physx_core.closeable import Closeable
 from physx_core.dataset.read.episodes import Episode, find_episodes
 from physx_core.dataset.read.mode_statistics import compute_statistics
 from physx_core.dataset.read.order.records import RecordedEpisodes
+from physx_core.dataset.read.ordered_statistics import compute_in_order, store_in_order
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.sampling import BatchOptions, BatchReader
 from physx_core.dataset.read.splits import Subset, split
@@ -24,10 +25,11 @@ from physx_core.dataset.read.views import ModeView, row_numbers
 from physx_core.dataset.repair import recovery, repair
 from physx_core.dataset.repair.report import find_problems, summarize
 from physx_core.dataset.store import failure_file, locks
-from physx_core.dataset.store.episode_table import EPISODES, EpisodeStatus, has_table
+from physx_core.dataset.store.episode_table import EPISODES, LOST, EpisodeStatus, has_table
 from physx_core.dataset.store.failure_file import FailedEpisode
 from physx_core.dataset.store.manifest import Manifest, to_plain_info
 from physx_core.dataset.write.appender import Appender
+from physx_core.dataset.write.compacting import compact
 from physx_core.dataset.write.merging import add_partitions, drop_partition
 from physx_core.dataset.write.opening import WriterOptions, create, extend
 from physx_core.dataset.write.recording import EpisodeRecord
@@ -377,12 +379,14 @@ class Dataset(Closeable):
         self._prepare_reading()
         self._reader.mode(mode).forget_statistics()
         if (order := self._reader.order(mode)) is not None:
-            order.statistics.clear()
+            compute_in_order(self._reader, mode, order, anew=True)
         found = self.normalization_of(mode)
         store = self._appender.writer.store if self._appender is not None else None
         if store is not None and not store.shared:  # of several writers, the next one stores them
-            with files.storing("The statistics"), store.change():
-                pass
+            with files.storing("The statistics"):
+                with store.change():
+                    pass
+                store_in_order(self._reader)
         return found
 
     def describe(self) -> list[dict[str, Any]]:
@@ -582,8 +586,8 @@ class Dataset(Closeable):
         numbers = row_numbers(index, total)
         single = not isinstance(index, slice) and np.ndim(index) == 0
         values = check_update(fields, numbers, rows, single=single)
-        stored = self._reader.index(mode)
-        numbers = numbers if stored is None else stored[numbers]
+        order = self._reader.order(mode)
+        numbers = numbers if order is None else order.stored(numbers)
         with files.storing(f"{len(numbers)} updated rows of mode {mode!r}"):
             writer.update(mode, numbers, values)
 
@@ -639,6 +643,39 @@ class Dataset(Closeable):
         self._check_ordinary(mode)
         with files.storing(f"Mode {mode!r} without partition {index}"):
             return drop_partition(writer, mode, session, index)
+
+    def compact(self, mode: str | None = None) -> int:
+        """Remove rows that no episode has from the disk, and put the others in order.
+
+        Such rows are those of failed, lost, replaced and unfinished episodes; the parts of the
+        latter have to be stored again, from the first one on. Rows, episodes, parameters and
+        statistics stay as they are. Modes without episodes are left alone. It takes disk space for
+        a copy of the rows, except for those of the first partitions if these are in order already.
+        If the process dies, the dataset is the one from before or after it, and the next writer
+        removes what is left over.
+
+        Args:
+            mode: Name of the mode; None: all.
+
+        Returns:
+            How many bytes of disk space were freed; negative if the files now take more.
+
+        Raises:
+            DatasetError: If there is no such mode, if its rows, their records or some of them are
+                damaged or lost, or if the disk is full or fails. Nothing is changed then.
+            UsageError: If the dataset is closed, open for reading only, or shared, or if other
+                processes write the rows.
+        """
+        writer = self._as_only_writer("compact it")
+        if mode is not None:
+            self._reader.mode(mode)  # there must be one
+        if self._manifest.info.get(LOST):
+            raise DatasetError(
+                f"Records of episodes in {self.directory} were lost, so it is unknown which rows "
+                "count. Nothing was compacted. `physx verify` says what can be done."
+            )
+        with files.storing("The compacted rows"):
+            return compact(writer, self.modes if mode is None else [mode])
 
     @staticmethod
     def repair(directory: str | Path) -> list[str]:

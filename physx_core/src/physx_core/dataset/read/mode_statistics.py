@@ -1,7 +1,6 @@
 """Statistics of a mode's rows: computed once per partition and merged when it is sealed.
 
-Those of a mode with episodes are merged over a fixed grid of its rows, in order: they are the same,
-bit by bit, wherever the rows are stored.
+`physx_core.dataset.read.ordered_statistics` has those of a mode with episodes.
 """
 
 from __future__ import annotations
@@ -10,26 +9,18 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from physx_core.dataset.read.order.order import Order
+from physx_core.dataset.read.ordered_statistics import Statistics, compute_in_order
 from physx_core.dataset.read.reader import Reader
-from physx_core.dataset.read.strategies.cache import ColumnCache
-from physx_core.dataset.read.views import ModeView
 from physx_core.dataset.store import statistics_file
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
-from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.statistics import RunningStatistics
-
-Statistics = dict[str, RunningStatistics]
-
-_GRID = 4096
 
 
 def compute_statistics(reader: Reader, mode_name: str) -> Statistics:
     """Return the statistics of a mode's floating-point fields over all its committed rows."""
     mode, order = reader.mode(mode_name), reader.order(mode_name)
     if order is not None:
-        order.statistics = order.statistics or _in_order(reader, mode_name, order)
-        return order.statistics
+        return compute_in_order(reader, mode_name, order)
     statistics_file.load(reader.directory, reader.manifest)
     for partition in mode.partitions:
         if not partition.counted:
@@ -39,17 +30,6 @@ def compute_statistics(reader: Reader, mode_name: str) -> Statistics:
     for partition in mode.partitions:
         if not partition.counted:
             found = merge_statistics(found, partition.running)
-    return found
-
-
-def _in_order(reader: Reader, mode_name: str, order: Order) -> Statistics:
-    """Return the statistics of a mode with episodes, from one pass over its rows in order."""
-    view, found = ModeView(ColumnCache(reader), mode_name), {}
-    for name, field in reader.mode(mode_name).counted_fields.items():
-        statistics = found[name] = RunningStatistics()
-        step = min(_GRID, rows_per_block(field.nbytes))
-        for start in range(0, order.rows, step):
-            statistics.update(view[name][start : start + step])
     return found
 
 

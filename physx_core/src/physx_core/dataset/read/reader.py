@@ -12,6 +12,7 @@ from physx_core.dataset.read.order.order import Order, Orders
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.episode_table import EPISODES
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
+from physx_core.dataset.store.order_file import Prefix
 from physx_core.dataset.store.partition.commits import name_rows
 from physx_core.dataset.store.partition.format import inspect
 from physx_core.dataset.store.partition.segment import BLOCK, RowsCheck, Segment, rows_per_block
@@ -32,12 +33,14 @@ class Reader:
         directory: The dataset's folder.
         manifest: The manifest; rows added to it later can be read too.
         orders: The orders of the modes with records.
+        prefixes: Statistics of the first rows of modes with records, as far as they are known.
     """
 
     def __init__(self, directory: Path, manifest: Manifest) -> None:
         self.directory = directory
         self.manifest = manifest
         self.orders = Orders(manifest, self._read_table)
+        self.prefixes: dict[str, Prefix] = {}
 
     def mode(self, mode: str) -> Mode:
         """Return a mode.
@@ -177,8 +180,8 @@ class Reader:
             self.read_into(block, mode, name, first, checks)
             yield block
 
-    def _read_table(self, name: str) -> Array:
-        return self.read(EPISODES, name, 0, self.stored_rows(EPISODES))
+    def _read_table(self, name: str, start: int, stop: int) -> Array:
+        return self.read(EPISODES, name, start, stop)
 
     def _read_part(
         self, out: Array, mode: str, segment: Segment, first: int, checks: dict[int, RowsCheck]

@@ -63,6 +63,7 @@ class Subset:
         self.mode, self._rows = view.mode, rows
         self._view, self._reader = view, view.columns.reader
         self._order = self._reader.order(self.mode)
+        self._stored = [partition.key for partition in self._reader.mode(self.mode).with_rows]
 
     @property
     def rows(self) -> Index:
@@ -71,10 +72,16 @@ class Subset:
         They change when an earlier independent episode is stored.
 
         Raises:
-            DatasetError: If some of the rows belong to an episode that was replaced.
+            DatasetError: If some of the rows belong to an episode that was replaced, or the mode
+                was compacted.
         """
         order = self._reader.order(self.mode)
         if order is not self._order:
+            stored = [partition.key for partition in self._reader.mode(self.mode).with_rows]
+            if stored[: len(self._stored)] != self._stored:
+                raise DatasetError(
+                    "Rows were removed, or compacted, since the mode was split: split it again."
+                )
             self._rows = _renumbered(self._rows, self._order, order)
             self._order = order
         return self._rows

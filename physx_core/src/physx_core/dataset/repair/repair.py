@@ -8,6 +8,7 @@ from pathlib import Path
 
 from physx_core import files
 from physx_core.dataset.read.mode_statistics import compute_statistics
+from physx_core.dataset.read.ordered_statistics import store_in_order
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.virtual_index import write_index
 from physx_core.dataset.repair import recovery
@@ -102,6 +103,7 @@ def _store(folder: Path, manifest: Manifest) -> None:
         compute_statistics(reader, name)
     write_index(folder, next(reversed(manifest.sessions), "run"), manifest)
     manifest_file.save(folder, manifest)
+    store_in_order(reader)
 
 
 def _load_sound_manifest(folder: Path) -> tuple[Manifest, list[str]]:

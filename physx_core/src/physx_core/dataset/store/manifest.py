@@ -261,16 +261,24 @@ class Mode:
 
     def continues(self, earlier: Mode) -> bool:
         """Return whether all rows of an earlier state still exist under the same numbers."""
-        before = [p for p in earlier.partitions if p.rows]
-        now = [p for p in self.partitions if p.rows]
+        before, now = earlier.with_rows, self.with_rows
         last = before[-1].group if before else None
         grown = all(
             old.key == new.key
             and (old.rows == new.rows or (old.group == last and old.rows < new.rows))
-            and (old.checksums == new.checksums or not old.sealed)
             for old, new in zip(before, now, strict=False)
         )
         return grown and len(now) >= len(before) and self.rows >= earlier.rows
+
+    def keeps_values(self, earlier: Mode) -> bool:
+        """Return whether no row of an earlier state, which it continues, was updated."""
+        pairs = zip(earlier.with_rows, self.with_rows, strict=False)
+        return all(old.checksums == new.checksums or not old.sealed for old, new in pairs)
+
+    @property
+    def with_rows(self) -> list[Partition]:
+        """The partitions that have rows."""
+        return [partition for partition in self.partitions if partition.rows]
 
     def copy(self) -> Mode:
         """Return a copy to change while this one stays; the partitions are shared."""
@@ -325,6 +333,7 @@ class Manifest:
         problems: Modes whose rows cannot be counted, and why; not stored.
         generation: Increases whenever known rows have been changed or renumbered, which makes
             rows kept in memory stale; not stored.
+        numbering: Increases whenever known rows have been renumbered; not stored.
     """
 
     modes: dict[str, Mode] = field(default_factory=dict)
@@ -333,6 +342,7 @@ class Manifest:
     statistics_checksum: int | None = None
     problems: dict[str, DatasetError] = field(default_factory=dict)
     generation: int = 0
+    numbering: int = 0
 
     @property
     def sessions(self) -> list[str]:
@@ -374,13 +384,18 @@ class Manifest:
             dict(self.problems),
         )
 
+    def renumber(self) -> None:
+        """Note that known rows have other numbers, or are no longer there."""
+        self.generation += 1
+        self.numbering += 1
+
     def take(self, other: Manifest) -> None:
         """Take over the contents of `other`."""
-        self.generation += any(
-            name not in other.modes or not other.modes[name].continues(mode)
-            for name, mode in self.modes.items()
-            if name not in self.problems
-        )
+        known = {name: mode for name, mode in self.modes.items() if name not in self.problems}
+        if not all(n in other.modes and other.modes[n].continues(m) for n, m in known.items()):
+            self.renumber()
+        elif not all(other.modes[name].keeps_values(mode) for name, mode in known.items()):
+            self.generation += 1
         self.modes, self.info = other.modes, other.info
         self.statistics_checksum = other.statistics_checksum
         self.versions, self.problems = other.versions, other.problems

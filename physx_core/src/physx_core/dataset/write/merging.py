@@ -55,7 +55,7 @@ def add_partitions(writer: Writer, source: Path, given: Manifest) -> None:
     except BaseException:
         with contextlib.suppress(OSError):  # the next writer removes what is left
             found = {name: [new for _, new in found] for name, found in pairs.items()}
-            _forget(writer, {**found, **({EPISODES: table} if table else {})})
+            forget(writer, {**found, **({EPISODES: table} if table else {})})
         raise
     records.take_effect()
 
@@ -72,8 +72,8 @@ def drop_partition(writer: Writer, mode_name: str, session: str | None, index: i
         mode.removed[found.session] = max(found.index, mode.removed.get(found.session, -1))
         if found.counted:
             mode.forget_statistics()
-    writer.store.manifest.generation += 1
-    _forget(writer, {mode_name: [found]})
+    writer.store.manifest.renumber()
+    forget(writer, {mode_name: [found]})
     writer.recorder.load()
     return found.rows
 
@@ -163,7 +163,7 @@ def _accept(manifest: Manifest, mode: Mode, other: Mode, pairs: Pairs) -> None:
         add_counted(manifest, mode, other.statistics or {})
 
 
-def _forget(writer: Writer, partitions: Mapping[str, list[Partition]]) -> None:
+def forget(writer: Writer, partitions: Mapping[str, list[Partition]]) -> None:
     """Remove the files of dropped partitions, then their entries."""
     for name, dropped in partitions.items():
         mode = writer.store.manifest.modes[name]

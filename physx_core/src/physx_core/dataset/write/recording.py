@@ -123,6 +123,8 @@ class Recorder:
         """
         if not has_table(self.manifest):
             return
+        for known in (self.recorded, self._streams, self._campaigns, self._parts):
+            known.clear()
         total = self._reader.stored_rows(EPISODES)
         columns = [self._reader.read(EPISODES, f.name, 0, total).tolist() for f in _OWN]
         places = {mode: Addresses(self.manifest.modes.get(mode, Mode({}))) for mode in MODES}

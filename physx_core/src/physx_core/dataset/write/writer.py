@@ -12,6 +12,7 @@ from typing import Any
 
 from physx_core import files
 from physx_core.dataset.read.mode_statistics import compute_statistics, count_sealed
+from physx_core.dataset.read.ordered_statistics import store_in_order
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.virtual_index import write_index
 from physx_core.dataset.repair import recovery
@@ -394,6 +395,7 @@ class Writer:
                     compute_statistics(self._reader, name)
         if changed or manifest.has_new_statistics:
             manifest_file.save(self._directory, manifest)
+        store_in_order(self._reader)
         write_index(self._directory, self.session, manifest, wait=True)
 
 

@@ -35,6 +35,14 @@ class Addresses:
         found: Index = self._starts[group] + inside
         return found
 
+    @property
+    def runs(self) -> tuple[Index, Index]:
+        """The first stored row of each run of rows with consecutive addresses, and its address."""
+        if not len(self._first):
+            return np.zeros(1, np.int64), np.zeros(1, np.int64)
+        new = np.append(True, self._first[1:] != (self._first + self._rows)[:-1])
+        return self._starts[new], self._first[new]
+
     def has_all(self, first: int, count: int) -> bool:
         """Return whether there are rows with all `count` addresses from the first on."""
         begin, end = self.stored_before(np.array([first, first + count]))

@@ -3,21 +3,27 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
 from physx_core.config import MODES
 from physx_core.dataset.read.order.addresses import Addresses
-from physx_core.dataset.read.order.records import Places, RecordedEpisodes, Records, resolve
+from physx_core.dataset.read.order.growing import GrowingRecords
+from physx_core.dataset.read.order.records import (
+    NOTHING,
+    Found,
+    Places,
+    RecordedEpisodes,
+    Records,
+)
 from physx_core.dataset.store.episode_table import EPISODES, LOST, has_table, mode_index
 from physx_core.dataset.store.manifest import Manifest, Mode
 from physx_core.errors import DatasetError
-from physx_core.statistics import RunningStatistics
 from physx_core.typing import Array, Index
 
-ReadColumn = Callable[[str], Array]
+ReadColumn = Callable[[str, int, int], Array]
 
 _COLUMNS = ("campaign", "episode", "count", "first_row", "rows", "part", "status")
 
@@ -27,19 +33,25 @@ class Order:
     """The rows of a mode with records, in order of campaign and number.
 
     Attributes:
-        episodes: The episodes that count.
-        places: Where their rows are stored.
-        statistics: Statistics of the rows, by field, once they are known.
+        found: The episodes that count.
     """
 
-    episodes: RecordedEpisodes
-    places: Places
-    statistics: dict[str, RunningStatistics] = field(default_factory=dict)
+    found: Found
+
+    @cached_property
+    def episodes(self) -> RecordedEpisodes:
+        """The episodes that count."""
+        return self.found.episodes
+
+    @cached_property
+    def places(self) -> Places:
+        """Where their rows are stored."""
+        return self.found.places
 
     @cached_property
     def rows(self) -> int:
         """Number of rows."""
-        return int(self.places.rows.sum())
+        return int(self.found.rows.sum())
 
     @cached_property
     def index(self) -> Index | None:
@@ -48,6 +60,22 @@ class Order:
         if not len(first) or (len(first) == 1 and first[0] == 0):
             return None
         return np.repeat(first - self._starts, rows) + np.arange(self.rows)
+
+    def stored(self, rows: Index) -> Index:
+        """Return the stored rows of some rows, without the index of all."""
+        if not len(rows):
+            return rows
+        piece = self._starts.searchsorted(rows, "right") - 1
+        found: Index = self.places.first[piece] + rows - self._starts[piece]
+        return found
+
+    def first_places(self, rows: int) -> Index:
+        """Return the places of the first rows, shape (2, pieces): their first rows, and numbers."""
+        number = int(self._starts.searchsorted(rows))
+        found = np.array([column[:number] for column in self.places])
+        if number:
+            found[1, -1] = min(found[1, -1], rows - int(self._starts[number - 1]))
+        return found
 
     def pieces(self, start: int, stop: int) -> Iterator[tuple[int, int]]:
         """Yield the first stored row and the number of rows of each piece of a range of rows."""
@@ -65,7 +93,7 @@ class Order:
 
 
 class Orders:
-    """The orders of a dataset's modes, made anew whenever records or rows have come.
+    """The orders of a dataset's modes, extended whenever records or rows have come.
 
     Attributes:
         until_gap: Whether of the episodes that are recorded from now on only those before the first
@@ -77,13 +105,13 @@ class Orders:
 
         Args:
             manifest: The dataset's contents, which may change.
-            read: Returns a column of the table of episodes.
+            read: Returns some rows of a column of the table of episodes.
         """
         self.until_gap = False
         self._manifest, self._read = manifest, read
-        self._state: tuple[int, int] = -1, -1
-        self._records: dict[str, Records] = {}
-        self._orders: dict[str, tuple[tuple[int, bool], Order]] = {}
+        self._numbering, self._done = -1, 0  # how many records have been read
+        self._records: dict[str, GrowingRecords] = {}
+        self._orders: dict[str, tuple[tuple[int, int, bool], Order]] = {}
         self._seen: dict[str, int] = {}  # records that were read when all episodes counted
 
     def of(self, mode: str) -> Order | None:
@@ -92,51 +120,56 @@ class Orders:
         Raises:
             DatasetError: If the table of episodes cannot be read or is invalid.
         """
-        records = self._records_of(mode)
-        if records is None:
-            return None
-        known = self._manifest.modes.get(mode, Mode({}))
-        state = known.rows, self.until_gap
-        found = self._orders.get(mode)
-        if found is None or found[0] != state:
-            found = self._orders[mode] = state, self._resolve(mode, records, Addresses(known))
-        return found[1]
-
-    def _records_of(self, mode: str) -> Records | None:
         if mode not in MODES or not has_table(self._manifest):
             return None
+        self._read_new()
+        records = self._records.get(mode)
+        if records is None:
+            return Order(NOTHING) if self._manifest.info.get(LOST) else None
+        known = self._manifest.modes.get(mode, Mode({}))
+        state = known.rows, records.count, self.until_gap
+        found = self._orders.get(mode)
+        if found is None or found[0] != state:
+            found = self._orders[mode] = state, self._find(mode, records, Addresses(known))
+        return found[1]
+
+    def places(self, mode: str) -> Index:
+        """Return which rows of the table are the records of a mode, as `Found.record` counts."""
+        return self._records[mode].places
+
+    def _read_new(self) -> None:
+        """Read the records that have come."""
         if EPISODES in self._manifest.problems:
             raise self._manifest.problems[EPISODES]
-        state = self._manifest.generation, self._manifest.modes[EPISODES].rows
-        if state != self._state:
-            self._records, self._orders = self._read_records(), {}
-            self._state = state
-        found = self._records.get(mode)
-        if found is None and self._manifest.info.get(LOST):
-            return Records(*(np.zeros(0, np.int64) for _ in _COLUMNS))  # no row has a record
-        return found
+        if self._manifest.numbering != self._numbering:
+            self._numbering, self._done = self._manifest.numbering, 0
+            self._records, self._orders = {}, {}
+        total = self._manifest.modes[EPISODES].rows
+        if self._done == total:
+            return
+        table = Records(*(self._column(name, total) for name in _COLUMNS))
+        about = self._column("mode_index", total)
+        for mode in MODES:
+            which = np.flatnonzero(about == mode_index(mode))
+            if len(which):
+                records = self._records.setdefault(mode, GrowingRecords())
+                records.add(table.take(which), self._done + which)
+        self._done = total
 
-    def _read_records(self) -> dict[str, Records]:
-        table = Records(*(self._column(name) for name in _COLUMNS))
-        about = self._column("mode_index")
-        return {
-            mode: table.take(about == mode_index(mode))
-            for mode in MODES
-            if (about == mode_index(mode)).any()
-        }
+    def _column(self, name: str, stop: int) -> Index:
+        return self._read(name, self._done, stop).astype(np.int64)
 
-    def _column(self, name: str) -> Index:
-        return self._read(name).astype(np.int64)
-
-    def _resolve(self, mode: str, records: Records, addresses: Addresses) -> Order:
+    def _find(self, mode: str, records: GrowingRecords, addresses: Addresses) -> Order:
         try:
-            records = records.take(records.is_valid)
-            if not self.until_gap:
-                self._seen[mode] = len(records.rows)
-            seen = self._seen.get(mode, 0) if self.until_gap else None
-            return Order(*resolve(records, addresses, seen))
+            found = records.find(addresses)
         except ValueError as error:
             raise DatasetError(
                 f'The table of episodes does not fit mode "{mode}": {error}. Restore it from a '
                 "backup, or remove its records."
             ) from error
+        if not self.until_gap:
+            self._seen[mode] = records.count
+            return Order(found)
+        counts = found.last < self._seen.get(mode, 0)
+        counts[: found.before_gap] = True
+        return Order(found.take(counts))

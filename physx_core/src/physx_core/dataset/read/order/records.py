@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import NamedTuple
 
 import numpy as np
@@ -78,6 +79,77 @@ class Places(NamedTuple):
     rows: Index
 
 
+class Found(NamedTuple):
+    """Episodes that count, in order of campaign and number, and their parts, in order.
+
+    Attributes:
+        campaign, episode, numbers, status: As in `RecordedEpisodes`, shape (episodes,).
+        parts: Number of parts of each episode, shape (episodes,).
+        record: Number of the record of each part, in the order of writing, shape (parts,).
+        first: Its first stored row.
+        rows: Its number of rows.
+    """
+
+    campaign: Index
+    episode: Index
+    numbers: Index
+    status: Index
+    parts: Index
+    record: Index
+    first: Index
+    rows: Index
+
+    def head(self, episodes: int) -> Found:
+        """Return the first episodes."""
+        parts = int(self.parts[:episodes].sum())
+        return Found(*(c[:episodes] for c in self[:5]), *(c[:parts] for c in self[5:]))
+
+    def take(self, chosen: Flags) -> Found:
+        """Return some of the episodes."""
+        parts = np.repeat(chosen, self.parts)
+        return Found(*(c[chosen] for c in self[:5]), *(c[parts] for c in self[5:]))
+
+    def joined(self, further: Found) -> Found:
+        """Return these episodes and further ones, which come after them."""
+        if not len(self.campaign):
+            return further
+        return Found(*map(np.concatenate, zip(self, further, strict=True)))
+
+    @property
+    def last(self) -> Index:
+        """Number of the last record of each episode."""
+        found: Index = self.record[np.cumsum(self.parts) - 1]
+        return found
+
+    @property
+    def episodes(self) -> RecordedEpisodes:
+        """The episodes with their rows."""
+        rows = np.diff(np.cumsum(self.rows)[np.cumsum(self.parts) - 1], prepend=0)
+        first = np.cumsum(rows) - rows
+        return RecordedEpisodes(*self[:4], first, rows)
+
+    @property
+    def places(self) -> Places:
+        """Where their rows are: pieces that follow one another where they are stored are joined."""
+        first, rows = (column[self.rows > 0] for column in (self.first, self.rows))
+        new = np.ones(len(first), bool)
+        new[1:] = first[1:] != first[:-1] + rows[:-1]
+        begins = np.flatnonzero(new)
+        return Places(first[begins], np.add.reduceat(rows, begins) if len(rows) else rows)
+
+    @property
+    def before_gap(self) -> int:
+        """Number of episodes before the first one whose predecessor is missing."""
+        expected = np.zeros(len(self.campaign), np.int64)
+        expected[1:] = (self.episode + self.numbers)[:-1]
+        expected[1:][np.diff(self.campaign) != 0] = 0
+        gaps = np.flatnonzero(self.episode > expected)
+        return int(gaps[0]) if len(gaps) else len(expected)
+
+
+NOTHING = Found(*(np.zeros(0, np.int64) for _ in Found._fields))
+
+
 class _Chosen(NamedTuple):
     """Complete episodes.
 
@@ -85,7 +157,7 @@ class _Chosen(NamedTuple):
         records: Records in order of campaign and number, with rows as they are stored now.
         start: The record of each episode's part 0, shape (episodes,).
         parts: Number of its parts.
-        offset: Which row of the record is the episode's, if only one is.
+        offset: Which row of the record is the first of its own, if it has not all.
         numbers: For how many numbers it stands.
     """
 
@@ -106,51 +178,56 @@ class _Chosen(NamedTuple):
         found: Index = self.records.episode[self.start] + self.offset
         return found
 
-    @property
-    def status(self) -> Index:
-        """How each episode ended."""
-        found: Index = self.records.status[self.start + self.parts - 1]
-        return found
-
-    def take(self, index: Index | slice) -> _Chosen:
+    def take(self, index: Index | Flags) -> _Chosen:
         """Return some of the episodes."""
         return _Chosen(self.records, *(column[index] for column in self[1:]))
 
 
-def resolve(
-    table: Records, addresses: Addresses, seen: int | None = None
-) -> tuple[RecordedEpisodes, Places]:
+def resolve(records: Records, addresses: Addresses, written: Index) -> Found:
     """Return the episodes that count, in order, and where their rows are.
 
     Args:
-        table: The valid records about the mode.
+        records: Valid records about the mode, all that there are about the numbers that they are
+            about, in order of campaign and number, then as written.
         addresses: Where the rows of the mode are.
-        seen: If only the episodes before the first missing number count: how many records count
-            regardless, since they were read when all did. None: all episodes count.
+        written: Number of each record in the order of writing, shape (records,).
 
     Raises:
         ValueError: If episodes share rows.
     """
-    order = np.lexsort((table.episode, table.campaign))
-    wanted = table.take(order)
-    first = addresses.stored_before(wanted.first_row)
-    rows = addresses.stored_before(wanted.first_row + wanted.rows) - first
-    stream, failed = (wanted.status == s for s in (EpisodeStatus.STREAM, EpisodeStatus.FAILED))
+    first = addresses.stored_before(records.first_row)
+    rows = addresses.stored_before(records.first_row + records.rows) - first
+    stream, failed = (records.status == s for s in (EpisodeStatus.STREAM, EpisodeStatus.FAILED))
     chosen = _newest_complete(
-        wanted._replace(first_row=first, rows=rows),
-        stream | failed | (rows == wanted.rows),
+        records._replace(first_row=first, rows=rows),
+        stream | failed | (rows == records.rows),
     )
-    _, places = _places(chosen)
-    if places.rows.sum() > addresses.rows:
+    check_shared(_found(chosen, written), addresses)
+    return _found(_without_replaced(chosen, written), written)
+
+
+def check_shared(found: Found, addresses: Addresses) -> None:
+    """Check that episodes have no more rows than there are.
+
+    Raises:
+        ValueError: If they have.
+    """
+    if found.rows.sum() > addresses.rows:
         raise ValueError("episodes share rows")
-    chosen = _without_replaced(chosen, order)
-    if seen is not None:
-        known = order[chosen.start + chosen.parts - 1] < seen
-        known[: _first_gap(chosen)] = True
-        chosen = chosen.take(np.flatnonzero(known))
-    ends, places = _places(chosen)
-    rows = np.diff(np.cumsum(places.rows)[ends], prepend=0)
-    return _describe(chosen, rows), _joined(places)
+
+
+def reach(campaign: Index, end: Index) -> Index:
+    """Return the greatest number before which each record or one before it ends, in its campaign.
+
+    Args:
+        campaign: The campaigns, in order.
+        end: The number after the last one of each record.
+    """
+    found = np.empty(len(end), np.int64)
+    bounds = [*np.flatnonzero(np.diff(campaign, prepend=-1)).tolist(), len(end)]
+    for begin, stop in itertools.pairwise(bounds):
+        np.maximum.accumulate(end[begin:stop], out=found[begin:stop])
+    return found
 
 
 def _newest_complete(records: Records, whole: Flags) -> _Chosen:
@@ -177,58 +254,56 @@ def _newest_complete(records: Records, whole: Flags) -> _Chosen:
     return _Chosen(records, start, parts, np.zeros_like(start), records.numbers[start])
 
 
-def _without_replaced(chosen: _Chosen, order: Index) -> _Chosen:
-    """Take apart ranges of numbers of which some were recorded again; keep the newest of each.
+def _without_replaced(chosen: _Chosen, written: Index) -> _Chosen:
+    """Leave out numbers of ranges that were recorded again later: keep the newest of each.
 
     Args:
         chosen: The episodes.
-        order: Number of each record in the order of writing.
+        written: Number of each record in the order of writing.
     """
-    campaign, end = chosen.campaign, chosen.episode + chosen.numbers
-    if not ((np.diff(campaign) == 0) & (end[:-1] > chosen.episode[1:])).any():
+    campaign, episode = chosen.campaign, chosen.episode
+    furthest = reach(campaign, episode + chosen.numbers)
+    begins = np.diff(campaign, prepend=-1) != 0
+    begins[1:] |= episode[1:] >= furthest[:-1]
+    group = np.cumsum(begins) - 1
+    crowded = np.bincount(group)[group] > 1 if len(group) else begins
+    if not crowded.any():
         return chosen
-    each = np.repeat(np.arange(len(end)), chosen.numbers)
+    single = _newest_of_each(_apart(chosen.take(crowded)), written)
+    kept = chosen.take(~crowded)
+    both = _Chosen(chosen.records, *map(np.concatenate, zip(kept[1:], single[1:], strict=True)))
+    return both.take(np.lexsort((both.episode, both.campaign)))
+
+
+def _apart(chosen: _Chosen) -> _Chosen:
+    """Return an episode for each number of ranges."""
+    each = np.repeat(np.arange(len(chosen.start)), chosen.numbers)
     starts = np.cumsum(chosen.numbers) - chosen.numbers
-    single = chosen.take(each)._replace(
-        offset=np.arange(len(each)) - starts[each], numbers=np.ones_like(each)
-    )
-    written = order[single.start + single.parts - 1]
-    place = np.lexsort((written, single.episode, single.campaign))
-    single = single.take(place)
+    offset = chosen.offset[each] + np.arange(len(each)) - starts[each]
+    return chosen.take(each)._replace(offset=offset, numbers=np.ones_like(each))
+
+
+def _newest_of_each(single: _Chosen, written: Index) -> _Chosen:
+    """Return the newest episode of each number; those of a range that follow one another as one."""
+    last = written[single.start + single.parts - 1]
+    single = single.take(np.lexsort((last, single.episode, single.campaign)))
     same = (np.diff(single.campaign) == 0) & (np.diff(single.episode) == 0)
-    return single.take(np.flatnonzero(np.append(~same, True)))
+    single = single.take(np.append(~same, True))
+    begins = np.diff(single.start, prepend=-1) != 0
+    begins[1:] |= np.diff(single.episode) != 1
+    runs = np.flatnonzero(begins)
+    return single.take(runs)._replace(numbers=np.diff(runs, append=len(begins)))
 
 
-def _first_gap(chosen: _Chosen) -> int:
-    """Return the number of episodes before the first one whose predecessor is missing."""
-    expected = np.zeros(len(chosen.start), np.int64)
-    expected[1:] = (chosen.episode + chosen.numbers)[:-1]
-    expected[1:][np.diff(chosen.campaign) != 0] = 0
-    gaps = np.flatnonzero(chosen.episode > expected)
-    return int(gaps[0]) if len(gaps) else len(expected)
-
-
-def _places(chosen: _Chosen) -> tuple[Index, Places]:
-    """Return which piece is the last of each episode, and the pieces of all episodes."""
+def _found(chosen: _Chosen, written: Index) -> Found:
+    """Return the episodes with the places of their parts."""
     ends = np.cumsum(chosen.parts)
     shift = np.repeat(chosen.start - (ends - chosen.parts), chosen.parts)
     record = np.arange(len(shift)) + shift
+    status = chosen.records.status[chosen.start + chosen.parts - 1]
     first = chosen.records.first_row[record] + np.repeat(chosen.offset, chosen.parts)
-    alone = np.repeat(chosen.numbers == 1, chosen.parts) & (chosen.records.numbers[record] > 1)
-    rows = np.where(alone, 1, chosen.records.rows[record])
-    rows[np.repeat(chosen.status == EpisodeStatus.FAILED, chosen.parts)] = 0
-    return ends - 1, Places(first, rows)
-
-
-def _describe(chosen: _Chosen, rows: Index) -> RecordedEpisodes:
-    status, first = chosen.status, np.cumsum(rows) - rows
-    return RecordedEpisodes(chosen.campaign, chosen.episode, chosen.numbers, status, first, rows)
-
-
-def _joined(places: Places) -> Places:
-    """Return pieces, with those joined that follow one another where they are stored."""
-    first, rows = (column[places.rows > 0] for column in places)
-    new = np.ones(len(first), bool)
-    new[1:] = first[1:] != first[:-1] + rows[:-1]
-    begins = np.flatnonzero(new)
-    return Places(first[begins], np.add.reduceat(rows, begins) if len(rows) else rows)
+    is_range = chosen.records.numbers[record] > 1
+    rows = np.where(is_range, np.repeat(chosen.numbers, chosen.parts), chosen.records.rows[record])
+    rows[np.repeat(status == EpisodeStatus.FAILED, chosen.parts)] = 0
+    numbers = chosen.campaign, chosen.episode, chosen.numbers
+    return Found(*numbers, status, chosen.parts, written[record], first, rows)

@@ -1,0 +1,183 @@
+"""Removes rows that no episode has, and puts the others in order of campaign and number.
+
+The rows are copied to new partitions, and the records that count to a new table. These take the
+place of the old ones with a single change of the manifest. Before it, the new ones are listed as
+dropped, after it the old ones, so that after a crash the next writer removes what is left of
+either. The first partitions of a mode stay if their rows are the first ones in order.
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+
+from physx_core import files
+from physx_core.dataset.read.order.order import Order
+from physx_core.dataset.read.ordered_statistics import store_in_order
+from physx_core.dataset.read.reader import Reader
+from physx_core.dataset.read.strategies.cache import ColumnCache
+from physx_core.dataset.read.views import ModeView
+from physx_core.dataset.read.virtual_index import write_index
+from physx_core.dataset.repair.report import find_problem
+from physx_core.dataset.store.episode_table import EPISODES
+from physx_core.dataset.store.manifest import Manifest, Mode, Partition
+from physx_core.dataset.store.partition.segment import rows_per_block
+from physx_core.dataset.store.sealing import seal
+from physx_core.dataset.write.compacted_records import compacted_records
+from physx_core.dataset.write.merging import forget
+from physx_core.dataset.write.writer import Writer
+from physx_core.errors import DatasetError
+from physx_core.typing import Array, Batch
+
+Partitions = dict[str, list[Partition]]
+ReadRows = Callable[[str, int, int], Array]
+
+
+def compact(writer: Writer, modes: Sequence[str]) -> int:
+    """Compact modes with episodes: see `Dataset.compact`.
+
+    Args:
+        writer: Writes the dataset.
+        modes: The modes; those without records are left as they are.
+
+    Returns:
+        How many bytes of disk space were freed.
+    """
+    store = writer.store
+    reader = Reader(store.directory, store.manifest)
+    orders = {name: order for name in modes if (order := reader.order(name)) is not None}
+    if not orders:
+        return 0
+    for name in (*orders, EPISODES):
+        writer.finish(name)
+    kept = {name: _kept(store.manifest.modes[name], order) for name, order in orders.items()}
+    old = {name: store.manifest.modes[name].partitions[count:] for name, count in kept.items()}
+    is_done = not any(partition.rows for each in old.values() for partition in each)
+    if is_done and _is_compact(writer, reader, orders):
+        return 0
+    old[EPISODES] = list(store.manifest.modes[EPISODES].partitions)
+    _check(store.directory, store.manifest, old)
+    before = _size(store.directory)
+    _replace(writer, reader, orders, old)
+    write_index(store.directory, writer.session, store.manifest)
+    store_in_order(Reader(store.directory, store.manifest))
+    return before - _size(store.directory)
+
+
+def _size(directory: Path) -> int:
+    """Return how much disk space the files of a folder take, in bytes."""
+    return sum(path.stat().st_blocks for path in directory.iterdir() if path.is_file()) * 512
+
+
+def _kept(mode: Mode, order: Order) -> int:
+    """Return how many of the first partitions hold the first rows, in order, and no others."""
+    first, rows = order.places
+    in_place = int(rows[0]) if len(rows) and first[0] == 0 else 0
+    count, kept = 0, 0
+    for group in mode.groups:
+        kept += sum(partition.rows for partition in group)
+        if kept > in_place:
+            break
+        count += len(group)
+    return count
+
+
+def _is_compact(writer: Writer, reader: Reader, orders: Mapping[str, Order]) -> bool:
+    """Return whether all records count, if all rows do and are in order."""
+    modes = writer.store.manifest.modes
+    own = {name: modes[name].partitions for name in orders}
+    return len(compacted_records(writer, reader, orders, own)["rows"]) == modes[EPISODES].rows
+
+
+def _check(directory: Path, manifest: Manifest, replaced: Partitions) -> None:
+    """Check what is to be copied: a copy of damaged rows would look sound."""
+    for name, partitions in replaced.items():
+        for partition in partitions:
+            for field in manifest.modes[name].fields.values():
+                if (problem := find_problem(directory, partition, field)) is not None:
+                    raise DatasetError(f"{problem} Nothing was compacted.")
+
+
+def _replace(writer: Writer, reader: Reader, orders: Mapping[str, Order], old: Partitions) -> None:
+    """Write the new partitions, and let them take the place of the old ones."""
+    store, new, sealed = writer.store, {}, {}
+    with store.change() as manifest:
+        stay = {name: _without(manifest.modes[name].partitions, old[name]) for name in orders}
+        begin = {name: sum(partition.rows for partition in stay[name]) for name in orders}
+        for name, order in orders.items():
+            new[name] = _reserve(writer, manifest.modes, name, order.rows - begin[name])
+        own = {name: [*stay[name], *new[name]] for name in orders}
+        table = compacted_records(writer, reader, orders, own)
+        new[EPISODES] = _reserve(writer, manifest.modes, EPISODES, len(table["rows"]))
+    try:
+        for name in orders:
+            rows = _rows_of(reader, name, begin[name])
+            sealed[name] = list(_write(writer, new[name], rows))
+        sealed[EPISODES] = list(_write(writer, new[EPISODES], _rows_in(table)))
+        files.sync_folder(store.directory)
+        with store.change() as manifest:
+            for name, partitions in sealed.items():
+                _exchange(manifest.modes[name], old[name], partitions)
+    except BaseException:
+        with contextlib.suppress(OSError):  # the next writer removes what is left
+            forget(writer, new)
+        raise
+    store.manifest.renumber()
+    forget(writer, old)
+    writer.recorder.load()
+
+
+def _reserve(writer: Writer, modes: Mapping[str, Mode], name: str, rows: int) -> list[Partition]:
+    """List partitions for rows as dropped, to reserve their names and addresses."""
+    mode, found = modes[name], []
+    capacity = writer.capacity(mode)
+    for start in range(0, rows, capacity):
+        entry = writer.new_partition(name, mode)
+        entry.rows = min(capacity, rows - start)
+        mode.dropped.append(entry)
+        found.append(entry)
+    return found
+
+
+def _rows_of(reader: Reader, mode: str, begin: int) -> ReadRows:
+    """Return what reads rows of a mode, counted from `begin`, in order."""
+    view = ModeView(ColumnCache(reader), mode)
+    return lambda name, start, stop: view[name][begin + start : begin + stop]
+
+
+def _rows_in(table: Batch) -> ReadRows:
+    return lambda name, start, stop: table[name][start:stop]
+
+
+def _write(writer: Writer, partitions: Sequence[Partition], read: ReadRows) -> Iterator[Partition]:
+    """Write rows to the files of reserved partitions, and yield these, sealed."""
+    done, directory = 0, writer.store.directory
+    for entry in partitions:
+        fields = writer.store.manifest.modes[entry.mode].fields
+        for name, field in fields.items():
+            file, step = writer.create_file(entry, field, entry.rows), rows_per_block(field.nbytes)
+            try:
+                for start in range(0, entry.rows, step):
+                    stop = min(start + step, entry.rows)
+                    file.append(start, read(name, done + start, done + stop), stop, durable=True)
+                file.sync()
+                file.publish()
+            finally:
+                file.close()
+        done += entry.rows
+        yield seal(directory, fields, entry)
+
+
+def _exchange(mode: Mode, old: Sequence[Partition], new: Sequence[Partition]) -> None:
+    """Let new partitions of a mode take the place of the old ones."""
+    mode.forget_statistics()
+    mode.partitions = [*_without(mode.partitions, old), *new]
+    mode.dropped = [*_without(mode.dropped, new), *old]
+    for each in old:
+        mode.removed[each.session] = max(each.index, mode.removed.get(each.session, -1))
+
+
+def _without(partitions: Sequence[Partition], others: Sequence[Partition]) -> list[Partition]:
+    keys = {partition.key for partition in others}
+    return [partition for partition in partitions if partition.key not in keys]

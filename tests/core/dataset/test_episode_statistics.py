@@ -1,0 +1,146 @@
+"""Statistics of modes with episodes: kept beside the rows, and always the same bits."""
+
+import numpy as np
+import pytest
+from numpy.testing import assert_array_equal
+
+from physx_core import Dataset
+from physx_core.dataset import EpisodeRecord
+from physx_core.dataset.read import ordered_statistics
+from physx_core.dataset.read.reader import Reader
+
+
+@pytest.fixture(autouse=True)
+def small_grid(monkeypatch):
+    monkeypatch.setattr(ordered_statistics, "_GRID", 8)
+
+
+@pytest.fixture
+def folder(tmp_path):
+    return tmp_path / "data"
+
+
+ROWS = np.random.default_rng(0).standard_normal((40, 5, 3)) + 100
+
+
+def store(dataset, *episodes):
+    for episode in episodes:
+        record = EpisodeRecord(episode=episode, rows=5)
+        dataset.append_episodes("training", {"x": ROWS[episode]}, [record])
+
+
+def statistics(dataset):
+    return [array.tobytes() for array in dataset.normalization["x"].arrays().values()]
+
+
+@pytest.fixture
+def rows_read(monkeypatch):
+    """How many rows have been read."""
+    count = [0]
+    cell = ordered_statistics._cell
+
+    def counted(view, start, stop):
+        count[0] += stop - start
+        return cell(view, start, stop)
+
+    monkeypatch.setattr(ordered_statistics, "_cell", counted)
+    return count
+
+
+def test_whoever_opens_the_dataset_reads_less_than_a_cell(folder, rows_read):
+    with Dataset.create(folder) as dataset:
+        store(dataset, *range(20, 0, -1))
+        assert rows_read[0] == 0
+        expected = statistics(dataset)
+    rows_read[0] = 0
+    with Dataset.open(folder) as dataset:
+        assert statistics(dataset) == expected
+        assert rows_read[0] == 100 % 8
+    with Dataset.open(folder, writable=True) as dataset:
+        store(dataset, *range(21, 31))
+        rows_read[0] = 0
+    assert rows_read[0] == 150 - 96
+    rows_read[0] = 0
+    with Dataset.open(folder) as dataset:
+        now = statistics(dataset)
+        assert rows_read[0] == 150 % 8
+        dataset.recompute_normalization()
+        assert statistics(dataset) == now
+    next(folder.glob("order_*")).unlink()
+    with Dataset.open(folder) as dataset:
+        assert statistics(dataset) == now
+
+
+def test_changed_rows_records_and_files_are_noticed(folder):
+    with Dataset.create(folder) as dataset:
+        store(dataset, *range(1, 10))
+
+    def expected():
+        reader = Dataset.open(folder)
+        return [a.tobytes() for a in reader.recompute_normalization()["x"].arrays().values()]
+
+    def check():
+        with Dataset.open(folder) as dataset:
+            assert statistics(dataset) == expected()
+
+    def update(dataset):
+        dataset.update("training", 3, {"x": [7.0, 7.0, 7.0]})
+
+    def replace(dataset):
+        record = EpisodeRecord(episode=4, rows=1)
+        dataset.append_episodes("training", {"x": ROWS[30, :1]}, [record])
+
+    changes = (
+        update,
+        replace,
+        lambda dataset: store(dataset, 0),
+        lambda dataset: store(dataset, 12),
+        lambda dataset: dataset.remove_partition("training", 0),
+        lambda dataset: dataset.compact(),
+    )
+    for change in changes:
+        with Dataset.open(folder, writable=True) as dataset:
+            statistics(dataset)
+            change(dataset)
+            if dataset.num_samples("training"):
+                found = statistics(dataset)
+        check()
+        assert found == expected()
+    path = next(folder.glob("order_*"))
+    content = bytearray(path.read_bytes())
+    content[-3] ^= 0xFF
+    path.write_bytes(content)
+    check()
+
+
+def test_what_is_extended_in_memory_has_the_same_bits(folder):
+    random = np.random.default_rng(1)
+    with Dataset.create(folder) as dataset:
+        for episode in random.permutation(30).tolist():
+            store(dataset, episode)
+            found = statistics(dataset)
+            with Dataset.open(folder) as reader:
+                fresh = reader.recompute_normalization()["x"]
+            assert found == [array.tobytes() for array in fresh.arrays().values()]
+
+
+def test_the_order_is_extended_as_if_it_were_read_anew(folder):
+    """Also where records of ranges, parts, failures and replacements overlap."""
+    random = np.random.default_rng(2)
+    with Dataset.create(folder, max_file_size=(2**14 + 64 * 8) * 1e-9) as dataset:
+        for _ in range(300):
+            count = int(random.choice([1, 1, 2, 5]))
+            first = int(random.integers(0, 60))
+            campaign = int(random.integers(0, 2))
+            record = EpisodeRecord(episode=first, rows=count, count=count, campaign=campaign)
+            dataset.append_episodes("training", {"x": np.zeros((count, 1))}, [record])
+            if random.random() < 0.05:
+                dataset.append("training", {"x": np.ones((3, 1))})
+            if random.random() < 0.5:
+                found = dataset._reader.order("training")
+                fresh = Reader(folder, dataset._manifest).order("training")
+                for mine, other in zip(found.found, fresh.found, strict=True):
+                    assert_array_equal(mine, other)
+                rows = np.arange(found.rows)
+                stored = rows if fresh.index is None else fresh.index
+                assert_array_equal(found.stored(rows), stored)
