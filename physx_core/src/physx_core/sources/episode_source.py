@@ -11,7 +11,7 @@ from physx_core.typing import Batch
 from physx_core.workers.episode_queue import EpisodeQueue
 from physx_core.workers.episode_runner import EpisodeBlock, EpisodeRunner
 from physx_core.workers.instance import Instance
-from physx_core.workers.lease import MOST, Lease
+from physx_core.workers.lease import Lease, most_numbers
 from physx_core.workers.parameter_sets import ParameterSets
 
 
@@ -112,6 +112,6 @@ class LocalEpisodes(EpisodeSource):
 
     def _lease(self) -> Lease | None:
         """Return the next numbers: at most twice as many as before, as sampling may be slow."""
-        numbers = self._queue.take_range(min(1 + self._leased, MOST))
+        numbers = self._queue.take_range(min(1 + self._leased, most_numbers(self._sets.parameters)))
         self._leased += len(numbers)
         return Lease(numbers, self._sets.values_of(numbers)) if numbers else None

@@ -3,16 +3,22 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping
 from typing import Any, NamedTuple
 
+from physx_core.components.parameter import Parameter
 from physx_core.typing import Batch
 from physx_core.workers.instance import NO_VALUES
 
 AIM = 20e-3
 """Time in s that the numbers of a lease should take; also the time after which rows are sent."""
-MOST = 4096
-"""Number of rows, and of numbers, that are handled at once if they take less than that."""
+_MOST, _MOST_VALUES = 4096, 2**20
+
+
+def most_numbers(parameters: Iterable[Parameter]) -> int:
+    """Return how many numbers a lease may have: their parameters fit into 8 MiB."""
+    size = sum(parameter.size for parameter in parameters)
+    return max(1, min(_MOST, _MOST_VALUES // max(1, size)))
 
 
 class Lease(NamedTuple):

@@ -17,7 +17,7 @@ from physx_core.net.values import decode, encode
 from physx_core.typing import Batch, Index
 from physx_core.workers.episode_queue import EpisodeQueue
 from physx_core.workers.episode_runner import EpisodeBlock
-from physx_core.workers.lease import AIM, MOST, Lease
+from physx_core.workers.lease import AIM, Lease, most_numbers
 from physx_core.workers.row_codec import unpack_rows
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.validation import check_values
@@ -72,7 +72,8 @@ class Leases:
             clients: How many clients there are; the last numbers are shared among them.
         """
         held = self._held.setdefault(peer.instance_id, _Held())
-        wanted = max(1, min(held.wanted, self._queue.waiting // (2 * clients)))
+        wanted = held.wanted(most_numbers(peer.parameters))
+        wanted = max(1, min(wanted, self._queue.waiting // (2 * clients)))
         if len(held.numbers) > wanted // 2 or not self._suspects.isdisjoint(held.numbers):
             return
         while len(held.numbers) < wanted:
@@ -177,11 +178,14 @@ class _Held:
         self._parts: dict[int, int] = {}  # number of an episode that has begun to its next part
         self._pace: float | None = None  # seconds of an episode
 
-    @property
-    def wanted(self) -> int:
-        """How many numbers it should have: the next 20 ms, and as much for the meantime."""
+    def wanted(self, most: int) -> int:
+        """Return how many numbers it should have: for 20 ms, and as many for the meantime.
+
+        Args:
+            most: The most that one lease may have.
+        """
         pace = self._pace
-        return 1 if pace is None or pace > AIM else 2 * int(AIM / max(pace, AIM / MOST))
+        return 1 if pace is None or pace > AIM else 2 * int(AIM / max(pace, AIM / most))
 
     def note_pace(self, records: list[EpisodeRecord]) -> None:
         """Take note of what episodes have cost."""
