@@ -273,7 +273,7 @@ class DataGeneration(NewSessionPipeline):
         self._record_config(self._seed)
         self._observe(resources, config)
         self._describe()
-        known = campaign.simulated(self.dataset).tolist()
+        known = campaign.simulated(self.dataset)
         self._queue = EpisodeQueue(episodes, known, self.retries)
         if not self._queue.is_done:
             self._episodes = resources.enter_context(self._make_episodes(config, campaign.seed))

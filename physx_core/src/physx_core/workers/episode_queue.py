@@ -6,6 +6,10 @@ import heapq
 from collections import Counter
 from collections.abc import Collection
 
+import numpy as np
+
+from physx_core.typing import Index
+
 
 class EpisodeQueue:
     """Gives out each number once; one whose simulation was lost is given out again, and first.
@@ -15,7 +19,9 @@ class EpisodeQueue:
         finished: How many of them are recorded, in this run or before.
     """
 
-    def __init__(self, total: int, recorded: Collection[int] = (), retries: int = 1) -> None:
+    def __init__(
+        self, total: int, recorded: Collection[int] | Index = (), retries: int = 1
+    ) -> None:
         """Start with all numbers that are not recorded.
 
         Args:
@@ -24,12 +30,15 @@ class EpisodeQueue:
             retries: How often a number is given out again after it was lost.
         """
         self.total = total
-        self._recorded = {number for number in recorded if number < total}
-        self.finished = len(self._recorded)
+        known = recorded if isinstance(recorded, np.ndarray) else np.array([*recorded], np.int64)
+        numbers = np.sort(known, kind="stable")
+        numbers = numbers[(numbers < total) & (np.diff(numbers, prepend=-1) > 0)]
+        self.finished = len(numbers)
+        self._begins, self._ends = _gaps(numbers, total)
         self._retries = retries
         self._losses: Counter[int] = Counter()
         self._returned: list[int] = []
-        self._next = 0
+        self._gap, self._next = 0, 0
 
     @property
     def is_done(self) -> bool:
@@ -40,11 +49,12 @@ class EpisodeQueue:
         """Return the next number; None if none waits, though one may be lost and returned yet."""
         if self._returned:
             return heapq.heappop(self._returned)
-        while self._next < self.total:
-            number, self._next = self._next, self._next + 1
-            if number not in self._recorded:
-                return number
-        return None
+        if self._gap == len(self._begins):
+            return None
+        number = max(self._next, int(self._begins[self._gap]))
+        self._next = number + 1
+        self._gap += int(self._next == self._ends[self._gap])
+        return number
 
     def finish(self, count: int) -> None:
         """Note that so many more numbers are recorded."""
@@ -66,3 +76,10 @@ class EpisodeQueue:
             return False
         heapq.heappush(self._returned, number)
         return True
+
+
+def _gaps(numbers: Index, total: int) -> tuple[Index, Index]:
+    """Return the begins and ends of the ranges of numbers below `total` that are missing."""
+    begins, ends = np.append(0, numbers + 1), np.append(numbers, total)
+    missing = begins < ends
+    return begins[missing], ends[missing]
