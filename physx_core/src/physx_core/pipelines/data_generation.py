@@ -342,7 +342,7 @@ class DataGeneration(NewSessionPipeline):
         if self.episodes is None:
             known = campaign.records(self.dataset, failed=failed)
             return RowQueue(self._amount()[0], known, self.retries)
-        numbers = campaign.simulated(self.dataset, failed=failed).tolist()
+        numbers = campaign.simulated(self.dataset, failed=failed)
         return EpisodeQueue(self.episodes, numbers, self.retries)
 
     def _simulates_episodes(self, dataset_config: DatasetConfig) -> bool:

@@ -6,7 +6,10 @@ import heapq
 from collections import Counter
 from collections.abc import Collection
 
+import numpy as np
+
 from physx_core.dataset import EpisodeRecord, EpisodeStatus
+from physx_core.typing import Index
 
 
 class EpisodeQueue:
@@ -17,7 +20,9 @@ class EpisodeQueue:
         finished: How many of them are recorded, in this run or before.
     """
 
-    def __init__(self, total: int, recorded: Collection[int] = (), retries: int = 1) -> None:
+    def __init__(
+        self, total: int, recorded: Collection[int] | Index = (), retries: int = 1
+    ) -> None:
         """Start with all numbers that are not recorded.
 
         Args:
@@ -26,12 +31,15 @@ class EpisodeQueue:
             retries: How often a number is given out again after it was lost.
         """
         self.total = total
-        self._recorded = {number for number in recorded if number < total}
-        self.finished = len(self._recorded)
+        known = recorded if isinstance(recorded, np.ndarray) else np.array([*recorded], np.int64)
+        numbers = np.sort(known, kind="stable")
+        numbers = numbers[(numbers < total) & (np.diff(numbers, prepend=-1) > 0)]
+        self.finished = len(numbers)
+        self._begins, self._ends = _gaps(numbers, total)
         self._retries = retries
         self._losses: Counter[int] = Counter()
         self._returned: list[int] = []
-        self._next = 0
+        self._gap, self._next = 0, 0
 
     @property
     def is_done(self) -> bool:
@@ -40,29 +48,24 @@ class EpisodeQueue:
 
     def take(self) -> int | None:
         """Return the next number; None if none waits, though one may be lost and returned yet."""
+        return next(iter(self.take_range(1)), None)
+
+    def take_range(self, most: int) -> range:
+        """Return the next numbers that follow one another, at most so many; empty if none waits."""
         if self._returned:
-            return heapq.heappop(self._returned)
-        while self._next < self.total:
-            number, self._next = self._next, self._next + 1
-            if number not in self._recorded:
-                return number
-        return None
+            number = heapq.heappop(self._returned)
+            return range(number, number + 1)
+        if self._gap == len(self._begins):
+            return range(0)
+        first, end = max(self._next, int(self._begins[self._gap])), int(self._ends[self._gap])
+        self._next = min(first + most, end)
+        self._gap += self._next == end
+        return range(first, self._next)
 
     def note(self, record: EpisodeRecord) -> None:
         """Note what became of a number, or of several."""
         if record.status is not EpisodeStatus.MORE:
             self.finished += record.count
-
-    def take_range(self, most: int) -> range:
-        """Return the next numbers that follow one another, at most so many; empty if none waits."""
-        is_new, first = not self._returned, self.take()
-        if first is None:
-            return range(0)
-        if not is_new:
-            return range(first, first + 1)
-        end = min(first + most, self.total)
-        self._next = next(filter(self._recorded.__contains__, range(first + 1, end)), end)
-        return range(first, self._next)
 
     @property
     def waiting(self) -> int:
@@ -80,3 +83,10 @@ class EpisodeQueue:
             return False
         heapq.heappush(self._returned, number)
         return True
+
+
+def _gaps(numbers: Index, total: int) -> tuple[Index, Index]:
+    """Return the begins and ends of the ranges of numbers below `total` that are missing."""
+    begins, ends = np.append(0, numbers + 1), np.append(numbers, total)
+    missing = begins < ends
+    return begins[missing], ends[missing]

@@ -4,6 +4,9 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Collection
+from itertools import chain
+
+import numpy as np
 
 from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.errors import UsageError
@@ -34,7 +37,8 @@ class RowQueue(EpisodeQueue):
             recorded: Numbers that an earlier run has recorded.
             retries: How often a number is given out again after it was lost.
         """
-        numbers = [n for each in recorded for n in range(each.episode, each.episode + each.count)]
+        ranges = (range(each.episode, each.episode + each.count) for each in recorded)
+        numbers = np.array([*chain.from_iterable(ranges)], np.int64)
         super().__init__(_NO_END, numbers, retries)
         self.goal, self.rows = goal, 0
         self._taken = self._all_rows = 0
@@ -55,19 +59,13 @@ class RowQueue(EpisodeQueue):
         """How many numbers wait, about."""
         return max(0, round((self.goal - self._expected) / self._mean))
 
-    def take(self) -> int | None:
-        """Return the next number; None if those that are being simulated may be enough."""
+    def take_range(self, most: int) -> range:
+        """Return the next numbers; none if those that are being simulated may be enough."""
         fills_gap = self._returned or self._next <= self._last
         if not fills_gap and self._expected >= self.goal:
-            return None
-        number = super().take()
-        self._taken += number is not None
-        return number
-
-    def take_range(self, most: int) -> range:
-        """Return the next numbers that follow one another, at most so many; empty if none waits."""
+            return range(0)
         found = super().take_range(min(most, max(1, self.waiting)))
-        self._taken += max(0, len(found) - 1)  # the first one was taken by `take`
+        self._taken += len(found)
         return found
 
     def note(self, record: EpisodeRecord) -> None:
