@@ -44,7 +44,7 @@ class RowQueue(EpisodeQueue):
         self._taken = self._all_rows = 0
         self._parts: Counter[int] = Counter()  # number to its rows so far
         self._ended: dict[int, tuple[int, int]] = {}  # first number to how many, and their rows
-        self._gap = 0  # the first missing number
+        self._missing = 0  # the first missing number
         self._last = -1  # the last one that has ended
         for each in recorded:
             self._end(each.episode, each.count, each.rows)
@@ -83,7 +83,7 @@ class RowQueue(EpisodeQueue):
         self._taken -= record.count
         rows = self._parts.pop(record.episode, 0) + record.rows
         self._end(record.episode, record.count, rows)
-        if self._gap >= _MOST_EMPTY and not self.rows:
+        if self._missing >= _MOST_EMPTY and not self.rows:
             raise UsageError(
                 f"{_MOST_EMPTY} episodes have no row, so there would never be {self.goal} rows: "
                 "call set_training_data() in the step that calls end_episode()."
@@ -113,7 +113,7 @@ class RowQueue(EpisodeQueue):
         self._all_rows += rows
         self._ended[first] = count, rows
         self._last = max(self._last, first + count - 1)
-        while self._gap in self._ended:
-            count, rows = self._ended.pop(self._gap)
-            self._gap += count
+        while self._missing in self._ended:
+            count, rows = self._ended.pop(self._missing)
+            self._missing += count
             self.rows += rows
