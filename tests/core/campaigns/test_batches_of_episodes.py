@@ -128,6 +128,25 @@ def test_events_of_batches_are_called_and_each_batch_is_stored_when_it_ends():
     assert seen == [(1, True), (2, True), (3, True)]
 
 
+def test_run_that_ends_early_has_the_rows_of_its_batches():
+    class Short(DataGeneration):
+        def batch_condition(self):
+            return self.batch_id < 2
+
+    config = dataclasses.replace(CONFIG, env_kwargs={"least": 1})
+    Short(config, session_name="run", batch_nb=9, batch_size=5).execute()
+    assert stored()[0] == expected(10, least=1)
+
+
+def test_open_run_generates_more_batches_each_time():
+    config = dataclasses.replace(CONFIG, env_kwargs={"least": 1})
+    with DataGeneration(config, session_name="run", batch_nb=2, batch_size=5) as run:
+        for _ in range(3):
+            run.execute()
+        assert run.batch == {}
+    assert stored()[0] == expected(30, least=1)
+
+
 def test_replaced_production_of_batches_gets_a_stream():
     class Own(DataGeneration):
         def batch_produce(self):

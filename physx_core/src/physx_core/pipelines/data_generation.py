@@ -52,7 +52,8 @@ class DataGeneration(NewSessionPipeline):
     Attributes:
         dataset: The session's dataset, open for writing.
         source: The environments.
-        batch: The last batch of a stream; empty if the clients write their own rows.
+        batch: The last batch of a stream; empty if episodes are stored as they end, or the clients
+            write their own rows.
         batch_id: Number of stored batches.
     """
 
@@ -125,10 +126,9 @@ class DataGeneration(NewSessionPipeline):
             self.data_generation_begin()
             if self.episodes is None:
                 self._generate_batches()
-            while self._queue is not None and not self._queue.is_done:
-                self._store_episodes(self._queue)
+            else:
+                self._simulate_episodes()
             self._prove_independence()
-            self._cut()
             self.data_generation_end()
 
     def _amount(self) -> tuple[int, str]:
@@ -150,6 +150,10 @@ class DataGeneration(NewSessionPipeline):
             self.batch_end()
         self._check_condition(more, "batch_condition")
 
+    def _simulate_episodes(self) -> None:
+        while self._queue is not None and not self._queue.is_done:
+            self._store_episodes(self._queue)
+
     def _store_episodes(self, queue: EpisodeQueue) -> None:
         """Store the episodes that end next; fail if too many of this run failed."""
         assert self._campaign is not None
@@ -157,11 +161,10 @@ class DataGeneration(NewSessionPipeline):
         before, campaign = queue.finished, self._campaign.number
         block = self._episodes.take()
         self._proof.note(block)
-        rows = block.rows
         if self._mode not in self.dataset.modes:
             self.dataset.define_fields(self._mode, self._episodes.fields)
         records = [replace(record, campaign=campaign) for record in block.records]
-        self.dataset.append_episodes(self._mode, rows, records, checked=True)
+        self.dataset.append_episodes(self._mode, block.rows, records, checked=True)
         if self.episodes is not None:
             self.observers.advance(queue.finished - before)
         failed = [record for record in records if record.status is EpisodeStatus.FAILED]
@@ -171,20 +174,19 @@ class DataGeneration(NewSessionPipeline):
 
     def _store_rows(self, queue: RowQueue) -> None:
         """Store episodes until there are enough rows for the batch."""
+        self.batch = {}
         wanted = self._first_row + (self.batch_id + 1) * (self.batch_size or 0)
         queue.goal = max(queue.goal, wanted)
         while queue.rows < wanted:
             self._store_episodes(queue)
 
-    def _cut(self) -> None:
-        """Leave out what the last episodes have more than the batches."""
-        if self._campaign is None or self.episodes is not None:
-            return
-        wanted = self._first_row + self.batch_id * (self.batch_size or 0)
+    def _cut(self, kind: type[BaseException] | None, *_: object) -> None:
+        """Leave out what the last episodes have more than the batches, when the run is closed."""
         known = self.dataset.recorded_episodes(self._mode)
-        surplus = 0
-        if known is not None:
-            surplus = int(known.rows[known.campaign == self._campaign.number].sum()) - wanted
+        if kind is not None or known is None or self._campaign is None:
+            return
+        rows = int(known.rows[known.campaign == self._campaign.number].sum())
+        surplus = rows - self._first_row - self.batch_id * (self.batch_size or 0)
         if surplus > 0:
             self._campaign.cut(self.dataset, surplus, self.source.sets)
 
@@ -206,6 +208,8 @@ class DataGeneration(NewSessionPipeline):
 
     def batch_produce(self) -> None:
         """Generate a batch and store it; the samples are committed when this returns.
+
+        Of independent episodes there may be more samples until the pipeline is closed.
 
         With ``record_wrong_samples``, the samples that `check_sample` rejected are stored too, in
         the mode "wrong".
@@ -285,7 +289,7 @@ class DataGeneration(NewSessionPipeline):
         else:
             self.session = self._create_session()
         self.dataset = resources.enter_context(open_own(self.session, dataset_config))
-        self._campaign, self._queue, self._first_row = None, None, 0
+        self._campaign, self._queue, self._first_row, self.batch_id = None, None, 0, 0
         self._proof, self._episodes = IndependenceProof(), None
         if self.resume:
             self._campaign = Campaign.last(self.dataset, self._mode, config)
@@ -332,6 +336,8 @@ class DataGeneration(NewSessionPipeline):
         if self._queue is not None:
             self._describe()
             self._episodes = self.source.lease(self._queue)
+            if self.episodes is None:
+                resources.push(self._cut)
 
     def _offset(self) -> int:
         """Return how many rows or campaigns there are already, which get other random numbers."""
