@@ -31,11 +31,13 @@ class Troubled(Environment):
         sleep=0.0,
         parameters=False,
         log="",
+        long=0.0,
         **kwargs,
     ):
         super().__init__(**kwargs)
         self.troubles, self.least, self.most, self.width = troubles or {}, least, most, width
         self.pace, self.sleep, self.has_parameters, self.log = pace, sleep, parameters, log
+        self.long = long
         self.stepped = 0
 
     def create(self):
@@ -70,9 +72,9 @@ class Troubled(Environment):
         if now and self.kind == "ends the process":
             self.leave()
         if now and self.kind in ("hangs", "sleeps long"):
-            time.sleep(100 if self.kind == "hangs" else 3)
+            time.sleep(100 if self.kind == "hangs" else self.long)
         if now and self.kind == "is busy long":
-            until = time.monotonic() + 3
+            until = time.monotonic() + self.long
             while time.monotonic() < until:
                 pass
         if now and self.kind == "asks for the wrong":

@@ -193,9 +193,10 @@ def test_client_that_runs_too_long_an_episode_is_ended(said, nothing_stays_behin
 
 
 @pytest.mark.parametrize("kind", ["sleeps long", "is busy long"])
-def test_long_step_of_an_episode_is_no_silence(kind, nothing_stays_behind):
-    kwargs = {"troubles": {"1": [kind, 0]}, "least": 1}
-    config = EnvironmentConfig(TROUBLED, env_kwargs=kwargs, timeout=1.0)
+def test_long_step_of_an_episode_is_no_silence(kind, unhurried, nothing_stays_behind):
+    timeout = unhurried(1.0)
+    kwargs = {"troubles": {"1": [kind, 0]}, "least": 1, "long": timeout + 1.5}
+    config = EnvironmentConfig(TROUBLED, env_kwargs=kwargs, timeout=timeout)
     queue = EpisodeQueue(3, retries=0)
     with leased(config, SEED, queue) as source:
         check(Results().take_all(source, queue), 3)

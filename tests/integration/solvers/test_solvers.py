@@ -105,6 +105,7 @@ class Run:
             *("--episodes", str(self.solver.episodes), "--session-dir", str(self.sessions)),
             *("--environment.sampler", "physx/sobol", "--environment.seed", "1"),
             *("--session-name", "run", "--max-failed", "10"),
+            "--no-prove-independence",  # each number is to be simulated once
             *(several if clients else alone),
             *self.solver.options,
         )
