@@ -307,7 +307,7 @@ def test_campaign_with_hangs_and_crashes_is_resumed(share, tmp_path):
     """Before any of them, while one is silent, and after that."""
     solver = SOLVERS["CalculiX"]
     solver.require()
-    options = ("--environment.env-kwargs.faults", FAULTS, "--environment.timeout", "3")
+    options = ("--environment.env-kwargs.faults", FAULTS, "--environment.episode-timeout", "3")
     solver = dataclasses.replace(solver, options=options, fails=True, silent=(11,))
     run = Run(solver, tmp_path / "cut")
     interrupt(run, share)
