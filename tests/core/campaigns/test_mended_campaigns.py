@@ -38,7 +38,7 @@ TYPO = "self.tpyo if self.episode_index in (1, 3) else 0"
 def write(tmp_path, monkeypatch):
     """Return a function that writes the environment's program."""
 
-    def write(parameters=P, line="pass"):
+    def write(parameters=P, line="pass"):  # of another size, as Python looks at seconds only
         (tmp_path / "case.py").write_text(PROGRAM.format(parameters=parameters, line=line))
 
     monkeypatch.chdir(tmp_path)
@@ -88,7 +88,7 @@ def test_batches_pass_over_episodes_that_failed_until_they_are_simulated_again(w
 
 @pytest.mark.parametrize(
     "parameters",
-    ['Parameter("p", 0.0, 2.0)', f'{P}, Parameter("q", 0, 1)', 'Parameter("q", 0.0, 1.0)'],
+    ['Parameter("p", 0.0, 20.0)', f'{P}, Parameter("q", 0, 1)', 'Parameter("other", 0.0, 1.0)'],
 )
 def test_other_parameters_cannot_continue_a_campaign(write, capsys, parameters):
     generate("--episodes", "4")
