@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
@@ -11,8 +11,7 @@ from physx_core.dataset.store.episode_table import EpisodeStatus
 from physx_core.typing import Array, Index
 
 
-@dataclass(frozen=True)
-class Progress:
+class Progress(NamedTuple):
     """How many episodes of a campaign have ended, and how.
 
     Attributes:
