@@ -33,6 +33,9 @@ def export(
         to: Name of the format, such as ``npz``, or its reference, such as ``mine/columns``.
         out: The file, or the folder for zarr, minari and lerobot. It must not exist.
         modes: Names of the modes; empty: all that have rows. Parquet, minari and lerobot hold one.
+            ``episodes`` are the records of independent episodes, with their parameters: one for
+            each, whose ``first_row`` is the number of its first row in its mode. The other formats
+            have them beside the rows if no modes are named.
         options: Options of the format.
         advance: Called with the number of bytes read.
 
@@ -48,7 +51,7 @@ def export(
     """
     out, options = Path(out), options or ExportOptions()
     form = _choose_format(to, options)
-    tables = _make_tables(dataset, modes, advance)
+    tables = _make_tables(dataset, modes, advance, with_episodes=form.several)
     if len(tables) > 1 and not form.several:
         raise ConfigError(
             f"{to} holds one mode. Choose one with modes (--mode on the command line): "
@@ -90,13 +93,18 @@ def _choose_format(to: str, options: ExportOptions) -> Format:
     return form
 
 
-def _make_tables(dataset: Dataset, modes: Sequence[str], advance: Advance) -> list[Table]:
+def _make_tables(
+    dataset: Dataset, modes: Sequence[str], advance: Advance, *, with_episodes: bool
+) -> list[Table]:
     samples = [name for name in dataset.modes if dataset.num_samples(name)]
-    if any(dataset.recorded_episodes(name) is not None for name in samples):
-        samples.remove(EPISODES)  # where rows are stored here says nothing elsewhere
-    names = modes or samples
+    recorded = [n for n in samples if dataset.recorded_episodes(n) is not None]
+    left_out = {EPISODES} if recorded and not with_episodes else set()
+    names = modes or [name for name in samples if name not in left_out]
     tables = []
     for name in dict.fromkeys(names):
+        if name == EPISODES and recorded:
+            tables.append(_make_episodes(dataset, recorded, advance))
+            continue
         fields, rows = dataset.fields(name), dataset.num_samples(name)
         if not rows:
             raise ExchangeError(f'Mode "{name}" has no samples to export.')
@@ -104,3 +112,10 @@ def _make_tables(dataset: Dataset, modes: Sequence[str], advance: Advance) -> li
     if not tables:
         raise ExchangeError(f"The dataset in {dataset.directory} has no samples to export.")
     return tables
+
+
+def _make_episodes(dataset: Dataset, modes: Sequence[str], advance: Advance) -> Table:
+    """Return the records of the episodes of modes, with their parameters."""
+    view = dataset.episode_table(modes)
+    rows, fields = len(view["rows"]), dataset.fields(EPISODES)
+    return Table(EPISODES, fields, rows, dataset.info, view, advance)

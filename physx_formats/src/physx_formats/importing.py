@@ -10,9 +10,11 @@ from contextlib import AbstractContextManager
 from pathlib import Path
 
 from physx_core.config import MODES
-from physx_core.dataset import Dataset, holds_dataset, rows_per_block
+from physx_core.dataset import EPISODES, TABLE_FIELDS, Dataset, holds_dataset, rows_per_block
 from physx_core.errors import SampleError, listed
 from physx_core.fields import Field
+from physx_core.typing import Batch
+from physx_formats.episodes import EpisodeCopier, split_records
 from physx_formats.errors import ExchangeError
 from physx_formats.format import Columns, all_formats
 from physx_formats.table import BLOCK, Advance, Column, Notes, check_size
@@ -37,7 +39,8 @@ def import_file(
 
     Arrays of equal length become the fields of one mode; groups become part of the names
     (``obs/state`` is the field ``obs_state``). Only groups that are named after modes, and those in
-    files written by physx, become modes themselves.
+    files written by physx, become modes themselves. Independent episodes that physx has exported
+    with their records are stored as such, after all campaigns that the dataset has.
 
     Args:
         path: A NumPy archive (npz), an HDF5 file or a DeepPhysX database, of any name; the folder
@@ -69,10 +72,29 @@ def import_file(
         with _open_target(directory) as dataset:
             if not dataset.modes:
                 dataset.update_info(**{**notes.info, "imported_from": path.name})
-            return {
+            records = _take_records(path, modes, tables)
+            done = {
                 name: _copy(dataset, name, tables[name], found, advance)
                 for name, found in modes.items()
+                if name not in records
             }
+            for name, entries in records.items():
+                copier = EpisodeCopier(dataset, name, tables[name], modes[name], advance)
+                done[name] = copier.copy(entries)
+            return done
+
+
+def _take_records(
+    path: Path, modes: dict[str, Columns], tables: Mapping[str, Mapping[str, Field]]
+) -> dict[str, Batch]:
+    """Take the table of episodes out of the modes, if there is one; return the records by mode."""
+    fields = tables.get(EPISODES, {})
+    own = {field.name: field.numpy_dtype for field in TABLE_FIELDS}
+    if any(n not in fields or fields[n].numpy_dtype != kind for n, kind in own.items()):
+        return {}
+    table = {name: column.read(0, column.shape[0]) for name, column in modes.pop(EPISODES).items()}
+    lengths = {name: next(iter(found.values())).shape[0] for name, found in modes.items()}
+    return split_records(path, table, lengths)
 
 
 def _size_of(path: Path) -> int:

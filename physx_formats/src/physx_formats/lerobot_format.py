@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.dataset import Episode, find_episodes
+from physx_core.dataset import Episode
 from physx_core.errors import ConfigError
 from physx_core.fields import Field
 from physx_core.statistics import RunningStatistics
@@ -72,7 +72,7 @@ def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
     pandas = import_library("pandas", "Exporting to LeRobot", "lerobot")
     task = options.task or "simulate"
     features = _features(table, Roles.choose(table, options))
-    episodes = find_episodes(table.view, table.rows)
+    episodes = table.trajectories
     with _Writer(out, features, options.fps, task) as writer:
         for number, episode in enumerate(episodes):
             writer.write(table, number, episode)

@@ -16,7 +16,7 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.dataset import Episode, find_episodes
+from physx_core.dataset import Episode
 from physx_core.fields import Field
 from physx_core.typing import Batch
 from physx_formats.errors import ExchangeError
@@ -52,7 +52,7 @@ def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
             "PIL",  # its HDF5 storage needs it
         )
     )
-    episodes = [e for e in find_episodes(table.view, table.rows) if len(e.rows) > 1]
+    episodes = [e for e in table.trajectories if len(e.rows) > 1]
     if not episodes:
         raise ExchangeError(
             f'No trajectory of mode "{table.mode}" has two samples, as a Minari episode needs. A '

@@ -12,7 +12,7 @@ from typing import Any, Protocol
 import numpy as np
 
 from physx_core import checks
-from physx_core.dataset import ModeView, rows_per_block
+from physx_core.dataset import Episode, ModeView, find_episodes, rows_per_block
 from physx_core.errors import ConfigError, MissingLibraryError
 from physx_core.fields import RESERVED, Field, Role
 from physx_core.parsing import parse_json
@@ -62,7 +62,7 @@ class Table:
         fields: The fields by name, all with shapes.
         rows: Number of rows to export; rows that a writer adds meanwhile are left out.
         info: Where the data come from.
-        view: Reads the rows.
+        view: Reads the rows, or holds those of the table of episodes.
         advance: Called with the number of bytes read.
     """
 
@@ -70,13 +70,25 @@ class Table:
     fields: Mapping[str, Field]
     rows: int
     info: Mapping[str, Any]
-    view: ModeView
+    view: ModeView | Batch
     advance: Advance
 
     @property
     def row_nbytes(self) -> int:
         """Bytes of the values of one row."""
         return sum(field.nbytes for field in self.fields.values())
+
+    @property
+    def trajectories(self) -> list[Episode]:
+        """The trajectories.
+
+        Raises:
+            ExchangeError: If it is the table of episodes.
+            DatasetError: If they are unknown.
+        """
+        if not isinstance(self.view, ModeView):
+            raise ExchangeError(f'The mode "{self.mode}" holds records, not trajectories.')
+        return find_episodes(self.view, self.rows)
 
     def column(self, name: str, step: int | None = None) -> Iterator[tuple[int, Array]]:
         """Yield the rows of one field in blocks, each with the number of its first row.

@@ -47,7 +47,8 @@ def test_rows_of_a_second_campaign_have_its_own_parameters(generate):
 def test_exported_rows_are_those_that_count_in_their_order(generate, tmp_path):
     place = generate("Single", 20)
     with Dataset.open(place) as dataset:
-        assert export(dataset, "npz", tmp_path / "rows.npz") == {"training": 20}
+        written = export(dataset, "npz", tmp_path / "rows.npz")
+        assert written == {"training": 20, "episodes": 21}  # with the stream before them
     assert import_file(tmp_path / "rows.npz", tmp_path / "again") == {"training": 20}
     with Dataset.open(place) as before, Dataset.open(tmp_path / "again") as after:
         for name in before.fields("training"):

@@ -59,7 +59,7 @@ def complete(request, capsys):
     ("words", "found"),
     [
         ("physx gen", ["generate"]),
-        ("physx com", ["completion"]),
+        ("physx comple", ["completion"]),
         ("physx stats --te", ["--tensorboard"]),
         ("physx generate --environment.num", ["--environment.num-clients"]),
         ("physx new ba", ["backend"]),

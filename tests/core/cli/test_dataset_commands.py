@@ -3,6 +3,7 @@ import pytest
 
 from physx_core import Dataset, Field
 from physx_core.cli import main
+from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.origin import install_hint
 
 WIDTH = 100
@@ -175,3 +176,44 @@ def test_a_missing_library_is_an_error_with_advice(session, run, monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "zarr", None)
     status, _, err = run("export", session, "out", "--to", "zarr")
     assert status == 1 and install_hint("physx-formats", "zarr") in err
+
+
+# Campaigns --------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def campaign(tmp_path):
+    """A session that has 42 of 64 episodes, which were to be simulated by two clients."""
+    folder = tmp_path / "campaign"
+    with Dataset.create(folder / "dataset") as dataset:
+        for episode in range(44):
+            status = EpisodeStatus.FAILED if episode == 7 else EpisodeStatus.FINISHED
+            status = EpisodeStatus.MORE if episode == 43 else status
+            rows = 0 if status is EpisodeStatus.FAILED else 2
+            record = EpisodeRecord(episode=episode, rows=rows, status=status, seconds=20.0)
+            dataset.append_episodes("training", {"x": np.zeros(rows)}, [record])
+    (folder / "config.toml").write_text(
+        "[data_generation]\nepisodes = 64\n"
+        "[data_generation.environment]\nas_tcp_ip_client = true\nnum_clients = 2\n"
+    )
+    return folder
+
+
+def test_info_says_how_far_a_campaign_is(campaign, run, monkeypatch):
+    text = run("info", campaign)[1]
+    assert "campaign 0: 42 of 64 finished, 1 failed, 1 unfinished" in text
+    assert "20 s each, 6 per min by 2 clients; 21 missing: go on with" in text
+    assert "episodes: 45 records" in text
+    monkeypatch.setattr(Dataset, "is_written", True)
+    assert "; about 3.5 min left at the rate so far" in run("info", campaign)[1]
+    (campaign / "config.toml").unlink()
+    assert "campaign 0: 42 finished, 1 failed" in run("info", campaign)[1]
+
+
+def test_verify_and_compact_a_campaign(campaign, run):
+    assert "45 records, 84 training samples" in run("verify", campaign)[1]
+    status, text, _ = run("compact", campaign)
+    assert status == 0 and text.startswith(("freed", "in order now", "there was nothing"))
+    assert run("compact", campaign)[1] == "there was nothing to free\n"
+    assert "44 records, 84 training samples" in run("verify", campaign)[1]
+    assert "no mode" in run("compact", campaign, "--mode", "other")[2]

@@ -10,8 +10,9 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from physx_core import Dataset
-from physx_core.dataset import EPISODES, EpisodeRecord, EpisodeStatus, FailedEpisode
+from physx_core.dataset import EPISODES, EpisodeRecord, EpisodeStatus, FailedEpisode, Progress
 from physx_core.dataset.read import virtual_index
+from physx_core.dataset.store import locks
 from physx_core.dataset.store.episode_table import OPEN
 from physx_core.dataset.write.stripe_writer import StripeWriter
 from physx_core.errors import (
@@ -103,6 +104,15 @@ def test_parameters_are_columns_of_the_table(folder):
         where = dataset[EPISODES]["episode"][:] == 3
         assert dataset[EPISODES]["mass"][:][where].tolist() == [2.5]
         assert dataset[EPISODES]["seconds"][:][where].tolist() == [0.5]
+
+
+def test_no_episodes_do_not_decide_which_parameters_all_have(folder):
+    with Dataset.create(folder) as dataset:
+        dataset.append_episodes("training", {}, [])
+        assert EPISODES not in dataset
+        with pytest.raises(ConfigError):
+            dataset.append_episodes("other", {}, [])
+        store(dataset, 0, 1, parameters={"mass": 1.0})
 
 
 def test_a_wrong_call_stores_nothing(folder):
@@ -327,6 +337,42 @@ def test_contents_change_with_the_records(folder):
         store(dataset, 1, status=FAILED)
     with Dataset.open(folder) as dataset:
         assert dataset.contents("training") != before
+
+
+def test_contents_do_not_count_records_as_rows(folder):
+    with Dataset.create(folder) as dataset:
+        store(dataset, 0, 1, 2)
+        store(dataset, 1, 3)
+    with Dataset.open(folder) as dataset:
+        found = dataset.contents("training")
+        assert sum(rows for _, _, rows, _ in found) == 3
+        assert len({(session, index) for session, index, _, _ in found}) == len(found)
+
+
+def test_progress_counts_how_episodes_ended(folder, monkeypatch):
+    with Dataset.create(folder) as dataset:
+        dataset.append("training", x(1))
+        assert dataset.progress("training") == []
+        for episode in (0, 2, 3):
+            store(dataset, episode, episode, seconds=2.0)
+        store(dataset, 4, status=FAILED, seconds=1.0)
+        store(dataset, 5, 5, status=EpisodeStatus.CUT, seconds=0.5)
+        store(dataset, 6, 6, status=MORE, seconds=4.0)
+        store(dataset, 3, 3, status=MORE, seconds=4.0)
+        store(dataset, 3, 3, part=1, seconds=4.0)
+        store(dataset, 0, *range(9), count=9, campaign=3, seconds=18.0)
+        expected = [
+            Progress(campaign=0, finished=3, failed=1, cut=1, unfinished=1, seconds=13.5),
+            Progress(campaign=3, finished=9, failed=0, cut=0, unfinished=0, seconds=18.0),
+        ]
+        assert dataset.progress("training") == expected
+        monkeypatch.setattr(locks, "is_written", lambda folder: True)
+        with Dataset.open(folder) as reader:
+            assert reader.progress("training") == expected  # also after the missing number 1
+            assert reader.num_samples("training") == 2
+            assert reader.is_written
+        assert not dataset.is_written
+    assert expected[0].mean == 2.7
 
 
 @pytest.mark.parametrize("seed", range(20))

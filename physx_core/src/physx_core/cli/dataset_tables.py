@@ -3,16 +3,17 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from physx_core.cli.output import show, show_table, width
-from physx_core.dataset import EPISODES, Dataset, EpisodeStatus, RecordedEpisodes
+from physx_core.config import read_toml
+from physx_core.dataset import EPISODES, Dataset, Progress
 from physx_core.dataset.read.episodes import episode_lengths
-from physx_core.errors import DatasetError
+from physx_core.errors import ConfigError, DatasetError
 from physx_core.statistics import Normalization
 from physx_core.typing import Array
 
@@ -67,10 +68,12 @@ def _origin(dataset: Dataset) -> list[str]:
 
 def _print_mode(dataset: Dataset, mode: str, rows: Sequence[dict[str, Any]]) -> None:
     nbytes, partitions = sum(row["bytes"] for row in rows), rows[0]["partitions"]
-    samples, files = count(rows[0]["samples"], "sample"), count(partitions, "partition")
+    what = "record" if mode == EPISODES and dataset.has_episodes else "sample"
+    samples, files = count(rows[0]["samples"], what), count(partitions, "partition")
     show(f"{mode}: {samples}, {size(nbytes)} in {files}")
     try:
         stored = dataset.num_samples(mode)
+        _print_progress(dataset, mode)
         if stored:
             show(f"  reading strategy: {dataset.reading_strategy(mode)}")
             _print_episodes(dataset, mode, stored)
@@ -100,9 +103,6 @@ def _print_episodes(dataset: Dataset, mode: str, samples: int) -> None:
     view = dataset[mode]
     if mode == EPISODES or ("step" not in view and "episode" not in view):
         return
-    recorded = dataset.recorded_episodes(mode)
-    if recorded is not None:
-        _print_recorded(recorded)
     lengths, instances = episode_lengths(view, samples)
     least, most = lengths.min(), lengths.max()
     steps = f"{least:,}" if least == most else f"{least:,} to {most:,}"
@@ -110,16 +110,52 @@ def _print_episodes(dataset: Dataset, mode: str, samples: int) -> None:
     show(f"  trajectories: {len(lengths):,} of {of}, {steps} samples each")
 
 
-def _print_recorded(episodes: RecordedEpisodes) -> None:
-    """Print how the independent episodes of each campaign ended."""
-    for campaign in np.unique(episodes.campaign[episodes.episode >= 0]).tolist():
-        chosen = episodes.campaign == campaign
-        ends = {
-            status.name.lower(): int(episodes.numbers[chosen & (episodes.status == status)].sum())
-            for status in (EpisodeStatus.FINISHED, EpisodeStatus.FAILED, EpisodeStatus.CUT)
-        }
-        counts = ", ".join(f"{number:,} {name}" for name, number in ends.items() if number)
-        show(f"  independent episodes of campaign {campaign}: {counts}")
+def _print_progress(dataset: Dataset, mode: str) -> None:
+    """Print how many episodes of each campaign have ended, and when the last one will have."""
+    config = _generation(dataset.directory.parent / "config.toml", mode)
+    campaigns = dataset.progress(mode)
+    for each in campaigns:
+        now = config if each is campaigns[-1] else {}
+        wanted = now.get("episodes") or 0
+        of = f" of {wanted:,}" if wanted else ""
+        ends = ((name, getattr(each, name)) for name in ("failed", "cut", "unfinished"))
+        others = "".join(f", {number:,} {name}" for name, number in ends if number)
+        counts = f"{each.finished:,}{of} finished{others}"
+        show(f"  independent episodes of campaign {each.campaign}: {counts}")
+        if each.ended:
+            missing = max(0, wanted - each.finished - each.failed)
+            show(f"    {_rate(each, now, missing, dataset.is_written)}")
+
+
+def _rate(progress: Progress, config: Mapping[str, Any], missing: int, is_running: bool) -> str:
+    """Return what an episode costs, and how long the missing ones will take or that they are."""
+    mean, text = progress.mean, f"{duration(progress.mean)} each"
+    environment = config.get("environment", {})
+    clients = environment.get("num_clients", 1) if environment.get("as_tcp_ip_client") else 1
+    if mean and clients > 1:
+        text += f", {60 * clients / mean:.3g} per min by {clients} clients"
+    if missing and is_running:
+        text += f"; about {duration(missing * mean / clients)} left at the rate so far"
+    elif missing:
+        text += f"; {missing:,} missing: go on with physx generate SESSION --resume"
+    return text
+
+
+def _generation(path: Path, mode: str) -> dict[str, Any]:
+    """Return how a session's last generation was configured, if it was one of this mode."""
+    try:
+        config = read_toml(path).get("data_generation", {})
+    except (OSError, ConfigError):
+        return {}
+    return config if config.get("dataset", {}).get("mode", "training") == mode else {}
+
+
+def duration(seconds: float) -> str:
+    """Return a time as human-readable text."""
+    for limit, divisor, unit in ((1, 1e-3, "ms"), (100, 1, "s"), (6000, 60, "min")):
+        if seconds < limit:
+            return f"{seconds / divisor:.3g} {unit}"
+    return f"{seconds / 3600:.3g} h"
 
 
 def _print_normalization(dataset: Dataset, mode: str) -> None:

@@ -8,6 +8,7 @@ from __future__ import annotations
 from physx_core.dataset.dataset import Dataset
 from physx_core.dataset.read.episodes import Episode, find_episodes
 from physx_core.dataset.read.order.records import RecordedEpisodes
+from physx_core.dataset.read.progress import Progress
 from physx_core.dataset.read.splits import Subset
 from physx_core.dataset.read.views import ModeView
 from physx_core.dataset.repair.recovery import holds_dataset
@@ -25,6 +26,7 @@ __all__ = [
     "EpisodeStatus",
     "FailedEpisode",
     "ModeView",
+    "Progress",
     "RecordedEpisodes",
     "Subset",
     "find_episodes",

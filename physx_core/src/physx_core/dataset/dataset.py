@@ -13,8 +13,11 @@ from physx_core import files
 from physx_core.closeable import Closeable
 from physx_core.dataset.read.episodes import Episode, find_episodes
 from physx_core.dataset.read.mode_statistics import compute_statistics
+from physx_core.dataset.read.order.addresses import Addresses
 from physx_core.dataset.read.order.records import RecordedEpisodes
+from physx_core.dataset.read.order.rewriting import records_at
 from physx_core.dataset.read.ordered_statistics import compute_in_order, store_in_order
+from physx_core.dataset.read.progress import Progress, find_progress
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.sampling import BatchOptions, BatchReader
 from physx_core.dataset.read.splits import Subset, split
@@ -27,7 +30,7 @@ from physx_core.dataset.repair.report import find_problems, summarize
 from physx_core.dataset.store import failure_file, locks
 from physx_core.dataset.store.episode_table import EPISODES, LOST, EpisodeStatus, has_table
 from physx_core.dataset.store.failure_file import FailedEpisode
-from physx_core.dataset.store.manifest import Manifest, to_plain_info
+from physx_core.dataset.store.manifest import Manifest, Mode, Partition, to_plain_info
 from physx_core.dataset.write.appender import Appender
 from physx_core.dataset.write.compacting import compact
 from physx_core.dataset.write.merging import add_partitions, drop_partition
@@ -336,6 +339,58 @@ class Dataset(Closeable):
         keys = zip(found.campaign[failed].tolist(), found.episode[failed].tolist(), strict=True)
         return [known.get((mode, *key), FailedEpisode(mode, *key, "")) for key in keys]
 
+    def episode_table(self, modes: Sequence[str]) -> Batch:
+        """Return the records of the episodes of some modes that count, by field.
+
+        They are those of `physx_core.dataset.store.episode_table`, with the parameters, but one for
+        each entry of `recorded_episodes`; ``first_row`` is the number of its first row.
+
+        Args:
+            modes: Names of the modes; those without records are left out.
+
+        Raises:
+            DatasetError: If there is no such mode, or no table of episodes, or it is damaged.
+        """
+        self._prepare_reading()
+        total = self._reader.stored_rows(EPISODES)
+        fields = self._reader.mode(EPISODES).fields
+        table = {name: self._reader.read(EPISODES, name, 0, total) for name in fields}
+        parts = [{name: column[:0] for name, column in table.items()}]
+        for mode in modes:
+            order = self._reader.order(mode)
+            if order is not None and len(order.found.last):
+                whole = Addresses(Mode({}, [Partition(mode, "", 0, 0, order.rows)]))
+                places = self._reader.orders.places(mode)
+                parts.append(records_at(order, places, whole, table, is_open=False))
+        return {name: np.concatenate([part[name] for part in parts]) for name in table}
+
+    def progress(self, mode: str) -> list[Progress]:
+        """Return how many episodes of each campaign of a mode have ended; none without records.
+
+        Unlike `recorded_episodes`, all count that another process has recorded so far.
+
+        Raises:
+            DatasetError: If there is no such mode, or the table of episodes is damaged.
+        """
+        if self.recorded_episodes(mode) is None:
+            return []
+        orders = self._reader.orders
+        found, records = orders.all(mode), orders.records(mode)
+        if not len(records.rows):
+            return []
+        seconds = self._reader.read(EPISODES, "seconds", 0, self._reader.stored_rows(EPISODES))
+        return find_progress(found, records, seconds[orders.places(mode)])
+
+    @property
+    def has_episodes(self) -> bool:
+        """Whether the mode ``episodes`` is the table of episodes."""
+        return has_table(self._manifest)
+
+    @property
+    def is_written(self) -> bool:
+        """Whether another process is writing to it as its only writer."""
+        return self._appender is None and locks.is_written(self.directory)
+
     def split(
         self, mode: str, shares: Mapping[str, float], *, by: str = "row", seed: int = 0
     ) -> dict[str, Subset]:
@@ -406,13 +461,16 @@ class Dataset(Closeable):
             For each partition the session that wrote it, its number there, its rows, and a digest
             of its fields and their checksums; empty while rows are being written or updated. Rows
             that are not committed yet do not count. If the mode has episodes, the partitions of
-            the table of episodes follow.
+            the table of episodes follow, without rows, as those of ``SESSION/episodes``.
         """
-        modes = [self._manifest.modes[mode]]
-        if self._reader.order(mode) is not None:
-            modes.append(self._manifest.modes[EPISODES])
-        return [
-            (p.session, p.index, p.rows, p.digest(m.fields)) for m in modes for p in m.partitions
+        known = self._manifest.modes[mode]
+        found = [(p.session, p.index, p.rows, p.digest(known.fields)) for p in known.partitions]
+        if self._reader.order(mode) is None:
+            return found
+        table = self._manifest.modes[EPISODES]
+        return found + [
+            (f"{p.session}/{EPISODES}", p.index, 0, p.digest(table.fields))
+            for p in table.partitions
         ]
 
     def verify(self, *, content: bool = True) -> list[str]:

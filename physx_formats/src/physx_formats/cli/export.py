@@ -9,7 +9,7 @@ from typing import Annotated
 import tyro
 
 from physx_core.cli import count, show
-from physx_core.dataset import Dataset
+from physx_core.dataset import EPISODES, Dataset
 from physx_core.observers import ProgressBar
 from physx_formats import ExportOptions, export
 
@@ -79,6 +79,8 @@ def run(words: Sequence[str]) -> None:
         finally:
             bar.end()
         stored = {mode: dataset.num_samples(mode) for mode in written}
+        if dataset.has_episodes and EPISODES in stored:
+            stored[EPISODES] = written[EPISODES]
     for mode, rows in written.items():
         show(f"{count(rows, f'{mode} sample')}: {options.out}")
         if rows < stored[mode]:

@@ -30,5 +30,6 @@ def run(words: Sequence[str]) -> None:
     options = tyro.cli(Compact, args=words, prog="physx compact")
     with Dataset.open(options.directory, writable=True) as dataset:
         freed = dataset.compact(options.mode)
-    what = "freed" if freed >= 0 else "in order now; the files take more space:"
-    show(f"{what} {abs(freed) / 1e6:.1f} MB" if freed else "nothing to do")
+    more = "in order now; the files take more space:"
+    size = f"{abs(freed) / 1e6:.1f} MB"
+    show(f"{'freed' if freed > 0 else more} {size}" if freed else "there was nothing to free")

@@ -10,7 +10,7 @@ import tyro
 
 from physx_core.cli.dataset_tables import count
 from physx_core.cli.output import show
-from physx_core.dataset import Dataset
+from physx_core.dataset import EPISODES, Dataset
 from physx_core.errors import DatasetError, DatasetNotFoundError
 
 
@@ -45,11 +45,14 @@ def _problems(directory: str) -> tuple[list[str], str]:
     try:
         with Dataset.open(directory) as dataset:
             problems = dataset.verify()
-            rows = dataset.describe()
+            rows, has_table = dataset.describe(), dataset.has_episodes
     except DatasetNotFoundError:
         raise
     except DatasetError as error:
         return [str(error)], ""
     files = sum(row["partitions"] for row in rows)
-    samples = {row["mode"]: count(row["samples"], f"{row['mode']} sample") for row in rows}
+    kinds = {row["mode"]: f"{row['mode']} sample" for row in rows}
+    if has_table:
+        kinds[EPISODES] = "record"
+    samples = {row["mode"]: count(row["samples"], kinds[row["mode"]]) for row in rows}
     return problems, f"{count(files, 'file')}, {', '.join(samples.values()) or 'no samples'}"

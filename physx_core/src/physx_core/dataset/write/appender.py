@@ -7,7 +7,7 @@ from typing import Any
 
 from physx_core import files
 from physx_core.dataset.store.definitions import compare_fields, complete_shapes
-from physx_core.dataset.store.episode_table import EPISODES, TABLE_FIELDS, has_table
+from physx_core.dataset.store.episode_table import EPISODES, TABLE_FIELDS, has_table, mode_index
 from physx_core.dataset.store.manifest import Mode
 from physx_core.dataset.write.recording import EpisodeRecord, table_rows
 from physx_core.dataset.write.row_validation import check_rows, count_rows, infer_fields
@@ -90,9 +90,10 @@ class Appender:
     ) -> None:
         """Store rows with the records that commit them: see `Dataset.append_episodes`."""
         recorder = self.writer.recorder
+        mode_index(mode)  # it must be one that can hold episodes
         self.writer.check_alone([mode, EPISODES])
         recorder.check(mode, episodes)
-        table = self._check_table(mode, episodes)
+        table = self._check_table(mode, episodes) if episodes else {}
         block, count = self._check_rows(mode, rows, checked=checked) if rows else ({}, 0)
         total = sum(each.rows for each in episodes)
         if total != count:
@@ -104,12 +105,12 @@ class Appender:
     def _check_table(self, mode: str, episodes: Sequence[EpisodeRecord]) -> Batch:
         """Return the records of a mode for the table of episodes, which is defined if needed."""
         own = {field.name: field for field in TABLE_FIELDS}
-        known, fields = self._manifest.modes.get(EPISODES), own
+        known = self._manifest.modes.get(EPISODES)
         if known is not None and not has_table(self._manifest):
             compare_fields(f'Mode "{EPISODES}" of the dataset', known.fields, own)
         if known is not None:
             fields = known.fields
-        elif episodes:
+        else:
             axes = int(episodes[0].count > 1)
             fields = {f.name: f for f in infer_fields(episodes[0].parameters, axes)} | own
         table, _ = check_rows(fields, table_rows(mode, fields, episodes))

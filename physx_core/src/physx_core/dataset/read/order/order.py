@@ -12,6 +12,7 @@ from physx_core.config import MODES
 from physx_core.dataset.read.order.addresses import Addresses
 from physx_core.dataset.read.order.growing import GrowingRecords
 from physx_core.dataset.read.order.records import (
+    NO_RECORDS,
     NOTHING,
     Found,
     Places,
@@ -136,6 +137,15 @@ class Orders:
     def places(self, mode: str) -> Index:
         """Return which rows of the table are the records of a mode, as `Found.record` counts."""
         return self._records[mode].places
+
+    def records(self, mode: str) -> Records:
+        """Return the records of a mode that has an order, as `Found.record` counts."""
+        return self._records[mode].records if mode in self._records else NO_RECORDS
+
+    def all(self, mode: str) -> Found:
+        """Return all episodes of a mode that has an order, even those after a missing number."""
+        known = self._manifest.modes.get(mode, Mode({}))
+        return self._records[mode].find(Addresses(known)) if mode in self._records else NOTHING
 
     def _read_new(self) -> None:
         """Read the records that have come."""

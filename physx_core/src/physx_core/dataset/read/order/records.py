@@ -147,6 +147,7 @@ class Found(NamedTuple):
         return int(gaps[0]) if len(gaps) else len(expected)
 
 
+NO_RECORDS = Records(*(np.zeros(0, np.int64) for _ in Records._fields))
 NOTHING = Found(*(np.zeros(0, np.int64) for _ in Found._fields))
 
 
