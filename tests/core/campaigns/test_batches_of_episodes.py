@@ -15,7 +15,7 @@ from campaigns import TROUBLED, rows_of
 
 from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.dataset import EpisodeStatus
-from physx_core.errors import FailedEpisodesError
+from physx_core.errors import FailedEpisodesError, MissingFieldError, PluginNotFoundError
 
 pytestmark = [pytest.mark.processes, pytest.mark.usefixtures("nothing_stays_behind")]
 
@@ -145,6 +145,15 @@ def test_open_run_generates_more_batches_each_time():
             run.execute()
         assert run.batch == {}
     assert stored()[0] == expected(30, least=1)
+
+
+def test_error_before_the_first_row_is_the_one_that_is_raised():
+    config = dataclasses.replace(CONFIG, environment="no/environment")
+    with pytest.raises(PluginNotFoundError):
+        DataGeneration(config, session_name="run", batch_nb=2, batch_size=5).execute()
+    troubles = {"0": ["lacks a field", 0]}
+    with pytest.raises(MissingFieldError):
+        generate(2, env_kwargs={"troubles": troubles, "least": 1})
 
 
 def test_replaced_production_of_batches_gets_a_stream():

@@ -156,7 +156,7 @@ class Attacked:
         self.longest = max(self.longest, time.monotonic() - began)
         for number, peer in list(self.server.peers.items()):
             if number in self.honest:
-                assert peer.finished or not peer.closed, peer.offense
+                assert peer.finished or not peer.closed, peer.violation
             self.take_rows(number, peer)
             if peer.closed or peer.failure or peer.finished:
                 self.lose(number, peer)
@@ -182,7 +182,7 @@ class Attacked:
 
     def lose(self, number, peer):
         if number in self.rogues:
-            self.cut_off += bool(peer.offense)
+            self.cut_off += bool(peer.violation)
             self.server.vacate(number)
             del self.server.peers[number]  # the next one begins anew
 

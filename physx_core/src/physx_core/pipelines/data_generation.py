@@ -182,8 +182,10 @@ class DataGeneration(NewSessionPipeline):
 
     def _cut(self, kind: type[BaseException] | None, *_: object) -> None:
         """Leave out what the last episodes have more than the batches, when the run is closed."""
+        if kind is not None or self._campaign is None or self._mode not in self.dataset.modes:
+            return
         known = self.dataset.recorded_episodes(self._mode)
-        if kind is not None or known is None or self._campaign is None:
+        if known is None:
             return
         rows = int(known.rows[known.campaign == self._campaign.number].sum())
         surplus = rows - self._first_row - self.batch_id * (self.batch_size or 0)

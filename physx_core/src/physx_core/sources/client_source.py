@@ -94,7 +94,6 @@ class ClientSource(Source):
             self.sets,
             accept_all=accept_all,
             skip=skip,
-            total=total,
             written=self._written,
             transport=transport,
         )

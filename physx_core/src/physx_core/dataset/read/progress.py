@@ -1,4 +1,4 @@
-"""How far the campaigns of a mode are, by the table of episodes."""
+"""Counts the finished, failed, cut and unfinished episodes of each campaign of a mode."""
 
 from __future__ import annotations
 

@@ -21,11 +21,11 @@ def exit_error(number: int, peer: Peer | None, handle: ClientHandle | None) -> C
         peer: Its connection; None: it has not connected yet.
         handle: Its process; None if it was started by hand.
     """
-    if peer is not None and peer.offense:
+    if peer is not None and peer.violation:
         if handle is not None:
             handle.wait(handle.clock.monotonic() + _LINES_TIME)
         stderr = "" if handle is None else handle.stderr()
-        what = f"was cut off after {peer.received} rows. {peer.offense}"
+        what = f"was cut off after {peer.received} rows. {peer.violation}"
         return ClientError(number, what, stderr=stderr)
     made = 0 if peer is None else peer.received
     when = "before it connected" if peer is None else f"after {made} rows"

@@ -65,7 +65,6 @@ class ClientGroup:
         *,
         accept_all: bool = False,
         skip: Skip = NOTHING,
-        total: int | None = None,
         written: WrittenRows | None = None,
         transport: Transport = SOCKETS,
     ) -> None:
@@ -78,7 +77,6 @@ class ClientGroup:
             sets: Chooses the instances' parameters.
             accept_all: Whether samples that `check_sample` rejects count like the others.
             skip: What an earlier run already got: clients generate it again, but do not send it.
-            total: Number of rows of the whole run, including those to skip; None: unknown.
             written: Counts the rows that the clients write themselves; None: they send them.
             transport: What connects the clients, and the clock that the run follows.
         """
@@ -87,7 +85,6 @@ class ClientGroup:
         self.config = config
         self._seed, self._sets = list(seed), sets
         self._accepts_all, self._skip = accept_all, skip
-        self._total = total
         self._launcher = launcher = _make_launcher(config)
         launcher.elastic = config.is_elastic
         token = choose_token(config, launcher.by_hand, launcher.elsewhere)
@@ -309,7 +306,7 @@ class ClientGroup:
             if peer is not None and peer.finished:
                 continue
             if peer is not None and peer.closed:
-                left = peer.has_left or (handle is None and not peer.offense)
+                left = peer.has_left or (handle is None and not peer.violation)
                 self._lose(number, exit_error(number, peer, handle), left=left)
             elif handle is not None and handle.exit_status() is not None:
                 # What it sent before it ended may still be in transit or unread.

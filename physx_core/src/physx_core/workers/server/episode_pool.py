@@ -112,9 +112,9 @@ class EpisodePool:
         if self._short_since is None:
             self._short_since = now
         waited = now - max(self._short_since, served_since)
-        hopeless = not self.is_open and count + len(absent) < self.least
-        if hopeless or (waited > self._config.timeout and not queued):
-            what = "no more can join" if hopeless else f"no other joined for {waited:.0f} s"
+        is_closed = not self.is_open and count + len(absent) < self.least
+        if is_closed or (waited > self._config.timeout and not queued):
+            what = "no more can join" if is_closed else f"no other joined for {waited:.0f} s"
             raise TooFewClientsError(
                 count,
                 self.least,

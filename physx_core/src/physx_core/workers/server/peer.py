@@ -56,7 +56,7 @@ class Peer(Connection):
         failure: The error that it sent.
         failed_row: Row, counted from 0, at which the error occurred.
         last_step: Step of its last row, -1 before the first.
-        offense: The protocol violation for which it was cut off; empty if there is none.
+        violation: The protocol violation for which it was cut off; empty if there is none.
         has_vanished: Whether its machine no longer answers.
         has_left: Whether it left the run on purpose.
         finished: Whether it reported that its environment is closed.
@@ -94,7 +94,7 @@ class Peer(Connection):
         self.failure: PhysxError | None = None
         self.failed_row = 0
         self.last_step = -1
-        self.offense = ""
+        self.violation = ""
         self.has_vanished = self.has_left = self.finished = self.vacant = False
         self.has_told_fields = False
         self.requests = self.shown = 0

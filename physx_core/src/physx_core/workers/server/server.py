@@ -267,7 +267,7 @@ class Server:
             peer.has_vanished = is_loss(error.__cause__)
             self._drop(peer)
         except ConnectionRefusedByPeerError as error:
-            peer.offense = str(error)
+            peer.violation = str(error)
             self._drop(peer)
         except SampleError as error:
             peer.failure, peer.failed_row = peer.failure or error, peer.received
