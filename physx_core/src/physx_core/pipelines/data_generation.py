@@ -5,15 +5,15 @@ from __future__ import annotations
 import contextlib
 import shlex
 from collections.abc import Iterable, Mapping
-from dataclasses import KW_ONLY, dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
 from physx_core.config import MODES, WRONG, DatasetConfig, EnvironmentConfig, at_least, options
-from physx_core.dataset import Dataset, EpisodeStatus
-from physx_core.errors import ConfigError, FailedEpisodesError, listed
+from physx_core.dataset import Dataset
+from physx_core.errors import ConfigError, listed
 from physx_core.pipelines.campaign import Campaign
-from physx_core.pipelines.independence import IndependenceProof
+from physx_core.pipelines.campaign_writer import CampaignWriter
 from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
 from physx_core.pipelines.run_description import (
     describe_dataset,
@@ -32,7 +32,6 @@ from physx_core.pipelines.storage import (
     stream_options,
 )
 from physx_core.session import Session
-from physx_core.sources.episode_source import EpisodeSource
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 from physx_core.workers.episode_queue import EpisodeQueue
@@ -94,12 +93,8 @@ class DataGeneration(NewSessionPipeline):
     batch_id: int = field(init=False, repr=False, default=0)
     _seed: int = field(init=False, repr=False, default=0)
     _mode: str = field(init=False, repr=False, default="")
-    _campaign: Campaign | None = field(init=False, repr=False, default=None)
-    _queue: EpisodeQueue | None = field(init=False, repr=False, default=None)
-    _episodes: EpisodeSource | None = field(init=False, repr=False, default=None)
+    _writer: CampaignWriter | None = field(init=False, repr=False, default=None)
     _first_row: int = field(init=False, repr=False, default=0)
-    _failed: int = field(init=False, repr=False, default=0)
-    _proof: IndependenceProof = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         """Check that the options ask for batches or for episodes.
@@ -128,13 +123,14 @@ class DataGeneration(NewSessionPipeline):
                 self._generate_batches()
             else:
                 self._simulate_episodes()
-            self._prove_independence()
+            if self._writer is not None and self.prove_independence:
+                self._writer.prove_independence()
             self.data_generation_end()
 
     def _amount(self) -> tuple[int, str]:
         """Return how much there is to generate, and its unit."""
         if self.episodes is not None:
-            known = 0 if self._queue is None else self._queue.finished
+            known = 0 if self._writer is None else self._writer.queue.finished
             return self.episodes - known, "episodes"
         return (self.batch_nb or 0) * (self.batch_size or 0), "samples"
 
@@ -151,52 +147,13 @@ class DataGeneration(NewSessionPipeline):
         self._check_condition(more, "batch_condition")
 
     def _simulate_episodes(self) -> None:
-        while self._queue is not None and not self._queue.is_done:
-            self._store_episodes(self._queue)
-
-    def _store_episodes(self, queue: EpisodeQueue) -> None:
-        """Store the episodes that end next; fail if too many of this run failed."""
-        assert self._campaign is not None
-        assert self._episodes is not None
-        before, campaign = queue.finished, self._campaign.number
-        block = self._episodes.take()
-        self._proof.note(block)
-        if self._mode not in self.dataset.modes:
-            self.dataset.define_fields(self._mode, self._episodes.fields)
-        records = [replace(record, campaign=campaign) for record in block.records]
-        self.dataset.append_episodes(self._mode, block.rows, records, checked=True)
-        if self.episodes is not None:
-            self.observers.advance(queue.finished - before)
-        failed = [record for record in records if record.status is EpisodeStatus.FAILED]
-        self._failed += len(failed)
-        if failed and self._failed > self.max_failed:
-            raise FailedEpisodesError(self._failed, failed[-1].episode, failed[-1].reason)
-
-    def _store_rows(self, queue: RowQueue) -> None:
-        """Store episodes until there are enough rows for the batch."""
-        self.batch = {}
-        wanted = self._first_row + (self.batch_id + 1) * (self.batch_size or 0)
-        queue.goal = max(queue.goal, wanted)
-        while queue.rows < wanted:
-            self._store_episodes(queue)
+        while self._writer is not None and not self._writer.queue.is_done:
+            self.observers.advance(self._writer.store())
 
     def _cut(self, kind: type[BaseException] | None, *_: object) -> None:
         """Leave out what the last episodes have more than the batches, when the run is closed."""
-        if kind is not None or self._campaign is None or self._mode not in self.dataset.modes:
-            return
-        known = self.dataset.recorded_episodes(self._mode)
-        if known is None:
-            return
-        rows = int(known.rows[known.campaign == self._campaign.number].sum())
-        surplus = rows - self._first_row - self.batch_id * (self.batch_size or 0)
-        if surplus > 0:
-            self._campaign.cut(self.dataset, surplus, self.source.sets)
-
-    def _prove_independence(self) -> None:
-        """Simulate an episode again, if that costs little, and compare its rows."""
-        if self._campaign and self._episodes and self.prove_independence:
-            number = self._campaign.number
-            self._proof.check(self._episodes, self.dataset, self._mode, number)
+        if kind is None and self._writer is not None:
+            self._writer.cut(self._first_row + self.batch_id * (self.batch_size or 0))
 
     def data_generation_begin(self) -> None:
         """Called before the first batch."""
@@ -216,8 +173,9 @@ class DataGeneration(NewSessionPipeline):
         With ``record_wrong_samples``, the samples that `check_sample` rejected are stored too, in
         the mode "wrong".
         """
-        if isinstance(self._queue, RowQueue):
-            self._store_rows(self._queue)
+        if self._writer is not None:
+            self.batch = {}
+            self._writer.store_rows(self._first_row + (self.batch_id + 1) * (self.batch_size or 0))
             return
         source, dataset, mode = self.source, self.dataset, self._mode
         with record_beside_rows(source, dataset, mode):
@@ -258,9 +216,11 @@ class DataGeneration(NewSessionPipeline):
 
     def _begin(self) -> None:
         self._first_row += self.batch_id * (self.batch_size or 0)
-        self.batch_id = self._failed = 0
-        if isinstance(self._queue, RowQueue):
-            self._queue.goal = self._first_row + self._amount()[0]
+        self.batch_id = 0
+        if self._writer is not None:
+            self._writer.failed = 0
+            if isinstance(self._writer.queue, RowQueue):
+                self._writer.queue.goal = self._first_row + self._amount()[0]
         end_generation(self.dataset)
 
     def _open(self, resources: contextlib.ExitStack) -> None:
@@ -291,20 +251,18 @@ class DataGeneration(NewSessionPipeline):
         else:
             self.session = self._create_session()
         self.dataset = resources.enter_context(open_own(self.session, dataset_config))
-        self._campaign, self._queue, self._first_row, self.batch_id = None, None, 0, 0
-        self._proof, self._episodes = IndependenceProof(), None
-        if self.resume:
-            self._campaign = Campaign.last(self.dataset, self._mode, config)
-        self._open_environments(resources, config, dataset_config)
+        self._writer, self._first_row, self.batch_id = None, 0, 0
+        campaign = Campaign.last(self.dataset, self._mode, config) if self.resume else None
+        self._open_environments(resources, config, dataset_config, campaign)
 
     def _open_environments(
         self,
         resources: contextlib.ExitStack,
         config: EnvironmentConfig,
         dataset_config: DatasetConfig,
+        campaign: Campaign | None,
     ) -> None:
         """Open the environments, unless there is nothing left to simulate."""
-        campaign = self._campaign
         if campaign is None:
             self._seed = choose_seed(config.seed)
             seed = derive_seed(self._seed, self._mode, self._offset())
@@ -313,45 +271,44 @@ class DataGeneration(NewSessionPipeline):
         self._record_config(self._seed)
         self._observe(resources, config)
         if campaign is not None:
-            self._queue = self._make_queue(campaign)
-            if self._queue.is_done and self.episodes is not None:
+            self._writer = self._make_writer(campaign)
+            if self._writer.queue.is_done and self.episodes is not None:
                 return
         stripes = None
         if dataset_config.writers == "clients":
             stripes = self.dataset.stripes(self._mode, config.num_clients)
         total = None if self.episodes is not None else self._amount()[0]
         self.source = self._open_source(resources, config, seed, total=total, stripes=stripes)
-        if campaign is None and not self._simulates_episodes(dataset_config):
-            if self.max_failed:
-                raise ConfigError(
-                    "DataGeneration.max_failed is for independent episodes, but "
-                    f"{describe_environment_config(config)} is a stream: leave it out."
-                )
-        elif campaign is None:
+        if campaign is None and self._simulates_episodes(dataset_config):
             self.source.check_independent()
-            self._campaign = campaign = Campaign.begin(
-                self.dataset, self._mode, config, self._seed, seed, self.source.sets.parameters
-            )
-            self._queue = self._make_queue(campaign)
-        else:
-            campaign.check_parameters(self.source.sets.parameters)
-        if self._queue is not None:
+            parameters = self.source.sets.parameters
+            campaign = Campaign.begin(self.dataset, self._mode, config, self._seed, seed, parameters)
+            self._writer = self._make_writer(campaign)
+        if self._writer is not None:
             self._describe()
-            self._episodes = self.source.lease(self._queue)
+            self._writer.open(self.source)
             if self.episodes is None:
                 resources.push(self._cut)
+        elif self.max_failed:
+            raise ConfigError(
+                "DataGeneration.max_failed is for independent episodes, but "
+                f"{describe_environment_config(config)} is a stream: leave it out."
+            )
 
     def _offset(self) -> int:
         """Return how many rows or campaigns there are already, which get other random numbers."""
         return max(self.dataset.num_samples(self._mode), Campaign.count(self.dataset, self._mode))
 
-    def _make_queue(self, campaign: Campaign) -> EpisodeQueue:
+    def _make_writer(self, campaign: Campaign) -> CampaignWriter:
         failed = not self.retry_failed
+        queue: EpisodeQueue
         if self.episodes is None:
             known = campaign.records(self.dataset, failed=failed)
-            return RowQueue(self._amount()[0], known, self.retries)
-        numbers = campaign.simulated(self.dataset, failed=failed)
-        return EpisodeQueue(self.episodes, numbers, self.retries)
+            queue = RowQueue(self._amount()[0], known, self.retries)
+        else:
+            numbers = campaign.simulated(self.dataset, failed=failed)
+            queue = EpisodeQueue(self.episodes, numbers, self.retries)
+        return CampaignWriter(self.dataset, campaign, queue, self.max_failed)
 
     def _simulates_episodes(self, dataset_config: DatasetConfig) -> bool:
         """Return whether episodes are simulated by number, instead of streams."""
@@ -365,14 +322,15 @@ class DataGeneration(NewSessionPipeline):
 
     def _plan(self) -> Iterable[str]:
         former = Path(self.session_dir) / self.session_name
-        if self._campaign is not None and self.session.is_new and former != self.session.path:
+        if self._writer is not None and self.session.is_new and former != self.session.path:
             yield f"to go on with the episodes of {former}: --resume"
 
     def _results(self, error: BaseException | None) -> Iterable[str]:
         duration = self._duration
         if self.episodes is not None:
-            finished = 0 if self._queue is None else self._queue.finished
-            failed = f", of which {self._failed} failed" if self._failed else ""
+            writer = self._writer
+            finished = 0 if writer is None else writer.queue.finished
+            failed = f", of which {writer.failed} failed" if writer and writer.failed else ""
             yield f"{finished} of {self.episodes} episodes{failed} in {duration:.2f} s"
             yield describe_samples(self.dataset.directory)
             return
@@ -380,14 +338,14 @@ class DataGeneration(NewSessionPipeline):
         rate = count * (self.batch_size or 0) / duration
         yield f"{count} of {self.batch_nb} batches in {duration:.2f} s, {rate:.0f} samples/s"
         yield describe_samples(self.dataset.directory)
-        if self._campaign is None:
+        if self._writer is None:
             yield from describe_failed_sets(self.source)
-        elif self._failed:
-            yield f"{self._failed} episodes failed"
+        elif self._writer.failed:
+            yield f"{self._writer.failed} episodes failed"
 
     def _next(self, error: BaseException | None) -> Iterable[str]:
         path = shlex.quote(str(self.session.path))
-        if error is not None and self._campaign is not None:
+        if error is not None and self._writer is not None:
             yield f"physx generate {path} --resume"
         yield f"physx info {path}"
         if error is None and self._mode == "training":

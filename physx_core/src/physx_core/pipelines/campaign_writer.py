@@ -1,0 +1,102 @@
+"""CampaignWriter: simulates the missing episodes of a campaign, and stores them as they end."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+
+from physx_core.dataset import Dataset, EpisodeStatus
+from physx_core.errors import FailedEpisodesError
+from physx_core.pipelines.campaign import Campaign
+from physx_core.pipelines.independence import IndependenceProof
+from physx_core.sources.episode_source import EpisodeSource
+from physx_core.sources.source import Source
+from physx_core.workers.episode_queue import EpisodeQueue
+from physx_core.workers.row_queue import RowQueue
+
+
+class CampaignWriter:
+    """Stores episodes in any order; the dataset's rows are those of its episodes in order.
+
+    Attributes:
+        campaign: The campaign.
+        queue: The numbers that nobody has simulated yet.
+        failed: Number of episodes that have failed in this run.
+    """
+
+    def __init__(
+        self, dataset: Dataset, campaign: Campaign, queue: EpisodeQueue, max_failed: int
+    ) -> None:
+        """Prepare; `open` gives it what simulates.
+
+        Args:
+            dataset: Stores the episodes; open for writing.
+            campaign: The campaign.
+            queue: The numbers that are missing.
+            max_failed: How many episodes of this run may fail.
+        """
+        self.campaign, self.queue, self.failed = campaign, queue, 0
+        self._dataset, self._max_failed = dataset, max_failed
+        self._source: Source | None = None
+        self._episodes: EpisodeSource | None = None
+        self._proof = IndependenceProof()
+
+    def open(self, source: Source) -> None:
+        """Simulate with open environments, whose episodes are independent.
+
+        Raises:
+            ConfigError: If they define other parameters than when the campaign began.
+        """
+        self.campaign.check_parameters(source.sets.parameters)
+        self._source, self._episodes = source, source.lease(self.queue)
+
+    def store(self) -> int:
+        """Store the episodes that end next; return how many have ended.
+
+        Raises:
+            FailedEpisodesError: If too many episodes have failed.
+            PhysxError: If an environment or client fails in a way that concerns all episodes.
+        """
+        assert self._episodes is not None
+        before, mode = self.queue.finished, self.campaign.mode
+        block = self._episodes.take()
+        self._proof.note(block)
+        if mode not in self._dataset.modes:
+            self._dataset.define_fields(mode, self._episodes.fields)
+        records = [replace(record, campaign=self.campaign.number) for record in block.records]
+        self._dataset.append_episodes(mode, block.rows, records, checked=True)
+        failed = [record for record in records if record.status is EpisodeStatus.FAILED]
+        self.failed += len(failed)
+        if failed and self.failed > self._max_failed:
+            raise FailedEpisodesError(self.failed, failed[-1].episode, failed[-1].reason)
+        return self.queue.finished - before
+
+    def store_rows(self, rows: int) -> None:
+        """Store episodes until those before the first missing one have enough rows."""
+        assert isinstance(self.queue, RowQueue)
+        self.queue.goal = max(self.queue.goal, rows)
+        while self.queue.rows < rows:
+            self.store()
+
+    def cut(self, rows: int) -> None:
+        """Leave out what the campaign has more than some rows; nothing may be stored afterwards."""
+        known = None
+        if self.campaign.mode in self._dataset.modes:
+            known = self._dataset.recorded_episodes(self.campaign.mode)
+        if known is None or self._source is None:
+            return
+        surplus = int(np.sum(known.rows[known.campaign == self.campaign.number])) - rows
+        if surplus > 0:
+            self.campaign.cut(self._dataset, surplus, self._source.sets)
+
+    def prove_independence(self) -> None:
+        """Simulate an episode again, if that costs little, and compare its rows.
+
+        Raises:
+            DependentEpisodeError: If they differ.
+        """
+        if self._episodes is not None:
+            self._proof.check(
+                self._episodes, self._dataset, self.campaign.mode, self.campaign.number
+            )
