@@ -185,8 +185,9 @@ class EnvironmentConfig:
     """Address of the server."""
     port: int = field(default=0, metadata={"minimum": 0, "maximum": 65535})
     """Port of the server; 0: any free one."""
-    independent_episodes: bool = False
-    """Say for the environment that its episodes are independent: see `Environment`."""
+    independent_episodes: bool | None = None
+    """Whether the environment's episodes are independent: see `Environment`; False: run it as a
+    stream. None: as the environment says."""
     episode_steps: int | None = at_least(1, None)
     """Number of samples of an episode, which is then independent; 1 if each is a simulation of its
     own. None: the environment decides."""
@@ -217,9 +218,6 @@ class EnvironmentConfig:
     their distributions."""
     sampler_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the sampler."""
-    redraw: int = at_least(0, 0)
-    """Number of times that each instance may continue with its next parameters after a simulation
-    failed; the parameters that failed are recorded."""
     seed: int | None = None
     """Seed of all instances' random streams; None: a random seed, recorded in the session."""
     timeout: float = at_least(0.1, 60.0)

@@ -32,49 +32,54 @@ SWING, HARD = f"{ENVS}:Swing", f"{ENVS}:Hard"
 class Recording(LearningSampler):
     """Chooses what it was told last, and notes how many batches each choice depends on."""
 
-    def __init__(self, delay=1, memory=512):
-        self.delay, self.memory = delay, memory
-        self.told = {0: 0.0}
+    def __init__(self, memory=512):
+        self.memory = memory
+        self.told = self.batches = 0
         self.asked = {}
 
-    def ask_after(self, number, batches):
-        self.asked[number] = batches
-        share = self.told[batches] % 1
-        return self.values(np.full(self.size, share))
+    def ask(self, number):
+        assert number == len(self.asked)
+        self.asked[number] = self.batches
+        return self.values(np.full(self.size, self.told % 1))
 
-    def state(self, batches):
-        return np.array([[n, told] for n, told in self.told.items() if n <= batches]).ravel()
+    def state(self):
+        return np.array([self.told, self.batches])
 
-    def restore(self, batches, state):
-        self.told = {int(n): told for n, told in state.reshape(-1, 2)}
+    def restore(self, state):
+        self.told, self.batches = state
 
-    def tell(self, batches, numbers, values, losses):
-        assert batches - 1 in self.told
+    def tell(self, numbers, values, losses):
         assert (np.diff(numbers) > 0).all()
         assert len(numbers) == len(values) == len(losses)
-        self.told[batches] = self.told[batches - 1] + float(losses.sum()) + numbers[-1] / 7
+        self.batches += 1
+        self.told += float(losses.sum()) + numbers[-1] / 7
 
 
 def train(folder, *, clients, environment=SWING, kwargs=None, sampler, online=None, **options):
     config = EnvironmentConfig(
-        environment, env_kwargs=kwargs or {}, num_clients=2, seed=3, as_tcp_ip_client=clients,
+        environment, env_kwargs=kwargs or {}, num_clients=options.pop("num_clients", 2), seed=3,
+        as_tcp_ip_client=clients, episode_steps=3 if environment == SWING else 1,
         sampler=sampler, sampler_kwargs=options.pop("sampler_kwargs", {}),
     )  # fmt: skip
     network = options.pop("network", None) or NetworkConfig(
         "toy/linear", network_kwargs={"net_fields": "x", "opt_fields": "noise"}
     )
-    online = online or {}
-    settings = {"epoch_nb": 1, "batch_nb": 8, "batch_size": 6, "seed": 5, **online, **options}
+    settings = {"epoch_nb": 1, "batch_nb": 8, "batch_size": 6, "seed": 5, "run_ahead": 4}
+    settings |= {**(online or {}), **options}
     run = Training(network, None, config, session_dir=str(folder), quiet=True, **settings)
     run.execute()
-    with Dataset.open(run.session.dataset_dir) as dataset:
-        found = {
-            f"{mode}/{name}": dataset[mode][name][:]
-            for mode in ("training", "parameters")
-            for name in dataset.fields(mode)
-        }
-    found["weights"] = run.learner.network.weights
-    return run, found
+    return run, stored(run.session.path) | {"weights": run.learner.network.weights}
+
+
+def stored(session):
+    """Return the rows of a session, and the parameters of its episodes in order."""
+    with Dataset.open(session / "dataset") as dataset:
+        assert dataset.verify() == []
+        rows = {name: dataset["training"][name][:] for name in dataset.fields("training")}
+        table = dataset.episode_table(["training"])
+        counts = table["rows"] > 0  # others were begun, but no batch needed them
+    names = table.keys() - {"seconds"}
+    return rows | {f"episode/{name}": table[name][counts] for name in names}
 
 
 RESERVOIR = {
@@ -84,26 +89,22 @@ RESERVOIR = {
 
 
 @pytest.mark.parametrize("online", [{}, RESERVOIR], ids=["stream", "reservoir"])
-@pytest.mark.parametrize("delay", [0, pytest.param(1, marks=pytest.mark.faults), 3])
-def test_active_sampler_is_independent_of_clients_and_delays(tmp_path, delay, online):
-    options = {"sampler": Recording, "sampler_kwargs": {"delay": delay}, "online": online}
+@pytest.mark.parametrize("run_ahead", [1, pytest.param(4, marks=pytest.mark.faults), 64])
+def test_sampler_that_learns_is_independent_of_clients_and_speed(tmp_path, run_ahead, online):
+    options = {"sampler": Recording, "online": online, "run_ahead": run_ahead}
     _, expected = train(tmp_path, clients=False, **options)
-    for kwargs in ({}, {"how": "slow"}):
-        _, found = train(tmp_path, clients=True, kwargs=kwargs, **options)
+    for kwargs, clients in (({}, 1), ({"how": "slow"}, 3)):
+        _, found = train(tmp_path, clients=True, num_clients=clients, kwargs=kwargs, **options)
         for name, values in expected.items():
             assert found[name].tobytes() == values.tobytes(), name
-    assert len(np.unique(expected["parameters/stiffness"])) >= 2
+    assert len(np.unique(expected["x"])) >= (2 if run_ahead < 64 else 1)
 
 
-def test_what_a_set_may_depend_on_is_counted_in_batches(tmp_path):
-    """Row r is one of batch r // 6; a set is asked for with the first row of its episode."""
-    run, found = train(tmp_path, clients=True, sampler=Recording, sampler_kwargs={"delay": 2})
+def test_parameters_depend_on_batches_of_earlier_episodes_only(tmp_path):
+    """Episodes have 3 rows and batches 6, so batch b needs episodes up to 2 b + 1."""
+    run, _ = train(tmp_path, clients=True, sampler=Recording, run_ahead=4)
     asked = run.data.source.sets._sampler.asked
-    numbers = found["training/episode"] * 2 + found["training/env_id"] - 1
-    firsts = [numbers.tolist().index(number) for number in found["parameters/set"]]
-    assert [asked[n] for n in found["parameters/set"].tolist()] == [
-        max(0, first // 6 - 2) for first in firsts
-    ]
+    assert [asked[number] for number in range(16)] == [max(0, n - 4) // 2 for n in range(16)]
 
 
 def test_active_draws_where_the_loss_is_high_and_everywhere_a_little(tmp_path):
@@ -114,7 +115,7 @@ def test_active_draws_where_the_loss_is_high_and_everywhere_a_little(tmp_path):
     shares = []
     for sampler in ("physx/uniform", "physx/active"):
         _, found = train(tmp_path, sampler=sampler, **options)
-        points = np.c_[found["parameters/a"], found["parameters/b"]][200:]
+        points = found["x"][200:]
         shares.append(np.mean(np.linalg.norm(points - 0.8, axis=1) < 0.2))
         cells = {*map(tuple, np.floor(points * 3).astype(int).tolist())}
         assert len(cells) == 9
@@ -127,25 +128,23 @@ def test_active_runs_in_clients_and_from_the_command_line(tmp_path):
     words = f"train {tmp_path}/run {HARD} --epoch-nb 1 --batch-nb 6 --batch-size 8 --seed 1"
     words += f" --session-dir {tmp_path} --session-name run --network.network toy/linear"
     words += " --network.network-kwargs net_fields=x opt_fields=y --environment.num-clients 2"
-    words += " --environment.sampler physx/active --environment.sampler-kwargs uniform=0.5 delay=2"
+    words += " --environment.sampler physx/active --environment.sampler-kwargs uniform=0.5"
+    words += " --environment.episode-steps 1 --run-ahead 2"
     words = words.replace(f"train {tmp_path}/run {HARD}", f"train --environment.environment {HARD}")
     assert main(words.split()) == 0
     with Dataset.open(tmp_path / "run" / "dataset") as dataset:
-        assert dataset.num_samples("parameters") == 48
+        assert dataset.num_samples("training") == 48
+        assert len(np.unique(dataset["training"]["x"][:], axis=0)) == 48
 
 
 # Resumed ------------------------------------------------------------------------------------------
 
 
 def kept(folder, name):
-    """Return all rows and sets, and the files of the last checkpoint."""
-    with Dataset.open(folder / "sessions" / name / "dataset") as dataset:
-        found = {
-            f"{mode}/{field}": dataset[mode][field][:].tobytes()
-            for mode in ("training", "parameters")
-            for field in dataset.fields(mode)
-        }
-    last = checkpoint.find(folder / "sessions" / name, None, -1)
+    """Return all rows and parameters, and the weights of the last checkpoint."""
+    session = folder / "sessions" / name
+    found = {field: values.tobytes() for field, values in stored(session).items()}
+    last = checkpoint.find(session, None, -1)
     with zipfile.ZipFile(last.path / "parameters.npz") as file:
         found["weights"] = file.read("weights.npy")
     return found
@@ -184,32 +183,8 @@ def test_kills_at_random_moments_with_active_sampler(tmp_path, words, run_killed
     assert survives(run_killed, tmp_path, seed(), trials(10, 4), words)
 
 
-def test_resume_after_failed_parameters_is_refused_with_recorded_rejections(tmp_path):
-    environment = EnvironmentConfig(
-        SWING,
-        env_kwargs={"fails_above": 25.0},
-        seed=3,
-        redraw=99,
-        as_tcp_ip_client=False,
-        record_wrong_samples=True,
-    )
-    network = NetworkConfig("toy/linear", network_kwargs={"net_fields": "x", "opt_fields": "noise"})
-    options = {"session_dir": str(tmp_path), "session_name": "run", "quiet": True, "batch_size": 5}
-    options |= {"epoch_nb": 2, "batch_nb": 6, "seed": 5, "checkpoint_every": 2}
-
-    class Stopped(Training):
-        def batch_end(self):
-            if self.batch_id == 4:
-                raise KeyboardInterrupt
-
-    with pytest.raises(KeyboardInterrupt):
-        Stopped(network, None, environment, **options).execute()
-    with pytest.raises(ConfigError, match="simulations failed.*network_dir"):
-        Training(network, None, environment, resume=True, **options).execute()
-
-
-@pytest.mark.parametrize("delay", [0, 1])
-def test_error_ends_run_whose_clients_wait_for_losses(tmp_path, delay, nothing_stays_behind):
+@pytest.mark.parametrize("run_ahead", [1, 3])
+def test_error_ends_run_whose_clients_wait_for_losses(tmp_path, run_ahead, nothing_stays_behind):
     class Failing(Training):
         def batch_begin(self):
             super().batch_begin()
@@ -218,14 +193,14 @@ def test_error_ends_run_whose_clients_wait_for_losses(tmp_path, delay, nothing_s
                 raise RuntimeError("on purpose")
 
     environment = EnvironmentConfig(
-        SWING, num_clients=2, seed=3, sampler="physx/active", sampler_kwargs={"delay": delay}
+        SWING, num_clients=2, seed=3, sampler="physx/active", episode_steps=3
     )
     network = NetworkConfig("toy/linear", network_kwargs={"net_fields": "x", "opt_fields": "noise"})
     began = time.monotonic()
     with pytest.raises(RuntimeError, match="on purpose"):
         Failing(
             network, None, environment, session_dir=str(tmp_path), epoch_nb=1, batch_nb=9,
-            batch_size=6, quiet=True,
+            batch_size=6, run_ahead=run_ahead, quiet=True,
         ).execute()  # fmt: skip
     assert time.monotonic() - began < 50
 
@@ -261,11 +236,24 @@ def test_an_optimization_without_losses_of_rows_is_an_error(
 
 
 @pytest.mark.parametrize("clients", [False, True])
-def test_a_sampler_that_learns_needs_a_training(tmp_path, clients):
-    config = EnvironmentConfig(SWING, as_tcp_ip_client=clients, sampler="physx/active")
+@pytest.mark.parametrize("episode_steps", [None, 3])
+def test_sampler_that_learns_needs_a_training(tmp_path, clients, episode_steps):
+    config = EnvironmentConfig(
+        SWING, as_tcp_ip_client=clients, sampler="physx/active", episode_steps=episode_steps
+    )
     with pytest.raises(UsageError, match="learns from training losses"):
         DataGeneration(
             config, session_dir=str(tmp_path), batch_nb=1, batch_size=2, quiet=True
+        ).execute()
+
+
+@pytest.mark.parametrize("clients", [False, True])
+def test_sampler_that_learns_needs_independent_episodes(tmp_path, clients):
+    config = EnvironmentConfig(SWING, as_tcp_ip_client=clients, sampler="physx/active")
+    network = NetworkConfig("toy/linear", network_kwargs={"net_fields": "x", "opt_fields": "noise"})
+    with pytest.raises(UsageError, match="learns from training losses.*independent episodes"):
+        Training(
+            network, None, config, session_dir=str(tmp_path), epoch_nb=1, batch_nb=2, batch_size=2
         ).execute()
 
 
@@ -275,7 +263,6 @@ def test_a_sampler_that_learns_needs_a_training(tmp_path, clients):
         ({"uniform": 0.0}, "uniform is 0.0"),
         ({"width": 0.6}, "width is 0.6"),
         ({"memory": 0}, "memory is 0"),
-        ({"delay": -1}, "delay is -1"),
     ],
 )
 def test_options_out_of_range_are_errors(tmp_path, options, message):

@@ -23,18 +23,20 @@ class Descending(LeastSquares):
         self._network.weights = self._network.weights - 0.02 * self._rows.T @ error
 
 
-SAMPLERS = {"sobol": {}, "active": {"delay": 1, "memory": 30}}
+SAMPLERS = {"sobol": {}, "active": {"memory": 30}}
 
 
 def training(name, over_tcp, always, online, sampler):
+    is_stream = sampler == "sobol"
     environment = EnvironmentConfig(
         APPRENTICE,
+        episode_steps=None if is_stream else 3,
         sampler=f"physx/{sampler}",
         sampler_kwargs=SAMPLERS[sampler],
-        env_kwargs={"delay": 0.004, "refuse": 5},
+        env_kwargs={"delay": 0.004, "refuse": 5 if is_stream else 0},
         as_tcp_ip_client=over_tcp,
         always_produce=always,
-        record_wrong_samples=True,
+        record_wrong_samples=is_stream,
         num_clients=2,
         seed=4,
     )
@@ -49,6 +51,7 @@ def training(name, over_tcp, always, online, sampler):
         batch_nb=30,
         batch_size=7,
         seed=3,
+        run_ahead=6,
         quiet=True,
         checkpoint_every=7,
         online=f"physx/{online}",

@@ -28,11 +28,9 @@ SET_FIELDS = (
     Field("env_id", (), "int32", role="additional"),
     Field("episode", (), "int64", role="additional"),
     Field("mode_index", (), "int8", role="additional"),
-    Field("failed", (), "bool", role="additional"),
 )
 """Fields of the dataset's record of sets, in addition to the parameters: the set's number, its
-instance and episode, the index of its rows' mode in `physx_core.config.MODES`, and whether its
-simulation failed."""
+instance and episode, and the index of its rows' mode in `physx_core.config.MODES`."""
 
 _DISTRIBUTIONS = ("uniform", "log_uniform", "normal", "integer")
 _TAKEN = {*RESERVED, *(field.name for field in SET_FIELDS)}

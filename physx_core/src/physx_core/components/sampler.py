@@ -19,10 +19,10 @@ class Sampler(ABC):
     """Chooses sets of parameters; plugins offer their own with the hook ``physx_samplers``.
 
     The constructor takes the entries of `EnvironmentConfig.sampler_kwargs`; `begin` follows. Sets
-    are numbered from 0: set k is for episode ``k // instance_nb`` of instance ``k % instance_nb``
-    (from 0 here). Sets are requested in any order, and again when a run is resumed, so what `ask`
-    returns may depend only on the arguments of `begin`, on the set's number, and on the losses that
-    the sampler was told.
+    are numbered from 0: set k is for episode k if episodes are independent, and for trajectory
+    ``k // instance_nb`` of instance ``k % instance_nb`` (from 0 here) of streams. Sets are
+    requested in any order, and again when a run is resumed, so what `ask` returns may depend only
+    on the arguments of `begin` and on the set's number, except for a `LearningSampler`.
 
     Attributes:
         learns: Whether it is told the losses of the samples generated with its sets.
@@ -85,67 +85,43 @@ class Sampler(ABC):
 
 
 class LearningSampler(Sampler):
-    """A sampler that learns from the losses of training rows.
+    """A sampler that learns from the losses of training rows of independent episodes.
 
-    What a set may depend on is counted in batches, never in time: a set for a row of batch n may
-    depend on the losses of the batches before n - `delay`. So the simulations are the same in every
-    run. With a delay of 1 or more, clients generate the rows of a batch while the network learns
-    from the previous ones.
+    It is asked for each set once, in order of the numbers, and told the losses of each batch once,
+    in order of the batches. What it has been told before a set is counted in episodes, never in
+    time: see `Training.run_ahead`. So the simulations are the same in every run.
 
     Attributes:
-        delay: Number of batches before a row's own whose losses its set does not depend on yet.
         memory: Number of sets, up to the latest one with losses, that the sampler is told of.
     """
 
     learns: ClassVar[bool] = True
-    delay: int = 1
     memory: int = 512
 
+    @abstractmethod
     def ask(self, number: int) -> Mapping[str, Any]:
-        """Return the values of a set that does not depend on losses."""
-        return self.ask_after(number, 0)
+        """Return the values of a set, which may depend on the losses told so far: see `Sampler`."""
 
     @abstractmethod
-    def ask_after(self, number: int, batches: int) -> Mapping[str, Any]:
-        """Return the values of a set by the parameters' names.
-
-        Args:
-            number: Number of the set, from 0.
-            batches: Number of batches, from the first one, whose losses it may depend on: those
-                told so far, or up to `delay` fewer.
-        """
-
-    @abstractmethod
-    def state(self, batches: int) -> Array:
-        """Return what `restore` needs to continue after some batches, as numbers, shape (n,).
-
-        Args:
-            batches: Number of batches: all that were told, or all but the last one.
-        """
-
-    @abstractmethod
-    def restore(self, batches: int, state: Array) -> None:
-        """Continue from a `state` of a sampler with the same options; called after `begin`.
-
-        Args:
-            batches: Number of batches after which the state was taken.
-            state: The state.
-
-        Raises:
-            ValueError: If `state` is not the state of such a sampler.
-        """
-
-    @abstractmethod
-    def tell(
-        self, batches: int, numbers: Index, values: Sequence[Mapping[str, Any]], losses: Array
-    ) -> None:
+    def tell(self, numbers: Index, values: Sequence[Mapping[str, Any]], losses: Array) -> None:
         """Learn from a batch.
 
         Args:
-            batches: Number of batches told so far, including this one.
             numbers: Numbers of the sets with rows in the batch, increasing.
             values: Their values.
             losses: Mean loss of the batch's rows of each set.
+        """
+
+    @abstractmethod
+    def state(self) -> Array:
+        """Return what `restore` needs to continue, as numbers, shape (n,)."""
+
+    @abstractmethod
+    def restore(self, state: Array) -> None:
+        """Continue from a `state` of a sampler with the same options; called after `begin`.
+
+        Raises:
+            ValueError: If `state` is not the state of such a sampler.
         """
 
 

@@ -77,8 +77,10 @@ class Campaign:
         return campaign
 
     @classmethod
-    def last(cls, dataset: Dataset, mode: str, config: EnvironmentConfig) -> Campaign:
-        """Return the last campaign of a mode, which a configuration continues.
+    def last(
+        cls, dataset: Dataset, mode: str, config: EnvironmentConfig, number: int = -1
+    ) -> Campaign:
+        """Return a campaign of a mode, by default the last one, which a configuration continues.
 
         Raises:
             ConfigError: If there is none, or its episodes would have other rows.
@@ -89,7 +91,7 @@ class Campaign:
                 f'{dataset.directory} has no episodes of the mode "{mode}" to go on with: leave '
                 "resume out."
             )
-        former = known[-1]
+        former = known[number]
         seed = former.environment["seed"] if config.seed is None else config.seed
         now = describe_environment(config, seed)
         for name in _SAME:

@@ -18,7 +18,6 @@ from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, deriv
 from physx_core.pipelines.run_description import (
     describe_dataset,
     describe_environment_config,
-    describe_failed_sets,
     describe_samples,
 )
 from physx_core.pipelines.storage import (
@@ -282,7 +281,9 @@ class DataGeneration(NewSessionPipeline):
         if campaign is None and self._simulates_episodes(dataset_config):
             self.source.check_independent()
             parameters = self.source.sets.parameters
-            campaign = Campaign.begin(self.dataset, self._mode, config, self._seed, seed, parameters)
+            campaign = Campaign.begin(
+                self.dataset, self._mode, config, self._seed, seed, parameters
+            )
             self._writer = self._make_writer(campaign)
         if self._writer is not None:
             self._describe()
@@ -316,7 +317,6 @@ class DataGeneration(NewSessionPipeline):
         return self.episodes is not None or (
             self.source.is_independent
             and self._is_own(DataGeneration.batch_produce)
-            and not self.source.sets.learns
             and not stream_options(config, dataset_config)
         )
 
@@ -338,9 +338,7 @@ class DataGeneration(NewSessionPipeline):
         rate = count * (self.batch_size or 0) / duration
         yield f"{count} of {self.batch_nb} batches in {duration:.2f} s, {rate:.0f} samples/s"
         yield describe_samples(self.dataset.directory)
-        if self._writer is None:
-            yield from describe_failed_sets(self.source)
-        elif self._writer.failed:
+        if self._writer is not None and self._writer.failed:
             yield f"{self._writer.failed} episodes failed"
 
     def _next(self, error: BaseException | None) -> Iterable[str]:

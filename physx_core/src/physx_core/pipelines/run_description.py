@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 
-from physx_core.config import SETS, EnvironmentConfig, to_plain
+from physx_core.config import EnvironmentConfig, to_plain
 from physx_core.dataset import EPISODES, Dataset
 from physx_core.errors import PhysxError
 from physx_core.pipelines.learning.learner import Learner
-from physx_core.sources.source import Source
 
 _MOST_NAMED = 5
 
@@ -64,15 +63,6 @@ def describe_samples(directory: Path) -> str:
     except PhysxError as error:  # the run's own error matters more
         return f"samples: {error}"
     return f"samples: {', '.join(counts) or 'none'} in {directory}"
-
-
-def describe_failed_sets(source: Source | None) -> Iterator[str]:
-    """Yield lines on the sets of parameters whose simulations failed, naming the first few."""
-    failures = source.sets.failures if source is not None else {}
-    if failures:
-        yield f'sets of parameters that failed: {len(failures)}, marked in the mode "{SETS}"'
-    for number, text in sorted(failures.items())[:_MOST_NAMED]:
-        yield f"  {number}: {text}"
 
 
 def describe_dataset(dataset: Dataset) -> str:

@@ -161,17 +161,11 @@ def check_client_writers(config: EnvironmentConfig) -> None:
             f"{clients}, so the run, which stores the rejected ones, does not know which batch "
             "they belong to. Use writers='server', or leave out record_wrong_samples."
         )
-    if config.redraw:
-        raise ConfigError(
-            f"{clients}, but redraw needs the rows in the run's process. Use writers='server'."
-        )
 
 
 def stream_options(config: EnvironmentConfig, dataset_config: DatasetConfig) -> dict[str, str]:
     """Return the options that are set but only for streams: name to what to do instead."""
     advice = {
-        "redraw": "use max_failed",
-        "restarts": "lost clients are replaced; DataGeneration.retries is for their episodes",
         "record_wrong_samples": "rejected samples of episodes are not kept",
     }
     found = {name: advice[name] for name in advice if getattr(config, name)}
@@ -276,8 +270,7 @@ def record_beside_rows(
     These are the samples that `check_sample` rejects during the body, in the mode "wrong", and the
     sets of parameters that begin in its batch, in the mode "parameters". They are stored after the
     body's batch, or the sets before its rows if the body calls `store_sets`. Rejected samples are
-    stored even if too many of them end the run, and sets whose simulation failed even if that ends
-    it. If the batch fails for another reason, rejected samples are not stored.
+    stored even if too many of them end the run; if it fails for another reason, they are not.
 
     Args:
         source: Generates the batch.
@@ -297,12 +290,9 @@ def _recording_beside_rows(
 ) -> Iterator[None]:
     try:
         yield
-    except PhysxError as error:
-        if isinstance(error, WrongSamplesError):
-            _store_rejected(source, dataset, earlier)
-        source.sets.note_failed()
+    except WrongSamplesError:
         with contextlib.suppress(PhysxError):  # the run's own error matters more
-            store_sets(source, dataset, mode)
+            _store_rejected(source, dataset, earlier)
         raise
     _store_rejected(source, dataset, earlier)
     store_sets(source, dataset, mode)
@@ -328,16 +318,10 @@ def store_sets(source: Source, dataset: Dataset | None, mode: str) -> None:
 
     They are stored before its rows, so rows have their parameters even if the process is killed.
     """
-    sets, failed = source.sets.pop(mode)
-    if dataset is None or not (sets or failed):
-        return
-    dataset.define_fields(SETS, source.sets.fields)
-    if sets:
+    sets = source.sets.pop(mode)
+    if dataset is not None and sets:
+        dataset.define_fields(SETS, source.sets.fields)
         dataset.append(SETS, sets)
-    if failed:
-        first = dataset.num_samples(SETS) - source.sets.count
-        index = [first + place for place in failed]
-        dataset.update(SETS, index, {"failed": [True] * len(index)})
 
 
 def end_generation(dataset: Dataset) -> None:

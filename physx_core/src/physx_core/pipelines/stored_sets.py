@@ -24,8 +24,7 @@ _FIRST = 1  # the instance that generates the first row and begins the first set
 class StoredSets:
     """Finds the set of each row by its instance and episode, which restart with each run.
 
-    The runs that added rows to a mode are those that added sets for it, in the same order. A run
-    whose simulations all failed has sets but no rows.
+    The runs that added rows to a mode are those that added sets for it, in the same order.
     """
 
     def __init__(self, dataset: Dataset, mode: str) -> None:
@@ -43,16 +42,11 @@ class StoredSets:
         record = {name: view[name][:][places] for name in dataset.fields(SETS)}
         env_id, episode = record["env_id"], record["episode"]
         runs = _runs(np.flatnonzero(env_id == _FIRST), episode, len(places))
-        has_rows = np.zeros(runs.max(initial=-1) + 1, bool)
-        known = runs >= 0
-        np.logical_or.at(has_rows, runs[known], ~record["failed"][known])
-        known[known] = has_rows[runs[known]]
-        runs = np.where(known, np.cumsum(has_rows)[runs] - 1 if len(has_rows) else -1, -1)
-        self._starts = _first_rows(dataset, mode)
-        if len(self._starts) != has_rows.sum():
+        known, self._starts = runs >= 0, _first_rows(dataset, mode)
+        if len(self._starts) != (count := runs.max(initial=-1) + 1):
             raise DatasetError(
                 f'The samples of mode "{mode}" in {dataset.directory} come from '
-                f"{len(self._starts)} runs, but their recorded parameters from {has_rows.sum()}, "
+                f"{len(self._starts)} runs, but their recorded parameters from {count}, "
                 "so each sample's parameters are unknown. Generate them again."
             )
         self._values = {name: record[name] for name in record if name not in _OWN}

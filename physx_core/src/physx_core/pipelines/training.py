@@ -38,7 +38,6 @@ from physx_core.pipelines.learning.training_data import TrainingData
 from physx_core.pipelines.learning.training_record import BestEpoch, TrainingRecord
 from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed
 from physx_core.pipelines.run_description import (
-    describe_failed_sets,
     describe_samples,
     describe_training,
 )
@@ -121,6 +120,15 @@ class Training(NewSessionPipeline):
     """Keyword arguments of the buffer: ``capacity``, number of rows kept in memory;
     ``watermark``, number of rows before the first batch; ``views``, average number of times that a
     row is used. All rows are stored, whether they are kept in memory or not."""
+    run_ahead: int = at_least(1, 64)
+    """For a sampler that learns: how many independent episodes may be simulated beyond the first
+    missing one. The parameters of episode k depend on the losses of the batches made only of
+    samples of episodes before ``k - run_ahead``."""
+    retries: int = at_least(0, 1)
+    """Number of times that an independent episode is simulated again after its client was lost;
+    then it has failed."""
+    max_failed: int = at_least(0, 0)
+    """Number of independent episodes that may fail before the training fails."""
     validation_every: int = at_least(0, 1)
     """Number of epochs between validations, if the dataset has a validation mode or
     `validation_split` holds samples back; 0: never."""
@@ -147,8 +155,9 @@ class Training(NewSessionPipeline):
     after the last batch of each epoch; 0: none. The last two of these are kept."""
     resume: bool = field(default=False, metadata={"recorded": False})
     """Resume from the session's last checkpoint, up to `epoch_nb` epochs in total. If environments
-    were generating the samples, they generate the stored ones again, unless these depend on
-    predictions; without a checkpoint, training restarts with the stored samples."""
+    were generating the samples, they go on with the independent episodes that are missing; streams
+    generate the stored samples again, unless these depend on predictions. Without a checkpoint,
+    training restarts with the stored samples."""
 
     kind: ClassVar[str] = "training"
     group: Group = field(init=False, repr=False, default_factory=Group)
@@ -569,6 +578,9 @@ class Training(NewSessionPipeline):
             open_source=partial(self._open_source, resources),
             predict=self._predict,
             show=self.observers.events,
+            run_ahead=self.run_ahead,
+            retries=self.retries,
+            max_failed=self.max_failed,
         )
         self.data = opening.open(resources, dataset)
         self._prepare_learner(start)
@@ -705,7 +717,6 @@ class Training(NewSessionPipeline):
             yield f"smallest loss {self.best.loss:.6g}, after epoch {self.best.epoch}"
         if self.environment_config is not None:
             yield describe_samples(self.data.dataset.directory)
-            yield from describe_failed_sets(self.data.source)
         if self.data.online is not None:
             yield from self.data.online.describe()
         if self.checkpoint_path is not None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
@@ -20,10 +21,10 @@ class Generator(LearningSampler):
     """Has a gest-api generator choose the sets, such as those of libEnsemble and Xopt.
 
     The generator gets the parameters' bounds as variables, one for each element (``name_0``,
-    ``name_1`` ... if a parameter has a shape), and the objective ``loss``. After each batch it
-    ingests the batch's sets with their mean losses and suggests `points` new ones; set k takes
-    number k modulo `points`. Runs are reproducible if the generator suggests the same after the
-    same losses: give it a seed. They cannot be resumed while environments generate.
+    ``name_1`` ... if a parameter has a shape), and the objective ``loss``. It suggests `points`
+    sets at once; when it has ingested the sets of a batch with their mean losses, it suggests new
+    ones. Runs are reproducible if the generator suggests the same after the same losses: give it a
+    seed. They cannot be resumed while environments generate.
     """
 
     def __init__(
@@ -33,7 +34,6 @@ class Generator(LearningSampler):
         objective: str = "MAXIMIZE",
         points: int = 32,
         memory: int = 512,
-        delay: int = 1,
     ) -> None:
         """Store the options.
 
@@ -41,24 +41,18 @@ class Generator(LearningSampler):
             generator: The generator's class, or ``"package.module:Class"``.
             generator_kwargs: Arguments of its constructor other than variables and objectives.
             objective: What it does with the loss: ``"MAXIMIZE"`` or ``"EXPLORE"``.
-            points: Number of points that it suggests after each batch: at least as many as sets are
-                requested in the meantime.
+            points: Number of sets that it suggests at once.
             memory: Number of most recent sets whose losses it ingests.
-            delay: See `LearningSampler`.
 
         Raises:
             ConfigError: If an option is out of range.
         """
-        for name, number, least in (
-            ("points", points, 1),
-            ("memory", memory, 1),
-            ("delay", delay, 0),
-        ):
-            if type(number) is not int or number < least:
-                raise ConfigError(f'"physx/generator": {name} is {number!r}, not at least {least}.')
+        for name, number in (("points", points), ("memory", memory)):
+            if type(number) is not int or number < 1:
+                raise ConfigError(f'"physx/generator": {name} is {number!r}, not at least 1.')
         self._make, self._arguments = generator, dict(generator_kwargs or {})
         self._objective, self._points = objective, points
-        self.memory, self.delay = memory, delay
+        self.memory = memory
 
     def begin(self, parameters: Sequence[Parameter], seed: Sequence[int]) -> None:
         """Create the generator: see `Sampler.begin`."""
@@ -82,11 +76,13 @@ class Generator(LearningSampler):
             VOCS(variables=domains, objectives={_LOSS: self._objective}), **self._arguments
         )
         self._ids: dict[int, Any] = {}
-        self._suggested = {0: self._suggest()}
+        self._suggested = self._suggest()
 
-    def ask_after(self, number: int, batches: int) -> dict[str, Any]:
-        """Return the values of a set: see `LearningSampler.ask_after`."""
-        point = self._suggested[batches][number % self._points]
+    def ask(self, number: int) -> dict[str, Any]:
+        """Return the values of a set: see `LearningSampler.ask`."""
+        if not self._suggested:
+            self._suggested = self._suggest()
+        point = self._suggested.popleft()
         if "_id" in point:
             self._ids[number] = point["_id"]
         values = {}
@@ -97,9 +93,7 @@ class Generator(LearningSampler):
             values[parameter.name] = flat.reshape(parameter.shape)
         return values
 
-    def tell(
-        self, batches: int, numbers: Index, values: Sequence[Mapping[str, Any]], losses: Array
-    ) -> None:
+    def tell(self, numbers: Index, values: Sequence[Mapping[str, Any]], losses: Array) -> None:
         """Make the generator learn from a batch: see `LearningSampler.tell`."""
         results = []
         for number, given, loss in zip(numbers.tolist(), values, losses.tolist(), strict=True):
@@ -114,23 +108,21 @@ class Generator(LearningSampler):
             for number in [known for known in self._ids if known <= numbers[-1] - self.memory]:
                 del self._ids[number]
             self._generator.ingest(results)
-        self._suggested[batches] = self._suggest()
-        for former in [known for known in self._suggested if known < batches - self.delay - 1]:
-            del self._suggested[former]
+        self._suggested.clear()
 
-    def state(self, batches: int) -> Array:
+    def state(self) -> Array:
         """Return nothing: the generator keeps its own state."""
         return np.zeros(0)
 
-    def restore(self, batches: int, state: Array) -> None:
+    def restore(self, state: Array) -> None:
         """Refuse to continue: see `LearningSampler.restore`."""
         raise ValueError('"physx/generator" cannot be resumed')
 
-    def _suggest(self) -> list[dict[str, Any]]:
+    def _suggest(self) -> deque[dict[str, Any]]:
         points: list[dict[str, Any]] = self._generator.suggest(self._points)
         if len(points) != self._points:
             raise ConfigError(
                 f"{type(self._generator).__name__}.suggest({self._points}) returned {len(points)} "
                 'points: choose a number of "points" that it can suggest.'
             )
-        return points
+        return deque(points)

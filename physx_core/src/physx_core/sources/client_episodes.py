@@ -16,6 +16,8 @@ from physx_core.workers.server.client_group import ClientGroup
 from physx_core.workers.server.leases import Leases
 from physx_core.workers.server.peer import Peer
 
+_TICK = 0.02  # s
+
 
 class ClientEpisodes(EpisodeSource):
     """Gives each number to the next free client, and returns what has ended, in any order."""
@@ -26,6 +28,7 @@ class ClientEpisodes(EpisodeSource):
         sets: ParameterSets,
         queue: EpisodeQueue,
         check: Callable[[Peer], None],
+        check_canceled: Callable[[], None],
         clock: Clock,
     ) -> None:
         """Prepare the clients.
@@ -35,10 +38,11 @@ class ClientEpisodes(EpisodeSource):
             sets: Chooses the parameters of each number.
             queue: The numbers to simulate.
             check: Raises an error if a client's environment differs from the others'.
+            check_canceled: Raises an error if the run is over.
             clock: Tells how long episodes take.
         """
         super().__init__(sets, queue)
-        self._group, self._check = group, check
+        self._group, self._check, self._check_canceled = group, check, check_canceled
         self._checked: set[Peer] = set()
         self._leases = Leases(queue, sets.values_of, clock)
         group.lease(self._leases)
@@ -57,8 +61,11 @@ class ClientEpisodes(EpisodeSource):
 
     def take(self) -> EpisodeBlock:
         """Wait until something has ended: see `EpisodeSource.take`."""
-        if not self._leases.blocks and not self._queue.is_done:
+        while not self._leases.blocks and not self._queue.is_done:
             self._group.wait(self._busy)
+            if self._leases.blocks or self._sets.learned is None:
+                break
+            self._sets.learned.wait(_TICK)
         if not self._leases.blocks:
             return EpisodeBlock({}, [])
         return self._settled(self._leases.blocks.popleft())
@@ -77,6 +84,7 @@ class ClientEpisodes(EpisodeSource):
 
     def _busy(self) -> list[int]:
         """Give free clients numbers; return those to wait for, none if something has ended."""
+        self._check_canceled()
         ready = self._group.ready
         for peer in ready:
             if peer not in self._checked:

@@ -152,7 +152,7 @@ class ClientSource(Source):
         from physx_core.sources.client_episodes import ClientEpisodes  # streams need no records
 
         self._episodes = ClientEpisodes(
-            self._group, self.sets, queue, self._check_guest, self._clock
+            self._group, self.sets, queue, self._check_guest, self._check_canceled, self._clock
         )
         return self._episodes
 
@@ -358,7 +358,7 @@ class ClientSource(Source):
             if not (earlier and self._rejections and isinstance(failed[row], WrongSamplesError)):
                 self._failed_row = row
                 number = row % self.instance_nb + 1
-                self.sets.fail(number, self._group.peer(number).episode, failed[row])
+                self.sets.explain(number, self._group.peer(number).episode, failed[row])
                 raise failed[row]
             return earlier  # rows rejected before it are needed too
         return owing

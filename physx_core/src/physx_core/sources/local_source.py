@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
 from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
@@ -16,13 +15,11 @@ from physx_core.rows import ROW_FIELDS, RowBuffer, concatenate, copy_row, infer_
 from physx_core.sources.source import Source, check_stored
 from physx_core.typing import Batch
 from physx_core.workers.instance import NOTHING, Instance, Skip, instance_arguments
-from physx_core.workers.parameter_sets import ParameterSets, next_step
+from physx_core.workers.parameter_sets import ParameterSets
 
 if TYPE_CHECKING:
     from physx_core.sources.episode_source import LocalEpisodes
     from physx_core.workers.episode_queue import EpisodeQueue
-
-_LOG = logging.getLogger("physx")
 
 
 class LocalSource(Source):
@@ -59,18 +56,15 @@ class LocalSource(Source):
         self._name = getattr(config.environment, "__name__", str(config.environment))
         self._services = services
         self._config = config
-        self._arguments = [
-            instance_arguments(config, number, seed, accept_all)
+        self.sets = ParameterSets(config, seed, skip)
+        self._instances = [
+            Instance(**instance_arguments(config, number, seed, accept_all))
             for number in range(1, self.instance_nb + 1)
         ]
-        self.sets = ParameterSets(config, seed, skip)
-        self._instances = [Instance(**arguments) for arguments in self._arguments]
         self._buffer: RowBuffer | None = None
         self._next = 0
         self._skip = skip
         self._last = range(0)
-        self._last_steps = [-1] * self.instance_nb
-        self._redraws = config.redraw > 0
 
     @property
     def fields(self) -> list[Field]:
@@ -119,7 +113,7 @@ class LocalSource(Source):
         instance.open(self._services, draw, partial(self._choose, instance.instance_id))
 
     def _choose(self, instance_id: int, episode: int) -> dict[str, Any]:
-        return self.sets.choose(instance_id, episode, self._next)
+        return self.sets.choose(instance_id, episode)
 
     def _fill(self, size: int, stored: Batch | None = None) -> RowBuffer:
         """Generate the next rows; return the buffer with them."""
@@ -128,44 +122,24 @@ class LocalSource(Source):
             buffer = self._buffer = RowBuffer(buffer.fields[: -len(ROW_FIELDS)], size)
         elif buffer is not None and buffer.count:  # an error ended the last batch
             buffer.clear()
-        instances, redraws = self._instances, self._redraws
+        instances = self._instances
         while self._next < first + size:
             place = self._next % count
             instance = instances[place]
             given = None if stored is None else copy_row(stored, self._next - first)
             try:
                 sample = instance.step(given)
-                if buffer is None:
-                    buffer = self._buffer = RowBuffer(infer_shapes(instance.fields, sample), size)
-                episode, step = instance.last_episode, instance.last_step
-                buffer.put(sample, place + 1, episode, step, finite=redraws)
             except PhysxError as error:
-                self._redraw(place, error)
-            else:
-                self._last_steps[place] = step
-                self._next += 1
+                if instance.environment is not None:
+                    self.sets.explain(place + 1, instance.environment.episode_index, error)
+                raise
+            if buffer is None:
+                buffer = self._buffer = RowBuffer(infer_shapes(instance.fields, sample), size)
+            buffer.put(sample, place + 1, instance.last_episode, instance.last_step)
+            self._next += 1
         if buffer is None:
             raise UsageError(f"A batch must have at least one row, not {size}.")
         return buffer
-
-    def _redraw(self, place: int, error: PhysxError) -> None:
-        """Continue with an instance's next parameters, or raise the error of its simulation."""
-        former = self._instances[place]
-        episode = -1 if former.environment is None else former.environment.episode_index
-        if not self.sets.can_redraw(place + 1, error):
-            self.sets.fail(place + 1, episode, error)
-            raise error
-        text = str(error).partition("\n")[0].rstrip(".")
-        _LOG.warning("%s. %s", text, self.sets.redraw(place + 1, episode, error))
-        with contextlib.suppress(PhysxError):
-            former.close()
-        instance = self._instances[place] = Instance(
-            **self._arguments[place],
-            first_step=next_step(self._last_steps[place], error),
-            first_episode=episode + 1,
-        )
-        instance.rejected = former.rejected
-        self._open(instance)
 
     def _generate_again(self, size: int) -> None:
         """Generate the rows that an earlier run already got, and discard them."""

@@ -147,7 +147,6 @@ class Source(Opened):
         Environments in this process finish the call.
         """
         self._is_canceled = True
-        self.sets.cancel()
 
     @abstractmethod
     def close(self) -> None:

@@ -17,6 +17,7 @@ class EpisodeQueue:
 
     Attributes:
         total: Number of episodes of the campaign: those from 0 to ``total - 1``.
+        end: Numbers from here on are not given out yet.
         finished: How many of them are recorded, in this run or before.
     """
 
@@ -30,7 +31,7 @@ class EpisodeQueue:
             recorded: Numbers that an earlier run has recorded; those from `total` on are ignored.
             retries: How often a number is given out again after it was lost.
         """
-        self.total = total
+        self.total = self.end = total
         known = recorded if isinstance(recorded, np.ndarray) else np.array([*recorded], np.int64)
         numbers = np.sort(known, kind="stable")
         numbers = numbers[(numbers < total) & (np.diff(numbers, prepend=-1) > 0)]
@@ -58,9 +59,11 @@ class EpisodeQueue:
         if self._gap == len(self._begins):
             return range(0)
         first, end = max(self._next, int(self._begins[self._gap])), int(self._ends[self._gap])
-        self._next = min(first + most, end)
-        self._gap += self._next == end
-        return range(first, self._next)
+        numbers = range(first, min(first + most, end, self.end))
+        if numbers:
+            self._next = numbers.stop
+            self._gap += self._next == end
+        return numbers
 
     def note(self, record: EpisodeRecord) -> None:
         """Note what became of a number, or of several."""

@@ -51,30 +51,18 @@ class Skip(NamedTuple):
     Attributes:
         rows: Number of rows from all instances together.
         rejected: Number of rejected samples of each instance; empty: none.
-        sets: Record of the sets of parameters; empty: none.
-        begun: Fields ``env_id``, ``episode`` and ``step`` of the rows; empty: unknown.
+        sets: Number of recorded sets of parameters.
+        begun: Fields ``env_id`` and ``episode`` of the rows; empty: there are no sets.
     """
 
     rows: int = 0
     rejected: tuple[int, ...] = ()
-    sets: Batch = {}  # noqa: RUF012 - never changed
+    sets: int = 0
     begun: Batch = {}  # noqa: RUF012 - never changed
 
     def rows_of(self, number: int, instance_nb: int) -> int:
         """Return how many of the rows an instance generated; instances are numbered from 1."""
         return (self.rows - number + instance_nb) // instance_nb
-
-    def last_of(self, number: int, episode: int) -> tuple[int, int]:
-        """Return how many rows an instance generated up to the end of an episode.
-
-        Returns:
-            The number of rows, and the step of the last one, -1 if there is none.
-        """
-        begun = self.begun
-        if not begun:
-            return 0, -1
-        steps = begun["step"][(begun["env_id"] == number) & (begun["episode"] <= episode)]
-        return len(steps), int(steps[-1]) if len(steps) else -1
 
     def rejected_of(self, number: int) -> int:
         """Return how many samples of an instance were rejected."""
@@ -125,14 +113,12 @@ class Instance(Closeable):
         instance_id: int,
         instance_nb: int,
         seed: Sequence[int],
-        independent_episodes: bool = False,
+        independent_episodes: bool | None = None,
         episode_steps: int | None = None,
         simulations_per_step: int = 1,
         max_wrong_samples: int = 10,
         record_wrong: bool = False,
         accept_all: bool = False,
-        first_step: int = 0,
-        first_episode: int | None = None,
     ) -> None:
         """Store the arguments of the environment.
 
@@ -142,14 +128,12 @@ class Instance(Closeable):
             instance_id: Number of the instance, counted from 1.
             instance_nb: How many instances run together.
             seed: Seed of the whole run.
-            independent_episodes: Whether its episodes are independent, even if it does not say so.
+            independent_episodes: Whether its episodes are independent; None: as it says.
             episode_steps: Number of rows of an episode; None: the environment decides.
             simulations_per_step: Calls of `step` for one sample.
             max_wrong_samples: How many consecutive samples `check_sample` may reject.
             record_wrong: Whether to keep the samples that it rejects in `rejected`.
             accept_all: Whether to ignore the verdict of `check_sample`, as in a replay.
-            first_step: Number of its first step; earlier ones are already done.
-            first_episode: Number of its first trajectory; None: the environment decides.
         """
         self.instance_id = instance_id
         self.environment: Environment | None = None
@@ -168,7 +152,7 @@ class Instance(Closeable):
         self._sub_steps = simulations_per_step - 1
         self._max_wrong_samples = max_wrong_samples
         self._accepts_all = accept_all
-        self._first_step, self._next_episode = first_step, first_episode
+        self._next_episode: int | None = None
         self._rows = 0  # of this episode
         self._counts = False  # whether rows are counted, or must be read
         self._is_numbered = False  # whether `begin` begins each episode
@@ -189,7 +173,7 @@ class Instance(Closeable):
     @property
     def is_independent(self) -> bool:
         """Whether the environment's episodes are independent."""
-        return self._alive().independent_episodes
+        return self._alive().independent_episodes and self._independent is not False
 
     @property
     def parameters(self) -> list[Parameter]:
@@ -215,10 +199,6 @@ class Instance(Closeable):
         environment = self.environment = self._create()
         environment._services, environment._choose_parameters = services, choose
         self._configure_episodes(environment)
-        if environment.independent_episodes:
-            environment._earlier_steps = self._first_step
-        else:
-            environment.step_index = self._first_step
         _warn_of_misspelt_methods(type(environment))
         self._call("create", environment.create)
         self._call("init", environment.init)
@@ -263,7 +243,9 @@ class Instance(Closeable):
 
     def _configure_episodes(self, environment: Environment) -> None:
         """Make the episodes independent if the run's configuration says so."""
-        configured = self._independent or self._episode_steps is not None
+        configured = self._independent or (
+            self._episode_steps is not None and self._independent is None
+        )
         self._episode_steps = self._episode_steps or type(environment).episode_steps
         if not configured or environment.independent_episodes:
             return

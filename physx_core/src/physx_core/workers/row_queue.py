@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from bisect import bisect_right
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from itertools import chain
 
 import numpy as np
@@ -25,7 +26,11 @@ class RowQueue(EpisodeQueue):
     Attributes:
         goal: How many rows are wanted.
         rows: How many the episodes before the first missing number have.
+        missing: The first missing number.
+        choose: Returns the first number whose parameters cannot be chosen yet; None: all can.
     """
+
+    choose: Callable[[RowQueue], int] | None = None
 
     def __init__(
         self, goal: int, recorded: Collection[EpisodeRecord] = (), retries: int = 1
@@ -44,7 +49,8 @@ class RowQueue(EpisodeQueue):
         self._taken = self._all_rows = 0
         self._parts: Counter[int] = Counter()  # number to its rows so far
         self._ended: dict[int, tuple[int, int]] = {}  # first number to how many, and their rows
-        self._missing = 0  # the first missing number
+        self.missing = 0
+        self._firsts, self._sums = [0], [0]  # numbers up to the first missing one, rows before them
         self._last = -1  # the last one that has ended
         for each in recorded:
             self._end(each.episode, each.count, each.rows)
@@ -64,6 +70,8 @@ class RowQueue(EpisodeQueue):
         fills_gap = self._returned or self._next <= self._last
         if not fills_gap and self._expected >= self.goal:
             return range(0)
+        if self.choose is not None:
+            self.end = self.choose(self)
         found = super().take_range(min(most, max(1, self.waiting)))
         self._taken += len(found)
         return found
@@ -83,11 +91,16 @@ class RowQueue(EpisodeQueue):
         self._taken -= record.count
         rows = self._parts.pop(record.episode, 0) + record.rows
         self._end(record.episode, record.count, rows)
-        if self._missing >= _MOST_EMPTY and not self.rows:
+        if self.missing >= _MOST_EMPTY and not self.rows:
             raise UsageError(
                 f"{_MOST_EMPTY} episodes have no row, so there would never be {self.goal} rows: "
                 "call set_training_data() in the step that calls end_episode()."
             )
+
+    def rows_before(self, number: int) -> int:
+        """Return how many rows the episodes before a number have, of those that have ended."""
+        place = bisect_right(self._firsts, max(0, number)) - 1
+        return self._sums[place] + max(0, number) - self._firsts[place]  # one row each, if several
 
     def put_back(self, number: int) -> None:
         """Return a number that nobody has begun to simulate."""
@@ -113,7 +126,9 @@ class RowQueue(EpisodeQueue):
         self._all_rows += rows
         self._ended[first] = count, rows
         self._last = max(self._last, first + count - 1)
-        while self._missing in self._ended:
-            count, rows = self._ended.pop(self._missing)
-            self._missing += count
+        while self.missing in self._ended:
+            count, rows = self._ended.pop(self.missing)
+            self.missing += count
             self.rows += rows
+            self._firsts.append(self.missing)
+            self._sums.append(self.rows)

@@ -14,7 +14,9 @@ from physx_core.components.group import Group
 from physx_core.components.network import Network
 from physx_core.config import EnvironmentConfig, NetworkConfig
 from physx_core.dataset import Dataset
-from physx_core.errors import ConfigError
+from physx_core.errors import ConfigError, UsageError
+from physx_core.pipelines.campaign import Campaign
+from physx_core.pipelines.campaign_writer import CampaignWriter
 from physx_core.pipelines.learning.batches.blocks import Block, Blocks
 from physx_core.pipelines.learning.batches.drawn_rows import DrawnRows
 from physx_core.pipelines.learning.batches.feeder import Feeder
@@ -32,12 +34,14 @@ from physx_core.pipelines.storage import (
     describe_environment,
     open_existing,
     open_own,
+    stream_options,
 )
 from physx_core.plugins.networks import resolve_network
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 from physx_core.workers.instance import NOTHING, Skip
+from physx_core.workers.row_queue import RowQueue
 
 
 def join_group(config: NetworkConfig) -> tuple[Group, Any]:
@@ -85,6 +89,7 @@ class DataOpening:
         open_source: Opens environments: `Pipeline._open_source` without its first argument.
         predict: The network's prediction for a batch; called in the training's thread.
         show: Receives drawing events; called in the training's thread.
+        run_ahead, retries, max_failed: See `Training`.
     """
 
     start: Start
@@ -101,6 +106,9 @@ class DataOpening:
     open_source: Callable[..., Source]
     predict: Predict
     show: Show
+    run_ahead: int
+    retries: int
+    max_failed: int
     _generation: Generation | None = field(init=False, default=None)
 
     def open(self, resources: contextlib.ExitStack, dataset: Dataset) -> TrainingData:
@@ -181,6 +189,7 @@ class DataOpening:
         if buffer.capacity:
             drawn = DrawnRows(self.session, buffer.batch_size, self.progress.blocks)
             resources.callback(drawn.close)
+        writer = self._open_campaign(dataset, environment, source, generation)
         blocks = Blocks(
             source,
             dataset,
@@ -188,11 +197,39 @@ class DataOpening:
             normalize=self.start.config.normalize,
             first=generation.first,
             statistics=RowStatistics(self.progress.seed, buffer.total),
+            writer=writer,
             feeder=feeder,
         )
+        resources.push(lambda kind, *_: blocks.finish() if kind is None else None)
         resources.callback(blocks.close)
-        source.sets.follow(buffer.needed)
         return source, OnlineBatches(blocks, buffer, self.data_type, drawn, generation.first)
+
+    def _open_campaign(
+        self,
+        dataset: Dataset,
+        environment: EnvironmentConfig,
+        source: Source,
+        generation: Generation,
+    ) -> CampaignWriter | None:
+        """Open what simulates and stores independent episodes; None: the rows are of streams."""
+        mode, number = self.start.config.mode, generation.campaign
+        if number is not None:
+            campaign = Campaign.last(dataset, mode, environment, number)
+        elif source.is_independent and not stream_options(environment, self.start.config):
+            seed = self._seed_of(environment)
+            seeds, parameters = derive_seed(seed, "training", generation.offset), source.sets
+            campaign = Campaign.begin(
+                dataset, mode, environment, seed, seeds, parameters.parameters
+            )
+            self._generation = dataclasses.replace(generation, campaign=campaign.number)
+            self._generation.store(dataset)
+        else:
+            return None
+        queue = RowQueue(self.buffer.total, campaign.records(dataset), self.retries)
+        writer = CampaignWriter(dataset, campaign, queue, self.max_failed)
+        source.sets.follow(queue, self.buffer.needed, self.buffer.batch_nb, self.run_ahead)
+        writer.open(source)
+        return writer
 
     def _open_environments(
         self,
@@ -215,6 +252,12 @@ class DataOpening:
         dataset.update_info(**describe_environment(environment, seed))
 
         def predict(batch: Batch) -> Batch:
+            if self._generation is not None and self._generation.campaign is not None:
+                raise UsageError(
+                    "An independent episode depends on nothing but its number, so it cannot ask "
+                    "the network that learns from it: set "
+                    "EnvironmentConfig.independent_episodes=False to generate streams."
+                )
             self._note_dependence(dataset)
             return self.predict(batch)
 

@@ -24,7 +24,7 @@ from physx_core.pipelines.storage import (
     restore_parameters,
 )
 from physx_core.session import Session
-from physx_core.workers.instance import Skip
+from physx_core.workers.instance import NOTHING, Skip
 
 _SAME = (
     "environment",
@@ -58,6 +58,7 @@ class Generation:
         environment: Description of the environment: see `describe_environment`.
         depends: Whether the rows depend on the learning network through its predictions for an
             environment; if so, they cannot be generated again.
+        campaign: Number of the campaign in the mode; None: the rows are those of streams.
         ended: Numbers of rows, rejected samples, and sets that the mode and the whole dataset had
             when another run started to add its own; None: there is none. See `end_generation`.
     """
@@ -72,6 +73,7 @@ class Generation:
     batch_nb: int | None
     environment: Mapping[str, Any]
     depends: bool = False
+    campaign: int | None = None
     ended: Sequence[int] | None = None
 
     @classmethod
@@ -135,28 +137,19 @@ class Generation:
                     f"so no more can follow. {_advice(dataset.directory.parent)}"
                 )
         restore_parameters(dataset.directory)
+        if self.campaign is not None:
+            return NOTHING
         rejected: tuple[int, ...] = ()
         if ends[1] > self.first_wrong:
             numbers = dataset[WRONG]["env_id"][self.first_wrong : ends[1]]
             found = np.bincount(numbers, minlength=environment.num_clients + 1)
             rejected = tuple(int(count) for count in found[1:])
         rows = ends[0] - self.first
-        begun = {}
-        if rows:
+        begun, sets = {}, ends[2] - self.first_set
+        if rows and sets:
             view = dataset[self.mode]
-            names = ("env_id", "episode", "step")
-            begun = {name: view[name][self.first : ends[0]] for name in names}
-        recorded = {}
-        if ends[2] > self.first_set:
-            view, part = dataset[SETS], slice(self.first_set, ends[2])
-            recorded = {name: view[name][part] for name in dataset.fields(SETS)}
-            if environment.record_wrong_samples and recorded["failed"].any():
-                raise ConfigError(
-                    "The training cannot be resumed while environments generate its samples, "
-                    f"because {recorded['failed'].sum()} of their simulations failed (redraw) and "
-                    f"rejected samples are recorded. {_advice(dataset.directory.parent)}"
-                )
-        return Skip(rows, rejected, recorded, begun)
+            begun = {name: view[name][self.first : ends[0]] for name in ("env_id", "episode")}
+        return Skip(rows, rejected, sets, begun)
 
 
 @dataclass(frozen=True)

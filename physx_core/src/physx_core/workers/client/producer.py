@@ -33,8 +33,6 @@ class Producer:
         *,
         rows: int = 0,
         rejected: int = 0,
-        made: int = 0,
-        slow_until: int = 0,
     ) -> None:
         """Store what generates and sends the rows.
 
@@ -45,15 +43,12 @@ class Producer:
             rows: How many rows the server has from earlier clients. They are generated again, but
                 not sent.
             rejected: How many of the rejected rows that it has are generated again.
-            made: How many of the rows are not generated again.
-            slow_until: Number of a trajectory: the rows of earlier ones are sent immediately.
         """
-        self.made = made
+        self.made = 0
         self.failure: PhysxError | None = None
         self._link, self._instance, self._sink = link, instance, sink
         self._clock = link.clock
         self._skip, self._skip_rejected = rows, rejected
-        self._slow_until = slow_until
         self._buffer: RowBuffer | None = None
         self._announced = False
         self._stored: deque[Sample] = deque()
@@ -162,7 +157,6 @@ class Producer:
         return (
             self.made >= self._credit
             or (buffer is not None and buffer.full)
-            or self._instance.last_episode < self._slow_until
             or self._clock.monotonic() - self._sent_at >= _BLOCK_TIME
         )
 

@@ -89,10 +89,9 @@ def run_instance(
         from physx_core.workers.client.striped_rows import StripedRows
 
         sink = StripedRows(link, stripes)
-    again = skip["rows"] - skip["made"]
     say(
         f"running {setup['environment']}, instance {setup['instance_id']} of {setup['instance_nb']}"
-        + (f"; {again} stored rows are generated again" if again else "")
+        + (f"; {skip['rows']} stored rows are generated again" if skip["rows"] else "")
     )
     link.spins = has_core_for_each(setup["instance_nb"])
     client = _Client(link, Instance(**setup), sink, skip.pop("shown"), skip)
@@ -218,9 +217,7 @@ class RemoteServices:
 
     def choose(self, episode: int) -> dict[str, Any]:
         """Return the parameters of an episode."""
-        self._producer.flush()
-        request = {"episode": episode, "row": self._producer.made}
-        values: dict[str, Any] = self._link.ask(Kind.CHOOSE, request, "the parameters")
+        values: dict[str, Any] = self._link.ask(Kind.CHOOSE, episode, "the parameters")
         return values
 
     def show(self, instance_id: int, step: int, events: list[Event]) -> None:

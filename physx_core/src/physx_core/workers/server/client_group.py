@@ -29,7 +29,7 @@ from physx_core.plugins import reference_of, resolve
 from physx_core.plugins.references import locate
 from physx_core.workers.instance import NOTHING, Skip, instance_arguments
 from physx_core.workers.launchers import describe_states, stop
-from physx_core.workers.parameter_sets import ParameterSets, next_step
+from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.server.client_errors import exit_error, overdue_error, timeout_error
 from physx_core.workers.server.episode_pool import EpisodePool
 from physx_core.workers.server.leases import Leases
@@ -84,7 +84,7 @@ class ClientGroup:
         self._written = written
         self.config = config
         self._seed, self._sets = list(seed), sets
-        self._accepts_all, self._skip = accept_all, skip
+        self._accepts_all = accept_all
         self._launcher = launcher = _make_launcher(config)
         launcher.elastic = config.is_elastic
         token = choose_token(config, launcher.by_hand, launcher.elsewhere)
@@ -355,32 +355,12 @@ class ClientGroup:
 
     def _replaces(self, number: int, error: PhysxError | None) -> bool:
         """Return whether another client replaces one that failed, or left without an error."""
-        if self._pool is not None:
+        if self._pool is not None or self._given_up(number):
             return False  # it does not go on where the other one ended
-        if self._given_up(number):  # the next one can only start with other parameters
-            return not isinstance(error, ClientError) and self._redraws_after(number, error)
-        if error is None and (self._launcher.by_hand or self.config.redraw):
+        if error is None and self._launcher.by_hand:
             return True
-        return self._restarts_after(number, error) or self._redraws_after(number, error)
-
-    def _restarts_after(self, number: int, error: PhysxError | None) -> bool:
         passing = error is None or isinstance(error, _PASSING)
         return passing and self._restarts[number] < self.config.restarts
-
-    def _redraws_after(self, number: int, error: PhysxError | None) -> bool:
-        is_known = getattr(error, "step", -1) >= 0 or isinstance(error, ClientError)
-        can_repeat = is_known and not self.config.record_wrong_samples
-        if error is None or (self._repeats(number) and not can_repeat):
-            return False
-        return self._sets.can_redraw(number, error)
-
-    def _repeats(self, number: int) -> bool:
-        """Return whether a client failed at a row that an earlier run got, or may have got."""
-        peer = self.server.peers.get(number)
-        had = self._skip.rows_of(number, self.config.num_clients)
-        if peer is None or not had:
-            return had > 0
-        return peer.received <= had if peer.failure is None else peer.failed_row < had
 
     def _lose(self, number: int, error: PhysxError, *, left: bool = False) -> None:
         """Replace a lost client.
@@ -395,17 +375,16 @@ class ClientGroup:
             return
         absent = self._launcher.by_hand and self._find_peer(number) is None
         if absent or not self._replaces(number, None if left else error):
-            self._sets.fail(number, self._episode(number), error)
             raise self._final(number, error)
         text, _, details = str(error).partition("\n")
-        if left or (self._restarts_after(number, error) and not self._given_up(number)):
-            self._restarts[number] += not left
-            follows = self._describe_next(number, left)
-        else:
-            follows = self._redraw(self.server.peers[number], error)
+        self._restarts[number] += not left
+        follows = self._describe_next(number, left)
         _LOG.warning("%s. %s%s", text.rstrip("."), follows, details and "\n" + details)
+        handle = self._handles.pop(number, None)
         closes = not isinstance(error, ClientError)  # which takes a moment
-        self._replace(number, self._handles.pop(number, None), _GRACE if closes else 0.0)
+        self._vacate(number, handle, _GRACE if closes else 0.0)
+        if not self._closing:
+            self._launch([number])
 
     def _lose_any(self, number: int, error: PhysxError, pool: EpisodePool) -> None:
         """Do without a client of which others can simulate the episodes, or start another one."""
@@ -418,12 +397,6 @@ class ClientGroup:
             again = pool.lose(number, error, ready=ready, launched=handle is not None)
         self._vacate(number, handle)
         if again and not self._closing:
-            self._launch([number])
-
-    def _replace(self, number: int, former: ClientHandle | None, patience: float = 0.0) -> None:
-        """End an instance's former client, and start another one in its place."""
-        self._vacate(number, former, patience)
-        if not self._closing:
             self._launch([number])
 
     def _vacate(self, number: int, former: ClientHandle | None, patience: float = 0.0) -> None:
@@ -440,34 +413,9 @@ class ClientGroup:
         """Add to an error that ends the run why its instance cannot be restarted, if so."""
         if reason := self._given_up(number):
             error.add_note(f"{reason}.")
+        if peer := self.server.peers.get(number):
+            self._sets.explain(number, peer.episode, error)
         return error
-
-    def _episode(self, number: int) -> int:
-        peer = self.server.peers.get(number)
-        return -1 if peer is None else peer.episode
-
-    def _redraw(self, peer: Peer, error: PhysxError) -> str:
-        """Make an instance's next client start with the next parameters; return a text for the log.
-
-        A client that ended without reporting an error may have generated rows that it did not
-        send. So the same parameters are simulated once more and each row is sent immediately:
-        where the simulation ends then depends only on the parameters. If an earlier run already
-        got rows of the next parameters, this is known.
-        """
-        last_step, row = peer.last_step, None
-        number, had = peer.instance_id, self._skip.rows_of(peer.instance_id, len(self._numbers))
-        if isinstance(error, ClientError):
-            rows, step = self._skip.last_of(number, peer.episode)
-            if rows < had and peer.received <= had:
-                last_step, row = step, rows
-            elif peer.slow_until <= peer.episode:
-                peer.slow_until = peer.episode + 1
-                return "The same parameters are simulated once more, to see where they fail."
-            else:
-                last_step = max(last_step, step)
-        text = self._sets.redraw(number, peer.episode, error)
-        peer.move_origin(next_step(last_step, error), row)
-        return text
 
     def _describe_next(self, number: int, left: bool) -> str:
         if self._closing:
@@ -532,16 +480,8 @@ class ClientGroup:
 
     def _encode_setup(self, peer: Peer) -> bytes:
         """Return the first message to a client: its instance, and what the server has from it."""
-        origin = peer.origin
-        skip = {
-            "rows": peer.received,
-            "rejected": peer.rejected.count - origin.rejected,
-            "shown": peer.shown - origin.shown,
-            "made": origin.rows,
-            "slow_until": peer.slow_until,
-        }
-        first: dict[str, Any] = {"first_step": origin.step, "first_episode": origin.episode}
-        first["heartbeat"] = min(_SAY_EVERY, self.config.timeout / 4)
+        skip = {"rows": peer.received, "rejected": peer.rejected.count, "shown": peer.shown}
+        first: dict[str, Any] = {"heartbeat": min(_SAY_EVERY, self.config.timeout / 4)}
         if self._written is not None:
             first["stripes"] = self._written.describe(peer)
         if self._pool is not None:

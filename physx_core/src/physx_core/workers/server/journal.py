@@ -39,11 +39,6 @@ class Journal:
         """
         self._instance_id, self._limit = instance_id, limit
         self.given_up = ""
-        self.restart()
-
-    def restart(self) -> None:
-        """Start again, empty: the next client needs nothing of what was told before."""
-        self.given_up = ""
         self._messages = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115 - see close
         self._size = 0
         self._answers = array("Q")  # request number - 1 to the offset of its answer + 1; 0: none

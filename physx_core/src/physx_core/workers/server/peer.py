@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-from typing import NamedTuple
 
 from physx_core.clock import SYSTEM_CLOCK, Clock
 from physx_core.components.parameter import Parameter
 from physx_core.errors import PhysxError
 from physx_core.fields import Field
 from physx_core.net.connection import Connection
-from physx_core.net.frames import FrameReader, Kind, pack
+from physx_core.net.frames import FrameReader
 from physx_core.net.handshake import HANDSHAKE_LIMIT
 from physx_core.net.link import Link
 from physx_core.workers.row_codec import RejectedRows, RowQueue
@@ -18,24 +17,6 @@ from physx_core.workers.server.journal import Journal
 from physx_core.workers.server.pace import Pace
 
 _PIECE = 1 << 16
-
-
-class Origin(NamedTuple):
-    """Where the next clients of an instance start: how much others had sent before.
-
-    Attributes:
-        rows: Number of rows.
-        rejected: Number of rejected rows.
-        shown: Number of messages with drawing events.
-        step: Number of the first step.
-        episode: Number of the first episode; None: the environment decides.
-    """
-
-    rows: int = 0
-    rejected: int = 0
-    shown: int = 0
-    step: int = 0
-    episode: int | None = None
 
 
 class Peer(Connection):
@@ -67,8 +48,6 @@ class Peer(Connection):
         journal: Messages for a client that takes its place; None if none can.
         parameters: The parameters that its environment defines.
         episode: Last episode that it was given parameters for; -1: none.
-        origin: Where a client that takes its place starts.
-        slow_until: That client sends the rows of earlier episodes immediately, one by one.
         pace: How fast this client generates rows.
     """
 
@@ -101,8 +80,6 @@ class Peer(Connection):
         self.journal: Journal | None = None
         self.parameters: list[Parameter] = []
         self.episode = -1
-        self.origin = Origin()
-        self.slow_until = 0
         self.pace = Pace(clock)
         self._arrived = 0  # of a long frame, when the peer was last heard from
         self._next_order: int | None = None  # of the journal's, for this client; None: it got all
@@ -132,24 +109,8 @@ class Peer(Connection):
         self.rejected, self.rejected_limit = former.rejected, former.rejected_limit
         self.row_fields, self.last_step = former.row_fields, former.last_step
         self.shown, self.journal = former.shown, former.journal
-        self.episode, self.origin = former.episode, former.origin
-        self.slow_until = former.slow_until
+        self.episode = former.episode
         self._next_order = None if self.journal is None else 0
-
-    def move_origin(self, step: int, row: int | None = None) -> None:
-        """Make a client that takes its place start with the next episode.
-
-        Args:
-            step: Number of its first step.
-            row: Its first row; None: the one after those that arrived, or the one that failed.
-        """
-        if row is None:
-            row = self.received if self.failure is None else self.failed_row
-        self.origin = Origin(row, self.rejected.count, self.shown, step, self.episode + 1)
-        if self.journal is not None:
-            self.journal.close()
-            self.journal.restart()
-            self.journal.record(pack(Kind.CREDIT, number=self.granted))
 
     def hear(self, *, whole: bool) -> None:
         """Note a sign of life: a whole frame, or a substantial part of a long one.

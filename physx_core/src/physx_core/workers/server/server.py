@@ -162,7 +162,6 @@ class Server:
             spin: How long to spin-wait for it before that, in s.
         """
         self._has_news = False
-        self._requests.choose()
         if self._can_predict():  # held requests that are due now
             timeout = 0.0
         for peer, events in self._listener.select(timeout, spin):
@@ -179,7 +178,7 @@ class Server:
 
     @property
     def asking(self) -> set[int]:
-        """The instances that wait for a prediction or parameters, due or held."""
+        """The instances that wait for a prediction, due or held."""
         return self._requests.asking
 
     def end(self) -> None:

@@ -30,7 +30,7 @@ class ServiceRequests:
 
     A request for a prediction is *due* when the run waits for the row that its environment is
     generating. Until then it is held, so the network's answers do not depend on how far clients run
-    ahead. Requests for parameters that depend on losses not known yet are held too.
+    ahead.
 
     If the services have a method ``predict_batch(batch) -> batch``, simultaneous requests with the
     same fields go through it as one batch. Otherwise each goes through `predict`.
@@ -53,7 +53,6 @@ class ServiceRequests:
         )
         self.batches = self._predict_batch is not None
         self._waiting: list[Request] = []
-        self._choices: list[tuple[Peer, int, tuple[int, int]]] = []
 
     @property
     def count(self) -> int:
@@ -62,8 +61,8 @@ class ServiceRequests:
 
     @property
     def asking(self) -> set[int]:
-        """The instances that wait for a prediction or parameters, due or held."""
-        return {peer.instance_id for peer, _, _ in (*self._waiting, *self._choices)}
+        """The instances that wait for a prediction, due or held."""
+        return {peer.instance_id for peer, _, _ in self._waiting}
 
     def take(self, peer: Peer, frame: Frame) -> None:
         """Answer a request, or keep it for `predict`.
@@ -93,32 +92,18 @@ class ServiceRequests:
             load = self._services.load_parameters
             self._answer(peer, frame.number, _KEPT, load, peer.instance_id)
         elif frame.kind is Kind.CHOOSE:
-            self._take_choice(peer, frame)
+            self._choose(peer, frame)
         else:
             events = parse_events(frame.payload)
             peer.shown += 1
             self._services.show(peer.instance_id, frame.number, events)
 
-    def _take_choice(self, peer: Peer, frame: Frame) -> None:
+    def _choose(self, peer: Peer, frame: Frame) -> None:
         if not peer.parameters:
             raise ConnectionRefusedByPeerError("It asked for parameters, but defined none.")
-        episode, row = parse_choice(frame.payload, peer.episode, peer.received)
-        row = row * self._sets.instance_nb + peer.instance_id - 1
-        self._choices.append((peer, frame.number, (episode, row)))
-        self.choose()
-
-    def choose(self) -> None:
-        """Answer the requests for parameters that can be chosen, or that the run waits for."""
-        if not self._choices:
-            return
-        waiting, self._choices = self._choices, []
-        for peer, number, (episode, row) in waiting:
-            if peer.is_ahead and not self._sets.is_ready(row):
-                self._choices.append((peer, number, (episode, row)))
-                continue
-            choose = self._sets.choose
-            self._answer(peer, number, "the parameters", choose, peer.instance_id, episode, row)
-            peer.episode = episode
+        episode, choose = parse_choice(frame.payload, peer.episode), self._sets.choose
+        self._answer(peer, frame.number, "the parameters", choose, peer.instance_id, episode)
+        peer.episode = episode
 
     def _keep(self, peer: Peer, frame: Frame) -> None:
         """Keep a request for `predict`; it replaces one that its environment abandoned."""
@@ -138,7 +123,6 @@ class ServiceRequests:
     def forget(self, peer: Peer) -> None:
         """Forget the requests of a lost client."""
         self._waiting = [request for request in self._waiting if request[0] is not peer]
-        self._choices = [request for request in self._choices if request[0] is not peer]
 
     def predict(self) -> bool:
         """Answer the due requests for predictions; return whether all answers are sent."""

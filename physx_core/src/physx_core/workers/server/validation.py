@@ -57,22 +57,17 @@ def parse_parameters(payload: bytes | bytearray) -> list[Parameter]:
     return parameters
 
 
-def parse_choice(payload: bytes | bytearray, last: int, received: int) -> tuple[int, int]:
-    """Return the episode whose parameters a message asks for, and the row being generated.
+def parse_choice(payload: bytes | bytearray, last: int) -> int:
+    """Return the episode whose parameters a message asks for.
 
     Args:
         payload: The message.
         last: Episode of the last such message, -1 if there was none.
-        received: How many rows of the instance arrived or existed before.
     """
-    plain = decode(payload)
-    given = plain if isinstance(plain, dict) else {}
-    episode, row = given.get("episode"), given.get("row")
+    episode = decode(payload)
     if type(episode) is not int or not last < episode < _MOST_EPISODES:
         raise ConnectionRefusedByPeerError("It asked for the parameters of an impossible episode.")
-    if type(row) is not int or not 0 <= row <= received:
-        raise ConnectionRefusedByPeerError("It asked for parameters at an impossible row.")
-    return episode, row
+    return episode
 
 
 def _is_field(plain: Any) -> bool:

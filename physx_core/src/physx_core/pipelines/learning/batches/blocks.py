@@ -8,6 +8,7 @@ from dataclasses import dataclass, field
 from physx_core.dataset import Dataset
 from physx_core.dataset.store.manifest import has_statistics
 from physx_core.fields import Field
+from physx_core.pipelines.campaign_writer import CampaignWriter
 from physx_core.pipelines.learning.batches.feeder import Feeder
 from physx_core.pipelines.learning.batches.row_statistics import RowStatistics
 from physx_core.pipelines.storage import record_beside_rows, store_sets
@@ -47,6 +48,7 @@ class Block:
 class Blocks:
     """Takes rows from environments in the order of their numbers, and stores them.
 
+    Independent episodes are stored as they end, and their rows read in the order of the episodes.
     A run that continues another run first gets the rows that the other run stored, in the same
     blocks and with bit-identical normalization.
 
@@ -63,6 +65,7 @@ class Blocks:
         normalize: bool,
         first: int,
         statistics: RowStatistics,
+        writer: CampaignWriter | None = None,
         feeder: Feeder[Block] | None = None,
     ) -> None:
         """Keep the arguments.
@@ -74,18 +77,20 @@ class Blocks:
             normalize: Whether the blocks have a normalization.
             first: Number of rows that the mode had before the first block.
             statistics: Summarizes the rows; still without any.
+            writer: Stores independent episodes; None: the environments are streams.
             feeder: Generates rows in its thread, which is not started yet; None: the rows are
                 generated when they are taken.
         """
         self._source, self._dataset, self._mode = source, dataset, mode
         self._normalizes, self._summary = normalize, statistics
+        self._writer, self._first = writer, first
         self._stored = dataset.num_samples(mode)
         self._next_row = first
         self._statistics: dict[str, RunningStatistics] = {}
         for start in range(0, first if normalize else 0, _CHUNK):
             self._add(self._read(start, min(start + _CHUNK, first)))
         self._earlier: dict[int, int] = {}
-        if self._stored > first:
+        if self._stored > first and writer is None:
             ends = self._read(max(first, self._stored - source.instance_nb), self._stored)
             self._earlier = dict(zip(ends["env_id"].tolist(), ends["step"].tolist(), strict=True))
         self._last = Block()
@@ -124,6 +129,11 @@ class Blocks:
             self._make(count)
         self._last = Block({}, self._dataset.fields(self._mode), self._last.normalization)
 
+    def finish(self) -> None:
+        """Leave out the rows of the last episodes that no block has taken."""
+        if self._writer is not None:
+            self._writer.cut(self._next_row - self._first)
+
     def close(self) -> None:
         """Stop generating; rows that were generated ahead are stored."""
         if self._feeder is not None:
@@ -134,14 +144,7 @@ class Blocks:
             self._last = Block({}, self._last.fields, self._last.normalization)
             return self._last
         start, self._next_row = self._next_row, self._next_row + count
-        stored = min(count, max(0, self._stored - start))
-        rows = self._read(start, start + stored) if stored else {}
-        if stored < count:
-            made = self._generate(count - stored, is_whole=not stored)
-            if rows:
-                rows = concatenate([rows, made])
-            else:
-                rows = {name: array.copy() for name, array in made.items()} if copies else made
+        rows = self._take(start, count, copies=copies)
         if self._normalizes:
             self._add(rows)
         found = {name: one.normalization() for name, one in self._statistics.items()}
@@ -149,6 +152,20 @@ class Blocks:
         summary = self._summary.add(rows, _counted(fields))
         self._last = Block(rows, fields, found, summary)
         return self._last
+
+    def _take(self, start: int, count: int, *, copies: bool) -> Batch:
+        """Return some rows, which are stored from now on at the latest."""
+        if self._writer is not None:
+            self._writer.store_rows(start + count - self._first)
+            return self._read(start, start + count)
+        stored = min(count, max(0, self._stored - start))
+        rows = self._read(start, start + stored) if stored else {}
+        if stored < count:
+            made = self._generate(count - stored, is_whole=not stored)
+            if rows:
+                return concatenate([rows, made])
+            return {name: array.copy() for name, array in made.items()} if copies else made
+        return rows
 
     def _generate(self, count: int, *, is_whole: bool) -> Batch:
         earlier, self._earlier = self._earlier if is_whole else {}, {}

@@ -18,8 +18,6 @@ from physx_core.sources.source import Source
 from physx_core.statistics import Normalization
 from physx_core.typing import Array, Batch, Index
 
-_IDENTITY = ("env_id", "episode")
-
 
 class GeneratedBatches:
     """Batches of samples that environments generate, stored before they are trained on.
@@ -57,7 +55,7 @@ class GeneratedBatches:
         self._stored, self._group, self._ahead, self.repeats = stored, group, ahead, repeats
         self._names: Sequence[str] = ()
         self._shared: SharedBatches | None = None
-        self.learns: bool = group.broadcast(source is not None and source.sets.learns)
+        self.learns: bool = group.broadcast(source is not None and source.sets.learned is not None)
         if group.size > 1:
             self._shared = SharedBatches(group, online, source.fields if source else ())
 
@@ -85,8 +83,8 @@ class GeneratedBatches:
         return self.online.next(names)
 
     def _drawn_fields(self, names: Sequence[str]) -> Sequence[str]:
-        """Return the fields of drawn batches, with those that identify rows for the sampler."""
-        return [*names, *_IDENTITY] if self.learns else names
+        """Return the fields of drawn batches, with the number of the episode for the sampler."""
+        return [*names, "episode"] if self.learns else names
 
     @property
     def weight(self) -> float | None:
@@ -103,11 +101,8 @@ class GeneratedBatches:
         if self._shared is not None:
             batch = self._shared.whole
             losses = self._group.gather(losses if self._shared.weight else losses[:0])
-        if self.source is None:
-            return
-        episodes = np.asarray(batch["episode"], np.int64)
-        numbers = episodes * self.source.instance_nb + batch["env_id"] - 1
-        self.source.sets.tell(numbers, losses)
+        if self.source is not None and self.source.sets.learned is not None:
+            self.source.sets.learned.tell(np.asarray(batch["episode"], np.int64), losses)
 
     @property
     def fields(self) -> Mapping[str, Field]:
@@ -136,7 +131,8 @@ class GeneratedBatches:
         """
         if self.online is None or self.source is None:
             return None, None
-        return self.online.state(batches), self.source.sets.state(batches)
+        learned = self.source.sets.learned
+        return self.online.state(batches), None if learned is None else learned.state(batches)
 
     def resume(self, found: checkpoint.Checkpoint, names: Sequence[str]) -> None:
         """Continue where a checkpoint was written, after at least one batch.
@@ -150,20 +146,21 @@ class GeneratedBatches:
         """
         if self.online is None or self.source is None:
             return
-        batches, sets = found.progress.blocks, self.source.sets
+        batches, learned = found.progress.blocks, self.source.sets.learned
         state, stored = partial(checkpoint.read_buffer, found), self._stored
-        self.online.resume(batches, state, stored.dataset, stored.mode, self._drawn_fields(names))
-        if not sets.learns:
-            return
         try:
-            sets.restore(batches, checkpoint.read_sampler(found))
+            if learned is not None:
+                learned.restore(batches, checkpoint.read_sampler(found))
         except ValueError as error:
             raise CheckpointError(
                 "The training cannot be resumed: the sampler state in its checkpoint does not "
                 f"match, because {error}. Resume with the same sampler and sampler_kwargs."
             ) from error
+        self.online.resume(batches, state, stored.dataset, stored.mode, self._drawn_fields(names))
 
     def finish(self) -> None:
         """End the last epoch: from now on the rows are read."""
+        if self.online is not None:
+            self.online.finish()
         if self._shared is not None:
             self._shared.finish(self._stored.dataset)

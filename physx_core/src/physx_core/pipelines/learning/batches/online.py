@@ -144,6 +144,10 @@ class OnlineBatches:
         """Announce that this many batches will be taken."""
         self._blocks.expect(self._sizes(range(self.number, self.number + batches)))
 
+    def finish(self) -> None:
+        """Leave out the rows that no batch needs: see `Blocks.finish`."""
+        self._blocks.finish()
+
     def _sizes(self, batches: range, most: int | None = None) -> Iterator[int]:
         """Yield the sizes of the blocks for some batches, the next one first.
 
