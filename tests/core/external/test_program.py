@@ -156,7 +156,6 @@ def sampled(program, episodes, as_clients, **ranges):
         as_tcp_ip_client=as_clients,
         num_clients=2,
         sampler="physx/sobol",
-        redraw=9,
         seed=3,
     )
     run = DataGeneration(environment, batch_nb=3, batch_size=10, quiet=True)
@@ -169,10 +168,8 @@ def sampled(program, episodes, as_clients, **ranges):
 
 
 @pytest.mark.faults
-def test_a_sampler_chooses_the_parameters_of_a_program_and_those_that_kill_it_are_redrawn(
-    heat, heat_fortran
-):
-    limits = {"low": 0.05, "high": 0.5, "distribution": "log_uniform"}
+def test_a_sampler_chooses_the_parameters_of_a_program(heat, heat_fortran):
+    limits = {"low": 0.05, "high": 0.25, "distribution": "log_uniform"}
     rows, sets = sampled(heat, 1, False, alpha=limits)
     for program, episodes, as_clients in [(heat, 1, True), (heat_fortran, 99, True)]:
         for mine, others in zip(
@@ -185,8 +182,6 @@ def test_a_sampler_chooses_the_parameters_of_a_program_and_those_that_kill_it_ar
     numbers = rows["episode"] * 2 + rows["env_id"] - 1
     np.testing.assert_array_equal(rows["alpha"], sets["alpha"][[place[n] for n in numbers]])
     assert len({*rows["seed"]}) == len({*numbers}) > 5
-    assert 0 < sets["failed"].sum() < len(sets["failed"])
-    np.testing.assert_array_equal(sets["failed"], sets["alpha"] > 0.25)
     for u, alpha, following in zip(rows["u"], rows["alpha"], rows["next"], strict=True):
         np.testing.assert_array_equal(following, advanced(u, alpha))
 
@@ -624,6 +619,7 @@ def test_a_reservoir_and_active_sampling_learn_the_same_from_clients_as_in_proce
             env_kwargs={"program": [heat, "4", "4", "3"], "ranges": {"alpha": [0.01, 0.2]}},
             as_tcp_ip_client=as_clients,
             num_clients=2,
+            episode_steps=4,
             sampler="physx/active",
             seed=3,
         )

@@ -287,7 +287,6 @@ def test_runs_of_client_writers_killed_at_random_moments(run_killed, nothing_sta
         ({"as_tcp_ip_client": False, "num_clients": 1}, "as_tcp_ip_client=False starts none"),
         ({"record_wrong_samples": True}, "leave out record_wrong_samples"),
         ({"environment": f"{PROGRAM}:Drawn"}, "has parameters"),
-        ({"environment": f"{PROGRAM}:Drawn", "redraw": 1}, "redraw needs the rows"),
     ],
 )
 def test_options_that_need_rows_are_refused_with_client_writers(

@@ -83,7 +83,6 @@ def test_rows_and_parameters_are_the_same_in_process_and_in_clients(tmp_path, sa
     rows, sets = (content(runs[0], mode) for mode in ("training", "parameters"))
     check_sets_explain_rows(rows, sets, 2)
     assert sets["set"].tolist() == list(range(14))
-    assert not sets["failed"].any()
     assert len({*rows["noise"].tolist()}) == 40
 
 
@@ -154,55 +153,20 @@ def test_restarted_client_gets_same_parameters(tmp_path):
         equal(content(failing, mode), content(whole, mode))
 
 
-# Sets that fail -----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("how", ["raise", "reset", "nan", "wrong"])
-def test_failed_parameters_are_recorded_and_redrawn(tmp_path, how):
-    kwargs = {"how": how, "fails_above": 32.0}
-    options = {"sampler": "physx/sobol", "redraw": 9, "kwargs": kwargs}
-    runs = [generate(tmp_path, clients=clients, **options) for clients in (False, True)]
-    for mode in ("training", "parameters"):
-        equal(*(content(run, mode) for run in runs))
-    rows, sets = (content(runs[0], mode) for mode in ("training", "parameters"))
-    check_sets_explain_rows(rows, sets, 2)
-    failed = sets["stiffness"] > 32.0
-    assert failed.any()
-    last = np.isin(sets["set"], [sets["set"][sets["env_id"] == i].max() for i in (1, 2)])
-    assert (sets["failed"] == failed)[~last].all()
-    assert {*runs[1].source.sets.failures} >= {*sets["set"][sets["failed"]].tolist()}
-
-
-def test_parameters_that_crash_the_client_are_redrawn(tmp_path):
-    options = {"sampler": "physx/sobol", "redraw": 5, "batch_nb": 2, "batch_size": 6}
-    raising = generate(
-        tmp_path, clients=False, kwargs={"how": "raise", "fails_above": 32.0}, **options
-    )
-    killing = generate(tmp_path, kwargs={"how": "kill", "fails_above": 32.0}, **options)
-    expected, found = content(raising), content(killing)
-    for name in ("x", "noise", "env_id", "episode"):
-        assert expected[name].tobytes() == found[name].tobytes()
-    equal(content(raising, "parameters"), content(killing, "parameters"))
-    assert content(killing, "parameters")["failed"].any()
-
-
 @pytest.mark.parametrize("clients", [False, True])
-def test_run_ends_at_redraw_limit_and_names_parameters(tmp_path, clients, capsys):
+def test_error_of_a_stream_names_its_parameters(tmp_path, clients):
     config = EnvironmentConfig(
-        SWING, env_kwargs={"fails_above": 11.0}, seed=3, redraw=2, as_tcp_ip_client=clients
+        SWING, env_kwargs={"fails_above": 11.0}, seed=3, as_tcp_ip_client=clients
     )
-    run = DataGeneration(config, session_dir=str(tmp_path), batch_nb=9, batch_size=1)
-    with pytest.raises(EnvironmentFailedError, match="it broke"):
+    run = DataGeneration(config, session_dir=str(tmp_path), batch_nb=9, batch_size=1, quiet=True)
+    with pytest.raises(EnvironmentFailedError, match="it broke") as error:
         run.execute()
-    assert "sets of parameters that failed: 3" in capsys.readouterr().err
-    sets = content(run, "parameters")
-    assert sets["set"].tolist() == [0, 1, 2]
-    assert sets["failed"].tolist() == [True] * 3
+    assert any("set 0: stiffness=" in note for note in error.value.__notes__)
 
 
-def test_an_error_that_parameters_cannot_cause_ends_the_run(tmp_path):
+def test_an_error_of_the_sampler_ends_the_run(tmp_path):
     with pytest.raises(ConfigError, match="on purpose"):
-        generate(tmp_path, clients=False, sampler=Broken, redraw=5)
+        generate(tmp_path, clients=False, sampler=Broken)
 
 
 # Errors ---------------------------------------------------------------------------------------
@@ -250,10 +214,9 @@ class Late(Environment):
 
 
 @pytest.mark.parametrize("clients", [False, True])
-@pytest.mark.parametrize("option", [{"sampler": "physx/sobol"}, {"redraw": 1}])
-def test_a_sampler_for_an_environment_without_parameters_is_an_error(tmp_path, clients, option):
+def test_a_sampler_for_an_environment_without_parameters_is_an_error(tmp_path, clients):
     with pytest.raises(ConfigError, match=r"defines no parameters: call define_parameters\(\)"):
-        generate(tmp_path, environment=f"{ENVS}:Plain", clients=clients, **option)
+        generate(tmp_path, environment=f"{ENVS}:Plain", clients=clients, sampler="physx/sobol")
     assert not list(tmp_path.iterdir())
 
 
@@ -292,13 +255,6 @@ def test_options_that_do_not_exist_or_fit_are_errors(tmp_path):
         generate(tmp_path, sampler="physx/grid", sampler_kwargs={"point": 3})
     with pytest.raises(ConfigError, match="without a sampler"):
         generate(tmp_path, sampler_kwargs={"points": 3})
-    with pytest.raises(ConfigError, match="leave redraw out"):
-        run = generate(tmp_path)
-        config = EnvironmentConfig(SWING, load_samples=True, redraw=1)
-        Training(
-            NetworkConfig("toy/linear"), None, config, session_dir=str(tmp_path),
-            session_name=run.session.name, new_session=False, epoch_nb=1, batch_size=2, quiet=True,
-        ).execute()  # fmt: skip
 
 
 AGAIN = f"{ENVS}:Again"
@@ -320,9 +276,9 @@ def replay(folder, existing, *, clients=False, environment=AGAIN, instances=2, *
 
 @pytest.mark.parametrize("clients", [False, True])
 def test_a_stored_row_is_replayed_with_the_parameters_that_it_was_made_with(tmp_path, clients):
-    """Also if its run was not the only one, simulations failed, and others replay it."""
-    options = {"clients": False, "redraw": 50, "kwargs": {"fails_above": 35.0}}
-    with pytest.raises(EnvironmentFailedError):  # has sets, but no rows
+    """Also if its run was not the only one, and others replay it."""
+    options = {"clients": False}
+    with pytest.raises(EnvironmentFailedError):  # has neither sets nor rows
         generate(tmp_path, clients=False, kwargs={"fails_above": 0.0}, batch_nb=1)
     for seed, mode in ((1, "training"), (2, "validation"), (3, "training")):
         made = generate(tmp_path, mode=mode, seed=seed, new_session=False, **options)

@@ -62,26 +62,24 @@ def begun(monkeypatch):
 
 def test_a_generator_suggests_ingests_and_gets_what_it_asks_for(begun):
     sampler = begun(points=8)
-    chosen = [sampler.ask_after(number, 0) for number in range(8)]
+    chosen = [sampler.ask(number) for number in range(8)]
     assert all(one.contains(values[one.name]) for values in chosen for one in PARAMETERS)
     assert np.shape(chosen[0]["push"]) == (2,)
-    assert sampler.ask_after(3, 0)["k"] == chosen[3]["k"]
-    losses = np.array([values["k"] for values in chosen])
-    for batches in range(1, 30):
-        sampler.tell(batches, np.arange(8) + 8 * batches - 8, chosen, losses)
-        chosen = [sampler.ask_after(number + 8 * batches, batches) for number in range(8)]
+    for batch in range(29):
         losses = np.array([values["k"] for values in chosen])
-    assert losses.mean() > 35  # it climbs
+        sampler.tell(np.arange(8) + 8 * batch, chosen, losses)
+        chosen = [sampler.ask(number + 8 * batch + 8) for number in range(8)]
+    assert np.mean([values["k"] for values in chosen]) > 35  # it climbs
 
 
-def test_sets_depend_on_what_was_told_and_not_on_the_order_of_questions(begun):
-    one, other = begun(points=4), begun(points=4)
-    for sampler in (one, other):
-        values = [sampler.ask_after(number, 0) for number in range(4)]
-        sampler.tell(1, np.arange(4), values, np.arange(4.0))
-    forward = [one.ask_after(4 + n, n % 2) for n in range(4)]
-    backward = [other.ask_after(4 + n, n % 2) for n in reversed(range(4))][::-1]
-    assert [values["k"] for values in forward] == [values["k"] for values in backward]
+def test_a_generator_suggests_anew_when_all_is_asked_for_and_when_it_is_told(begun):
+    sampler = begun(points=4)
+    chosen = [sampler.ask(number) for number in range(6)]
+    assert sampler._generator.made == 8
+    sampler.tell(np.arange(4), chosen[:4], np.arange(4.0))
+    assert [one["loss"] for one in sampler._generator.known] == [0.0, 1.0, 2.0, 3.0]
+    sampler.ask(6)
+    assert sampler._generator.made == 12
 
 
 def test_what_does_not_fit_is_an_error(begun, monkeypatch):

@@ -349,16 +349,6 @@ def test_full_temporary_folder_during_restart_is_an_error(full_disk):
     assert journal.order(0)
 
 
-def test_redraw_of_parameters_clears_journal(simulated, batch_services, said):
-    journal = Journal(1, 10)
-    journal.record(pack(Kind.APPLY, bytes(100), 1))
-    assert journal.given_up
-    journal.restart()
-    assert not journal.given_up
-    assert journal.record(pack(Kind.CREDIT, number=3))
-    assert journal.credit
-
-
 # The journal ------------------------------------------------------------------------------------
 
 
