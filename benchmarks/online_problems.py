@@ -65,6 +65,8 @@ class Lorenz(Environment):
     A sample is a state with the coefficients, and the change of the state in 20 ms.
     """
 
+    episode_steps = POINTS
+
     def create(self) -> None:
         """Define coefficients and initial states."""
         self.define_parameters(
@@ -80,19 +82,17 @@ class Lorenz(Environment):
 
     def reset_parameters(self, coefficients: Vector, begin: Vector) -> None:
         """Start a trajectory."""
-        self._coefficients, self._state, self._made = coefficients, begin, 0
+        self._coefficients, self._state = coefficients, begin
 
     def step(self) -> None:
-        """Make a step of the classic Runge-Kutta method; after the last one, start another."""
-        if self._made == POINTS:
-            self.new_episode()
+        """Make a step of the classic Runge-Kutta method."""
         state, half = self._state, PERIOD / 2
         first = self._speed(state)
         second = self._speed(state + half * first)
         third = self._speed(state + half * second)
         fourth = self._speed(state + PERIOD * third)
         change = PERIOD / 6 * (first + 2 * second + 2 * third + fourth)
-        self._state, self._made = state + change, self._made + 1
+        self._state = state + change
         self.set_training_data(input=[*state, *self._coefficients], output=change)
 
     def _speed(self, state: Vector) -> Vector:
@@ -107,10 +107,11 @@ class Resonance(Environment):
     range of parameters.
     """
 
+    episode_steps = 1
+
     def create(self) -> None:
         """Define frequency, in natural frequencies, and damping, relative to critical damping."""
         self.define_parameters([Parameter("frequency", 0.2, 3.0), Parameter("damping", 0.03, 0.4)])
-        self._is_new = True
 
     def init_database(self) -> None:
         """Define an input and an output field."""
@@ -122,9 +123,6 @@ class Resonance(Environment):
 
     def step(self) -> None:
         """Compute the parts of the response in phase with the force and a quarter period behind."""
-        if not self._is_new:
-            self.new_episode()
-        self._is_new = False
         response = 1 / (1 - self._frequency**2 + 2j * self._damping * self._frequency)
         scaled = [(self._frequency - 1.6) / 1.4, (self._damping - 0.2) / 0.2]
         self.set_training_data(input=scaled, output=[response.real, response.imag])

@@ -42,7 +42,7 @@ def online(sampler, rows, seed, folder, given):
     with training:
         training.execute()
         (guess,) = training.learner.predict_in_training({"input": given}).values()
-    return samples(training.session.path, "parameters", "width", "diffusivity"), guess
+    return samples(training.session.path, "episodes", "width", "diffusivity"), guess
 
 
 def main() -> int:

@@ -80,3 +80,43 @@ class Apprentice(Pupil):
         if self.step_index % 4 == 3:
             self.new_episode()
         super().step()
+
+
+class Lesson(Environment):
+    """Independent episodes of different lengths, noted in a file when they begin and end."""
+
+    independent_episodes = True
+
+    def __init__(self, *, delay=0.0, fails=(), dies=(), asks=False, **kwargs):
+        super().__init__(**kwargs)
+        self.delay, self.fails, self.dies, self.asks = delay, fails, dies, asks
+
+    def create(self):
+        self.define_parameters([Parameter("slope", 0.5, 1.5)])
+
+    def init_database(self):
+        self.define_training_fields([Field("x", (2,)), Field("y", (1,))])
+
+    def reset_parameters(self, slope):
+        self.slope, self.left = slope, int(self.rng.integers(1, 6))
+        self.note("begun")
+
+    def step(self):
+        time.sleep(self.delay * int.from_bytes(os.urandom(2), "little") / 65536)
+        if self.episode_index in self.fails:
+            raise RuntimeError("no more beans")
+        if self.episode_index in self.dies and not Path(f"died_{self.episode_index}").exists():
+            Path(f"died_{self.episode_index}").touch()
+            os.kill(os.getpid(), signal.SIGKILL)
+        x = self.rng.random(2)
+        if self.asks:
+            self.get_prediction(x=x)
+        self.set_training_data(x=x, y=self.slope * x.sum(keepdims=True))
+        self.left -= 1
+        if not self.left:
+            self.end_episode()
+            self.note("ended")
+
+    def note(self, what):
+        with Path("simulated.txt").open("a") as file:
+            file.write(f"{what} {self.episode_index}\n")

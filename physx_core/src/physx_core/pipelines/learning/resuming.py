@@ -120,6 +120,8 @@ class Generation:
         after |= {name: now.environment.get(name) for name in _SAME}
         if environment.seed is None:
             after["seed"] = before["seed"]
+        if self.campaign is not None or now.first == self.first:  # else rows of streams exist
+            after["num_clients"] = before["num_clients"]
         for name, value in after.items():
             if value != before[name]:
                 raise ConfigError(

@@ -1,0 +1,130 @@
+"""Trainings on independent episodes that are simulated meanwhile: by number, whoever simulates."""
+
+from __future__ import annotations
+
+import time
+from collections import Counter
+from pathlib import Path
+
+import numpy as np
+import online_lessons
+import pytest
+from online_lessons import RESERVOIR, result, train
+from sizes import seed, trials
+
+from physx_core import Dataset, Training
+from physx_core.dataset import EpisodeStatus
+from physx_core.errors import FailedEpisodesError, UsageError
+
+pytestmark = pytest.mark.processes
+
+PROGRAM = Path(online_lessons.__file__)
+
+
+def simulated():
+    """Return how often each episode was begun and ended."""
+    lines = [line.split() for line in Path("simulated.txt").read_text().splitlines()]
+    return [Counter(int(n) for what, n in lines if what == each) for each in ("begun", "ended")]
+
+
+@pytest.mark.parametrize(
+    "training",
+    [{}, RESERVOIR, {"epoch_nb": 3}, pytest.param({"epoch_nb": 2}, id="always")],
+    ids=str,
+)
+def test_network_does_not_depend_on_the_number_of_clients(training, request):
+    always = "always" in request.node.name
+    options = {"training": training, "always_produce": always}
+    expected = result(train("local", **options))
+    for clients in (1, 2, 3):
+        run = train(f"clients_{clients}", clients, delay=0.01, **options)
+        assert result(run) == expected, clients
+
+
+def test_rows_are_those_that_the_batches_need():
+    run = train("run", 2, training=RESERVOIR)
+    rows = run.data.online._buffer.total
+    with Dataset.open(run.session.dataset_dir) as dataset:
+        assert dataset.num_samples("training") == rows
+        numbers = dataset["training"]["episode"][:]
+        assert (np.diff(numbers) >= 0).all()
+        known = dataset.recorded_episodes("training")
+        assert EpisodeStatus(known.status[-1]) in (EpisodeStatus.FINISHED, EpisodeStatus.CUT)
+
+
+def test_dead_client_costs_the_episode_that_it_was_simulating():
+    expected = result(train("whole", 2))
+    before, _ = simulated()
+    Path("simulated.txt").unlink()
+    assert result(train("died", 2, dies=(2, 5), delay=0.01)) == expected
+    begun, _ = simulated()
+    assert {2, 5} <= {number for number, count in begun.items() if count == 2}
+    assert sum(begun.values()) <= sum(before.values()) + 2 + 4
+
+
+def test_episodes_may_fail():
+    with pytest.raises(FailedEpisodesError, match="no more beans"):
+        train("failed", 2, fails=(3,))
+    found = [result(train(f"run{n}", n, fails=(3, 4), training={"max_failed": 2})) for n in (0, 2)]
+    assert found[0] == found[1]
+
+
+def test_interrupted_training_simulates_what_has_no_record():
+    class Stopped(Training):
+        def batch_end(self):
+            if self.batch_id == 4:
+                raise KeyboardInterrupt
+
+    expected = result(train("whole", 2, training=RESERVOIR))
+    Path("simulated.txt").unlink()
+    with pytest.raises(KeyboardInterrupt):
+        train("stopped", 2, cls=Stopped, training=RESERVOIR, delay=0.02)
+    run = train("stopped", 3, training={**RESERVOIR, "resume": True}, delay=0.02)
+    assert result(run) == expected
+    begun, ended = simulated()
+    assert sum(begun.values()) <= len(ended) + 2 * (2 + 3)
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("buffer", ["stream", "reservoir"])
+@pytest.mark.parametrize("clients", ["1", "2", "3"])
+def test_training_killed_at_random_moments(tmp_path, buffer, clients, run_killed, monkeypatch):
+    random, program = np.random.default_rng(seed()), str(PROGRAM)
+    folders = [tmp_path / name for name in ("whole", "killed")]
+    for folder in folders:
+        folder.mkdir()
+    _, duration = run_killed(program, folders[0], [], buffer, "2")
+    moments = (duration * random.uniform(0.3, 0.9, trials(10, 3))).tolist()
+    run_killed(program, folders[1], moments, buffer, clients)
+    found = []
+    for folder in folders:
+        monkeypatch.chdir(folder)
+        found.append(Path("result.txt").read_text())
+    assert found[0] == found[1]
+    begun, ended = simulated()
+    assert sum(begun.values()) <= len(ended) + (len(moments) + 1) * int(clients) * 2
+
+
+def test_independent_episode_cannot_ask_the_network_that_learns():
+    with pytest.raises(UsageError, match="independent_episodes=False"):
+        train("asks", 2, asks=True)
+    run = train("stream", 2, asks=True, independent_episodes=False)
+    assert "parameters" in run.data.dataset.modes
+
+
+def test_clients_join_a_training(nothing_stays_behind):
+    expected = result(train("whole", 1))
+    run = train("joined", 1, min_clients=1, max_clients=3, delay=0.01)
+    assert result(run) == expected
+
+
+def test_error_of_the_training_ends_clients_that_run_ahead(nothing_stays_behind):
+    class Failing(Training):
+        def batch_begin(self):
+            if self.batch_id == 3:
+                time.sleep(0.3)
+                raise RuntimeError("on purpose")
+
+    with pytest.raises(RuntimeError, match="on purpose"):
+        train("failing", 2, cls=Failing)
+    assert Path("sessions/failing/dataset").is_dir()
