@@ -102,7 +102,7 @@ def test_training_killed_at_random_moments(tmp_path, buffer, clients, run_killed
         found.append(Path("result.txt").read_text())
     assert found[0] == found[1]
     begun, ended = simulated()
-    assert sum(begun.values()) <= len(ended) + (len(moments) + 1) * int(clients) * 2
+    assert sum(begun.values()) <= len(ended) + (len(moments) + 1) * int(clients) * 8
 
 
 def test_independent_episode_cannot_ask_the_network_that_learns():

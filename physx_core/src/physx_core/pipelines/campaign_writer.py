@@ -80,7 +80,10 @@ class CampaignWriter:
             self.store()
 
     def cut(self, rows: int) -> None:
-        """Leave out what the campaign has more than some rows; nothing may be stored afterwards."""
+        """Leave out what the campaign has more than some rows; nothing may be stored afterwards.
+
+        When this returns, a kill of the process loses nothing of it.
+        """
         known = None
         if self.campaign.mode in self._dataset.modes:
             known = self._dataset.recorded_episodes(self.campaign.mode)
@@ -89,6 +92,7 @@ class CampaignWriter:
         surplus = int(np.sum(known.rows[known.campaign == self.campaign.number])) - rows
         if surplus > 0:
             self.campaign.cut(self._dataset, surplus, self._source.sets)
+        self._dataset.flush()
 
     def prove_independence(self) -> None:
         """Simulate an episode again, if that costs little, and compare its rows.

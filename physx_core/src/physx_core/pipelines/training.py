@@ -345,6 +345,7 @@ class Training(NewSessionPipeline):
         if self._epoch_batches is None:
             return
         self._report()
+        self.data.end_epoch()
         self._epoch_batches, self.batch_id = None, 0
         values = self._record.take_epoch()
         self.training_loss = values.get("loss/training", float("nan"))

@@ -81,11 +81,15 @@ class TrainingData:
             done: Number of its batches that the network has already learned from.
         """
         made, stored = self._made, self.stored
-        if made is not None and epoch_id and not self._always and self._current is made:
-            made.finish()
+        if made is not None and epoch_id and not self._always:
             self._choose(stored)
         self._current.begin_epoch(names, max(0, (self._batch_nb or 0) - done))
         return self.batches_per_epoch
+
+    def end_epoch(self) -> None:
+        """End the last epoch in which environments provide the samples; others just end."""
+        if self._made is not None and self._current is self._made and not self._always:
+            self._made.finish()
 
     @property
     def batches_per_epoch(self) -> int:

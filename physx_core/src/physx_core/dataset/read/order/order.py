@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
@@ -114,6 +115,7 @@ class Orders:
         self._records: dict[str, GrowingRecords] = {}
         self._orders: dict[str, tuple[tuple[int, int, bool], Order]] = {}
         self._seen: dict[str, int] = {}  # records that were read when all episodes counted
+        self._lock = threading.Lock()  # a training reads while its feeder appends
 
     def of(self, mode: str) -> Order | None:
         """Return the order of a mode; None if it has no records, so that all its rows count.
@@ -123,6 +125,10 @@ class Orders:
         """
         if mode not in MODES or not has_table(self._manifest):
             return None
+        with self._lock:
+            return self._newest(mode)
+
+    def _newest(self, mode: str) -> Order | None:
         self._read_new()
         records = self._records.get(mode)
         if records is None:
