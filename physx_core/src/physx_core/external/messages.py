@@ -50,6 +50,12 @@ class Kind(enum.IntEnum):
     """Program: there are no more samples."""
     ANSWER = 6
     """Environment: the data of the requested arrays."""
+    PART = 7
+    """Program, before the fields: they are this rank's parts of the fields. Its array ``part`` has
+    the rank, the number of ranks, and the offset of each field's part along the first axis."""
+
+
+_OF_PROGRAMS = frozenset(Kind) - {Kind.ANSWER}
 
 
 class MalformedMessageError(Exception):
@@ -98,7 +104,7 @@ def parse_header(data: bytes | bytearray) -> Header:
             f"was compiled with a physx.h of protocol {magic[3]}, but this physx uses {_VERSION}: "
             "compile it with the header in the folder that  physx include  prints."
         )
-    if not Kind.FIELDS <= kind <= Kind.CLOSE or count > _MOST_ARRAYS or size > _LARGEST:
+    if kind not in _OF_PROGRAMS or count > _MOST_ARRAYS or size > _LARGEST:
         raise MalformedMessageError(
             f"sent a message of kind {kind} with {count} arrays of {size} bytes, which physx.h "
             f"never sends, or which is longer than {_LARGEST} bytes."
