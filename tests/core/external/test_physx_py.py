@@ -11,6 +11,7 @@ import sys
 import numpy as np
 import pytest
 
+from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.errors import ProgramError
 from physx_core.external import INCLUDE
 from physx_core.external.messages import (
@@ -219,3 +220,41 @@ def test_a_mistake_in_a_script_is_told_with_its_traceback(local, tmp_path):
         local("external/program", env_kwargs=kwargs) as source,
     ):
         source.batch(1)
+
+
+FAILING = """
+import sys
+import physx
+with physx.Run({"number": 0, "k": 0.0}) as run:
+    while True:
+        given = run.parameters(k=0.0, episode=0)
+        if given["k"] > 0.5:
+            sys.exit(3)
+        run.send(number=given["episode"], k=given["k"])
+"""
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("as_clients", [False, True])
+def test_a_program_that_fails_before_its_first_sample_fails_no_other_episode(as_clients, tmp_path):
+    (tmp_path / "solver.py").write_text(FAILING)
+    kwargs = {
+        "program": [sys.executable, "-S", str(tmp_path / "solver.py")],
+        "ranges": {"k": [0.0, 1.0]},
+    }
+    config = EnvironmentConfig(
+        "external/program",
+        env_kwargs=kwargs,
+        episode_steps=1,
+        seed=1,
+        as_tcp_ip_client=as_clients,
+        num_clients=2,
+    )
+    run = DataGeneration(config, episodes=12, max_failed=12, quiet=True)
+    run.execute()
+    with Dataset.open(run.session.dataset_dir) as dataset:
+        table, rows = dataset["episodes"], dataset["training"]
+        failed = {each.episode for each in dataset.failed_episodes("training")}
+        assert failed == set(table["episode"][table["k"][:] > 0.5].tolist())
+        assert 1 < len(failed) < 11
+        assert rows["number"][:].tolist() == [n for n in range(12) if n not in failed]

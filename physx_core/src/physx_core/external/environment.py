@@ -112,7 +112,8 @@ class ExternalProgram(Environment):
         """
         self._chosen = values
         if self.independent_episodes:
-            if not self._is_new and self._held is None:
+            assert self._process is not None
+            if self._process.is_over or (not self._is_new and self._held is None):
                 self._start_again()
             self._is_new, self._seed = True, None
 
@@ -173,6 +174,7 @@ class ExternalProgram(Environment):
     def _start_again(self) -> None:
         """Start the program once more."""
         self.close()
+        self._held = None
         self._process, declared = self._start()
         if declared != self._declared:
             raise self._process.error(

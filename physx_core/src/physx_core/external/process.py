@@ -77,6 +77,11 @@ class ProgramProcess(Closeable):
             self.close()
             raise
 
+    @property
+    def is_over(self) -> bool:
+        """Whether it was closed, for example because of an error."""
+        return not self._connections
+
     def receive(self) -> Message:
         """Return the next message; if there are several ranks, what theirs are together.
 
