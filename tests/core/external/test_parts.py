@@ -51,6 +51,12 @@ def test_each_process_gets_its_part_of_a_prediction(local, services):
     np.testing.assert_array_equal(rows["predicted"], 0.5 * np.array(WHOLE))
 
 
+def test_one_process_may_ask_for_a_prediction_alone(local, services):
+    services.predict = lambda fields: {"v": 0.5 * np.asarray(fields["t"])}
+    kwargs = {"program": program("ask alone"), "parameters": {"scale": 2.0}}
+    np.testing.assert_array_equal(rows_of(local("external/program", env_kwargs=kwargs))["u"], WHOLE)
+
+
 WAYS = {
     "overlap": r'parts of "u" that overlap: 0 to 2 \(rank 1\) and 2 to 6 \(rank 2\)',
     "gap": r'parts of "u" with a gap: nobody has 3 to 4, before 5 to 6 \(rank 2\)',

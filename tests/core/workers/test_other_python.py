@@ -72,7 +72,13 @@ def test_clients_in_another_interpreter_use_the_physx_that_is_installed_there(ma
 
 def test_environment_variables_of_clients_replace_those_of_the_run(monkeypatch):
     monkeypatch.setenv("SETTING", "no")
-    words = ["--episodes", "2", "--environment.launcher-kwargs", 'env={SETTING="yes"}']
+    words = [
+        "--episodes",
+        "2",
+        "--environment.launcher-kwargs",
+        f"python={sys.executable}",
+        'env={SETTING="yes"}',
+    ]
     assert main(["generate", ELSEWHERE, *words]) == 0
     assert ast.literal_eval(Path("1.txt").read_text())["setting"] == "yes"
 

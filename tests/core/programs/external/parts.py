@@ -49,6 +49,10 @@ for step in range(3):
     sample = {"u": u, "predicted": [[0.0, 0.0]] * len(u)}
     if way == "ask":
         sample["predicted"] = run.predict({"u": u}, {"predicted": fields["predicted"]})["predicted"]
+    if way == "ask alone":  # the others make the same call, for nothing
+        asked = ({"t": 1.0}, {"v": 0.0}) if rank == 1 else ({}, {})
+        assert rank != 1 or run.predict(*asked) == {"v": 0.5}
+        assert rank == 1 or run.predict(*asked) == {}
     if rank == 0:
         sample["t"] = float(step)
     if rank == 2 and step == 1:
