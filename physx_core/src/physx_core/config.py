@@ -238,7 +238,8 @@ class EnvironmentConfig:
     """Launcher of the clients: "physx/subprocess" on this machine; "physx/manual" if you start them
     with ``physx client``; or a plugin's launcher."""
     launcher_kwargs: dict[str, Any] = field(default_factory=dict)
-    """Keyword arguments of the launcher."""
+    """Keyword arguments of the launcher; those of "physx/subprocess" are `python`, another
+    interpreter for the clients, `env`, their environment variables, and `affinity`."""
     token_file: str | None = None
     """File with the clients' secret token, readable only by its owner; None: the environment
     variable PHYSX_TOKEN if set, otherwise a random token for clients started here."""

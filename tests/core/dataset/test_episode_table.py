@@ -13,7 +13,7 @@ from physx_core import Dataset
 from physx_core.dataset import EPISODES, EpisodeRecord, EpisodeStatus, FailedEpisode, Progress
 from physx_core.dataset.read import virtual_index
 from physx_core.dataset.store import locks
-from physx_core.dataset.store.episode_table import OPEN
+from physx_core.dataset.store.episode_record import OPEN
 from physx_core.dataset.write.stripe_writer import StripeWriter
 from physx_core.errors import (
     ConfigError,

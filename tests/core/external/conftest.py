@@ -6,6 +6,7 @@ import functools
 import os
 import shutil
 import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -60,6 +61,26 @@ def heat(build):
 def heat_fortran(build):
     """The heat equation in Fortran, with sanitizers."""
     return build("heat.f90", *WARNINGS, *SANITIZERS, using="gfortran")
+
+
+@pytest.fixture
+def heat_python(tmp_path):
+    """The heat equation in Python, without any package."""
+    return _in_python(tmp_path, "-S", "")
+
+
+@pytest.fixture
+def heat_numpy(tmp_path):
+    """The heat equation in Python, with NumPy's arrays."""
+    return _in_python(tmp_path, "", "--numpy")
+
+
+def _in_python(folder, option, word):
+    script = folder / "heat"
+    command = f'exec {sys.executable} {option} {SOURCES / "heat.py"} "$@" {word}'
+    script.write_text(f"#!/bin/sh\n{command}\n")
+    script.chmod(0o755)
+    return str(script)
 
 
 @pytest.fixture

@@ -57,7 +57,7 @@ def test_the_program_in_c(compiler):
     before = (rows["env_id"] == 1) & (rows["step"] % 100 < 99)
     np.testing.assert_array_equal(rows["state"][goes_on], rows["next_state"][before])
     assert set(rows["episode"]) == set(range(5))
-    run(block("sh", "physx/sobol"))
+    run(block("sh", "redraw 3"))
     assert len({*rows_of("data_generation_1", "parameters")["stiffness"]}) == 10
 
 
@@ -70,7 +70,8 @@ def test_the_program_in_fortran(compiler):
     assert rows["u"].shape == (200, 20) and (rows["u"][0] != rows["u"][100]).any()
 
 
-def test_the_pieces_are_those_of_the_whole_programs():
-    whole = (Path(__file__).parents[1] / "programs/external/mean.c").read_text()
-    for line in block("c", "MPI_Bcast").splitlines():
+@pytest.mark.parametrize(("word", "source"), [("MPI_Bcast", "mean.c"), ("_open_part", "parts.c")])
+def test_the_pieces_are_those_of_the_whole_programs(word, source):
+    whole = (Path(__file__).parents[1] / "programs/external" / source).read_text()
+    for line in block("c", word).splitlines():
         assert line.strip() in whole

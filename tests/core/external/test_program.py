@@ -88,7 +88,10 @@ def check_heat(rows, instances=1):
     return seeds
 
 
-@pytest.mark.parametrize("language", ["heat", "heat_fortran"])
+LANGUAGES = ["heat", "heat_fortran", "heat_python", "heat_numpy"]
+
+
+@pytest.mark.parametrize("language", LANGUAGES)
 def test_the_samples_of_a_program_are_those_of_numpy_bit_for_bit(local, language, request):
     program = request.getfixturevalue(language)
     rows = run(local("external/program", env_kwargs=options(program, SIZE, STEPS, 2)), 4, 10, 1)
@@ -136,7 +139,7 @@ def test_clients_make_the_rows_that_are_made_in_process(local, clients, heat, he
     assert len(check_heat(ours, 2)) == 10
 
 
-@pytest.mark.parametrize("language", ["heat", "heat_fortran"])
+@pytest.mark.parametrize("language", LANGUAGES)
 def test_a_program_asks_for_predictions(local, clients, services, language, request):
     services.predict = lambda fields: {"next": 0.5 * np.asarray(fields["u"])}
     kwargs = options(request.getfixturevalue(language), SIZE, STEPS, 2, "ask")
@@ -287,7 +290,7 @@ def test_the_command_line_starts_a_program(heat, capsys):
 def test_include_prints_the_folder_of_the_header(capsys):
     assert main(["include"]) == 0
     folder = capsys.readouterr().out.strip()
-    assert {"physx.h", "physx.f90", "physx_fortran.c"} <= {
+    assert {"physx.h", "physx.f90", "physx_fortran.c", "physx.py"} <= {
         path.name for path in Path(folder).iterdir()
     }
     assert main(["include", "--help"]) == 0

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import dataclasses
-import importlib.util
 import itertools
+import json
 import os
 import random
 import shutil
@@ -38,13 +38,14 @@ class Solver:
     """A campaign of a solver.
 
     Attributes:
-        environment: Name of the class in a file of the same name.
+        environment: Name of the class in a file of the same name, or a reference.
         needs: Module or program.
         package: What installs it.
         episodes: Number of simulations.
         options: Further options of the command.
         fails: Whether it fails for some parameters.
         silent: Numbers of those that lose their client, so that they are simulated twice.
+        python: The interpreter that has it.
     """
 
     environment: str
@@ -54,28 +55,64 @@ class Solver:
     options: tuple[str, ...] = ()
     fails: bool = False
     silent: tuple[int, ...] = ()
+    python: str = sys.executable
 
     @property
     def reference(self):
         """Its environment on a command line."""
+        if "/" in self.environment:
+            return self.environment
         place = Path(__file__).parent / f"{self.environment.lower()}.py"
         return f"{place}:{self.environment}"
 
     def require(self):
         """Skip the test where the solver is not installed, but not in CI."""
-        if importlib.util.find_spec(self.needs) or shutil.which(self.needs):
+        if shutil.which(self.needs) or has_module(self.python, self.needs):
             return
         if os.environ.get("CI"):
             pytest.fail(f"{self.needs} must be there: CI installs {self.package}")
         pytest.skip(f"{self.needs} is not installed: it is in {self.package}")
 
 
+def has_module(python, name):
+    """Return whether an interpreter has a module."""
+    found = f"import importlib.util, sys; sys.exit(importlib.util.find_spec({name!r}) is None)"
+    return shutil.which(python) is not None and not subprocess.run([python, "-c", found]).returncode
+
+
+DEBIAN = "/usr/bin/python3"
+"""The interpreter of the system, whose packages are not for that of the run."""
+PROGRAM = [DEBIAN, str(Path(__file__).with_name("plate_program.py"))]
+RANGES = (
+    '{k = {low = 0.1, high = 10.0, distribution = "log_uniform"}, '
+    "spot = {low = [0.2, 0.2], high = [0.8, 0.8], shape = [2]}}"
+)
 PATIENT = ("--environment.timeout", "300")
 """Numba compiles for half a minute when it is first used."""
 SOLVERS = {
     "scikit-fem": Solver("Heat", "skfem", "scikit-fem", 40, fails=True),
     "CalculiX": Solver("Beam", "ccx", "Debian's calculix-ccx", 30),
     "PyElastica": Solver("Rod", "elastica", "pyelastica", 20, PATIENT),
+    "dolfinx": Solver(
+        "Plate",
+        "dolfinx",
+        "Debian's python3-dolfinx",
+        30,
+        (*PATIENT, "--environment.launcher-kwargs.python", DEBIAN),
+        python=DEBIAN,
+    ),
+    "dolfinx as a program": Solver(
+        "external/program",
+        "dolfinx",
+        "Debian's python3-dolfinx",
+        30,
+        (
+            *(*PATIENT, "--environment.episode-steps", "1"),
+            *("--environment.env-kwargs.program", json.dumps(PROGRAM)),
+            *("--environment.env-kwargs.ranges", RANGES),
+        ),
+        python=DEBIAN,
+    ),
 }
 FAULTS = '{3 = "hangs", 7 = "crashes", 11 = "is silent"}'
 
@@ -99,6 +136,8 @@ class Run:
     def start(self, clients=CLIENTS):
         """Begin in the background."""
         alone = ["--environment.no-as-tcp-ip-client"]
+        if self.solver.python != sys.executable:
+            clients = clients or 1  # this interpreter does not have it
         several = ["--environment.num-clients", str(clients)]
         return self._command(
             self.solver.reference,

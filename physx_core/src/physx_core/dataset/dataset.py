@@ -28,14 +28,14 @@ from physx_core.dataset.read.views import ModeView, row_numbers
 from physx_core.dataset.repair import recovery, repair
 from physx_core.dataset.repair.report import find_problems, summarize
 from physx_core.dataset.store import failure_file, locks
-from physx_core.dataset.store.episode_table import EPISODES, LOST, EpisodeStatus, has_table
+from physx_core.dataset.store.episode_record import EpisodeRecord, EpisodeStatus
+from physx_core.dataset.store.episode_table import EPISODES, LOST, has_table
 from physx_core.dataset.store.failure_file import FailedEpisode
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition, to_plain_info
 from physx_core.dataset.write.appender import Appender
 from physx_core.dataset.write.compacting import compact
 from physx_core.dataset.write.merging import add_partitions, drop_partition
 from physx_core.dataset.write.opening import WriterOptions, create, extend
-from physx_core.dataset.write.recording import EpisodeRecord
 from physx_core.dataset.write.stripes import Stripes
 from physx_core.dataset.write.updating import check_update
 from physx_core.dataset.write.writer import Writer

@@ -1,4 +1,4 @@
-"""The plugin ``external``: environments whose samples come from programs in C, C++, or Fortran."""
+"""The plugin ``external``: environments whose samples come from programs in other languages."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from pathlib import Path
 from physx_core.plugins.hookspecs import Components, hookimpl
 
 INCLUDE = Path(__file__).parent / "include"
-"""Include folder for compiling such programs: ``physx.h`` and ``physx.f90``."""
+"""Folder with what such programs need: ``physx.h``, ``physx.f90`` and ``physx.py``."""
 
 
 @hookimpl

@@ -3,15 +3,18 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 from physx_core.components.environment import Environment
 from physx_core.components.parameter import Parameter
 from physx_core.errors import ConfigError, SampleError, UnknownOptionError, listed, nearest
+from physx_core.external import INCLUDE
 from physx_core.external.messages import Kind, Message
 from physx_core.external.process import ProgramProcess
 from physx_core.fields import Field
+from physx_core.typing import Array
 
 _OPTIONS = {field.name: field for field in dataclasses.fields(Parameter) if field.name != "name"}
 
@@ -20,8 +23,9 @@ class ExternalProgram(Environment):
     """Starts a program and takes one sample from it in each step.
 
     The program is compiled with ``physx.h`` or ``physx.f90`` from the folder that ``physx include``
-    prints. It declares the fields itself. If it ends normally and more samples are needed, it is
-    started again, which begins a new episode, as does a request for parameters after a sample.
+    prints, or is a script in any Python that imports ``physx.py`` from there. It declares the
+    fields itself. If it ends normally and more samples are needed, it is started again, which
+    begins a new episode, as does a request for parameters after a sample.
     """
 
     runs_programs: ClassVar[bool] = True
@@ -108,7 +112,8 @@ class ExternalProgram(Environment):
         """
         self._chosen = values
         if self.independent_episodes:
-            if not self._is_new and self._held is None:
+            assert self._process is not None
+            if self._process.is_over or (not self._is_new and self._held is None):
                 self._start_again()
             self._is_new, self._seed = True, None
 
@@ -152,16 +157,13 @@ class ExternalProgram(Environment):
 
     def _start(self) -> tuple[ProgramProcess, Sequence[Field]]:
         """Start the program, and return it and the fields that it declares."""
-        variables = {"PHYSX_INSTANCE": str(self.instance_id)}
+        path = filter(None, (os.environ.get("PYTHONPATH"), str(INCLUDE)))
+        variables = {
+            "PHYSX_INSTANCE": str(self.instance_id),
+            "PYTHONPATH": os.pathsep.join(path),  # the program may be a script that imports physx
+        }
         process = ProgramProcess(self._command, variables, self._timeout)
-        try:
-            message = process.receive()
-            if message.kind is not Kind.FIELDS or not message.wanted:
-                raise process.error("declared no fields in physx_open().")
-        except BaseException:
-            process.close()
-            raise
-        return process, message.wanted
+        return process, process.fields
 
     def _end(self, process: ProgramProcess) -> None:
         """Wait until a program that has sent all its samples has ended normally."""
@@ -172,6 +174,7 @@ class ExternalProgram(Environment):
     def _start_again(self) -> None:
         """Start the program once more."""
         self.close()
+        self._held = None
         self._process, declared = self._start()
         if declared != self._declared:
             raise self._process.error(
@@ -199,13 +202,13 @@ class ExternalProgram(Environment):
             self._seed = int(self.rng.integers(2**31))
         own = {**self._own_parameters(), "seed": self._seed}
         values = {**self._fixed, **self._chosen, **own}
-        process.answer([_convert(process, "parameter", values, field) for field in message.wanted])
+        process.answer(_converted(process, "parameter", values, message.wanted))
 
     def _answer_prediction(self, process: ProgramProcess, message: Message) -> None:
         if not message.given:
             raise process.error("called physx_predict() without inputs.")
         values = dict(self.get_prediction(**message.given))
-        process.answer([_convert(process, "prediction", values, field) for field in message.wanted])
+        process.answer(_converted(process, "prediction", values, message.wanted))
 
 
 def _is_word(value: Any) -> bool:
@@ -225,7 +228,13 @@ def _as_parameter(name: str, given: Any) -> Parameter:
     )
 
 
-def _convert(process: ProgramProcess, what: str, values: Mapping[str, Any], field: Field) -> Any:
+def _converted(
+    process: ProgramProcess, what: str, values: Mapping[str, Any], wanted: Sequence[Field]
+) -> dict[str, Array]:
+    return {field.name: _convert(process, what, values, field) for field in wanted}
+
+
+def _convert(process: ProgramProcess, what: str, values: Mapping[str, Any], field: Field) -> Array:
     """Return one of the values in the type and shape that the program requests."""
     name = field.name
     if name not in values:

@@ -50,6 +50,12 @@ class Kind(enum.IntEnum):
     """Program: there are no more samples."""
     ANSWER = 6
     """Environment: the data of the requested arrays."""
+    PART = 7
+    """Program, before the fields: they are this rank's parts of the fields. Its array ``part`` has
+    the rank, the number of ranks, and the offset of each field's part along the first axis."""
+
+
+_OF_PROGRAMS = frozenset(Kind) - {Kind.ANSWER}
 
 
 class MalformedMessageError(Exception):
@@ -98,7 +104,7 @@ def parse_header(data: bytes | bytearray) -> Header:
             f"was compiled with a physx.h of protocol {magic[3]}, but this physx uses {_VERSION}: "
             "compile it with the header in the folder that  physx include  prints."
         )
-    if not Kind.FIELDS <= kind <= Kind.CLOSE or count > _MOST_ARRAYS or size > _LARGEST:
+    if kind not in _OF_PROGRAMS or count > _MOST_ARRAYS or size > _LARGEST:
         raise MalformedMessageError(
             f"sent a message of kind {kind} with {count} arrays of {size} bytes, which physx.h "
             f"never sends, or which is longer than {_LARGEST} bytes."
@@ -117,8 +123,7 @@ def parse_descriptions(header: Header, data: bytes) -> tuple[tuple[Field, ...], 
     given: list[Field] = []
     wanted: list[Field] = []
     for parts in DESCRIPTION.iter_unpack(data):
-        may_be_open = header.kind is Kind.FIELDS
-        (wanted if parts[3] else given).append(_parse_description(parts, may_be_open))
+        (wanted if parts[3] else given).append(_parse_description(parts, header.kind))
     for group in (given, wanted):
         names = [field.name for field in group]
         if len(set(names)) < len(names):
@@ -134,16 +139,16 @@ def parse_descriptions(header: Header, data: bytes) -> tuple[tuple[Field, ...], 
     return tuple(given), tuple(wanted)
 
 
-def _parse_description(parts: tuple[Any, ...], may_be_open: bool) -> Field:
+def _parse_description(parts: tuple[Any, ...], kind: Kind) -> Field:
     raw, number, rank, _, *shape = parts
     name = raw.partition(b"\0")[0].decode("ascii", errors="replace")
-    if not name.isidentifier() or name in RESERVED:
+    if not name.isidentifier() or (name in RESERVED and kind is not Kind.PARAMETERS):
         raise MalformedMessageError(
             f"named an array {name!r}, which is not an identifier, or is reserved by physx."
         )
     if number not in _TYPES:
         raise MalformedMessageError(f'gave the array "{name}" the unknown type {number}.')
-    if not (0 <= rank <= _MOST_AXES or (rank == _OPEN and may_be_open)):
+    if not (0 <= rank <= _MOST_AXES or (rank == _OPEN and kind is Kind.FIELDS)):
         raise MalformedMessageError(f'gave the array "{name}" the rank {rank}.')
     axes = None if rank == _OPEN else tuple(shape[:rank])
     dtype = _TYPES[number]

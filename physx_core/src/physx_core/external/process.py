@@ -18,6 +18,7 @@ from physx_core.errors import ProgramError
 from physx_core.external.messages import (
     DESCRIPTION,
     HEADER,
+    Kind,
     MalformedMessageError,
     Message,
     check_values,
@@ -25,6 +26,8 @@ from physx_core.external.messages import (
     parse_descriptions,
     parse_header,
 )
+from physx_core.external.parts import Division, Part, read_part
+from physx_core.fields import Field
 from physx_core.processes import ChildProcess, OutputTail, TemporaryFolder, describe_exit
 from physx_core.typing import Array
 
@@ -37,19 +40,20 @@ _LONGEST_PATH = 107  # bytes, of a socket address
 
 
 class ProgramProcess(Closeable):
-    """A started program that has connected with ``physx_open``.
+    """A started program that has connected with ``physx_open``, or several ranks of one.
 
     It connects to a socket in a folder that only this user can access, and that is removed after
     the connection. An inherited socket would not work, because MPI launchers close those.
 
     Attributes:
+        fields: The fields that it declared.
         samples: Number of samples that it has sent.
     """
 
     def __init__(
         self, command: Sequence[str], variables: Mapping[str, str], timeout: float
     ) -> None:
-        """Start the program and wait until it connects.
+        """Start the program and wait until it has declared its fields.
 
         Args:
             command: Program and arguments.
@@ -57,50 +61,51 @@ class ProgramProcess(Closeable):
             timeout: Longest time in s to wait for the program at any point.
 
         Raises:
-            ProgramError: If it cannot be started, or ends or does nothing before it connects.
+            ProgramError: If it cannot be started, or does something else.
         """
         self.samples = 0
+        self.fields: Sequence[Field] = ()
         self._name, self._timeout = shlex.join(command), timeout
         self._process: ChildProcess | None = None
-        self._connection: socket.socket | None = None
+        self._connections: list[socket.socket] = []  # in order of ranks, once all have connected
+        self._ranks = 1
+        self._division: Division | None = None
+        self._wanted: list[tuple[Field, ...]] = []
         try:
             self._start(command, variables)
         except BaseException:
             self.close()
             raise
 
+    @property
+    def is_over(self) -> bool:
+        """Whether it was closed, for example because of an error."""
+        return not self._connections
+
     def receive(self) -> Message:
-        """Return the next message.
+        """Return the next message; if there are several ranks, what theirs are together.
 
         Raises:
             ProgramError: If the program ends, sends nothing for too long, or violates the protocol.
         """
-        try:
-            header = parse_header(self._read(bytearray(HEADER.size)))
-            place = header.arrays * DESCRIPTION.size
-            content = self._read(bytearray(place + header.size))
-            given, wanted = parse_descriptions(header, bytes(content[:place]))
-            values = {}
-            for field in given:
-                shape = field.shape or ()
-                values[field.name] = np.ndarray(shape, field.numpy_dtype, content, place)
-                check_values(field, values[field.name])
-                place += field.nbytes
-        except MalformedMessageError as error:
-            raise self.error(str(error)) from None
-        return Message(header.kind, values, wanted)
+        messages = [self._receive(rank) for rank in range(len(self._connections))]
+        self._wanted = [message.wanted for message in messages]
+        return self._understood(partial(self._merge, messages))
 
-    def answer(self, values: list[Array]) -> None:
-        """Send the arrays that the last message requested, in its order.
+    def answer(self, values: Mapping[str, Array]) -> None:
+        """Send the arrays that the last message requested.
 
         Raises:
             ProgramError: If the program does not receive them.
         """
-        for part in pack_answer(values):
-            rest = memoryview(part).cast("B")
-            while rest:
-                sent = self._attempt(partial(self._connected().send, rest))
-                rest = rest[sent:]
+        for rank, wanted in enumerate(self._wanted):
+            for part in pack_answer([self._part(rank, field, values) for field in wanted]):
+                rest = memoryview(part).cast("B")
+                while rest:
+                    sent = self._attempt(
+                        partial(self._connections[rank].send, rest), self._where(rank)
+                    )
+                    rest = rest[sent:]
 
     def end(self) -> None:
         """Wait for a program that has sent all its samples to end.
@@ -128,8 +133,8 @@ class ProgramProcess(Closeable):
 
     def close(self) -> None:
         """End the program and all its child processes; none is left when this returns."""
-        connection, self._connection = self._connection, None
-        if connection is not None:
+        connections, self._connections = self._connections, []
+        for connection in connections:
             connection.close()
         if self._process is not None:
             self._process.close(patience=1.0)
@@ -147,7 +152,7 @@ class ProgramProcess(Closeable):
                     "bytes: set TMPDIR to a folder with a shorter path.",
                 )
             listener.bind(path)
-            listener.listen(1)
+            listener.listen()
             listener.settimeout(_TICK)
             try:
                 self._process = ChildProcess(
@@ -161,20 +166,92 @@ class ProgramProcess(Closeable):
                 ) from None
             assert self._process.stderr is not None
             self._tail = OutputTail(self._process.stderr)
-            self._connection, _ = self._attempt(listener.accept)
-            self._connection.settimeout(_TICK)
+            self._accept(listener)
 
-    def _read(self, into: bytearray) -> bytearray:
+    def _accept(self, listener: socket.socket) -> None:
+        """Have the program connect and declare its fields, in each of its ranks."""
+        message = self._receive(self._connect(listener))
+        if message.kind is Kind.PART:
+            self._accept_ranks(listener, self._understood(partial(read_part, message)))
+            return
+        self.fields = self._check_fields(message)
+
+    def _accept_ranks(self, listener: socket.socket, first: Part) -> None:
+        parts, found = [first], {first.rank: self._connections[0]}
+        while len(found) < first.ranks:
+            missing = min(set(range(first.ranks)) - found.keys())
+            number = self._connect(listener, missing)
+            message = self._receive(number)
+            part = self._understood(partial(read_part, message))
+            if part.ranks != first.ranks or part.rank in found:
+                raise self.error(
+                    f"called physx_open_part() in rank {part.rank} of {part.ranks}, after rank "
+                    f"{first.rank} of {first.ranks}: each rank calls it once."
+                )
+            parts.append(part)
+            found[part.rank] = self._connections[number]
+        self._connections = [found[rank] for rank in range(first.ranks)]
+        self._ranks = first.ranks
+        parts.sort()
+        declared = [self._check_fields(self._receive(rank), rank) for rank in range(first.ranks)]
+        self._division = self._understood(partial(Division, parts, declared))
+        self.fields = tuple(self._division.fields)
+
+    def _connect(self, listener: socket.socket, rank: int | None = None) -> int:
+        """Wait for a connection, that of a rank if there are several; return its number."""
+        connection, _ = self._attempt(listener.accept, "" if rank is None else f" in rank {rank}")
+        connection.settimeout(_TICK)
+        self._connections.append(connection)
+        return len(self._connections) - 1
+
+    def _check_fields(self, message: Message, rank: int = 0) -> tuple[Field, ...]:
+        if message.kind is not Kind.FIELDS or not (message.wanted or rank):
+            raise self.error("declared no fields in physx_open().")
+        return message.wanted
+
+    def _merge(self, messages: list[Message]) -> Message:
+        return messages[0] if self._division is None else self._division.merge(messages)
+
+    def _part(self, rank: int, field: Field, values: Mapping[str, Array]) -> Array:
+        whole = values[field.name]
+        return whole if self._division is None else self._division.divide(rank, field, whole)
+
+    def _receive(self, rank: int) -> Message:
+        """Return the next message of a connection."""
+
+        def parse() -> Message:
+            header = parse_header(self._read(bytearray(HEADER.size), rank))
+            place = header.arrays * DESCRIPTION.size
+            content = self._read(bytearray(place + header.size), rank)
+            given, wanted = parse_descriptions(header, bytes(content[:place]))
+            values = {}
+            for field in given:
+                shape = field.shape or ()
+                values[field.name] = np.ndarray(shape, field.numpy_dtype, content, place)
+                check_values(field, values[field.name])
+                place += field.nbytes
+            return Message(header.kind, values, wanted)
+
+        return self._understood(parse)
+
+    def _understood(self, call: Callable[[], Result]) -> Result:
+        """Return what a call returns that parses something of the program."""
+        try:
+            return call()
+        except MalformedMessageError as error:
+            raise self.error(str(error)) from None
+
+    def _read(self, into: bytearray, rank: int) -> bytearray:
         """Fill a buffer with what the program sends."""
-        rest = memoryview(into)
+        rest, where = memoryview(into), self._where(rank)
         while rest:
-            count = self._attempt(partial(self._connected().recv_into, rest))
+            count = self._attempt(partial(self._connections[rank].recv_into, rest), where)
             if not count:
-                raise self._gone()
+                raise self._gone(where)
             rest = rest[count:]
         return into
 
-    def _attempt(self, call: Callable[[], Result]) -> Result:
+    def _attempt(self, call: Callable[[], Result], where: str = "") -> Result:
         """Repeat a call that times out at each tick while the program does nothing."""
         until = time.monotonic() + self._timeout
         ended = False
@@ -183,25 +260,24 @@ class ProgramProcess(Closeable):
                 return call()
             except TimeoutError:
                 if ended:  # and everything that it sent has been read
-                    raise self._gone() from None
+                    raise self._gone(where) from None
                 ended = self._wait(0.0) is not None
             except OSError:
-                raise self._gone() from None
+                raise self._gone(where) from None
             if time.monotonic() > until:
                 raise self.error(
-                    f"did nothing for {self._timeout:g} s. If it needs that long, raise its "
-                    'env_kwargs "timeout" and EnvironmentConfig.timeout.'
+                    f"did nothing{where} for {self._timeout:g} s. If it needs that long, raise "
+                    'its env_kwargs "timeout" and EnvironmentConfig.timeout.'
                 )
 
-    def _gone(self) -> ProgramError:
+    def _gone(self, where: str) -> ProgramError:
         status = self._wait(_EXIT_TIME)
         how = "closed its connection" if status is None else describe_exit(status)
-        when = f"after {self.samples} samples" if self._connection else "before physx_open()"
-        return self.error(f"{how} {when}, without physx_close().")
+        when = f"after {self.samples} samples" if self._connections else "before physx_open()"
+        return self.error(f"{how}{where} {when}, without physx_close().")
 
-    def _connected(self) -> socket.socket:
-        assert self._connection is not None
-        return self._connection
+    def _where(self, rank: int) -> str:
+        return f" in rank {rank}" if self._ranks > 1 else ""
 
     def _wait(self, timeout: float) -> int | None:
         return None if self._process is None else self._process.wait(timeout)

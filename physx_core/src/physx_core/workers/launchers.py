@@ -8,12 +8,14 @@ import signal
 import subprocess
 import sys
 from collections import Counter
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
+from typing import Any
 
 from physx_core.components.launcher import ClientHandle, Launcher
 from physx_core.errors import ClientError, ConfigError
 from physx_core.net.handshake import TOKEN_VARIABLE
 from physx_core.processes import ChildProcess, OutputFile, OutputTail, worker_variables
+from physx_core.workers.other_python import OtherPython
 
 _TERMINATE_TIME = 0.5
 
@@ -35,6 +37,9 @@ class ClientProcess(ClientHandle):
         token: str,
         core: int | None = None,
         detached: bool = False,
+        *,
+        python: str | None = None,
+        variables: Mapping[str, str] | None = None,
     ) -> None:
         """Store the arguments of the process.
 
@@ -44,14 +49,16 @@ class ClientProcess(ClientHandle):
             token: Token of the run.
             core: The only processor core that it may use; None: all that this process may use.
             detached: Whether it outlives this process; it ends with its connection to the server.
+            python: The interpreter; None: that of this process.
+            variables: Further environment variables.
         """
         self.instance_id = instance_id
         self._core = core
         self._command = [
-            *(sys.executable, "-P", "-m", "physx_core.workers"),
+            *(python or sys.executable, "-P", "-m", "physx_core.workers"),
             *("--connect", address, "--instance", str(instance_id)),
         ]
-        self._variables = {TOKEN_VARIABLE: token, **worker_variables()}
+        self._variables = {**worker_variables(), **(variables or {}), TOKEN_VARIABLE: token}
         self._process: ChildProcess | None = None
         self._tail: OutputTail | None = None
         self._file: OutputFile | None = None
@@ -120,14 +127,28 @@ class ClientProcess(ClientHandle):
 class SubprocessLauncher(Launcher):
     """Starts each client as a process on this machine."""
 
-    def __init__(self, *, affinity: bool = False) -> None:
+    def __init__(
+        self,
+        *,
+        affinity: bool = False,
+        python: str | None = None,
+        env: Mapping[str, str] | None = None,
+    ) -> None:
         """Store the options.
 
         Args:
             affinity: Bind each client to one of the processor cores that this process may use, in
                 turn. This helps if there are as many busy clients as cores, and hurts if the
                 environments use several threads.
+            python: Another interpreter that runs the clients, for example "/usr/bin/python3" for
+                packages of the system. It needs Python 3.11 and NumPy, not physx.
+            env: Environment variables of the clients, in addition to those of this process.
+
+        Raises:
+            ConfigError: If an option is malformed, or this machine cannot do it.
         """
+        self._python, self._variables = _check_python(python), _check_variables(env)
+        self._other: OtherPython | None = None
         self._cores: list[int] = []
         if affinity:
             if not hasattr(os, "sched_setaffinity"):
@@ -136,19 +157,64 @@ class SubprocessLauncher(Launcher):
                 )
             self._cores = sorted(os.sched_getaffinity(0))
 
+    def open(self) -> str | None:
+        """Ask another interpreter whether it can run clients: see `Launcher.open`."""
+        if self._python is not None:
+            self._other = OtherPython(self._python, self._variables)
+            self._variables = self._other.variables
+        return None
+
+    def close(self) -> None:
+        """Remove what was lent to another interpreter."""
+        if self._other is not None:
+            self._other.close()
+
     def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
         """Start the processes: see `Launcher.launch`."""
+        given: dict[str, Any] = {"python": self._python, "variables": self._variables}
         started: list[ClientHandle] = []
         try:
             for number in instances:
                 core = self._cores[(number - 1) % len(self._cores)] if self._cores else None
-                process = ClientProcess(number, address, token, core)
+                process = ClientProcess(number, address, token, core, **given)
                 started.append(process)
                 process.start()
         except BaseException:
             stop(started, 0.0)
             raise
         return started
+
+
+def _check_python(python: Any) -> str | None:
+    if python is not None and not (isinstance(python, str) and python):
+        raise ConfigError(
+            'python must be the path of an interpreter, such as "/usr/bin/python3", '
+            f"not {python!r}."
+        )
+    return python
+
+
+def _check_variables(env: Any) -> dict[str, str]:
+    given = {} if env is None else env
+    if not (isinstance(given, Mapping) and all(map(_is_variable, given.items()))):
+        raise ConfigError(
+            f'env must be a table of environment variables, such as {{OMP_NUM_THREADS="4"}}, whose '
+            f"values are strings, not {env!r}."
+        )
+    if TOKEN_VARIABLE in given:
+        raise ConfigError(f"env must not set {TOKEN_VARIABLE}: see EnvironmentConfig.token_file.")
+    return dict(given)
+
+
+def _is_variable(item: tuple[Any, Any]) -> bool:
+    name, value = item
+    return (
+        isinstance(name, str)
+        and isinstance(value, str)
+        and bool(name)
+        and "=" not in name
+        and "\0" not in name + value
+    )
 
 
 class ManualLauncher(Launcher):

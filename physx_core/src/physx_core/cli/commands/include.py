@@ -1,4 +1,4 @@
-"""``physx include``: print the folder of physx.h and physx.f90, for programs in C and Fortran."""
+"""``physx include``: print the folder of physx.h, physx.f90 and physx.py, for other programs."""
 
 from __future__ import annotations
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physx_core.dataset.read.views import ModeView
-from physx_core.dataset.store.episode_table import EpisodeStatus
+from physx_core.dataset.store.episode_record import EpisodeStatus
 from physx_core.errors import DatasetError
 from physx_core.typing import Array, Index
 

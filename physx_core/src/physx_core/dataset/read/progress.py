@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from physx_core.dataset.read.order.records import Found, Records
-from physx_core.dataset.store.episode_table import EpisodeStatus
+from physx_core.dataset.store.episode_record import EpisodeStatus
 from physx_core.typing import Array, Index
 
 

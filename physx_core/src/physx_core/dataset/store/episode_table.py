@@ -31,8 +31,6 @@ those of an unfinished episode do not.
 
 from __future__ import annotations
 
-from enum import IntEnum
-
 from physx_core.config import MODES
 from physx_core.dataset.store.manifest import Manifest
 from physx_core.errors import ConfigError, listed
@@ -43,24 +41,6 @@ EPISODES = "episodes"
 
 LOST = "lost_episodes"
 """Entry in a dataset's info: records were lost, so no row of a mode without any counts."""
-
-OPEN = 2**60
-"""Number of rows of a stream that is being written."""
-
-
-class EpisodeStatus(IntEnum):
-    """What a record says about an episode."""
-
-    FINISHED = 0
-    FAILED = 1
-    """It has no rows."""
-    CUT = 2
-    """It was ended before its own end; its rows count."""
-    MORE = 3
-    """Further parts follow."""
-    STREAM = 4
-    """Its rows are a stream's; only the dataset writes such records."""
-
 
 TABLE_FIELDS = (
     Field("mode_index", (), "int8", role="additional"),

@@ -10,10 +10,7 @@ from physx_core.dataset.read.order.addresses import Addresses
 from physx_core.dataset.read.order.order import Order
 from physx_core.dataset.read.order.rewriting import records_at
 from physx_core.dataset.read.reader import Reader
-from physx_core.dataset.store.episode_table import (
-    EPISODES,
-    mode_index,
-)
+from physx_core.dataset.store.episode_table import EPISODES, mode_index
 from physx_core.dataset.store.manifest import Mode, Partition
 from physx_core.dataset.write.writer import Writer
 from physx_core.typing import Batch

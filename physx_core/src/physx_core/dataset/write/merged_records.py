@@ -10,13 +10,8 @@ from physx_core.config import MODES
 from physx_core.dataset.read.order.addresses import Addresses
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.store import failure_file
-from physx_core.dataset.store.episode_table import (
-    EPISODES,
-    OPEN,
-    EpisodeStatus,
-    has_table,
-    mode_index,
-)
+from physx_core.dataset.store.episode_record import OPEN, EpisodeStatus
+from physx_core.dataset.store.episode_table import EPISODES, has_table, mode_index
 from physx_core.dataset.store.manifest import Manifest
 from physx_core.dataset.write.recording import Recorder, stream_record
 from physx_core.typing import Batch

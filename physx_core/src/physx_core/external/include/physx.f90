@@ -16,14 +16,15 @@
 !     if (physx_close(run) /= 0) stop 1
 !
 ! Each function returns 0, or -1 if the run is over or after a mistake, which is written to stderr;
-! all later calls then return -1 as well. In an MPI program only one process calls them.
+! all later calls then return -1 as well. In an MPI program only one process calls them, unless each
+! begins with physx_open_part.
 
 module physx
     use, intrinsic :: iso_c_binding
     implicit none
     private
     public :: physx_run, physx_array, physx_field, physx_open, physx_parameters, physx_send
-    public :: physx_predict, physx_close, physx_any_shape
+    public :: physx_predict, physx_close, physx_any_shape, physx_open_part
     public :: c_double, c_float, c_int8_t, c_int16_t, c_int32_t, c_int64_t, c_bool
     public :: c_double_complex, c_float_complex
 
@@ -55,6 +56,16 @@ module physx
             import :: physx_run, physx_array, c_int
             type(physx_run), intent(inout) :: run
             type(physx_array), intent(in) :: fields(*)
+            integer(c_int), value :: count
+        end function
+
+        integer(c_int) function c_open_part(run, rank, ranks, fields, offsets, count) &
+                bind(c, name="physx_open_part")
+            import :: physx_run, physx_array, c_int, c_int64_t
+            type(physx_run), intent(inout) :: run
+            integer(c_int), value :: rank, ranks
+            type(physx_array), intent(in) :: fields(*)
+            integer(c_int64_t), intent(in) :: offsets(*)
             integer(c_int), value :: count
         end function
 
@@ -102,6 +113,18 @@ contains
         type(physx_run), intent(inout) :: run
         type(physx_array), intent(in) :: fields(:)
         status = c_open(run, fields, size(fields, kind=c_int))
+    end function
+
+    !> As physx_open, in each of several processes that send parts of each sample. All of them make
+    !> the same calls in the same order then. A field that several declare is divided along its last
+    !> axis: the part of this process begins after so many indices of the whole field. The others
+    !> are whole.
+    integer(c_int) function physx_open_part(run, rank, ranks, fields, offsets) result(status)
+        type(physx_run), intent(inout) :: run
+        integer(c_int), intent(in) :: rank, ranks
+        type(physx_array), intent(in) :: fields(:)
+        integer(c_int64_t), intent(in) :: offsets(:)
+        status = c_open_part(run, rank, ranks, fields, offsets, size(fields, kind=c_int))
     end function
 
     !> Receive parameters by name. A call after a sample begins a new episode, and waits until it

@@ -16,8 +16,9 @@
        return physx_close(&run) ? 1 : 0;
 
    Each function returns 0, or -1 if the run is over or after a mistake, which is written to stderr;
-   all later calls then return -1 as well. In an MPI program only one process calls them, and only
-   one thread at a time. For more, see docs/external.md of physx. */
+   all later calls then return -1 as well. In an MPI program only one process calls them, unless each
+   begins with physx_open_part; and only one thread at a time. For more, see docs/external.md of
+   physx. */
 
 #ifndef PHYSX_H
 #define PHYSX_H
@@ -80,6 +81,12 @@ typedef struct {
 /* Connect to the run that started this program, and declare the fields of a sample. */
 PHYSX_API int physx_open(physx_run *run, const physx_array *fields, int count);
 
+/* As physx_open, in each of several processes that send parts of each sample. All of them make the
+   same calls in the same order then. A field that several declare is divided along its first axis:
+   the part of this process begins at its offset in the whole field. The others are whole. */
+PHYSX_API int physx_open_part(physx_run *run, int rank, int ranks, const physx_array *fields,
+                              const int64_t *offsets, int count);
+
 /* Receive parameters, by name, into the arrays. A call after a sample begins a new episode, and
    waits until it is due. */
 PHYSX_API int physx_parameters(physx_run *run, const physx_array *wanted, int count);
@@ -104,7 +111,8 @@ enum {
     PHYSX_SAMPLE_ = 3,
     PHYSX_PREDICT_ = 4,
     PHYSX_CLOSE_ = 5,
-    PHYSX_ANSWER_ = 6
+    PHYSX_ANSWER_ = 6,
+    PHYSX_PART_ = 7
 };
 
 static const char physx_magic_[4] = {'p', 'h', 'y', 1}; /* last byte: the protocol's version */
@@ -263,33 +271,68 @@ static inline int physx_message_(physx_run *run, const char *call, int kind,
     return 0;
 }
 
-PHYSX_API int physx_open(physx_run *run, const physx_array *fields, int count)
+/* Connect to the run that started this program. */
+static inline int physx_connect_(physx_run *run, const char *call)
 {
     const char *path = getenv("PHYSX_SOCKET");
     const uint16_t one = 1;
     struct sockaddr_un address;
-    const physx_array *groups[2];
-    int counts[2];
 
     run->socket = -1;
     if (!path)
-        return physx_mistake_(run, "physx_open", "PHYSX_SOCKET is not set",
+        return physx_mistake_(run, call, "PHYSX_SOCKET is not set",
                               "this program was not started by a physx run");
     memset(&address, 0, sizeof address);
     address.sun_family = AF_UNIX;
     if (!*(const unsigned char *)&one || strlen(path) >= sizeof address.sun_path)
-        return physx_mistake_(run, "physx_open", path,
+        return physx_mistake_(run, call, path,
                               "the path is too long, or this machine is big-endian");
     memcpy(address.sun_path, path, strlen(path));
     run->socket = socket(AF_UNIX, SOCK_STREAM | SOCK_CLOEXEC, 0);
     if (run->socket < 0 || connect(run->socket, (const struct sockaddr *)&address, sizeof address))
-        return physx_mistake_(run, "physx_open", strerror(errno),
-                              "the run is over, or this program has already called it (only one "
-                              "process of an MPI program may)");
+        return physx_mistake_(run, call, strerror(errno),
+                              "the run is over, or this program has already called it (of an MPI "
+                              "program one process may, or each calls physx_open_part)");
+    return 0;
+}
+
+PHYSX_API int physx_open(physx_run *run, const physx_array *fields, int count)
+{
+    const physx_array *groups[2];
+    int counts[2];
     groups[0] = groups[1] = fields;
     counts[0] = 0;
     counts[1] = count;
+    if (physx_connect_(run, "physx_open")) return -1;
     return physx_message_(run, "physx_open", PHYSX_FIELDS_, groups, counts);
+}
+
+PHYSX_API int physx_open_part(physx_run *run, int rank, int ranks, const physx_array *fields,
+                              const int64_t *offsets, int count)
+{
+    int64_t part[PHYSX_ARRAYS + 2];
+    physx_array array;
+    const physx_array *groups[2];
+    int counts[2] = {1, 0};
+    int index;
+    if (physx_connect_(run, "physx_open_part")) return -1;
+    if (count < 0 || count > PHYSX_ARRAYS)
+        return physx_mistake_(run, "physx_open_part", "", "it takes 0 to 64 arrays");
+    part[0] = rank;
+    part[1] = ranks;
+    for (index = 0; index < count; index++) part[index + 2] = offsets[index];
+    memset(&array, 0, sizeof array);
+    memcpy(array.name, "part", 5);
+    array.type = PHYSX_INT64;
+    array.rank = 1;
+    array.shape[0] = count + 2;
+    array.data = part;
+    groups[0] = groups[1] = &array;
+    if (physx_message_(run, "physx_open_part", PHYSX_PART_, groups, counts)) return -1;
+    groups[1] = fields;
+    counts[0] = 0;
+    counts[1] = count;
+    return physx_message_(run, "physx_open_part", PHYSX_FIELDS_, groups, counts);
 }
 
 PHYSX_API int physx_parameters(physx_run *run, const physx_array *wanted, int count)

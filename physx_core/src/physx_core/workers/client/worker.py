@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import re
 import sys
 from collections.abc import Callable
 from pathlib import Path
@@ -25,6 +26,9 @@ from physx_core.workers.instance import Instance
 
 if TYPE_CHECKING:
     from physx_core.workers.client.episode_producer import EpisodeProducer
+
+_PACKAGES = re.compile(r"/(site-packages|dist-packages|lib-dynload|lib\d*/python3[^/]*)(/|$)")
+"""What belongs to an interpreter, in the module path."""
 
 
 def run_client(
@@ -110,10 +114,18 @@ def run_instance(
 
 
 def _take_place(path: list[str], directory: str) -> None:
-    """Use the server's module path and working directory, as far as they exist here."""
+    """Use the server's module path and working directory, as far as they exist here.
+
+    The packages of another interpreter are not for this one.
+    """
     if Path(directory).is_dir():
         os.chdir(directory)
-    found = [entry for entry in path if Path(entry).exists()]
+    own = {str(Path(entry).resolve()) for entry in sys.path}
+    found = [
+        entry
+        for entry in path
+        if Path(entry).exists() and (entry in own or not _PACKAGES.search(entry))
+    ]
     sys.path[:] = [*found, *(entry for entry in sys.path if entry not in found)]
 
 

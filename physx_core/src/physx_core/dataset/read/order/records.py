@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physx_core.dataset.read.order.addresses import Addresses
-from physx_core.dataset.store.episode_table import OPEN, EpisodeStatus
+from physx_core.dataset.store.episode_record import OPEN, EpisodeStatus
 from physx_core.typing import Index
 
 Flags = NDArray[np.bool_]

@@ -6,7 +6,7 @@ import numpy as np
 
 from physx_core.dataset.read.order.addresses import Addresses
 from physx_core.dataset.read.order.order import Order
-from physx_core.dataset.store.episode_table import OPEN, EpisodeStatus
+from physx_core.dataset.store.episode_record import OPEN, EpisodeStatus
 from physx_core.typing import Batch, Index
 
 
