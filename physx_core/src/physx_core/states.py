@@ -70,7 +70,9 @@ class Baseline:
         graph.walk(root, with_snapshots=False)
         self._nodes, self._numbers = graph.nodes, graph.numbers
         self._contents = graph.contents
-        self._created = graph.digests()
+        digests = graph.digests()
+        self._names = "\n".join(digests)
+        self._created = np.array(list(digests.values()), np.uint64)
 
     def capture(self) -> dict[str, Any]:
         """Return what has changed, as values that `physx_core.net.encode` takes.
@@ -90,7 +92,7 @@ class Baseline:
                 added.append([*graph.describe(number), content])
             elif not _same(content, self._contents[number]):
                 changed.append([number, content])
-        return {"created": dict(self._created), "changed": changed, "added": added}
+        return {"created": self._created.copy(), "names": self._names, "changed": changed, "added": added}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Change the object to a state of it, or of another one that was created alike.
@@ -98,9 +100,9 @@ class Baseline:
         Raises:
             StateError: If it was created differently, or a class of the state is not imported.
         """
-        created = state["created"]
-        names = self._created.keys() | created.keys()
-        differ = [name for name in names if self._created.get(name) != created.get(name)]
+        here = _digests(self._names, self._created)
+        there = _digests(state["names"], state["created"])
+        differ = [name for name in {**here, **there} if here.get(name) != there.get(name)]
         if differ:
             root = type(self._nodes[0]).__name__
             raise StateError(
@@ -115,16 +117,23 @@ class Baseline:
         made = _Making(self._nodes, state["added"])
         nodes = [made(number) for number in range(first + len(state["added"]))]
         kinds = ["object", *map(_kind_of, nodes[1:])]
-        for later in (False, True):  # what has a hash comes before what needs it
-            for number, content in contents.items():
-                if (kinds[number] in _HASHING) is later:
-                    _fill(nodes[number], kinds[number], content, made.value, self._kept(number))
+
+        def fill() -> None:
+            for later in (False, True):  # what has a hash comes before what needs it
+                for number, content in contents.items():
+                    if (kinds[number] in _HASHING) is later:
+                        kept = frozenset() if number else self._left_out
+                        _fill(nodes[number], kinds[number], content, made.value, kept)
+
+        fill()
         for number, content in contents.items():
             if kinds[number] == "snapshot" and content is not None:
                 nodes[number].restore(made.value(content))
+        fill()  # what restoring a snapshot has changed around it
 
-    def _kept(self, number: int) -> frozenset[str]:
-        return frozenset() if number else self._left_out
+
+def _digests(names: str, digests: Array) -> dict[str, int]:
+    return dict(zip(names.split("\n"), digests.tolist(), strict=True))
 
 
 # Reading ----------------------------------------------------------------------------------------

@@ -10,7 +10,7 @@ import numpy as np
 
 from physx_core.components import Environment, Event
 from physx_core.config import EnvironmentConfig
-from physx_core.errors import NotFiniteError
+from physx_core.errors import NotFiniteError, StateError
 from physx_core.rows import ROW_FIELDS, RowBuffer, infer_shapes
 from physx_core.sources import ClientSource, LocalSource
 from physx_core.typing import Batch, Sample
@@ -28,6 +28,10 @@ from physx_testing.subject import (
 
 _ROWS = 6
 _SEED = (5, 0, 0)
+_DISTURBED = (
+    "rows that follow a state differ from those without one, as an engine may discard memory of "
+    "its last step there: take states after the same rows in each run"
+)
 
 
 def check_environment(
@@ -110,14 +114,12 @@ def _rows(
 
 
 @contextlib.contextmanager
-def _instance(
-    subject: Subject, number: int, instances: int, services: Services
-) -> Iterator[Instance]:
+def one_instance(subject: Subject, number: int = 1, instances: int = 1) -> Iterator[Instance]:
     """Yield one of several instances, as a client would have it."""
     config = _config(subject, instances)
     instance = Instance(**instance_arguments(config, number, _SEED, accept_all=False))
     try:
-        instance.open(services, draw=False)
+        instance.open(Services(), draw=False)
         yield instance
     finally:
         instance.close()
@@ -128,12 +130,12 @@ def _refuses(subject: Subject) -> None:
 
 
 def _open(subject: Subject) -> None:
-    with _instance(subject, 1, 1, Services()):
+    with one_instance(subject):
         pass
 
 
 def _steps(subject: Subject) -> None:
-    with _instance(subject, 1, 1, Services()) as instance:
+    with one_instance(subject) as instance:
         promised = {field.name: field for field in instance.fields}
         for step in range(_ROWS):
             sample = instance.step()
@@ -169,7 +171,7 @@ def _independent(subject: Subject) -> None:
     together = _rows(subject, 2 * _ROWS, 2)
     for number in (1, 2):
         mine = together["env_id"] == number
-        with _instance(subject, number, 2, Services()) as instance:
+        with one_instance(subject, number, 2) as instance:
             buffer: RowBuffer | None = None
             for _ in range(_ROWS):
                 sample = instance.step()
@@ -212,7 +214,7 @@ def _replays(subject: Subject) -> None:
 
 
 def _reads_samples(subject: Subject) -> bool:
-    with _instance(subject, 1, 1, Services()) as instance:
+    with one_instance(subject) as instance:
         instance.step()
         assert instance.environment is not None
         return instance.environment._has_read_sample
@@ -224,10 +226,43 @@ def _many_steps(subject: Subject) -> None:
     expect_equal(again, first, "with two simulations per row, a second run has different rows")
 
 
+def _rows_with_states(subject: Subject) -> tuple[list[Batch], dict[int, bytes]]:
+    """Return rows, and the states that were taken between them."""
+    from physx_testing.continuing import rows_between
+
+    states: dict[int, bytes] = {}
+    with one_instance(subject) as instance:
+        try:
+            instance.track_states()
+            return rows_between(instance, 0, states), states
+        except StateError as error:
+            raise NotApplicableError(str(error)) from error
+
+
+def _continues(subject: Subject) -> None:
+    from physx_testing.continuing import in_another_process
+
+    rows, states = _rows_with_states(subject)
+    for made, found in in_another_process(subject, states).items():
+        for row, wanted in enumerate(rows[made:], made):
+            what = f"row {row} differs in another process that got the state after {made} rows"
+            expect_equal(found[row - made], wanted, what)
+
+
+def _is_not_disturbed(subject: Subject) -> None:
+    from physx_testing.continuing import rows_between
+
+    rows, _ = _rows_with_states(subject)
+    with one_instance(subject) as instance:
+        for found, wanted in zip(rows, rows_between(instance, 0, None), strict=True):
+            if any(not np.array_equal(wanted[name], found[name]) for name in wanted):
+                raise NotApplicableError(_DISTURBED)
+
+
 def _closes(subject: Subject) -> None:
     made = subject.make(instance_id=1, instance_nb=1, seed=list(_SEED))
     _close(made, "before create(), as after a failure there")
-    with _instance(subject, 1, 1, Services()) as instance:
+    with one_instance(subject) as instance:
         instance.step()
         environment = instance.environment
     assert environment is not None
@@ -270,6 +305,8 @@ CHECKS: dict[str, Check] = {
     "gives the same rows from clients over TCP": _over_tcp,
     "draws without an effect on its rows": _draws,
     "replays stored rows": _replays,
+    "continues from its state in another process": _continues,
+    "gives the same rows when states are taken": _is_not_disturbed,
     "closes at any time, even twice": _closes,
     "leaves its process as it was": _quiet,
 }
