@@ -22,7 +22,7 @@ from types import (
     MethodType,
     ModuleType,
 )
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import xxhash
@@ -30,29 +30,32 @@ import xxhash
 from physx_core.errors import StateError, listed
 from physx_core.typing import Array
 
+Part: TypeAlias = Callable[[Any, str], Any]
+"""Returns what stands for a part in a content: atoms themselves, the number of an object as a tuple
+``(number,)``. Takes the part and where it is."""
+Value: TypeAlias = Callable[[Any], Any]
+"""Returns the part that an atom or number stands for."""
+
 _ATOMS = frozenset((type(None), bool, int, float, complex, str, bytes))
 _PLAIN = "biufcSUmM"
 """Kinds of dtypes that values of any process understand."""
-_BASES = (dict, list, tuple, set, frozenset, deque, object)
-_NUMPY = (np.random.MT19937, np.random.PCG64, np.random.PCG64DXSM, np.random.Philox,
-          np.random.SFC64)  # fmt: skip
-_BITS = {kind.__name__: kind for kind in _NUMPY}
-_FIXED = (type, ModuleType, np.dtype, np.ufunc, range, slice, re.Pattern)
-_FUNCTIONS = (FunctionType, MethodType, BuiltinFunctionType, functools.partial)
-_BUFFERS = (type(None), bytes, bytearray, memoryview)
-_IN_PARTS = ("tuple", "frozenset", "generator")
-"""Kinds of objects that are made of their parts, and do not change."""
-_HASHING = ("dict", "set")
-_ORDERED = "collections:OrderedDict"
+_BITS = {
+    kind.__name__: kind
+    for kind in (
+        *(np.random.MT19937, np.random.PCG64, np.random.PCG64DXSM),
+        *(np.random.Philox, np.random.SFC64),
+    )
+}
+_BASES = {each.__name__: each for each in (dict, list, tuple, set, frozenset, deque, object)}
 
 
 class Baseline:
     """The parts of an object as they were when it was created, by number.
 
-    Known are numbers, texts, bytes, paths, NumPy arrays, random generators and bit generators,
-    lists, dictionaries, tuples, sets, deques, members of enumerations, objects of Python classes,
-    with their attributes, and any object with methods ``snapshot()`` and ``restore(snapshot)``,
-    such as the simulations of engines.
+    Known are numbers, texts, bytes, paths, NumPy arrays and their views, random generators, lists,
+    dictionaries, tuples, sets, deques, members of enumerations, objects of Python classes with
+    their attributes, their methods, what functions remember, and any object with methods
+    ``snapshot()`` and ``restore(snapshot)``, such as the simulations of engines.
     """
 
     def __init__(self, root: Any, left_out: Iterable[str] = ()) -> None:
@@ -81,18 +84,18 @@ class Baseline:
         the last bits: see `physx_sim.Simulation.snapshot`.
 
         Raises:
-            StateError: If a part is of an unknown kind, or an array added since then is a view of
-                another one.
+            StateError: If a part is of an unknown kind.
         """
         graph, known = _Graph(self._left_out, self._nodes, self._numbers), len(self._nodes)
         graph.walk(self._nodes[0])
         changed, added = [], []
         for number, content in sorted(graph.contents.items()):
             if number >= known:
-                added.append([*graph.describe(number), content])
+                added.append([*graph.recipe(number), content])
             elif not _same(content, self._contents[number]):
                 changed.append([number, content])
-        return {"created": self._created.copy(), "names": self._names, "changed": changed, "added": added}
+        created = {"names": self._names, "created": self._created.copy()}
+        return {**created, "changed": changed, "added": added}
 
     def restore(self, state: Mapping[str, Any]) -> None:
         """Change the object to a state of it, or of another one that was created alike.
@@ -100,8 +103,36 @@ class Baseline:
         Raises:
             StateError: If it was created differently, or a class of the state is not imported.
         """
-        here = _digests(self._names, self._created)
-        there = _digests(state["names"], state["created"])
+        self._check_created(state)
+        contents = self._contents | dict(state["changed"])
+        added, first = state["added"], len(self._nodes)
+        contents |= {number: content for number, (_, _, content) in enumerate(added, first)}
+        made = _Making(self._nodes, added)
+        nodes = [made(number) for number in range(first + len(added))]
+        kinds = ["object", *map(_kind_of, nodes[1:])]
+
+        def fill() -> None:
+            for later in (False, True):  # what has a hash comes before what needs it
+                for number, content in contents.items():
+                    kind = _KINDS[kinds[number]]
+                    if kind.hashes is later:
+                        kept = frozenset() if number else self._left_out
+                        kind.fill(nodes[number], content, made.value, kept)
+
+        fill()
+        for number, content in contents.items():
+            if kinds[number] == "snapshot" and content is not None:
+                nodes[number].restore(made.value(content))
+        fill()  # what restoring a snapshot has changed around it
+
+    def _check_created(self, state: Mapping[str, Any]) -> None:
+        here, there = (
+            dict(zip(names.split("\n"), digests.tolist(), strict=True))
+            for names, digests in (
+                (self._names, self._created),
+                (state["names"], state["created"]),
+            )
+        )
         differ = [name for name in {**here, **there} if here.get(name) != there.get(name)]
         if differ:
             root = type(self._nodes[0]).__name__
@@ -110,40 +141,10 @@ class Baseline:
                 f"{listed(differ)}. Create it with the same arguments, seed and code, and name "
                 f"what may differ in the class: constants = ({differ[0]!r},)."
             )
-        contents = self._contents | dict(state["changed"])
-        first = len(self._nodes)
-        for number, (_, _, content) in enumerate(state["added"], first):
-            contents[number] = content
-        made = _Making(self._nodes, state["added"])
-        nodes = [made(number) for number in range(first + len(state["added"]))]
-        kinds = ["object", *map(_kind_of, nodes[1:])]
-
-        def fill() -> None:
-            for later in (False, True):  # what has a hash comes before what needs it
-                for number, content in contents.items():
-                    if (kinds[number] in _HASHING) is later:
-                        kept = frozenset() if number else self._left_out
-                        _fill(nodes[number], kinds[number], content, made.value, kept)
-
-        fill()
-        for number, content in contents.items():
-            if kinds[number] == "snapshot" and content is not None:
-                nodes[number].restore(made.value(content))
-        fill()  # what restoring a snapshot has changed around it
-
-
-def _digests(names: str, digests: Array) -> dict[str, int]:
-    return dict(zip(names.split("\n"), digests.tolist(), strict=True))
-
-
-# Reading ----------------------------------------------------------------------------------------
 
 
 class _Graph:
-    """Objects by number, and the contents of those that can be reached.
-
-    In a content, a part is an atom, or the number of an object as a tuple ``(number,)``.
-    """
+    """Objects by number, and the contents of those that can be reached."""
 
     def __init__(
         self,
@@ -153,34 +154,34 @@ class _Graph:
     ) -> None:
         self.nodes, self.numbers = list(nodes), dict(numbers or {})  # number by id
         self.contents: dict[int, Any] = {}
+        self._left_out, self._known = left_out, len(self.nodes)
         self._queue: list[int] = []
-        self._known, self._left_out = len(self.nodes), left_out
         self._origins: dict[int, tuple[int, str]] = {}  # by number: who has it, and where
-        self._memory: dict[int, int] = {}  # number of an array by the id of what owns its memory
 
     def walk(self, root: Any, *, with_snapshots: bool = True) -> None:
         """Read the contents of all objects that can be reached."""
-        self._part(root, -1, type(root).__name__)
+        self._part(-1, root, type(root).__name__)
         for number in self._queue:  # which grows
-            self.contents[number] = self._content(number, with_snapshots)
+            value, part = self.nodes[number], functools.partial(self._part, number)
+            try:
+                if not number:
+                    content: Any = _read_attributes(value, part, self._left_out)
+                elif _kind_of(value) == "snapshot" and not with_snapshots:
+                    content = None
+                else:
+                    content = _KINDS[_kind_of(value)].read(value, part)
+            except _RefusedError as error:
+                raise self._error(number, str(error)) from None
+            self.contents[number] = content
 
-    def describe(self, number: int) -> tuple[str, Any]:
-        """Return the kind of an added object and what is needed to make it."""
+    def recipe(self, number: int) -> tuple[str, Any]:
+        """Return the kind of an added object, and what is needed to make it."""
         value = self.nodes[number]
         kind = _kind_of(value)
-        if kind == "array":
-            return kind, [_axes(value), value.flags.writeable, _descr(value.dtype),
-                          list(value.shape)]  # fmt: skip
-        if kind == "bits":
-            sequence = value.seed_seq
-            return kind, [type(value).__name__, None if sequence is None else sequence.state]
-        if kind == "deque":
-            return kind, value.maxlen
-        if kind in ("function", "fixed", "snapshot"):
-            raise self._error(number, "was added after creation")
-        if kind == "generator":
-            return kind, None
-        return kind, None if type(value).__module__ == "builtins" else _name_of(type(value))
+        try:
+            return kind, _KINDS[kind].recipe(value)
+        except _RefusedError as error:
+            raise self._error(number, str(error)) from None
 
     def digests(self) -> dict[str, int]:
         """Return a digest of the contents below each attribute of the root."""
@@ -199,7 +200,7 @@ class _Graph:
             found.setdefault(name, xxhash.xxh3_64(_as_bytes([part])))
         return {name: found[name].intdigest() for name in root}
 
-    def _part(self, value: Any, owner: int, label: str) -> Any:
+    def _part(self, owner: int, value: Any, label: str) -> Any:
         """Return an atom itself, and the number of any other object."""
         if type(value) in _ATOMS or isinstance(value, PurePath):
             return value
@@ -214,71 +215,13 @@ class _Graph:
             self._queue.append(number)
         return (number,)
 
-    def _content(self, number: int, with_snapshots: bool) -> Any:
-        value = self.nodes[number]
-        kind = _kind_of(value) if number else "object"
-        if kind == "object":
-            left_out = frozenset() if number else self._left_out
-            parts = {name: each for name, each in _attributes(value) if name not in left_out}
-            return {name: self._part(each, number, f".{name}") for name, each in parts.items()}
-        if kind == "dict":
-            return [
-                part
-                for key, each in value.items()
-                for part in (
-                    self._part(key, number, " key"),
-                    self._part(each, number, f"[{key!r:.40}]"),
-                )
-            ]
-        if kind in ("set", "frozenset"):  # the order may differ between processes
-            value = sorted(value, key=repr)
-        if kind in ("list", "tuple", "deque", "set", "frozenset"):
-            return [self._part(each, number, f"[{i}]") for i, each in enumerate(value)]
-        if kind == "array":
-            return self._array(number, value)
-        if kind == "generator":
-            return [self._part(value.bit_generator, number, ".bit_generator")]
-        if kind == "bits":
-            return [as_lists(value.state), getattr(value.seed_seq, "n_children_spawned", 0)]
-        if kind == "enum":
-            return self._part(value.value, number, ".value")
-        if kind == "function":
-            return {name: self._part(each, number, f".{name}") for name, each in _needs(value)}
-        if kind == "snapshot":
-            return self._part(value.snapshot(), number, ".snapshot()") if with_snapshots else None
-        if kind == "fixed":
-            return getattr(value, "__qualname__", None) or getattr(value, "__name__", str(value))
-        raise self._error(number, "cannot be captured")
-
-    def _array(self, number: int, value: Array) -> Any:
-        if value.dtype.hasobject:
-            raise self._error(number, f"of {value.dtype} cannot be captured")
-        whole: Any = value
-        while isinstance(whole.base, np.ndarray):
-            whole = whole.base
-        other = self._memory.setdefault(id(whole), number)
-        is_added = number >= self._known > 0
-        if self._known and other != number and max(number, other) >= self._known:
-            added, seen = max(number, other), min(number, other)
-            raise self._error(added, f"is a view of {self._path(seen)}: store a copy of it")
-        if is_added and type(whole.base) not in _BUFFERS:
-            what = type(whole.base).__name__
-            raise self._error(number, f"is a view of memory of a {what}: store a copy of it")
-        if is_added and not value.transpose(_axes(value)).flags.c_contiguous:
-            raise self._error(number, "is a view with gaps: store a copy of it")
-        copied = np.array(value.transpose(_axes(value)) if is_added else value, order="C")
-        return copied if value.dtype.kind in _PLAIN else copied.tobytes()
-
-    def _path(self, number: int) -> str:
-        labels: list[str] = []
-        while number >= 0:
-            number, label = self._origins[number]
-            labels.append(label)
-        return "".join(reversed(labels))
-
     def _error(self, number: int, why: str) -> StateError:
-        path, kind = self._path(number), _name_of(type(self.nodes[number])).replace(":", ".")
-        name = path.split(".")[1].split("[")[0] if "." in path else path
+        labels, place = [], number
+        while place >= 0:
+            place, label = self._origins[place]
+            labels.append(label)
+        path, name = "".join(reversed(labels)), "".join(labels[-2:-1]).removeprefix(".")
+        kind = _name_of(type(self.nodes[number])).replace(":", ".")
         return StateError(
             f"{path} ({kind}) {why}, so there can be no state of it. If it never changes, name it "
             f'in the class: constants = ("{name}",). Otherwise implement get_state() and '
@@ -288,62 +231,363 @@ class _Graph:
         )
 
 
+class _Making:
+    """Makes the added objects of a state, still empty unless they consist of their parts."""
+
+    def __init__(self, nodes: list[Any], added: list[Any]) -> None:
+        self._nodes, self._first, self._added = [*nodes, *([None] * len(added))], len(nodes), added
+        self._is_made = [True] * len(nodes) + [False] * len(added)
+
+    def __call__(self, number: int) -> Any:
+        if not self._is_made[number]:
+            kind, recipe, content = self._added[number - self._first]
+            self._nodes[number] = _KINDS[kind].make(recipe, content, self.value)
+            self._is_made[number] = True
+        return self._nodes[number]
+
+    def value(self, part: Any) -> Any:
+        return self(part[0]) if type(part) is tuple else part
+
+
+# Kinds ------------------------------------------------------------------------------------------
+
+
+class _RefusedError(Exception):
+    """Why there can be no state of an object."""
+
+
+class _Kind:
+    """What is done with objects of a kind; here: with those that never change.
+
+    Attributes:
+        hashes: Whether filling them needs the hash of parts.
+    """
+
+    hashes = False
+
+    def read(self, value: Any, part: Part) -> Any:
+        """Return the content: a list or dictionary of parts, an array, bytes, or an atom."""
+        return getattr(value, "__qualname__", None) or getattr(value, "__name__", str(value))
+
+    def recipe(self, value: Any) -> Any:
+        """Return what is needed to make an object, besides its content."""
+        raise _RefusedError("was added after creation")
+
+    def make(self, recipe: Any, content: Any, value: Value) -> Any:
+        """Return a new object, empty if `fill` fills it."""
+        raise StateError("The state has an object that cannot be made.")
+
+    def fill(self, node: Any, content: Any, value: Value, kept: frozenset[str]) -> None:
+        """Give an object its content, in place."""
+
+
+class _Unknown(_Kind):
+    def read(self, value: Any, part: Part) -> Any:
+        raise _RefusedError("cannot be captured")
+
+
+class _Snapshot(_Kind):
+    def read(self, value: Any, part: Part) -> Any:
+        return part(value.snapshot(), ".snapshot()")
+
+
+class _Object(_Kind):
+    """An object of a Python class, with attributes."""
+
+    def read(self, value: Any, part: Part) -> Any:
+        return _read_attributes(value, part)
+
+    def recipe(self, value: Any) -> Any:
+        return _name_of(type(value))
+
+    def make(self, recipe: Any, content: Any, value: Value) -> Any:
+        return object.__new__(_class_named(recipe, object))
+
+    def fill(self, node: Any, content: Any, value: Value, kept: frozenset[str]) -> None:
+        values = {name: value(part) for name, part in content.items()}
+        own = getattr(node, "__dict__", {})
+        for name in own.keys() - values.keys() - kept:
+            del own[name]
+        for name in _slots(type(node)):
+            if name in values:
+                object.__setattr__(node, name, values.pop(name))
+            elif hasattr(node, name):
+                object.__delattr__(node, name)
+        own.update(values)
+
+
+class _Items(_Kind):
+    """A list, deque or set, or a tuple or frozenset, which cannot be filled."""
+
+    def __init__(self, base: type[Any]) -> None:
+        self._base, self.hashes = base, base is set
+        self._is_fixed = base in (tuple, frozenset)
+
+    def read(self, value: Any, part: Part) -> Any:
+        if self._base in (set, frozenset):  # whose order may differ between processes
+            value = sorted(value, key=repr)
+        return [part(each, f"[{place}]") for place, each in enumerate(value)]
+
+    def recipe(self, value: Any) -> Any:
+        if self._base is deque:
+            return value.maxlen
+        return None if type(value) is self._base else _name_of(type(value))
+
+    def make(self, recipe: Any, content: Any, value: Value) -> Any:
+        if self._base is deque:
+            return deque(maxlen=recipe)
+        kind: Any = self._base if recipe is None else _class_named(recipe, self._base)
+        items = [[value(part) for part in content]] if self._is_fixed else []
+        return self._base.__new__(kind, *items)
+
+    def fill(self, node: Any, content: Any, value: Value, kept: frozenset[str]) -> None:
+        if not self._is_fixed:
+            node.clear()
+            (node.update if self._base is set else node.extend)(value(part) for part in content)
+
+
+class _Dict(_Kind):
+    hashes = True
+
+    def read(self, value: Any, part: Part) -> Any:
+        return [
+            found
+            for key, each in value.items()
+            for found in (part(key, " key"), part(each, f"[{key!r:.40}]"))
+        ]
+
+    def recipe(self, value: Any) -> Any:
+        return None if type(value) is dict else _name_of(type(value))
+
+    def make(self, recipe: Any, content: Any, value: Value) -> Any:
+        kind: Any = dict if recipe is None else _class_named(recipe, dict)
+        return OrderedDict() if kind is OrderedDict else dict.__new__(kind)
+
+    def fill(self, node: Any, content: Any, value: Value, kept: frozenset[str]) -> None:
+        parts = [value(part) for part in content]
+        node.clear()
+        node.update(zip(parts[::2], parts[1::2], strict=True))
+
+
+class _Array(_Kind):
+    """An array that has its own memory; its axes stay in their order there."""
+
+    def read(self, value: Any, part: Part) -> Any:
+        if value.dtype.hasobject:
+            raise _RefusedError(f"of {value.dtype} cannot be captured")
+        copied = np.array(value.transpose(_axes(value)), order="C")
+        return copied if value.dtype.kind in _PLAIN else copied.tobytes()
+
+    def recipe(self, value: Any) -> Any:
+        if value.size and type(value.base) not in (type(None), bytes, bytearray, memoryview):
+            raise _RefusedError(f"is memory of a {type(value.base).__name__}: store a copy of it")
+        return [_axes(value), list(value.shape), _descr(value.dtype), value.flags.writeable]
+
+    def make(self, recipe: Any, content: Any, value: Value) -> Any:
+        axes, shape, descr, writeable = recipe
+        lying = np.empty([shape[axis] for axis in axes], _dtype(descr))
+        found = np.empty_like(lying.transpose(np.argsort(axes)))  # no view
+        self.fill(found, content, value, frozenset())
+        found.flags.writeable = writeable
+        return found
+
+    def fill(self, node: Any, content: Any, value: Value, kept: frozenset[str]) -> None:
+        whole = node.transpose(_axes(node))
+        if isinstance(content, bytes):
+            content = np.frombuffer(content, node.dtype).reshape(whole.shape)
+        if whole.shape != content.shape:
+            raise StateError(f"The shape of an array was changed in place, to {content.shape}.")
+        if not node.flags.writeable and whole.tobytes() == content.tobytes():
+            return
+        writeable, node.flags.writeable = node.flags.writeable, True
+        node.transpose(_axes(node))[...] = content
+        node.flags.writeable = writeable
+
+
+class _View(_Kind):
+    """A view of an array, which has its content."""
+
+    def read(self, value: Any, part: Part) -> Any:
+        whole = _whole(value)
+        offset = _address(value) - _address(whole)
+        return [part(whole, ".base"), offset, str(value.strides), str(value.shape)]
+
+    def recipe(self, value: Any) -> Any:
+        return [list(value.shape), list(value.strides), _descr(value.dtype), value.flags.writeable]
+
+    def make(self, recipe: Any, content: Any, value: Value) -> Any:
+        whole, (shape, strides, descr, writeable) = value(content[0]), recipe
+        whole = whole.transpose(_axes(whole))
+        found: Array = np.ndarray(shape, _dtype(descr), whole, content[1], strides)
+        found.flags.writeable &= writeable
+        return found
+
+
+class _Bits(_Kind):
+    """What a random generator draws its bits from."""
+
+    def read(self, value: Any, part: Part) -> Any:
+        return [as_lists(value.state), getattr(value.seed_seq, "n_children_spawned", 0)]
+
+    def recipe(self, value: Any) -> Any:
+        seeds = value.seed_seq
+        return [type(value).__name__, None if seeds is None else seeds.state]
+
+    def make(self, recipe: Any, content: Any, value: Value) -> Any:
+        name, seeds = recipe
+        return _BITS[name](None if seeds is None else np.random.SeedSequence(**seeds))
+
+    def fill(self, node: Any, content: Any, value: Value, kept: frozenset[str]) -> None:
+        node.state, spawned = content
+        missing = spawned - getattr(node.seed_seq, "n_children_spawned", 0)
+        if missing < 0:
+            raise StateError("A random generator has spawned others since: restore a new object.")
+        if missing:
+            node.seed_seq.spawn(missing)
+
+
+class _Generator(_Kind):
+    def read(self, value: Any, part: Part) -> Any:
+        return [part(value.bit_generator, ".bit_generator")]
+
+    def recipe(self, value: Any) -> Any:
+        return None
+
+    def make(self, recipe: Any, content: Any, value: Value) -> Any:
+        return np.random.Generator(value(content[0]))
+
+
+class _Enum(_Kind):
+    def read(self, value: Any, part: Part) -> Any:
+        return part(value.value, ".value")
+
+    def recipe(self, value: Any) -> Any:
+        return _name_of(type(value))
+
+    def make(self, recipe: Any, content: Any, value: Value) -> Any:
+        return _class_named(recipe, enum.Enum)(value(content))
+
+
+class _Function(_Kind):
+    """A function, whose closure may change; or one with arguments."""
+
+    def read(self, value: Any, part: Part) -> Any:
+        if isinstance(value, functools.partial):
+            names = ("func", "args", "keywords")
+            return {name: part(getattr(value, name), f".{name}") for name in names}
+        if isinstance(value, FunctionType):
+            return {name: part(cell.cell_contents, f".{name}") for name, cell in _cells(value)}
+        is_free = isinstance(value.__self__, ModuleType)
+        return {} if is_free else {"__self__": part(value.__self__, ".__self__")}
+
+    def fill(self, node: Any, content: Any, value: Value, kept: frozenset[str]) -> None:
+        if isinstance(node, FunctionType):
+            for name, cell in _cells(node):
+                cell.cell_contents = value(content[name])
+
+
+class _Method(_Function):
+    """A method of an object that is part of the graph."""
+
+    def recipe(self, value: Any) -> Any:
+        name = value.__name__
+        if getattr(type(value.__self__), name, None) is not value.__func__:
+            raise _RefusedError("is not a method of its class")
+        return name
+
+    def make(self, recipe: Any, content: Any, value: Value) -> Any:
+        owner = value(content["__self__"])
+        function = getattr(type(owner), recipe)
+        if not isinstance(function, FunctionType):
+            raise StateError(f"{type(owner).__name__} has no method {recipe}().")
+        return MethodType(function, owner)
+
+
+_KINDS: dict[str, _Kind] = {
+    **{base.__name__: _Items(base) for base in (list, tuple, set, frozenset, deque)},
+    "dict": _Dict(),
+    "object": _Object(),
+    "array": _Array(),
+    "view": _View(),
+    "bits": _Bits(),
+    "generator": _Generator(),
+    "enum": _Enum(),
+    "function": _Function(),
+    "method": _Method(),
+    "snapshot": _Snapshot(),
+    "fixed": _Kind(),
+    "unknown": _Unknown(),
+}
+_OF_TYPES: tuple[tuple[Any, str], ...] = (
+    (enum.Enum, "enum"),
+    (MethodType, "method"),
+    ((FunctionType, BuiltinFunctionType, functools.partial), "function"),
+    ((type, ModuleType, np.dtype, np.ufunc, range, slice, re.Pattern), "fixed"),
+)
+
+
 def _kind_of(value: Any) -> str:
-    kind = type(value)
+    kind: Any = type(value)
     if kind is np.ndarray:
-        return "array"
-    if kind is np.random.Generator:
-        return "generator"
-    if kind in _NUMPY:
-        return "bits"
-    if isinstance(value, enum.Enum):
-        return "enum"
-    if isinstance(value, _FUNCTIONS):
-        return "function"
-    if isinstance(value, _FIXED):
-        return "fixed"
+        return "view" if value.size and type(value.base) is np.ndarray else "array"
     return _kind_of_class(kind)
 
 
 @functools.cache
 def _kind_of_class(kind: Any) -> str:
     """Return the kind of a class's objects; "unknown" if they have memory of their own in C."""
+    if kind is np.random.Generator or kind in _BITS.values():
+        return "generator" if kind is np.random.Generator else "bits"
+    for types, name in _OF_TYPES:
+        if issubclass(kind, types):
+            return name
     if all(callable(getattr(kind, name, None)) for name in ("snapshot", "restore")):
         return "snapshot"
-    if kind is OrderedDict:
-        return "dict"
-    base = next(each for each in _BASES if issubclass(kind, each))
+    base = next(each for each in _BASES.values() if issubclass(kind, each))
     slots = 0 if kind is base else len(_slots(kind))
     words = slots + (kind.__dictoffset__ > 0) + (kind.__weakrefoffset__ > 0)
     is_known = kind.__basicsize__ <= base.__basicsize__ + 8 * words and kind is not object
-    if not is_known or (base is not object and slots):
-        return "unknown"
-    return "object" if base is object else base.__name__
+    if kind is OrderedDict or (is_known and (base is object or not slots)):
+        return base.__name__
+    return "unknown"
 
 
 @functools.cache
 def _slots(kind: Any) -> list[str]:
-    return [name for each in kind.__mro__ for name, what in vars(each).items()
-            if isinstance(what, MemberDescriptorType)]  # fmt: skip
+    members = [(name, what) for each in kind.__mro__ for name, what in vars(each).items()]
+    return [name for name, what in members if isinstance(what, MemberDescriptorType)]
 
 
-def _attributes(value: Any) -> Iterator[tuple[str, Any]]:
-    yield from getattr(value, "__dict__", {}).items()
+def _read_attributes(value: Any, part: Part, left_out: frozenset[str] = frozenset()) -> Any:
+    own = getattr(value, "__dict__", {})
+    found = {name: part(own[name], f".{name}") for name in own if name not in left_out}
     for name in _slots(type(value)):
         if hasattr(value, name):
-            yield name, getattr(value, name)
+            found[name] = part(getattr(value, name), f".{name}")
+    return found
 
 
-def _needs(function: Any) -> Iterator[tuple[str, Any]]:
-    """Yield what a function refers to, but for module variables."""
-    if isinstance(function, functools.partial):
-        yield from (("func", function.func), ("args", function.args))
-        yield "keywords", function.keywords
-    elif isinstance(function, FunctionType):
-        cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
-        yield from ((name, cell.cell_contents) for name, cell in cells)
-    elif not isinstance(function.__self__, ModuleType):
-        yield "__self__", function.__self__
+def _cells(function: FunctionType) -> Iterator[tuple[str, Any]]:
+    return zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+
+
+def _class_named(name: str, base: type[Any]) -> Any:
+    """Return a class that is imported, and whose objects run no code when they are made or end."""
+    module, _, qualified = name.partition(":")
+    found: Any = sys.modules.get(module)
+    for each in qualified.split("."):
+        found = None if found is None else vars(found).get(each)
+    is_class = isinstance(found, type) and issubclass(found, base)
+    if not is_class or hasattr(found, "__del__"):
+        raise StateError(
+            f"The state has an object of {name.replace(':', '.')}, which is not a class of an "
+            "imported module, or defines __del__: import it where the environment is defined."
+        )
+    return found
+
+
+def _name_of(kind: type[Any]) -> str:
+    return f"{kind.__module__}:{kind.__qualname__}"
 
 
 def _axes(array: Array) -> list[int]:
@@ -351,12 +595,22 @@ def _axes(array: Array) -> list[int]:
     return sorted(range(array.ndim), key=lambda axis: -array.strides[axis])
 
 
+def _whole(view: Any) -> Any:
+    while type(view.base) is np.ndarray:
+        view = view.base
+    return view
+
+
+def _address(array: Array) -> int:
+    return int(array.__array_interface__["data"][0])
+
+
 def _descr(dtype: np.dtype[Any]) -> Any:
     return dtype.str if dtype.kind in _PLAIN else dtype.descr
 
 
-def _name_of(kind: type[Any]) -> str:
-    return f"{kind.__module__}:{kind.__qualname__}"
+def _dtype(descr: Any) -> Any:
+    return np.dtype(descr if isinstance(descr, str) else [tuple(each) for each in descr])
 
 
 def as_lists(state: Any) -> Any:
@@ -364,6 +618,9 @@ def as_lists(state: Any) -> Any:
     if isinstance(state, dict):
         return {name: as_lists(each) for name, each in state.items()}
     return state.tolist() if isinstance(state, np.ndarray) else state
+
+
+# Comparing --------------------------------------------------------------------------------------
 
 
 def _parts(content: Any) -> list[Any]:
@@ -387,119 +644,3 @@ def _same(one: Any, other: Any) -> bool:
     if repr(one) != repr(other):
         return False
     return list(map(type, _parts(one))) == list(map(type, _parts(other)))
-
-
-# Restoring --------------------------------------------------------------------------------------
-
-
-class _Making:
-    """Makes the added objects of a state, still empty unless they consist of their parts."""
-
-    def __init__(self, nodes: list[Any], added: list[Any]) -> None:
-        self._nodes, self._first, self._added = [*nodes, *([None] * len(added))], len(nodes), added
-        self._is_made = [True] * len(nodes) + [False] * len(added)
-
-    def __call__(self, number: int) -> Any:
-        if not self._is_made[number]:
-            self._nodes[number] = self._made(*self._added[number - self._first])
-            self._is_made[number] = True
-        return self._nodes[number]
-
-    def value(self, part: Any) -> Any:
-        return self(part[0]) if type(part) is tuple else part
-
-    def _made(self, kind: str, how: Any, content: Any) -> Any:
-        if kind == "array":
-            return _new_array(*how, content)
-        if kind == "bits":
-            name, seeds = how
-            return _BITS[name](None if seeds is None else np.random.SeedSequence(**seeds))
-        if kind == "generator":
-            return np.random.Generator(self.value(content[0]))
-        if kind == "deque":
-            return deque(maxlen=how)
-        if kind == "enum":
-            return _class_named(how, enum.Enum)(self.value(content))
-        if how == _ORDERED:
-            return OrderedDict()
-        base = {each.__name__: each for each in _BASES}[kind]
-        made: Any = base if how is None else _class_named(how, base)
-        if kind in _IN_PARTS:
-            return base.__new__(made, [self.value(part) for part in content])
-        return base.__new__(made)
-
-
-def _new_array(axes: list[int], writeable: bool, descr: Any, shape: list[int], content: Any) -> Any:
-    found = content
-    if isinstance(content, bytes):
-        dtype = np.dtype([tuple(each) for each in descr])
-        found = np.frombuffer(bytearray(content), dtype).reshape([shape[axis] for axis in axes])
-    found = np.array(found).transpose(np.argsort(axes))
-    found.flags.writeable = writeable
-    return found
-
-
-def _class_named(name: str, base: type[Any]) -> Any:
-    """Return a class that is imported, and whose objects are made without any code of its own."""
-    module, _, qualified = name.partition(":")
-    found: Any = sys.modules.get(module)
-    for each in qualified.split("."):
-        found = None if found is None else vars(found).get(each)
-    is_class = isinstance(found, type) and issubclass(found, base)
-    if not is_class or hasattr(found, "__del__"):
-        raise StateError(
-            f"The state has an object of {name.replace(':', '.')}, which is not a class of an "
-            "imported module, or defines __del__: import it where the environment is defined."
-        )
-    return found
-
-
-def _fill(
-    node: Any, kind: str, content: Any, value: Callable[[Any], Any], kept: frozenset[str]
-) -> None:
-    """Give an object its content, in place."""
-    if kind == "object":
-        _fill_attributes(node, {name: value(part) for name, part in content.items()}, kept)
-    elif kind == "dict":
-        parts = [value(part) for part in content]
-        node.clear()
-        node.update(zip(parts[::2], parts[1::2], strict=True))
-    elif kind == "list":
-        node[:] = [value(part) for part in content]
-    elif kind in ("set", "deque"):
-        node.clear()
-        (node.update if kind == "set" else node.extend)(value(part) for part in content)
-    elif kind == "array":
-        _fill_array(node, content)
-    elif kind == "bits":
-        node.state, spawned = content
-        missing = spawned - getattr(node.seed_seq, "n_children_spawned", 0)
-        if missing > 0:
-            node.seed_seq.spawn(missing)
-    elif isinstance(node, FunctionType):
-        for name, cell in zip(node.__code__.co_freevars, node.__closure__ or (), strict=True):
-            cell.cell_contents = value(content[name])
-
-
-def _fill_attributes(node: Any, values: dict[str, Any], kept: frozenset[str]) -> None:
-    own = getattr(node, "__dict__", {})
-    for name in own.keys() - values.keys() - kept:
-        del own[name]
-    for name in _slots(type(node)):
-        if name in values:
-            object.__setattr__(node, name, values.pop(name))
-        elif hasattr(node, name):
-            object.__delattr__(node, name)
-    own.update(values)
-
-
-def _fill_array(node: Array, content: Any) -> None:
-    if isinstance(content, bytes):
-        content = np.frombuffer(content, node.dtype).reshape(node.shape)
-    if node.shape != content.shape:
-        raise StateError(f"An array's shape has been changed in place, to {content.shape}.")
-    writeable = node.flags.writeable
-    if writeable or node.tobytes() != content.tobytes():
-        node.flags.writeable = True
-        node[...] = content
-        node.flags.writeable = writeable

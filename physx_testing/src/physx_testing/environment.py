@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-from physx_core.components import Environment, Event
+from physx_core.components import Environment
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import NotFiniteError, StateError
 from physx_core.rows import ROW_FIELDS, RowBuffer, infer_shapes
 from physx_core.sources import ClientSource, LocalSource
-from physx_core.typing import Batch, Sample
-from physx_core.workers import Instance, instance_arguments
+from physx_core.typing import Batch
+from physx_testing.instances import (
+    SEED,
+    Services,
+    config_of,
+    in_another_process,
+    one_instance,
+    rows_between,
+)
 from physx_testing.process_state import unchanged
 from physx_testing.report import NotApplicableError, Report
 from physx_testing.running import TIMEOUT, run_checks
@@ -27,7 +33,6 @@ from physx_testing.subject import (
 )
 
 _ROWS = 6
-_SEED = (5, 0, 0)
 _DISTURBED = (
     "rows that follow a state differ from those without one, as an engine may discard memory of "
     "its last step there: take states after the same rows in each run"
@@ -62,67 +67,21 @@ def check_environment(
     )
 
 
-class Services:
-    """A run without a network that keeps what the environment saves and draws."""
-
-    def __init__(self) -> None:
-        self.saved: dict[int, dict[str, Any]] = {}
-        self.drawn: list[Event] = []
-
-    def predict(self, fields: Sample) -> Sample:
-        """Skip the check, because the kit has no network for the environment."""
-        raise NotApplicableError("it asks for predictions of a network, which the kit lacks")
-
-    def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
-        """Keep values of an instance."""
-        self.saved[instance_id] = {**self.saved.get(instance_id, {}), **values}
-
-    def load_parameters(self, instance_id: int) -> dict[str, Any]:
-        """Return the values that an instance saved."""
-        return self.saved.get(instance_id, {})
-
-    def show(self, instance_id: int, step: int, events: list[Event]) -> None:
-        """Keep what is drawn."""
-        self.drawn += events
-
-
-def _config(subject: Subject, number: int, **options: Any) -> EnvironmentConfig:
-    return EnvironmentConfig(
-        subject.reference,
-        env_kwargs=dict(subject.arguments),
-        num_clients=number,
-        as_tcp_ip_client=False,
-        **options,
-    )
-
-
 def _rows(
     subject: Subject,
     count: int = _ROWS,
     instances: int = 1,
     *,
-    seed: tuple[int, ...] = _SEED,
+    seed: tuple[int, ...] = SEED,
     stored: Batch | None = None,
     services: Services | None = None,
     **options: Any,
 ) -> Batch:
     """Return rows that instances in this process generate."""
-    config = _config(subject, instances, **options)
+    config = config_of(subject, instances, **options)
     with LocalSource(config, services or Services(), seed) as source:
         found = source.batch(count, stored)
         return {name: values.copy() for name, values in found.items()}
-
-
-@contextlib.contextmanager
-def one_instance(subject: Subject, number: int = 1, instances: int = 1) -> Iterator[Instance]:
-    """Yield one of several instances, as a client would have it."""
-    config = _config(subject, instances)
-    instance = Instance(**instance_arguments(config, number, _SEED, accept_all=False))
-    try:
-        instance.open(Services(), draw=False)
-        yield instance
-    finally:
-        instance.close()
 
 
 def _refuses(subject: Subject) -> None:
@@ -190,7 +149,7 @@ def _independent(subject: Subject) -> None:
 def _over_tcp(subject: Subject) -> None:
     wanted = _rows(subject, 2 * _ROWS, 2)
     config = EnvironmentConfig(subject.reference, env_kwargs=dict(subject.arguments), num_clients=2)
-    with ClientSource(config, Services(), _SEED, total=2 * _ROWS) as source:
+    with ClientSource(config, Services(), SEED, total=2 * _ROWS) as source:
         found = source.batch(2 * _ROWS)
         expect_equal(found, wanted, "clients' rows differ from those generated in this process")
 
@@ -228,8 +187,6 @@ def _many_steps(subject: Subject) -> None:
 
 def _rows_with_states(subject: Subject) -> tuple[list[Batch], dict[int, bytes]]:
     """Return rows, and the states that were taken between them."""
-    from physx_testing.continuing import rows_between
-
     states: dict[int, bytes] = {}
     with one_instance(subject) as instance:
         try:
@@ -240,8 +197,6 @@ def _rows_with_states(subject: Subject) -> tuple[list[Batch], dict[int, bytes]]:
 
 
 def _continues(subject: Subject) -> None:
-    from physx_testing.continuing import in_another_process
-
     rows, states = _rows_with_states(subject)
     for made, found in in_another_process(subject, states).items():
         for row, wanted in enumerate(rows[made:], made):
@@ -250,8 +205,6 @@ def _continues(subject: Subject) -> None:
 
 
 def _is_not_disturbed(subject: Subject) -> None:
-    from physx_testing.continuing import rows_between
-
     rows, _ = _rows_with_states(subject)
     with one_instance(subject) as instance:
         for found, wanted in zip(rows, rows_between(instance, 0, None), strict=True):
@@ -260,7 +213,7 @@ def _is_not_disturbed(subject: Subject) -> None:
 
 
 def _closes(subject: Subject) -> None:
-    made = subject.make(instance_id=1, instance_nb=1, seed=list(_SEED))
+    made = subject.make(instance_id=1, instance_nb=1, seed=list(SEED))
     _close(made, "before create(), as after a failure there")
     with one_instance(subject) as instance:
         instance.step()
@@ -285,7 +238,7 @@ def _quiet(subject: Subject) -> None:
 
 def _takes_identity(subject: Subject) -> None:
     for number in (1, 3):
-        made = subject.make(instance_id=number, instance_nb=3, seed=list(_SEED))
+        made = subject.make(instance_id=number, instance_nb=3, seed=list(SEED))
         expect(
             (made.instance_id, made.instance_nb) == (number, 3),
             f"it is instance {made.instance_id} of {made.instance_nb}, though it was created as "
