@@ -205,11 +205,11 @@ class Instance(Closeable):
         environment = self.environment
         return [] if environment is None else list(environment._defined_parameters)
 
-    def open(self, services: Services, draw: bool, choose: Choose | None = None) -> None:
+    def open(self, services: Services | None, draw: bool, choose: Choose | None = None) -> None:
         """Create the environment: `create`, `init`, `init_database`, `init_visualization`.
 
         Args:
-            services: What the environment may request from the run.
+            services: What the environment may request from the run; None: nothing.
             draw: Whether there is a visualizer.
             choose: Chooses the parameters of an episode; None: they are drawn from their
                 distributions.
