@@ -139,7 +139,7 @@ class Baseline:
             raise StateError(
                 f"The state is of another {root}: after creation, these attributes differ: "
                 f"{listed(differ)}. Create it with the same arguments, seed and code, and name "
-                f"what may differ in the class: constants = ({differ[0]!r},)."
+                'what may differ in the class: constants = ("name",).'
             )
 
 
