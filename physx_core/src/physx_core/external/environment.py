@@ -8,7 +8,14 @@ from typing import Any, ClassVar
 
 from physx_core.components.environment import Environment
 from physx_core.components.parameter import Parameter
-from physx_core.errors import ConfigError, SampleError, StateError, UnknownOptionError, listed, nearest
+from physx_core.errors import (
+    ConfigError,
+    SampleError,
+    StateError,
+    UnknownOptionError,
+    listed,
+    nearest,
+)
 from physx_core.external.messages import Kind, Message
 from physx_core.external.process import ProgramProcess
 from physx_core.fields import Field
