@@ -4,8 +4,9 @@ from __future__ import annotations
 
 import enum
 import threading
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, defaultdict, deque
 from dataclasses import dataclass, field
+from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -287,6 +288,24 @@ def test_what_a_function_remembers():
     assert other.counted() == 4
 
 
+class Mixed(dict):
+    def __init__(self, **items):
+        super().__init__(items)
+        self.more = 1
+
+
+class Ends:
+    def __del__(self):
+        pass
+
+
+def local():
+    class Local:
+        pass
+
+    return Local()
+
+
 @pytest.mark.parametrize(
     ("attribute", "value"),
     [
@@ -297,6 +316,10 @@ def test_what_a_function_remembers():
         ("names", lambda: np.array([None])),
         ("made", lambda: [].append),
         ("nothing", object),
+        ("mixed", lambda: Mixed(a=1)),
+        ("local", local),
+        ("ends", Ends),
+        ("counts", lambda: defaultdict(int)),
     ],
 )
 def test_what_cannot_be_captured_is_named(attribute, value):
@@ -323,6 +346,28 @@ def test_new_views_stay_views():
     assert (other.grid[1:, ::-2] == 2).all()
     other.field[:] = 3
     assert other.records["b"].tolist() == [[3, 3], [3, 3]]
+
+
+def test_objects_of_other_classes():
+    def change(one):
+        one.space, one.count, one.order = SimpleNamespace(x=1), Counter("aab"), OrderedDict(a=1)
+        one.order["b"] = 2
+
+    one, other = continued(change)
+    assert (other.space, other.count, other.order) == (one.space, one.count, one.order)
+    assert type(other.count) is Counter
+
+
+def test_damaged_states_are_errors():
+    for added in (
+        ["object", "test_states:Node", {}],
+        ["bits", ["os", None], []],
+        ["tuple", None, 3],
+    ):
+        state = Baseline(Node(x=None)).capture()
+        state["changed"], state["added"] = [[0, {"x": (2,)}]], [added]
+        with pytest.raises(StateError):
+            Baseline(Node(x=None)).restore(state)
 
 
 def test_methods_of_what_is_captured():

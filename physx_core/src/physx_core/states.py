@@ -108,7 +108,10 @@ class Baseline:
         added, first = state["added"], len(self._nodes)
         contents |= {number: content for number, (_, _, content) in enumerate(added, first)}
         made = _Making(self._nodes, added)
-        nodes = [made(number) for number in range(first + len(added))]
+        try:
+            nodes = [made(number) for number in range(first + len(added))]
+        except (LookupError, TypeError, ValueError, AttributeError) as error:
+            raise StateError(f"The state is damaged: {error!r:.200}.") from error
         kinds = ["object", *map(_kind_of, nodes[1:])]
 
         def fill() -> None:
@@ -127,7 +130,7 @@ class Baseline:
 
     def _check_created(self, state: Mapping[str, Any]) -> None:
         here, there = (
-            dict(zip(names.split("\n"), digests.tolist(), strict=True))
+            dict(zip(names.splitlines(), digests.tolist(), strict=True))
             for names, digests in (
                 (self._names, self._created),
                 (state["names"], state["created"]),
@@ -298,10 +301,10 @@ class _Object(_Kind):
         return _read_attributes(value, part)
 
     def recipe(self, value: Any) -> Any:
-        return _name_of(type(value))
+        return _recipe_of(type(value), object)
 
     def make(self, recipe: Any, content: Any, value: Value) -> Any:
-        return object.__new__(_class_named(recipe, object))
+        return _new(recipe, object)
 
     def fill(self, node: Any, content: Any, value: Value, kept: frozenset[str]) -> None:
         values = {name: value(part) for name, part in content.items()}
@@ -324,6 +327,7 @@ class _Items(_Kind):
         self._is_fixed = base in (tuple, frozenset)
 
     def read(self, value: Any, part: Part) -> Any:
+        _check_bare(value)
         if self._base in (set, frozenset):  # whose order may differ between processes
             value = sorted(value, key=repr)
         return [part(each, f"[{place}]") for place, each in enumerate(value)]
@@ -331,14 +335,13 @@ class _Items(_Kind):
     def recipe(self, value: Any) -> Any:
         if self._base is deque:
             return value.maxlen
-        return None if type(value) is self._base else _name_of(type(value))
+        return _recipe_of(type(value), self._base)
 
     def make(self, recipe: Any, content: Any, value: Value) -> Any:
         if self._base is deque:
             return deque(maxlen=recipe)
-        kind: Any = self._base if recipe is None else _class_named(recipe, self._base)
         items = [[value(part) for part in content]] if self._is_fixed else []
-        return self._base.__new__(kind, *items)
+        return _new(recipe, self._base, *items)
 
     def fill(self, node: Any, content: Any, value: Value, kept: frozenset[str]) -> None:
         if not self._is_fixed:
@@ -350,6 +353,7 @@ class _Dict(_Kind):
     hashes = True
 
     def read(self, value: Any, part: Part) -> Any:
+        _check_bare(value)
         return [
             found
             for key, each in value.items()
@@ -357,11 +361,10 @@ class _Dict(_Kind):
         ]
 
     def recipe(self, value: Any) -> Any:
-        return None if type(value) is dict else _name_of(type(value))
+        return _recipe_of(type(value), dict)
 
     def make(self, recipe: Any, content: Any, value: Value) -> Any:
-        kind: Any = dict if recipe is None else _class_named(recipe, dict)
-        return OrderedDict() if kind is OrderedDict else dict.__new__(kind)
+        return _new(recipe, dict)
 
     def fill(self, node: Any, content: Any, value: Value, kept: frozenset[str]) -> None:
         parts = [value(part) for part in content]
@@ -462,7 +465,7 @@ class _Enum(_Kind):
         return part(value.value, ".value")
 
     def recipe(self, value: Any) -> Any:
-        return _name_of(type(value))
+        return _recipe_of(type(value), enum.Enum)
 
     def make(self, recipe: Any, content: Any, value: Value) -> Any:
         return _class_named(recipe, enum.Enum)(value(content))
@@ -546,7 +549,8 @@ def _kind_of_class(kind: Any) -> str:
     base = next(each for each in _BASES.values() if issubclass(kind, each))
     slots = 0 if kind is base else len(_slots(kind))
     words = slots + (kind.__dictoffset__ > 0) + (kind.__weakrefoffset__ > 0)
-    is_known = kind.__basicsize__ <= base.__basicsize__ + 8 * words and kind is not object
+    is_known = kind.__basicsize__ <= base.__basicsize__ + 8 * words
+    is_known &= kind is not object and (base is not deque or kind is deque)
     if kind is OrderedDict or (is_known and (base is object or not slots)):
         return base.__name__
     return "unknown"
@@ -571,12 +575,32 @@ def _cells(function: FunctionType) -> Iterator[tuple[str, Any]]:
     return zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
 
 
+def _check_bare(value: Any) -> None:
+    """Check that items are all that a list or dictionary of a class of its own has."""
+    if getattr(value, "__dict__", None):
+        raise _RefusedError("has both items and attributes")
+
+
+@functools.cache
+def _recipe_of(kind: type[Any], base: type[Any]) -> str | None:
+    """Return the name of a class; None if it is the base itself."""
+    if kind is base:
+        return None
+    name = _name_of(kind)
+    try:
+        if _class_named(name, base) is kind and (base is enum.Enum or _new(name, base) is not None):
+            return name
+    except (StateError, TypeError):
+        pass
+    raise _RefusedError("is of a class that cannot be found and made by its name, or has __del__")
+
+
 def _class_named(name: str, base: type[Any]) -> Any:
     """Return a class that is imported, and whose objects run no code when they are made or end."""
     module, _, qualified = name.partition(":")
     found: Any = sys.modules.get(module)
     for each in qualified.split("."):
-        found = None if found is None else vars(found).get(each)
+        found = vars(found).get(each) if hasattr(found, "__dict__") else None
     is_class = isinstance(found, type) and issubclass(found, base)
     if not is_class or hasattr(found, "__del__"):
         raise StateError(
@@ -584,6 +608,13 @@ def _class_named(name: str, base: type[Any]) -> Any:
             "imported module, or defines __del__: import it where the environment is defined."
         )
     return found
+
+
+def _new(name: str | None, base: Any, *items: Any) -> Any:
+    """Return an object of a class by its name, made without any method of that class."""
+    kind = base if name is None else _class_named(name, base)
+    make = base.__new__ if isinstance(kind.__new__, FunctionType) else kind.__new__
+    return make(kind, *items)
 
 
 def _name_of(kind: type[Any]) -> str:
