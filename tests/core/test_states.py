@@ -16,6 +16,7 @@ from hypothesis import strategies as st
 
 from physx_core.errors import StateError
 from physx_core.net import decode, encode
+from physx_core.plugins import resolve
 from physx_core.states import Baseline
 
 
@@ -427,3 +428,30 @@ def test_a_state_creates_no_class_that_is_not_plain():
         state["changed"], state["added"] = [[0, {"x": (1,)}]], [["object", name, {}]]
         with pytest.raises(StateError, match="which is not a class"):
             Baseline(Node(x=None)).restore(state)
+
+
+def test_scripts_are_known_by_their_files(tmp_path):
+    """In clients, their modules have other names than in the process that was started."""
+    text = (
+        "class Part:\n    pass\nclass Whole:\n    def __init__(self):\n        self.part = Part()\n"
+    )
+    found = []
+    for folder in ("one", "other"):
+        file = tmp_path / folder / "script.py"
+        file.parent.mkdir()
+        file.write_text(text)
+        found.append(resolve("environment", f"{file}:Whole"))
+    one, other = (kind() for kind in found)
+    assert type(one).__module__ != type(other).__module__
+    source, target = Baseline(one), Baseline(other)
+    one.part, one.more = 3, type(one.part)()
+    target.restore(decode(encode(source.capture(), "state")))
+    assert other.part == 3
+    assert type(other.more).__name__ == "Part"
+
+
+def test_a_damaged_name_is_an_error():
+    state = Baseline(Node(x=None)).capture()
+    state["changed"], state["added"] = [[0, {"x": (1,)}]], [["object", "nowhere.py:Part", {}]]
+    with pytest.raises(StateError, match="nowhere.py.Part, which is not a class"):
+        Baseline(Node(x=None)).restore(state)

@@ -27,6 +27,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import xxhash
 
+from physx_core.config import SCRIPT_PREFIX
 from physx_core.errors import StateError, listed
 from physx_core.typing import Array
 
@@ -345,8 +346,9 @@ class _Items(_Kind):
 
     def fill(self, node: Any, content: Any, value: Value, kept: frozenset[str]) -> None:
         if not self._is_fixed:
-            node.clear()
-            (node.update if self._base is set else node.extend)(value(part) for part in content)
+            base: Any = self._base  # a class may have methods of its own
+            base.clear(node)
+            (base.update if base is set else base.extend)(node, [value(part) for part in content])
 
 
 class _Dict(_Kind):
@@ -368,8 +370,10 @@ class _Dict(_Kind):
 
     def fill(self, node: Any, content: Any, value: Value, kept: frozenset[str]) -> None:
         parts = [value(part) for part in content]
-        node.clear()
-        node.update(zip(parts[::2], parts[1::2], strict=True))
+        base: Any = OrderedDict if isinstance(node, OrderedDict) else dict
+        base.clear(node)  # a class may have methods of its own
+        for key, each in zip(parts[::2], parts[1::2], strict=True):
+            base.__setitem__(node, key, each)
 
 
 class _Array(_Kind):
@@ -559,7 +563,11 @@ def _kind_of_class(kind: Any) -> str:
 @functools.cache
 def _slots(kind: Any) -> list[str]:
     members = [(name, what) for each in kind.__mro__ for name, what in vars(each).items()]
-    return [name for name, what in members if isinstance(what, MemberDescriptorType)]
+    return [
+        name
+        for name, what in members
+        if isinstance(what, MemberDescriptorType) and name != "__dict__"
+    ]
 
 
 def _read_attributes(value: Any, part: Part, left_out: frozenset[str] = frozenset()) -> Any:
@@ -598,7 +606,7 @@ def _recipe_of(kind: type[Any], base: type[Any]) -> str | None:
 def _class_named(name: str, base: type[Any]) -> Any:
     """Return a class that is imported, and whose objects run no code when they are made or end."""
     module, _, qualified = name.partition(":")
-    found: Any = sys.modules.get(module)
+    found = _module_named(module)
     for each in qualified.split("."):
         found = vars(found).get(each) if hasattr(found, "__dict__") else None
     is_class = isinstance(found, type) and issubclass(found, base)
@@ -618,7 +626,21 @@ def _new(name: str | None, base: Any, *items: Any) -> Any:
 
 
 def _name_of(kind: type[Any]) -> str:
-    return f"{kind.__module__}:{kind.__qualname__}"
+    return f"{_file_or_module(kind.__module__)}:{kind.__qualname__}"
+
+
+def _file_or_module(module: str) -> str:
+    """Return the name of a module; of a script's file, as its module has many names."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    is_script = module == "__main__" or module.startswith(SCRIPT_PREFIX)
+    return PurePath(file).name if is_script and file else module
+
+
+def _module_named(name: str) -> Any:
+    if name in sys.modules or not name.endswith(".py"):
+        return sys.modules.get(name)
+    names = (each for each in list(sys.modules) if _file_or_module(each) == name)
+    return sys.modules.get(next(names, ""))
 
 
 def _axes(array: Array) -> list[int]:
