@@ -432,16 +432,22 @@ def test_a_state_creates_no_class_that_is_not_plain():
 
 def test_scripts_are_known_by_their_files(tmp_path):
     """In clients, their modules have other names than in the process that was started."""
-    text = (
-        "class Part:\n    pass\nclass Whole:\n    def __init__(self):\n        self.part = Part()\n"
-    )
+    text = """
+from physx_core import Environment
+class Part: ...
+class Whole(Environment):
+    def create(self):
+        self.part = Part()
+"""
     found = []
     for folder in ("one", "other"):
         file = tmp_path / folder / "script.py"
         file.parent.mkdir()
         file.write_text(text)
         found.append(resolve("environment", f"{file}:Whole"))
-    one, other = (kind() for kind in found)
+    one, other = (kind(seed=1) for kind in found)
+    for each in (one, other):
+        each.create()
     assert type(one).__module__ != type(other).__module__
     source, target = Baseline(one), Baseline(other)
     one.part, one.more = 3, type(one.part)()

@@ -302,7 +302,7 @@ class _Object(_Kind):
         return _read_attributes(value, part)
 
     def recipe(self, value: Any) -> Any:
-        return _recipe_of(type(value), object)
+        return _recipe_of(_class_of(value), object)
 
     def make(self, recipe: Any, content: Any, value: Value) -> Any:
         return _new(recipe, object)
@@ -312,7 +312,7 @@ class _Object(_Kind):
         own = getattr(node, "__dict__", {})
         for name in own.keys() - values.keys() - kept:
             del own[name]
-        for name in _slots(type(node)):
+        for name in _slots(_class_of(node)):
             if name in values:
                 object.__setattr__(node, name, values.pop(name))
             elif hasattr(node, name):
@@ -323,7 +323,7 @@ class _Object(_Kind):
 class _Items(_Kind):
     """A list, deque or set, or a tuple or frozenset, which cannot be filled."""
 
-    def __init__(self, base: type[Any]) -> None:
+    def __init__(self, base: Any) -> None:
         self._base, self.hashes = base, base is set
         self._is_fixed = base in (tuple, frozenset)
 
@@ -336,7 +336,7 @@ class _Items(_Kind):
     def recipe(self, value: Any) -> Any:
         if self._base is deque:
             return value.maxlen
-        return _recipe_of(type(value), self._base)
+        return _recipe_of(_class_of(value), self._base)
 
     def make(self, recipe: Any, content: Any, value: Value) -> Any:
         if self._base is deque:
@@ -363,7 +363,7 @@ class _Dict(_Kind):
         ]
 
     def recipe(self, value: Any) -> Any:
-        return _recipe_of(type(value), dict)
+        return _recipe_of(_class_of(value), dict)
 
     def make(self, recipe: Any, content: Any, value: Value) -> Any:
         return _new(recipe, dict)
@@ -469,7 +469,7 @@ class _Enum(_Kind):
         return part(value.value, ".value")
 
     def recipe(self, value: Any) -> Any:
-        return _recipe_of(type(value), enum.Enum)
+        return _recipe_of(_class_of(value), enum.Enum)
 
     def make(self, recipe: Any, content: Any, value: Value) -> Any:
         return _class_named(recipe, enum.Enum)(value(content))
@@ -573,7 +573,7 @@ def _slots(kind: Any) -> list[str]:
 def _read_attributes(value: Any, part: Part, left_out: frozenset[str] = frozenset()) -> Any:
     own = getattr(value, "__dict__", {})
     found = {name: part(own[name], f".{name}") for name in own if name not in left_out}
-    for name in _slots(type(value)):
+    for name in _slots(_class_of(value)):
         if hasattr(value, name):
             found[name] = part(getattr(value, name), f".{name}")
     return found
@@ -590,7 +590,7 @@ def _check_bare(value: Any) -> None:
 
 
 @functools.cache
-def _recipe_of(kind: type[Any], base: type[Any]) -> str | None:
+def _recipe_of(kind: Any, base: Any) -> str | None:
     """Return the name of a class; None if it is the base itself."""
     if kind is base:
         return None
@@ -623,6 +623,10 @@ def _new(name: str | None, base: Any, *items: Any) -> Any:
     kind = base if name is None else _class_named(name, base)
     make = base.__new__ if isinstance(kind.__new__, FunctionType) else kind.__new__
     return make(kind, *items)
+
+
+def _class_of(value: Any) -> Any:
+    return type(value)
 
 
 def _name_of(kind: type[Any]) -> str:
@@ -693,7 +697,7 @@ def _as_bytes(content: Any) -> bytes:
 def _same(one: Any, other: Any) -> bool:
     """Return whether contents are equal in type and bits."""
     if isinstance(one, np.ndarray):
-        return one.shape == other.shape and one.tobytes() == other.tobytes()
+        return bool(one.shape == other.shape and one.tobytes() == other.tobytes())
     if repr(one) != repr(other):
         return False
     return list(map(type, _parts(one))) == list(map(type, _parts(other)))

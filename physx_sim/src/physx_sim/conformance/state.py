@@ -119,20 +119,25 @@ def _continues(subject: Subject) -> None:
     need(subject, "exact_restore")
     for steps in (0, 150, 190):  # the box and the ball touch the ground, and slide on it
         with build(subject, busy(subject)) as simulation, build(subject, busy(subject)) as other:
-            here, there = (Baseline(_Holder(each)) for each in (simulation, other))
             simulation.set_torques(np.array([2.0, -1.0, 1.0]))
             simulation.step(steps)
-            state, snapshot = encode(here.capture(), "state"), simulation.snapshot()
-            simulation.step(60)
-            for name, restore, what in (
-                ("the state of an environment", there.restore, decode(state)),
-                ("a pickled snapshot", other.restore, pickle.loads(pickle.dumps(snapshot))),  # noqa: S301
-                ("a copied snapshot", other.restore, copy.deepcopy(snapshot)),
-            ):
-                restore(what)
-                other.step(60)
-                text = f"after {steps} steps, {name} has another future"
-                expect_equal(_now(other), _now(simulation), text)
+            _expect_futures(simulation, other, f"after {steps} steps")
+
+
+def _expect_futures(simulation: Simulation, other: Simulation, when: str) -> None:
+    """Expect that another simulation goes on alike, however it gets the state."""
+    here, there = (Baseline(_Holder(each)) for each in (simulation, other))
+    state, snapshot = encode(here.capture(), "state"), simulation.snapshot()
+    ways: dict[str, Callable[[], None]] = {
+        "the state of an environment": lambda: there.restore(decode(state)),
+        "a pickled snapshot": lambda: other.restore(pickle.loads(pickle.dumps(snapshot))),  # noqa: S301
+        "a copied snapshot": lambda: other.restore(copy.deepcopy(snapshot)),
+    }
+    simulation.step(60)
+    for name, restore in ways.items():
+        restore()
+        other.step(60)
+        expect_equal(_now(other), _now(simulation), f"{when}, {name} has another future")
 
 
 def _state_alone(subject: Subject) -> None:
