@@ -78,6 +78,10 @@ class Baseline:
         self._names = "\n".join(digests)
         self._created = np.array(list(digests.values()), np.uint64)
 
+    def leave_out(self, names: Iterable[str]) -> None:
+        """Leave attributes out that the object has got since."""
+        self._left_out |= frozenset(names)
+
     def capture(self) -> dict[str, Any]:
         """Return what has changed, as values that `physx_core.net.encode` takes.
 

@@ -111,8 +111,7 @@ class Predicted(Walk):
 def opened(environment, draw=False, **options):
     arguments = {"instance_id": 2, "instance_nb": 3, "seed": [7], "max_wrong_samples": 99}
     instance = Instance(environment, {}, **(arguments | options))
-    instance.open(Services(), draw)
-    instance.track_states()
+    instance.open(Services(), draw, with_states=True)
     return instance
 
 
@@ -145,8 +144,10 @@ def test_rows_go_on_in_another_instance(environment, options, rows):
 
     one = opened(environment, **options)
     list(run(one, rows))
-    state = encode(one.get_state(), "state")
+    taken = one.get_state()
+    state = encode(taken, "state")
     wanted = list(run(one, 20))
+    assert encode(taken, "state") == state, "later steps change it"
     fresh = {name: each for name, each in options.items() if not name.startswith("first")}
     other = opened(environment, **fresh)
     other.set_state(decode(state))
@@ -255,3 +256,22 @@ def test_other_seeds_and_arguments_are_refused():
     for options, name in (({"seed": [8]}, "_seed_entropy"), ({"instance_id": 1}, "instance_id")):
         with pytest.raises(StateError, match=rf"attributes differ: .*{name}"):
             opened(Walk, **options).set_state(state)
+
+
+def test_a_state_does_not_depend_on_drawing():
+    class Shown(Walk):
+        def init_visualization(self):
+            self.factory.add_points("x", [[0, 0, 0]])
+            self.frame, self.step_time = [0], 0.1
+
+        def step(self):
+            super().step()
+            if self.factory:
+                self.frame.append(1)  # which only viewers need
+                self.factory.update_points("x", positions=[[*self.x, 0]])
+
+    for draws in ((True, False), (False, True), (True, True)):
+        one, other = (opened(Shown, draw) for draw in draws)
+        one.step()
+        other.set_state(decode(encode(one.get_state(), "state")))
+        assert bits(other, other.step()) == bits(one, one.step())

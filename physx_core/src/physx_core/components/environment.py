@@ -55,10 +55,10 @@ _COUNTERS = (
 )
 """What changes about the place of an environment in its run; instances keep it."""
 _OF_THE_RUN = (
-    *("factory", "compute_training_data", "_sample", "_training", "_additional"),
+    *("factory", "step_time", "compute_training_data", "_sample", "_training", "_additional"),
     *("_services", "_choose_parameters", "_baseline"),
 )
-"""What an environment has from its run, or only within a step."""
+"""What an environment has from its run, for viewers, or only within a step."""
 
 
 class PredictedFields(dict[str, Array]):
@@ -468,6 +468,11 @@ class Environment(Closeable):
         if not own:
             _ = self.rng  # which is created on first use
             self._baseline = Baseline(self, [*_OF_THE_RUN, *_COUNTERS, *_constants_of(kind)])
+
+    def leave_out_of_state(self, names: Iterable[str]) -> None:
+        """Leave attributes out that only viewers need; physx calls it."""
+        if self._baseline is not None:
+            self._baseline.leave_out(names)
 
     def _tracked(self) -> Baseline:
         if self._baseline is None:

@@ -205,7 +205,14 @@ class Instance(Closeable):
         environment = self.environment
         return [] if environment is None else list(environment._defined_parameters)
 
-    def open(self, services: Services | None, draw: bool, choose: Choose | None = None) -> None:
+    def open(
+        self,
+        services: Services | None,
+        draw: bool,
+        choose: Choose | None = None,
+        *,
+        with_states: bool = False,
+    ) -> None:
         """Create the environment: `create`, `init`, `init_database`, `init_visualization`.
 
         Args:
@@ -213,6 +220,7 @@ class Instance(Closeable):
             draw: Whether there is a visualizer.
             choose: Chooses the parameters of an episode; None: they are drawn from their
                 distributions.
+            with_states: Whether to call `track_states`.
 
         Raises:
             EnvironmentFailedError: If the environment cannot be imported or one of its methods
@@ -237,11 +245,16 @@ class Instance(Closeable):
                 f"{type(environment).__name__}.init_database() defined no training fields: "
                 "call define_training_fields()."
             )
+        if with_states:
+            self.track_states()
         self._draws = draw
         if draw:
-            environment.factory = Factory()
+            environment.factory, before = Factory(), set(vars(environment))
             self._call("init_visualization", environment.init_visualization)
             environment.update_visualization()
+            if with_states:
+                self._drawing = Baseline(environment.factory)
+                environment.leave_out_of_state(vars(environment).keys() - before)
 
     def _create(self) -> Environment:
         """Create the environment, and check that its constructor passed on its arguments."""
@@ -365,14 +378,12 @@ class Instance(Closeable):
                 return {}
 
     def track_states(self) -> None:
-        """Prepare `get_state` and `set_state`, right after `open`.
+        """Prepare `get_state` and `set_state`, after `open` if nothing is drawn.
 
         Raises:
             StateError: If something cannot be captured; it is named.
         """
-        environment = self._alive()
-        self._call("get_state", environment.track_state)
-        self._drawing = Baseline(environment.factory) if self._draws else None
+        self._call("get_state", self._alive().track_state)
 
     def get_state(self) -> dict[str, Any]:
         """Return what an instance in another process needs to go on with the next row.
@@ -394,7 +405,7 @@ class Instance(Closeable):
             "environment": self._call("get_state", environment.get_state),
             "place": environment.get_place(),
             "instance": {name: getattr(self, name) for name in _COUNTERS},
-            "rejected": None if rejected is None else rejected.waiting,
+            "rejected": None if rejected is None else list(rejected.waiting),
             "drawing": None if self._drawing is None else self._drawing.capture(),
         }
 
@@ -411,7 +422,7 @@ class Instance(Closeable):
         for name in _COUNTERS:
             setattr(self, name, state["instance"][name])
         if self.rejected is not None:
-            self.rejected.waiting = state["rejected"] or []
+            self.rejected.waiting = list(state["rejected"] or [])
         if self._drawing is not None and state["drawing"] is not None:
             self._drawing.restore(state["drawing"])
 
