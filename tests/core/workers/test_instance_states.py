@@ -90,7 +90,7 @@ class Own(Walk):
         self.lock = threading.Lock()
 
     def get_state(self):
-        return [self.x.copy(), self.past]
+        return [self.x.copy(), dict(self.past)]
 
     def set_state(self, state):
         self.x, self.past = state
