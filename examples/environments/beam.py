@@ -19,6 +19,8 @@ class Beam(Environment):
     prediction of the correction is drawn over the solver's, along with that of linear elasticity.
     """
 
+    constants = ("solver",)
+
     def create(self) -> None:
         self.solver = ElasticBeam()
         self.rest = self.solver.rest.reshape(-1, 3)

@@ -23,7 +23,10 @@ WRONG = {
         "refuses states and torques that make no sense": "torques with NaN",
         "has forward and inverse dynamics that agree": "inverse_dynamics()",
     },
-    "KeepsImpulses": {"depends on nothing but the state that is set": "impulses"},
+    "KeepsImpulses": {
+        "depends on nothing but the state that is set": "impulses",
+        "continues from states and snapshots, in the middle of contacts too": "after 150 steps",
+    },
     "Invents": {"claims features that exist": "antigravity"},
     "LivesOn": {"ends once and for all": "after close()"},
     "Aliases": {"gives copies of its state": "written to"},

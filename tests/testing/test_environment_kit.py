@@ -7,6 +7,7 @@ from physx_testing import check_environment
 pytestmark = pytest.mark.processes
 
 STEPS = "gives every field in each step, finite and of its shape and type"
+CONTINUES = "continues from its state in another process"
 WRONG = [
     ("GlobalRandom", "leaves its process as it was", "NumPy's global random numbers"),
     ("Unseeded", "gives the same rows with the same seed", '"state"'),
@@ -24,6 +25,8 @@ WRONG = [
     ("ClosesOnce", "closes at any time, even twice", "before create()"),
     ("Crashes", "gives the same rows with the same seed", "SIGSEGV"),
     ("ReplaysAnything", "replays stored rows", "second replay"),
+    ("Forgets", CONTINUES, "row 1 differs in another process that got the state after 1 rows"),
+    ("CreatesRandomly", CONTINUES, "after creation, these attributes differ: drift"),
     ("OtherInClients", "gives the same rows from clients over TCP", '"state"'),
 ]
 
@@ -62,3 +65,15 @@ def test_what_needs_a_network_is_left_out(place):
     report = check_environment(place("wrong_environments", "Asks"))
     assert report.ok and report.counts()["skipped"] >= 6, str(report)
     assert "a network, which the kit lacks" in str(report)
+
+
+def test_what_has_no_state_is_named_and_not_judged(place):
+    report = check_environment(place("wrong_environments", "Holds"))
+    assert report.ok and report.counts()["skipped"] >= 2, str(report)
+    assert "Holds.lock (_thread.lock) cannot be captured" in str(report)
+
+
+def test_a_state_that_disturbs_is_said_and_not_judged(place):
+    report = check_environment(place("wrong_environments", "Disturbed"))
+    assert report.ok, str(report)
+    assert "take states after the same rows in each run" in str(report)

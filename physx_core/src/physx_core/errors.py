@@ -312,6 +312,19 @@ class DependentEpisodeError(PhysxError):
         super().__init__(message)
 
 
+class StateError(PhysxError):
+    """The state of an environment cannot be captured or restored.
+
+    Attributes:
+        path: What cannot be captured, as an attribute of the environment; empty: see the message.
+        kind: Its type.
+    """
+
+    def __init__(self, message: str, path: str = "", kind: str = "") -> None:
+        super().__init__(message)
+        self.path, self.kind = path, kind
+
+
 class ProgramError(PhysxError):
     """A program that generates an environment's samples failed, hung, or violated the protocol.
 

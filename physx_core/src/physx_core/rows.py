@@ -204,10 +204,13 @@ class RejectedSamples:
 
     Nothing invalid is ever stored: a sample that does not fit the fields, or that contains NaN or
     infinity, is left out.
+
+    Attributes:
+        waiting: The samples, their trajectories and steps.
     """
 
     def __init__(self) -> None:
-        self._waiting: list[tuple[Sample, int, int]] = []
+        self.waiting: list[tuple[Sample, int, int]] = []
 
     def add(self, sample: Mapping[str, Any], episode: int, step: int) -> None:
         """Keep a copy of a sample.
@@ -219,15 +222,15 @@ class RejectedSamples:
         """
         with contextlib.suppress(*NO_ARRAY):
             copies = {name: np.array(value) for name, value in sample.items()}
-            self._waiting.append((copies, episode, step))
+            self.waiting.append((copies, episode, step))
 
     def discard(self, count: int) -> None:
         """Discard the first samples."""
-        del self._waiting[:count]
+        del self.waiting[:count]
 
     def infer_shapes(self, fields: Sequence[Field]) -> list[Field]:
         """Fill in open shapes of fields from the first sample that has all the fields."""
-        for sample, _, _ in self._waiting:
+        for sample, _, _ in self.waiting:
             if all(field.name in sample for field in fields):
                 return infer_shapes(fields, sample)
         return list(fields)
@@ -239,7 +242,7 @@ class RejectedSamples:
             fields: The environment's fields; no sample fits while a shape is open.
             instance_id: Instance that generated the samples.
         """
-        waiting, self._waiting = self._waiting, []
+        waiting, self.waiting = self.waiting, []
         if any(field.shape is None for field in fields):
             waiting = []
         buffer = RowBuffer(fields, len(waiting))

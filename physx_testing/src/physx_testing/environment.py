@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
-import contextlib
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import numpy as np
 
-from physx_core.components import Environment, Event
+from physx_core.components import Environment
 from physx_core.config import EnvironmentConfig
-from physx_core.errors import NotFiniteError
+from physx_core.errors import NotFiniteError, StateError
 from physx_core.rows import ROW_FIELDS, RowBuffer, infer_shapes
 from physx_core.sources import ClientSource, LocalSource
-from physx_core.typing import Batch, Sample
-from physx_core.workers import Instance, instance_arguments
+from physx_core.typing import Batch
+from physx_testing.instances import (
+    SEED,
+    Services,
+    config_of,
+    in_another_process,
+    one_instance,
+    rows_between,
+)
 from physx_testing.process_state import unchanged
 from physx_testing.report import NotApplicableError, Report
 from physx_testing.running import TIMEOUT, run_checks
@@ -27,7 +33,10 @@ from physx_testing.subject import (
 )
 
 _ROWS = 6
-_SEED = (5, 0, 0)
+_DISTURBED = (
+    "rows that follow a state differ from those without one, as an engine may discard memory of "
+    "its last step there: take states after the same rows in each run"
+)
 
 
 def check_environment(
@@ -58,69 +67,21 @@ def check_environment(
     )
 
 
-class Services:
-    """A run without a network that keeps what the environment saves and draws."""
-
-    def __init__(self) -> None:
-        self.saved: dict[int, dict[str, Any]] = {}
-        self.drawn: list[Event] = []
-
-    def predict(self, fields: Sample) -> Sample:
-        """Skip the check, because the kit has no network for the environment."""
-        raise NotApplicableError("it asks for predictions of a network, which the kit lacks")
-
-    def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
-        """Keep values of an instance."""
-        self.saved[instance_id] = {**self.saved.get(instance_id, {}), **values}
-
-    def load_parameters(self, instance_id: int) -> dict[str, Any]:
-        """Return the values that an instance saved."""
-        return self.saved.get(instance_id, {})
-
-    def show(self, instance_id: int, step: int, events: list[Event]) -> None:
-        """Keep what is drawn."""
-        self.drawn += events
-
-
-def _config(subject: Subject, number: int, **options: Any) -> EnvironmentConfig:
-    return EnvironmentConfig(
-        subject.reference,
-        env_kwargs=dict(subject.arguments),
-        num_clients=number,
-        as_tcp_ip_client=False,
-        **options,
-    )
-
-
 def _rows(
     subject: Subject,
     count: int = _ROWS,
     instances: int = 1,
     *,
-    seed: tuple[int, ...] = _SEED,
+    seed: tuple[int, ...] = SEED,
     stored: Batch | None = None,
     services: Services | None = None,
     **options: Any,
 ) -> Batch:
     """Return rows that instances in this process generate."""
-    config = _config(subject, instances, **options)
+    config = config_of(subject, instances, **options)
     with LocalSource(config, services or Services(), seed) as source:
         found = source.batch(count, stored)
         return {name: values.copy() for name, values in found.items()}
-
-
-@contextlib.contextmanager
-def _instance(
-    subject: Subject, number: int, instances: int, services: Services
-) -> Iterator[Instance]:
-    """Yield one of several instances, as a client would have it."""
-    config = _config(subject, instances)
-    instance = Instance(**instance_arguments(config, number, _SEED, accept_all=False))
-    try:
-        instance.open(services, draw=False)
-        yield instance
-    finally:
-        instance.close()
 
 
 def _refuses(subject: Subject) -> None:
@@ -128,12 +89,12 @@ def _refuses(subject: Subject) -> None:
 
 
 def _open(subject: Subject) -> None:
-    with _instance(subject, 1, 1, Services()):
+    with one_instance(subject):
         pass
 
 
 def _steps(subject: Subject) -> None:
-    with _instance(subject, 1, 1, Services()) as instance:
+    with one_instance(subject) as instance:
         promised = {field.name: field for field in instance.fields}
         for step in range(_ROWS):
             sample = instance.step()
@@ -169,7 +130,7 @@ def _independent(subject: Subject) -> None:
     together = _rows(subject, 2 * _ROWS, 2)
     for number in (1, 2):
         mine = together["env_id"] == number
-        with _instance(subject, number, 2, Services()) as instance:
+        with one_instance(subject, number, 2) as instance:
             buffer: RowBuffer | None = None
             for _ in range(_ROWS):
                 sample = instance.step()
@@ -188,7 +149,7 @@ def _independent(subject: Subject) -> None:
 def _over_tcp(subject: Subject) -> None:
     wanted = _rows(subject, 2 * _ROWS, 2)
     config = EnvironmentConfig(subject.reference, env_kwargs=dict(subject.arguments), num_clients=2)
-    with ClientSource(config, Services(), _SEED, total=2 * _ROWS) as source:
+    with ClientSource(config, Services(), SEED, total=2 * _ROWS) as source:
         found = source.batch(2 * _ROWS)
         expect_equal(found, wanted, "clients' rows differ from those generated in this process")
 
@@ -212,7 +173,7 @@ def _replays(subject: Subject) -> None:
 
 
 def _reads_samples(subject: Subject) -> bool:
-    with _instance(subject, 1, 1, Services()) as instance:
+    with one_instance(subject) as instance:
         instance.step()
         assert instance.environment is not None
         return instance.environment._has_read_sample
@@ -224,10 +185,37 @@ def _many_steps(subject: Subject) -> None:
     expect_equal(again, first, "with two simulations per row, a second run has different rows")
 
 
+def _rows_with_states(subject: Subject) -> tuple[list[Batch], dict[int, bytes]]:
+    """Return rows, and the states that were taken between them."""
+    states: dict[int, bytes] = {}
+    with one_instance(subject) as instance:
+        try:
+            instance.track_states()
+            return rows_between(instance, 0, states), states
+        except StateError as error:
+            raise NotApplicableError(str(error)) from error
+
+
+def _continues(subject: Subject) -> None:
+    rows, states = _rows_with_states(subject)
+    for made, found in in_another_process(subject, states).items():
+        for row, wanted in enumerate(rows[made:], made):
+            what = f"row {row} differs in another process that got the state after {made} rows"
+            expect_equal(found[row - made], wanted, what)
+
+
+def _is_not_disturbed(subject: Subject) -> None:
+    rows, _ = _rows_with_states(subject)
+    with one_instance(subject) as instance:
+        for found, wanted in zip(rows, rows_between(instance, 0, None), strict=True):
+            if any(not np.array_equal(wanted[name], found[name]) for name in wanted):
+                raise NotApplicableError(_DISTURBED)
+
+
 def _closes(subject: Subject) -> None:
-    made = subject.make(instance_id=1, instance_nb=1, seed=list(_SEED))
+    made = subject.make(instance_id=1, instance_nb=1, seed=list(SEED))
     _close(made, "before create(), as after a failure there")
-    with _instance(subject, 1, 1, Services()) as instance:
+    with one_instance(subject) as instance:
         instance.step()
         environment = instance.environment
     assert environment is not None
@@ -250,7 +238,7 @@ def _quiet(subject: Subject) -> None:
 
 def _takes_identity(subject: Subject) -> None:
     for number in (1, 3):
-        made = subject.make(instance_id=number, instance_nb=3, seed=list(_SEED))
+        made = subject.make(instance_id=number, instance_nb=3, seed=list(SEED))
         expect(
             (made.instance_id, made.instance_nb) == (number, 3),
             f"it is instance {made.instance_id} of {made.instance_nb}, though it was created as "
@@ -270,6 +258,8 @@ CHECKS: dict[str, Check] = {
     "gives the same rows from clients over TCP": _over_tcp,
     "draws without an effect on its rows": _draws,
     "replays stored rows": _replays,
+    "continues from its state in another process": _continues,
+    "gives the same rows when states are taken": _is_not_disturbed,
     "closes at any time, even twice": _closes,
     "leaves its process as it was": _quiet,
 }

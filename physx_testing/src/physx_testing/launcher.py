@@ -18,7 +18,7 @@ from physx_core.net import format_address
 from physx_core.processes import describe_exit
 from physx_core.sources import ClientSource, LocalSource
 from physx_core.typing import Batch
-from physx_testing.environment import Services
+from physx_testing.instances import Services
 from physx_testing.process_state import unchanged
 from physx_testing.report import NotApplicableError, Report
 from physx_testing.running import TIMEOUT, run_checks

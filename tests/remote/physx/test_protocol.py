@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 import warnings
 from collections import OrderedDict
 from typing import ClassVar
@@ -95,6 +96,16 @@ class Episodes(gymnasium.Env):
 
     def render(self):
         return np.full((2, 2, 3), self.n, np.uint8)
+
+
+class Locked(Episodes):
+    """Holds something that only its process can have."""
+
+    snapshot = None
+
+    def __init__(self, **options):
+        super().__init__(**options)
+        self.lock = threading.Lock()
 
 
 @pytest.fixture
@@ -264,7 +275,7 @@ def test_a_snapshot_of_one_world_goes_on_in_another(client):
 
 
 def test_snapshots_that_cannot_be_made(place):
-    with connect(place("gym/CartPole-v1"), token=TOKEN) as env:
+    with connect(place(Locked), token=TOKEN) as env:
         assert not env.client.has_snapshots
         with pytest.raises(RequestError, match="not started"):
             env.snapshot()

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import subprocess
 import sys
+import threading
 import uuid
 
 import gymnasium
@@ -20,6 +21,7 @@ from physx_core.errors import (
     EpisodeError,
     FieldShapeError,
     PluginNotFoundError,
+    StateError,
     UnknownOptionError,
     UsageError,
 )
@@ -185,8 +187,51 @@ def test_snapshots_go_through_wrappers_and_count_their_steps():
     assert first[-1][3], "truncated by the limit, both times"
     with pytest.raises(UsageError, match="was not returned by snapshot"):
         worlds.restore(0, {"environment": 3})
-    with pytest.raises(UsageError, match="no snapshots"):
-        open_worlds("gym/CartPole-v1").snapshot(0)
+
+
+class Holds(Plain):
+    def __init__(self):
+        super().__init__()
+        self.lock = threading.Lock()
+
+    snapshot = None
+
+
+def test_worlds_without_snapshots_name_what_holds_them():
+    worlds = Worlds([gymnasium.wrappers.TimeLimit(Holds(), 3)])
+    assert not worlds.has_snapshots
+    with pytest.raises(UsageError, match=r"no snapshots: _World\S*env.lock \(_thread.lock"):
+        worlds.snapshot(0)
+
+
+@pytest.mark.parametrize("name", ["gym/CartPole-v1", "physx/Cartpole-v0"])
+def test_any_world_goes_on_in_another(name):
+    worlds = open_worlds(name, 2)
+    for world in (0, 1):
+        worlds.reset(world, seed=4 + world)
+    worlds.environments[0].action_space.seed(3)
+    action = worlds.environments[0].action_space.sample()
+    worlds.step(0, action)
+    state = worlds.snapshot(0)
+    first = [worlds.step(0, action) for _ in range(3)]
+    for world in (1, 0):
+        worlds.restore(world, state)
+        np.testing.assert_equal([worlds.step(world, action) for _ in range(3)], first)
+    worlds.close()
+
+
+def test_a_world_of_physx_goes_back_after_a_reset():
+    worlds = open_worlds("toy/spring", 2)
+    for world in (0, 1):
+        worlds.reset(world, seed=4)
+    worlds.step(0, {})
+    state = worlds.snapshot(0)
+    first = [worlds.step(0, {}), worlds.reset(0), worlds.step(0, {})]
+    worlds.restore(0, state)
+    np.testing.assert_equal([worlds.step(0, {}), worlds.reset(0), worlds.step(0, {})], first)
+    with pytest.raises(StateError, match="attributes differ: .*instance_id"):
+        worlds.restore(1, state)
+    worlds.close()
 
 
 # Environments of physx ------------------------------------------------------------------------

@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import tempfile
+import threading
 import time
 
 import numpy as np
@@ -137,3 +138,56 @@ class Asks(Right):
     def step(self):
         super().step()
         self.state = self.state + self.get_prediction()["state"]
+
+
+class Forgets(Right):
+    """Keeps something where states do not look."""
+
+    constants = ("memory",)
+
+    def create(self):
+        super().create()
+        self.memory = [0]
+
+    def step(self):
+        self.memory.append(1)
+        self.state = self.state + len(self.memory)
+        self.set_training_data(state=self.state, count=self.step_index)
+
+
+class CreatesRandomly(Right):
+    def create(self):
+        super().create()
+        self.drift = os.getpid()
+
+
+class Holds(Right):
+    def create(self):
+        super().create()
+        self.lock = threading.Lock()
+
+
+class Engine:
+    def __init__(self):
+        self.value = self.warmth = 0.0
+
+    def step(self):
+        self.warmth += 1.0
+        self.value += 1e-3 * self.warmth
+
+    def snapshot(self):
+        self.warmth = 0.0
+        return self.value
+
+    def restore(self, state):
+        self.value, self.warmth = state, 0.0
+
+
+class Disturbed(Right):
+    def create(self):
+        super().create()
+        self.engine = Engine()
+
+    def step(self):
+        self.engine.step()
+        self.set_training_data(state=self.state + self.engine.value, count=self.step_index)

@@ -27,6 +27,7 @@ from physx_core.errors import (
 from physx_core.fields import NO_ARRAY, Field, FieldLike, as_fields, is_finite
 from physx_core.random_streams import NumberedStreams
 from physx_core.rows import infer_shapes
+from physx_core.states import Baseline, as_lists
 from physx_core.typing import Array, Sample
 
 _OTHER_NAMES = {
@@ -40,6 +41,24 @@ _OTHER_NAMES = {
     "render": "Environment.update_visualization()",
 }
 """Attributes of other systems' environments and factories, and their equivalents here."""
+
+
+_COUNTERS = (
+    "step_index",
+    "episode_index",
+    "sample_episode",
+    "_has_read_sample",
+    "_has_begun_episodes",
+    "_episode_is_over",
+    "_earlier_steps",
+    "_replayed",
+)
+"""What changes about the place of an environment in its run; instances keep it."""
+_OF_THE_RUN = (
+    *("factory", "step_time", "compute_training_data", "_sample", "_training", "_additional"),
+    *("_services", "_choose_parameters", "_baseline"),
+)
+"""What an environment has from its run, for viewers, or only within a step."""
 
 
 class PredictedFields(dict[str, Array]):
@@ -117,10 +136,12 @@ class Environment(Closeable):
         episode_index: Index of the current trajectory, from 0.
         sample_episode: Index of the trajectory of the last training data.
         runs_programs: Whether arguments name programs to run; then no file may supply them.
+        constants: Class attribute: names of attributes that states leave out: see `get_state`.
         step_time: Simulated time of a step, in s; None, the default: unknown. Viewers play what is
             drawn in simulated time; if the times of steps differ, call `Factory.set_time` instead.
     """
 
+    constants: ClassVar[tuple[str, ...]] = ()
     step_time: float | None = None
     runs_programs: ClassVar[bool] = False
     independent_episodes: bool = False
@@ -172,6 +193,7 @@ class Environment(Closeable):
         self._earlier_steps = 0  # of the episodes before this one
         self._numbering = instance_id - 1, instance_nb  # of episodes: the first, and the distance
         self._replayed: tuple[int, dict[str, Any]] | None = None  # index of a set, and its values
+        self._baseline: Baseline | None = None
 
     # What a subclass implements -------------------------------------------------------------
 
@@ -218,6 +240,39 @@ class Environment(Closeable):
 
     def apply_prediction(self, prediction: Sample) -> None:
         """Use the network's prediction, in physical units, in the simulation."""
+
+    def get_state(self) -> Any:
+        """Return everything that `set_state` needs to go on exactly from here, between two steps.
+
+        By default, that is what has changed in the attributes since the environment was created,
+        but for those that a class names in `constants`: see `physx_core.states.Baseline`. Not part
+        of it are variables of modules and classes, global random numbers, open files, threads and
+        other processes; ``physx check`` compares the rows that follow with those of an
+        environment that gets the state in another process.
+
+        Returns:
+            Numbers, strings, bytes, NumPy arrays, and lists, tuples and dictionaries of those,
+            which later steps do not change.
+
+        Raises:
+            StateError: If an attribute cannot be captured; it is named.
+            UsageError: If `track_state` was not called.
+        """
+        return self._tracked().capture()
+
+    def set_state(self, state: Any) -> None:
+        """Return to a state of this environment, or of one in another process that is alike.
+
+        Called after `create`, `init` and `init_database`. Implement it together with `get_state`.
+        The counters of steps and episodes, and `rng`, are restored in any case.
+
+        Args:
+            state: What `get_state` has returned.
+
+        Raises:
+            StateError: If this environment was created differently.
+        """
+        self._tracked().restore(state)
 
     def close(self) -> None:
         """Free the resources that `create` acquired."""
@@ -399,6 +454,45 @@ class Environment(Closeable):
         """Number of finished steps of all episodes of this instance."""
         return self._earlier_steps + self.step_index
 
+    def track_state(self) -> None:
+        """Prepare the default `get_state`, right after creation; physx calls it.
+
+        Raises:
+            StateError: If an attribute cannot be captured; it is named.
+            UsageError: If it defines only one of `get_state` and `set_state`.
+        """
+        kind, methods = type(self), ("get_state", "set_state")
+        own = [name for name in methods if getattr(kind, name) is not getattr(Environment, name)]
+        if len(own) == 1:
+            raise UsageError(f"{kind.__name__} defines {own[0]}(), but needs both: {methods}.")
+        if not own:
+            _ = self.rng  # which is created on first use
+            self._baseline = Baseline(self, [*_OF_THE_RUN, *_COUNTERS, *_constants_of(kind)])
+
+    def leave_out_of_state(self, names: Iterable[str]) -> None:
+        """Leave attributes out that only viewers need; physx calls it."""
+        if self._baseline is not None:
+            self._baseline.leave_out(names)
+
+    def _tracked(self) -> Baseline:
+        if self._baseline is None:
+            raise UsageError(
+                f"There is no state of {type(self).__name__} by default, because it has methods of "
+                "its own for it, or track_state() was not called right after creation."
+            )
+        return self._baseline
+
+    def get_place(self) -> dict[str, Any]:
+        """Return the counters and the state of `rng`, which are not in `get_state`."""
+        place = {name: getattr(self, name) for name in _COUNTERS}
+        return {**place, "rng": as_lists(self.rng.bit_generator.state)}
+
+    def set_place(self, place: Mapping[str, Any]) -> None:
+        """Set what `get_place` returned."""
+        for name in _COUNTERS:
+            setattr(self, name, place[name])
+        self.rng.bit_generator.state = place["rng"]
+
     def begin_episode(self, episode: int | None = None) -> None:
         """Begin the first episode of a stream, or any independent one; physx calls it.
 
@@ -523,6 +617,13 @@ def _is_finite(value: Any) -> bool:
         return is_finite(np.asarray(value))
     except NO_ARRAY:  # the network reports what is wrong
         return True
+
+
+def _constants_of(kind: type[Environment]) -> list[str]:
+    given = [vars(each).get("constants", ()) for each in kind.__mro__]
+    if any(isinstance(each, str) for each in given):
+        raise UsageError(f'{kind.__name__}.constants must be a tuple: constants = ("name",).')
+    return [name for names in given for name in names]
 
 
 def explain_missing_attribute(error: AttributeError) -> str:

@@ -9,7 +9,14 @@ from typing import Any, ClassVar
 
 from physx_core.components.environment import Environment
 from physx_core.components.parameter import Parameter
-from physx_core.errors import ConfigError, SampleError, UnknownOptionError, listed, nearest
+from physx_core.errors import (
+    ConfigError,
+    SampleError,
+    StateError,
+    UnknownOptionError,
+    listed,
+    nearest,
+)
 from physx_core.external import INCLUDE
 from physx_core.external.messages import Kind, Message
 from physx_core.external.process import ProgramProcess
@@ -148,6 +155,21 @@ class ExternalProgram(Environment):
                 self._start_again()
             else:
                 raise self._process.error("called physx_open() twice.")
+
+    def get_state(self) -> Any:
+        """Refuse: a program's state is in its own memory.
+
+        Raises:
+            StateError: Always.
+        """
+        raise StateError(
+            f"The state of {self._command[0]} is in its own memory, so there can be no state of "
+            "this environment: let its episodes be independent, which need none."
+        )
+
+    def set_state(self, state: Any) -> None:
+        """Refuse, as `get_state` does."""
+        self.get_state()
 
     def close(self) -> None:
         """End the program."""

@@ -23,6 +23,7 @@ from physx_core.config import EnvironmentConfig
 from physx_core.errors import (
     EnvironmentFailedError,
     PhysxError,
+    StateError,
     UnknownOptionError,
     UsageError,
     WrongSamplesError,
@@ -31,6 +32,7 @@ from physx_core.fields import Field
 from physx_core.plugins import resolve
 from physx_core.plugins.references import adapters_hint
 from physx_core.rows import RejectedSamples
+from physx_core.states import Baseline
 from physx_core.typing import Batch, Sample
 
 PARAMETER = "parameters/"
@@ -42,6 +44,11 @@ NO_VALUES: Mapping[str, Any] = {}
 """For an episode without parameters; never changed. A dict is unpacked faster than a view."""
 _MOST_EMPTY = 1000
 """Number of episodes in a row that may end without a row."""
+_COUNTERS = (
+    *("last_step", "last_episode", "has_ended"),
+    *("_next_episode", "_rows", "_counts", "_is_numbered"),
+)
+"""What changes about an instance."""
 _STEPPING = ("reset_parameters", "step", "check_sample", "apply_prediction", "close")
 
 
@@ -158,6 +165,7 @@ class Instance(Closeable):
         self._is_numbered = False  # whether `begin` begins each episode
         self._simulate: Callable[[], Any] = self._alive
         self._draws = False
+        self._drawing: Baseline | None = None
         self._runner: Any = None
 
     @property
@@ -181,14 +189,22 @@ class Instance(Closeable):
         environment = self.environment
         return [] if environment is None else list(environment._defined_parameters)
 
-    def open(self, services: Services, draw: bool, choose: Choose | None = None) -> None:
+    def open(
+        self,
+        services: Services | None,
+        draw: bool,
+        choose: Choose | None = None,
+        *,
+        with_states: bool = False,
+    ) -> None:
         """Create the environment: `create`, `init`, `init_database`, `init_visualization`.
 
         Args:
-            services: What the environment may request from the run.
+            services: What the environment may request from the run; None: nothing.
             draw: Whether there is a visualizer.
             choose: Chooses the parameters of an episode; None: they are drawn from their
                 distributions.
+            with_states: Whether to call `track_states`.
 
         Raises:
             EnvironmentFailedError: If the environment cannot be imported or one of its methods
@@ -209,11 +225,16 @@ class Instance(Closeable):
                 f"{type(environment).__name__}.init_database() defined no training fields: "
                 "call define_training_fields()."
             )
+        if with_states:
+            self.track_states()
         self._draws = draw
         if draw:
-            environment.factory = Factory()
+            environment.factory, before = Factory(), set(vars(environment))
             self._call("init_visualization", environment.init_visualization)
             environment.update_visualization()
+            if with_states:
+                self._drawing = Baseline(environment.factory)
+                environment.leave_out_of_state(vars(environment).keys() - before)
 
     def _create(self) -> Environment:
         """Create the environment, and check that its constructor passed on its arguments."""
@@ -337,6 +358,64 @@ class Instance(Closeable):
                 self._reject(sample, wrong)
             if environment._episode_is_over and not self._prepare(environment, stored):
                 return {}
+
+    def track_states(self) -> None:
+        """Prepare `get_state` and `set_state`, after `open` if nothing is drawn.
+
+        Raises:
+            StateError: If something cannot be captured; it is named.
+        """
+        self._call("get_state", self._alive().track_state)
+
+    def get_state(self) -> dict[str, Any]:
+        """Return what an instance in another process needs to go on with the next row.
+
+        Its next rows have the same bits, as have the next ones here. Where an engine keeps memory
+        of its last step, these differ in the last bits from those without a state: take states
+        after the same rows in each run.
+
+        Returns:
+            A value that `physx_core.net.encode` takes, which later steps do not change.
+
+        Raises:
+            StateError: If something cannot be captured; it is named.
+            EnvironmentFailedError: If the environment raises.
+        """
+        environment, rejected = self._alive(), self.rejected
+        self._check_tasks()
+        return {
+            "environment": self._call("get_state", environment.get_state),
+            "place": environment.get_place(),
+            "instance": {name: getattr(self, name) for name in _COUNTERS},
+            "rejected": None if rejected is None else list(rejected.waiting),
+            "drawing": None if self._drawing is None else self._drawing.capture(),
+        }
+
+    def set_state(self, state: Mapping[str, Any]) -> None:
+        """Go on from the state of an instance with the same arguments.
+
+        Raises:
+            StateError: If the environment was created differently.
+            EnvironmentFailedError: If the environment raises.
+        """
+        environment = self._alive()
+        self._call("set_state", environment.set_state, state["environment"])
+        environment.set_place(state["place"])
+        for name in _COUNTERS:
+            setattr(self, name, state["instance"][name])
+        if self.rejected is not None:
+            self.rejected.waiting = list(state["rejected"] or [])
+        if self._drawing is not None and state["drawing"] is not None:
+            self._drawing.restore(state["drawing"])
+
+    def _check_tasks(self) -> None:
+        """Check that no task waits in the event loop."""
+        if self._runner is not None:
+            import asyncio
+
+            for task in asyncio.all_tasks(self._runner.get_loop()):
+                text = f"step() has left {task!r:.80} running, so there can be no state."
+                raise StateError(text, task.get_name(), "asyncio.Task")
 
     def apply(self, prediction: Sample) -> None:
         """Pass a prediction in physical units to the environment.

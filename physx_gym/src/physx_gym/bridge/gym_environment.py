@@ -160,7 +160,8 @@ class GymEnvironment(Environment):
     def _choose_policy(self) -> Callable[[Any], Any]:
         policy = self._policy
         if policy == "random":
-            return lambda _: self.env.action_space.sample()
+            space = self.env.action_space  # a snapshot of a robot leaves its random numbers out
+            return lambda _: space.sample()
         if policy == "network":
             return self._ask_network
         if not isinstance(policy, str):

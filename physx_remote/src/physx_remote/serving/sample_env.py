@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Sequence
 from typing import Any
 
@@ -16,6 +17,7 @@ from physx_core.errors import (
     ConfigError,
     EpisodeError,
     SampleError,
+    StateError,
     UsageError,
     listed,
     nearest,
@@ -76,6 +78,8 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         self._prediction: Sample = {}
         self._parameters: dict[str, Any] = {}
         self._instance: Instance | None = None
+        self._untracked: StateError | None = None
+        self._seed = 0
         self._row = RowBuffer(self._find_fields(), 1)
         fields = {field.name: field for field in self._row.fields if field.role == "training"}
         self._observed = [n for n in fields if n not in (REWARD, TERMINATED, TRUNCATED)]
@@ -129,6 +133,31 @@ class SampleEnv(gymnasium.Env[Any, Any]):
             self._instance.apply(self._prediction)
         return self._advance()
 
+    def snapshot(self) -> dict[str, Any]:
+        """Return everything that `restore` needs to go on exactly from here.
+
+        Raises:
+            EpisodeError: If `reset` was not called.
+            StateError: If a part of the environment cannot be captured; it is named.
+        """
+        if self._instance is None:
+            raise EpisodeError("Call reset() before snapshot().")
+        if self._untracked is not None:
+            raise self._untracked
+        return {
+            "instance": self._instance.get_state(),
+            "seed": self._seed,
+            "prediction": {name: value.copy() for name, value in self._prediction.items()},
+            "parameters": dict(self._parameters),
+            "random": copy.deepcopy(self.np_random.bit_generator.state),
+        }
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Return to a snapshot, also of another environment with the same arguments."""
+        self._open(state["seed"]).set_state(state["instance"])
+        self._prediction, self._parameters = dict(state["prediction"]), dict(state["parameters"])
+        self.np_random.bit_generator.state = state["random"]
+
     def close(self) -> None:
         """Close the environment; calling it again does nothing."""
         instance, self._instance = self._instance, None
@@ -174,12 +203,21 @@ class SampleEnv(gymnasium.Env[Any, Any]):
         )
         try:
             instance.open(self, draw=False)
+            self._track(instance)
             self._prediction = self._zeros(instance.fields)
         except BaseException:
             instance.close()
             raise
-        self._instance = instance
+        self._instance, self._seed = instance, seed
         return instance
+
+    def _track(self, instance: Instance) -> None:
+        """Prepare snapshots; if there can be none, remember why."""
+        self._untracked = None
+        try:
+            instance.track_states()
+        except StateError as error:
+            self._untracked = error
 
     def _zeros(self, given: Sequence[Field]) -> Sample:
         """Return an action of zeros."""

@@ -10,8 +10,9 @@ import gymnasium
 
 from physx_core import Closeable, PhysxError
 from physx_core.components import Environment
-from physx_core.errors import ComponentNotFoundError, ConfigError, UsageError
+from physx_core.errors import ComponentNotFoundError, ConfigError, StateError, UsageError
 from physx_core.plugins import available, find, import_module, load
+from physx_core.states import Baseline
 from physx_remote.serving.sample_env import SampleEnv
 
 _PLUGIN = "gym"
@@ -55,6 +56,7 @@ class Worlds(Closeable):
             raise UsageError("There must be at least one world.")
         self.environments = list(environments)
         self._is_closed = False
+        self._baselines = [_baseline_of(each) for each in environments]
         first = self.environments[0]
         own_name = first.spec.id if first.spec is not None else type(first.unwrapped).__name__
         self.name = name or own_name
@@ -88,58 +90,32 @@ class Worlds(Closeable):
 
     @property
     def has_snapshots(self) -> bool:
-        """Whether the environments can return and restore their state."""
-        return self._keeper(0) is not None
+        """Whether the environments' states can be captured and restored."""
+        return isinstance(self._baselines[0], Baseline)
 
     def snapshot(self, world: int) -> Any:
-        """Return one world's state.
+        """Return one world's state, wrappers included: see `physx_core.states`.
 
         Raises:
-            UsageError: If the environment does not define `snapshot`.
+            UsageError: If it cannot be captured; the message names the part.
         """
-        keeper = self._required_keeper(world)
-        elapsed = [limit._elapsed_steps for limit in self._limits(world)]
-        return {"environment": keeper.snapshot(), "elapsed_steps": elapsed}
+        return self._baseline(world).capture()
 
     def restore(self, world: int, state: Mapping[str, Any]) -> None:
         """Restore one world to a state that `snapshot` returned.
 
         Raises:
-            UsageError: If the environment does not define `snapshot`, or the state is not one that
-                it returned.
+            UsageError: If it has none, or the state is not one that `snapshot` returned.
         """
-        limits = self._limits(world)
-        is_own = set(state) == {"environment", "elapsed_steps"}
-        if not is_own or len(state["elapsed_steps"]) != len(limits):
+        if "created" not in state:
             raise UsageError(f"This state was not returned by snapshot() of {self.name}.")
-        self._required_keeper(world).restore(state["environment"])
-        for limit, elapsed in zip(limits, state["elapsed_steps"], strict=True):
-            limit._elapsed_steps = elapsed
+        self._baseline(world).restore(state)
 
-    def _keeper(self, world: int) -> Any:
-        """Return the outermost wrapper or environment that has snapshots; None if there is none."""
-        found = (env for env in self._parts(world) if hasattr(env, "snapshot"))
-        return next(found, None)
-
-    def _required_keeper(self, world: int) -> Any:
-        keeper = self._keeper(world)
-        if keeper is None:
-            raise UsageError(
-                f"{self.name} has no snapshots: its environment does not define snapshot()."
-            )
-        return keeper
-
-    def _limits(self, world: int) -> list[Any]:
-        """Return the wrappers that count steps."""
-        limit = gymnasium.wrappers.TimeLimit
-        return [env for env in self._parts(world) if isinstance(env, limit)]
-
-    def _parts(self, world: int) -> list[gymnasium.Env[Any, Any]]:
-        """Return an environment's wrappers, outermost first, and the environment itself."""
-        parts = [self.environments[world]]
-        while isinstance(parts[-1], gymnasium.Wrapper):
-            parts.append(parts[-1].env)
-        return parts
+    def _baseline(self, world: int) -> Baseline:
+        found = self._baselines[world]
+        if isinstance(found, StateError):
+            raise UsageError(f"{self.name} has no snapshots: {found}") from found
+        return found
 
     # ----------------------------------------------------------------------------------------
 
@@ -154,6 +130,20 @@ class Worlds(Closeable):
         with contextlib.ExitStack() as stack:
             for environment in self.environments:
                 stack.callback(environment.close)
+
+
+class _World:
+    """What has an environment, for its state."""
+
+    def __init__(self, environment: gymnasium.Env[Any, Any]) -> None:
+        self.environment = environment
+
+
+def _baseline_of(environment: gymnasium.Env[Any, Any]) -> Baseline | StateError:
+    try:
+        return Baseline(_World(environment))
+    except StateError as error:
+        return error
 
 
 def open_worlds(

@@ -8,6 +8,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from physx_core.net import decode, encode
+from physx_core.states import Baseline
 from physx_core.typing import Batch
 from physx_sim import Robot, Simulation, World
 from physx_sim.conformance.worlds import (
@@ -104,6 +106,38 @@ def _restores(subject: Subject) -> None:
                 expect_close(
                     one.positions(), wanted["positions"], 1e-2, f"restored in {name}, it diverges"
                 )
+
+
+class _Holder:
+    """What an environment is to its state: an object that has a simulation."""
+
+    def __init__(self, simulation: Simulation) -> None:
+        self.simulation = simulation
+
+
+def _continues(subject: Subject) -> None:
+    need(subject, "exact_restore")
+    for steps in (0, 150, 190):  # the box and the ball touch the ground, and slide on it
+        with build(subject, busy(subject)) as simulation, build(subject, busy(subject)) as other:
+            simulation.set_torques(np.array([2.0, -1.0, 1.0]))
+            simulation.step(steps)
+            _expect_futures(simulation, other, f"after {steps} steps")
+
+
+def _expect_futures(simulation: Simulation, other: Simulation, when: str) -> None:
+    """Expect that another simulation goes on alike, however it gets the state."""
+    here, there = (Baseline(_Holder(each)) for each in (simulation, other))
+    state, snapshot = encode(here.capture(), "state"), simulation.snapshot()
+    ways: dict[str, Callable[[], None]] = {
+        "the state of an environment": lambda: there.restore(decode(state)),
+        "a pickled snapshot": lambda: other.restore(pickle.loads(pickle.dumps(snapshot))),  # noqa: S301
+        "a copied snapshot": lambda: other.restore(copy.deepcopy(snapshot)),
+    }
+    simulation.step(60)
+    for name, restore in ways.items():
+        restore()
+        other.step(60)
+        expect_equal(_now(other), _now(simulation), f"{when}, {name} has another future")
 
 
 def _state_alone(subject: Subject) -> None:
@@ -223,6 +257,7 @@ CHECKS: dict[str, Check] = {
     "describes its layout as the file does": _layout,
     "gives copies of its state": _copies,
     "restores snapshots": _restores,
+    "continues from states and snapshots, in the middle of contacts too": _continues,
     "depends on nothing but the state that is set": _state_alone,
     "moves the same again": _repeats,
     "does not disturb another simulation": _independent,
