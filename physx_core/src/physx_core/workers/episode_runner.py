@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -99,6 +100,7 @@ class EpisodeRunner:
         self._joined: _Part | None = None  # the last part, if an episode of one row can be added
         self._first = 0  # row of the buffer with which the episode's part begins
         self._began = 0.0
+        self._makes_single_rows = instance.makes_single_rows
 
     def run(self) -> EpisodeBlock:
         """Simulate until rows fill a block, episodes took 20 ms, or no number is left.
@@ -115,6 +117,8 @@ class EpisodeRunner:
                 if self._number is None and not self._begin():
                     break
                 self._make_row()
+                if self._makes_single_rows and self._number is None:
+                    self._make_single_rows(until)
             except OF_EPISODES as error:
                 self._fail(error)
             if self._number is None and self._began >= until:
@@ -157,25 +161,57 @@ class EpisodeRunner:
             self._end(_FINISHED)
             self._number = None
 
+    def _make_single_rows(self, until: float) -> None:
+        """Simulate episodes of one row while there are numbers, space, and time."""
+        buffer = self._buffer
+        if buffer is None or buffer.full or self._began >= until:
+            return
+        put, now, start, first = buffer.put, self._now, buffer.count, self._instance.number + 1
+        sample: Mapping[str, Any] | None = None
+        try:
+            following = itertools.islice(self._episodes, buffer.capacity - start)
+            for sample in self._instance.single_rows(following):
+                if not sample:
+                    break
+                put(sample, 0, None, 0)
+                if now() >= until:
+                    break
+        finally:
+            if count := buffer.count - start:
+                buffer.number_rows(start, first)
+                self._number, self._part = first, 0
+                self._end(_FINISHED, count)
+            has_ended = self._instance.number < first + count
+            self._number, self._part = None if has_ended else first + count, 0
+        if not has_ended:  # without a row
+            self._end(_FINISHED)
+            self._number = None
+
     def _make_buffer(self, sample: dict[str, Any]) -> RowBuffer:
         buffer = self._buffer = RowBuffer(infer_shapes(self._instance.fields, sample))
         self.fields = buffer.fields
         return buffer
 
-    def _end(self, status: EpisodeStatus) -> None:
-        """Note the rows of the episode since its last part, which ends with this status."""
+    def _end(self, status: EpisodeStatus, count: int = 1) -> None:
+        """Note the rows of the episode since its last part, which ends with this status.
+
+        Args:
+            status: The status.
+            count: Number of episodes, of one row each if they are several.
+        """
         end = 0 if self._buffer is None else self._buffer.count
         rows, self._first = end - self._first, end
         now = self._now()
         seconds, self._began = now - self._began, now
-        is_single, joined = rows == 1 and not self._part and status is _FINISHED, self._joined
+        is_single = rows == count and not self._part and status is _FINISHED
+        joined = self._joined
         if is_single and joined is not None:
-            joined.count += 1
-            joined.rows += 1
+            joined.count += count
+            joined.rows += rows
             joined.seconds += seconds
             return
         assert self._number is not None
-        part = _Part(self._number, rows, seconds, self._part, self._lease, status=status)
+        part = _Part(self._number, rows, seconds, self._part, self._lease, count, status)
         self._parts.append(part)
         self._joined = part if is_single else None
         self._part += 1

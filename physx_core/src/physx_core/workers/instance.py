@@ -5,7 +5,7 @@ from __future__ import annotations
 import inspect
 import traceback
 import warnings
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 from physx_core.closeable import Closeable
@@ -192,6 +192,11 @@ class Instance(Closeable):
         return self._alive().independent_episodes
 
     @property
+    def number(self) -> int:
+        """Number of the last episode that has begun."""
+        return self._alive().episode_index
+
+    @property
     def parameters(self) -> list[Parameter]:
         """The parameters that the environment defines. Empty if it is closed."""
         environment = self.environment
@@ -303,6 +308,47 @@ class Instance(Closeable):
     def _count_episodes(self, environment: Environment) -> None:
         """Let `begin` begin all episodes."""
         self._is_numbered, self._counts = True, self._episode_steps is not None
+
+    @property
+    def makes_single_rows(self) -> bool:
+        """Whether each step is an episode, and nothing is asked of it but its sample."""
+        kept = type(self._alive()).check_sample is Environment.check_sample
+        return self._episode_steps == 1 and kept and not (self._sub_steps or self._draws)
+
+    def single_rows(
+        self, episodes: Iterator[tuple[int, Mapping[str, Any]]]
+    ) -> Iterator[dict[str, Any]]:
+        """Simulate episodes of one row: what `begin` and `step` do for each, in half the time.
+
+        Args:
+            episodes: Number and values of parameters of each.
+
+        Yields:
+            The sample of each, without further checks; empty if it has none.
+        """
+        environment, simulate, method = self._alive(), self._simulate, ""
+        streams, reset = environment._episode_streams, environment.reset_parameters
+        resets = type(environment).reset_parameters is not Environment.reset_parameters
+        environment._earlier_steps, environment.step_index = environment._step_count, 0
+        try:
+            for number, values in episodes:
+                environment.episode_index, environment._episode_is_over = number, False
+                method = "reset_parameters"
+                if environment.rng is not streams.generator:
+                    environment._check_generator()
+                streams.seek(number)
+                if resets:
+                    reset(**values)
+                method = "step"
+                if (result := simulate()) is not None:
+                    self._finish(result)
+                sample = environment._training
+                if sample is None or environment._additional is not None:
+                    sample = environment.take_sample() or {}
+                environment._training = None
+                yield sample
+        except Exception as error:
+            raise self._failure(method, error) from error
 
     def step(self, stored: Sample | None = None) -> dict[str, Any]:
         """Simulate until `check_sample` accepts a sample; return it without further checks.
