@@ -22,7 +22,9 @@ SEED = [5, 2]
 def simulate(total, env_kwargs, recorded=(), environment=TROUBLED, **options):
     """Return what a source in this process has simulated."""
     queue = EpisodeQueue(total, recorded)
-    config = EnvironmentConfig(environment, as_tcp_ip_client=False, env_kwargs=env_kwargs, **options)
+    config = EnvironmentConfig(
+        environment, as_tcp_ip_client=False, env_kwargs=env_kwargs, **options
+    )
     with leased(config, SEED, queue) as source:
         return Results().take_all(source, queue)
 

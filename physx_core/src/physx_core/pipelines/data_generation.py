@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import shlex
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, field, replace
 from pathlib import Path
 from typing import ClassVar
 
-from physx_core.config import MODES, WRONG, DatasetConfig, EnvironmentConfig, at_least, options
+from physx_core.config import (
+    MODES,
+    WRONG,
+    DatasetConfig,
+    EnvironmentConfig,
+    at_least,
+    options,
+    read_toml,
+)
 from physx_core.dataset import Dataset, EpisodeStatus
 from physx_core.errors import ConfigError, FailedEpisodesError, listed
 from physx_core.pipelines.campaign import Campaign
@@ -153,6 +162,12 @@ class DataGeneration(NewSessionPipeline):
     def _simulate_episodes(self) -> None:
         while self._queue is not None and not self._queue.is_done:
             self._store_episodes(self._queue)
+        if self._queue is not None and self._queue.finished > self._failed and not self._rows():
+            warnings.warn(
+                "All episodes that have finished ended without a row: call set_training_data() in "
+                "each step, also in that which calls end_episode().",
+                stacklevel=2,
+            )
 
     def _store_episodes(self, queue: EpisodeQueue) -> None:
         """Store the episodes that end next; fail if too many of this run failed."""
@@ -184,13 +199,16 @@ class DataGeneration(NewSessionPipeline):
         """Leave out what the last episodes have more than the batches, when the run is closed."""
         if kind is not None or self._campaign is None or self._mode not in self.dataset.modes:
             return
-        known = self.dataset.recorded_episodes(self._mode)
-        if known is None:
-            return
-        rows = int(known.rows[known.campaign == self._campaign.number].sum())
-        surplus = rows - self._first_row - self.batch_id * (self.batch_size or 0)
+        surplus = self._rows() - self._first_row - self.batch_id * (self.batch_size or 0)
         if surplus > 0:
             self._campaign.cut(self.dataset, surplus, self.source.sets)
+
+    def _rows(self) -> int:
+        """Return how many rows the campaign has."""
+        known = self.dataset.recorded_episodes(self._mode)
+        if known is None or self._campaign is None:
+            return 0
+        return int(known.rows[known.campaign == self._campaign.number].sum())
 
     def _prove_independence(self) -> None:
         """Simulate an episode again, if that costs little, and compare its rows."""
@@ -310,7 +328,7 @@ class DataGeneration(NewSessionPipeline):
             seed = derive_seed(self._seed, self._mode, self._offset())
         else:
             self._seed, seed = campaign.environment["seed"], campaign.seed
-        self._record_config(self._seed)
+        self._record_config(self._seed, **self._larger_number())
         self._observe(resources, config)
         if campaign is not None:
             self._queue = self._make_queue(campaign)
@@ -340,6 +358,15 @@ class DataGeneration(NewSessionPipeline):
             self._episodes = self.source.lease(self._queue)
             if self.episodes is None:
                 resources.push(self._cut)
+
+    def _larger_number(self) -> dict[str, int]:
+        """Return the number of episodes to record if it is larger than what this run asks for."""
+        file = self.session.path / "config.toml"
+        former = read_toml(file).get(self.kind) if self.resume and file.exists() else None
+        known = former if isinstance(former, dict) else {}
+        mode = known.get("mode") or known.get("dataset", {}).get("mode", "training")
+        wanted = known.get("episodes") if mode == self._mode and self.episodes else None
+        return {} if not wanted else {"episodes": max(int(wanted), self.episodes or 0)}
 
     def _offset(self) -> int:
         """Return how many rows or campaigns there are already, which get other random numbers."""

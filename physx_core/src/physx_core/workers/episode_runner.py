@@ -7,10 +7,13 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
+import numpy as np
+
 from physx_core.clock import SYSTEM_CLOCK, Clock
 from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.errors import (
     EnvironmentFailedError,
+    FieldShapeError,
     NotFiniteError,
     PhysxError,
     ProgramError,
@@ -23,7 +26,7 @@ from physx_core.workers.instance import Instance
 from physx_core.workers.lease import AIM, Lease
 
 OF_EPISODES = (EnvironmentFailedError, ProgramError, NotFiniteError, WrongSamplesError)
-"""Errors that end an episode; others end the run."""
+"""Errors that end an episode."""
 _FINISHED, _MORE = EpisodeStatus.FINISHED, EpisodeStatus.MORE  # looking members up takes long
 _PART_TIME = 10.0  # s
 
@@ -119,7 +122,10 @@ class EpisodeRunner:
                 self._make_row()
                 if self._makes_single_rows and self._number is None:
                     self._make_single_rows(until)
-            except OF_EPISODES as error:
+            except PhysxError as error:
+                if not self._concerns_one(error):
+                    error.add_note(f"in {self._described()}")
+                    raise
                 self._fail(error)
             if self._number is None and self._began >= until:
                 break
@@ -215,6 +221,23 @@ class EpisodeRunner:
         self._parts.append(part)
         self._joined = part if is_single else None
         self._part += 1
+
+    def _concerns_one(self, error: PhysxError) -> bool:
+        """Return whether an error ends its episode; others end the run.
+
+        What has another shape than an earlier episode's may be right, if the field has none.
+        """
+        if isinstance(error, FieldShapeError):
+            fields = self._instance.fields
+            return any(f.name == error.field and f.shape is not None for f in fields)
+        return isinstance(error, OF_EPISODES)
+
+    def _described(self) -> str:
+        """Return the number of the episode and its first parameters, for an error."""
+        number = self._number or 0
+        values = self._lease.parameters(number, 1).items()
+        texts = [f"{name} = {value}" for name, value in values if not np.ndim(value)]
+        return f"episode {number}" + (f", with {', '.join(texts[:8])}" if texts else "")
 
     def _fail(self, error: PhysxError) -> None:
         """Note that the episode has failed, without its rows."""

@@ -30,6 +30,7 @@ from physx_core.errors import (
 from physx_core.fields import Field
 from physx_core.plugins import resolve
 from physx_core.plugins.references import adapters_hint
+from physx_core.processes.endings import describe_ending, is_ending
 from physx_core.rows import RejectedSamples
 from physx_core.typing import Batch, Sample
 
@@ -302,7 +303,7 @@ class Instance(Closeable):
         self._rows = 0
         try:
             environment.begin_number(number, values)
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise self._failure("reset_parameters", error) from error
 
     def _count_episodes(self, environment: Environment) -> None:
@@ -347,7 +348,7 @@ class Instance(Closeable):
                     sample = environment.take_sample() or {}
                 environment._training = None
                 yield sample
-        except Exception as error:
+        except (Exception, SystemExit) as error:
             raise self._failure(method, error) from error
 
     def step(self, stored: Sample | None = None) -> dict[str, Any]:
@@ -383,7 +384,7 @@ class Instance(Closeable):
                 accepted = sample is None or environment.check_sample()
                 if self._draws:
                     self._show(environment)
-            except Exception as error:
+            except (Exception, SystemExit) as error:
                 raise self._failure(method, error) from error
             if sample is None:
                 empty += 1
@@ -517,8 +518,14 @@ class Instance(Closeable):
         except Exception as error:
             raise self._failure(method, error) from error
 
-    def _failure(self, method: str, error: Exception) -> Exception:
-        """Return the error to raise: physx errors get a note, others are wrapped."""
+    def _failure(self, method: str, error: BaseException) -> BaseException:
+        """Return the error to raise: physx errors get a note, others are wrapped.
+
+        An environment that exits fails its episode, but ends a stream.
+        """
+        exits = isinstance(error, SystemExit)
+        if exits and not (self._is_numbered and is_ending(error)):
+            return error
         environment = self.environment
         if environment is None or method not in _STEPPING:
             step = -1
@@ -529,6 +536,8 @@ class Instance(Closeable):
                 error.add_note(f"in {method}() of instance {self.instance_id}")
             return error
         summary = "".join(traceback.format_exception_only(error)).strip()
+        if exits:
+            summary = describe_ending(error)
         if isinstance(error, AttributeError):
             summary += explain_missing_attribute(error)
         text = "".join(traceback.format_exception(error))
