@@ -119,3 +119,52 @@ def test_run_that_was_killed_at_its_start_cannot_be_resumed(write, capsys):
     said = capsys.readouterr().err
     assert "ended before it began" in said
     assert "without --resume" in said
+
+
+# Saved parameters --------------------------------------------------------------------------------
+
+SAVING = """
+from physx_core import Environment
+
+class Case(Environment):
+    episode_steps = 2
+
+    def init_database(self):
+        self.define_training_fields(("x", float))
+
+    def create(self):
+        {create}
+
+    def step(self):
+        {step}
+        self.set_training_data(x=self.load_parameters().get("mean", -1.0))
+"""
+
+
+def save(create="pass", step="pass"):
+    Path("case.py").write_text(SAVING.format(create=create, step=step))
+
+
+@pytest.mark.parametrize("where", [LOCAL, CLIENTS])
+def test_instances_of_a_campaign_have_the_same_saved_parameters(write, where):
+    save("self.save_parameters(mean=2.5)")
+    assert generate(where) == 0
+    with Dataset.open("sessions/run") as dataset:
+        assert dataset["training"]["x"][:].tolist() == [2.5] * 12
+    assert [path.name for path in Path("sessions/run/dataset").glob("*.bin")] == [
+        "parameters_0.bin"
+    ]
+
+
+def test_instances_that_save_others_end_the_campaign(write, capsys):
+    save("self.save_parameters(mean=self.instance_id)")
+    assert generate(CLIENTS) == 1
+    assert 'save_parameters() got another value of "mean"' in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("where", [LOCAL, CLIENTS])
+def test_parameters_cannot_be_saved_in_an_episode(write, capsys, where):
+    save(step="self.save_parameters(mean=2.0)")
+    assert generate(where) == 1
+    said = capsys.readouterr().err
+    assert "called save_parameters() in an independent episode" in said
