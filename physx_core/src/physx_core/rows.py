@@ -234,6 +234,10 @@ class RejectedSamples:
             copies = {name: np.array(value) for name, value in sample.items()}
             self._waiting.append((copies, episode, step))
 
+    def __len__(self) -> int:
+        """Return how many samples there are."""
+        return len(self._waiting)
+
     def discard(self, count: int) -> None:
         """Discard the first samples."""
         del self._waiting[:count]
@@ -245,14 +249,16 @@ class RejectedSamples:
                 return infer_shapes(fields, sample)
         return list(fields)
 
-    def take(self, fields: Sequence[Field], instance_id: int) -> Batch:
+    def take(self, fields: Sequence[Field], instance_id: int, keep: int | None = None) -> Batch:
         """Return the samples as rows, with the fields that physx adds, and discard them.
 
         Args:
             fields: The environment's fields; no sample fits while a shape is open.
             instance_id: Instance that generated the samples.
+            keep: Episode whose samples stay; None: there is none.
         """
-        waiting, self._waiting = self._waiting, []
+        waiting = [each for each in self._waiting if each[1] != keep]
+        self._waiting = [each for each in self._waiting if each[1] == keep]
         if any(field.shape is None for field in fields):
             waiting = []
         buffer = RowBuffer(fields, len(waiting))

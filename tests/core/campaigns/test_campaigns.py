@@ -402,9 +402,7 @@ def test_stream_has_no_episodes(clients):
         generate("run", 3, config, clients=clients)
 
 
-@pytest.mark.parametrize(
-    ("option", "value"), [("restarts", 1), ("redraw", 1), ("record_wrong_samples", True)]
-)
+@pytest.mark.parametrize(("option", "value"), [("restarts", 1), ("redraw", 1)])
 def test_options_of_streams_are_not_for_episodes(option, value):
     with pytest.raises(ConfigError, match=f"{option} is for streams"):
         generate("run", 6, dataclasses.replace(LOCAL, **{option: value}))

@@ -179,6 +179,9 @@ class DataGeneration(NewSessionPipeline):
         if self._mode not in self.dataset.modes:
             self.dataset.define_fields(self._mode, self._episodes.fields)
         records = [replace(record, campaign=campaign) for record in block.records]
+        if block.rejected and self.environment_config.record_wrong_samples:
+            self.dataset.define_fields(WRONG, self._episodes.fields)
+            self._campaign.store_rejected(self.dataset, block.rejected, records)
         self.dataset.append_episodes(self._mode, block.rows, records, checked=True)
         if self.episodes is not None:
             self.observers.advance(queue.finished - before)

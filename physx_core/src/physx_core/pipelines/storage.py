@@ -172,7 +172,6 @@ def stream_options(config: EnvironmentConfig, dataset_config: DatasetConfig) -> 
     advice = {
         "redraw": "use max_failed",
         "restarts": "lost clients are replaced; DataGeneration.retries is for their episodes",
-        "record_wrong_samples": "rejected samples of episodes are not kept",
     }
     found = {name: advice[name] for name in advice if getattr(config, name)}
     if dataset_config.writers != "server":

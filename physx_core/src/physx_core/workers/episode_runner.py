@@ -39,11 +39,14 @@ class EpisodeBlock(NamedTuple):
             fields if there are no rows.
         records: The episodes, or parts of them, that the rows belong to, in order.
         instance_id: The instance that has simulated them.
+        rejected: The samples that `check_sample` rejected in the episodes that have ended, if they
+            are recorded; ``step`` counts all of an episode's.
     """
 
     rows: Batch
     records: list[EpisodeRecord]
     instance_id: int = 1
+    rejected: Batch = {}  # noqa: RUF012 - never changed
 
 
 @dataclass(slots=True)
@@ -255,7 +258,18 @@ class EpisodeRunner:
             except NotFiniteError as error:
                 self._leave_out(self._buffer, self._buffer.count, count, str(error))
         parts, self._parts, self._first, self._joined = self._parts, [], 0, None
-        return EpisodeBlock(rows, [_record(part) for part in parts])
+        records, who = [_record(part) for part in parts], self._instance.instance_id
+        return EpisodeBlock(rows, records, who, self._take_rejected())
+
+    def _take_rejected(self) -> Batch:
+        """Return the rejected samples of all episodes but the one that goes on."""
+        rejected = self._instance.rejected
+        if not rejected:
+            return {}
+        if self._buffer is None:
+            self.fields = [*rejected.infer_shapes(self._instance.fields), *ROW_FIELDS]
+        rows = rejected.take(self.fields[: -len(ROW_FIELDS)], 0, self._number)
+        return rows if len(rows["step"]) else {}
 
     def _leave_out(self, buffer: RowBuffer, row: int, count: int, reason: str) -> None:
         """Note that the episode of an invalid row, of `count`, has failed, without its rows."""

@@ -494,12 +494,13 @@ class Instance(Closeable):
     def _reject(self, sample: dict[str, Any], wrong: int) -> None:
         """Record a rejected sample, the `wrong`-th in a row; raise if there are too many."""
         if self.rejected is not None:
-            self.rejected.add(sample, self.last_episode, self.last_step)
+            steps = self._alive()._earlier_steps if self._is_numbered else 0
+            self.rejected.add(sample, self.last_episode, self.last_step - steps)
         if wrong > self._max_wrong_samples:
             raise WrongSamplesError(
                 f"check_sample() rejected {wrong} samples in a row; "
                 f"max_wrong_samples_per_step is {self._max_wrong_samples}.",
-                instance_id=self.instance_id,
+                instance_id=0 if self._is_numbered else self.instance_id,
                 step=self.last_step,
             )
 

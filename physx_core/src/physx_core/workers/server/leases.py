@@ -15,6 +15,7 @@ from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
 from physx_core.net.frames import Frame, Kind, pack
 from physx_core.net.values import decode, encode
+from physx_core.rows import concatenate
 from physx_core.typing import Batch, Index
 from physx_core.workers.episode_queue import EpisodeQueue
 from physx_core.workers.episode_runner import EpisodeBlock
@@ -54,6 +55,7 @@ class Leases:
         self.blocks: deque[EpisodeBlock] = deque()
         self.dispatch: dict[Kind, Callable[[Peer, Frame], None]] = {
             Kind.ROWS: self._take_rows,
+            Kind.WRONG: self._take_rejected,
             Kind.EPISODES: self._take_episodes,
         }
         self._queue, self._choose = queue, choose
@@ -146,9 +148,18 @@ class Leases:
             raise ConnectionRefusedByPeerError(f"It sent {count} rows that belong to no episode.")
         held.rows = unpack_rows(frame.payload, peer.row_fields, count)
 
+    def _take_rejected(self, peer: Peer, frame: Frame) -> None:
+        held, count = self._held.get(peer.instance_id), frame.number
+        if held is None or not peer.row_fields or count < 1:
+            raise ConnectionRefusedByPeerError(f"It sent {count} rejected rows of no episode.")
+        rows = unpack_rows(frame.payload, peer.row_fields, count)
+        check_values(rows, peer.row_fields, peer.instance_id)
+        held.rejected.append(rows)
+
     def _take_episodes(self, peer: Peer, frame: Frame) -> None:
         held = self._held.get(peer.instance_id, _Held())
         rows, held.rows = held.rows, {}
+        rejected, held.rejected = concatenate(held.rejected), []
         try:
             records = [_parse(plain) for plain in decode(frame.payload)]
         except (TypeError, ValueError, ConfigError) as error:
@@ -160,9 +171,10 @@ class Leases:
         _check_rows(rows, records)
         if rows:
             check_values(rows, peer.row_fields, peer.instance_id)
+        _check_rejected(rejected, records)
         peer.received += len(rows.get("step", ()))
         held.note_pace(records)
-        self.blocks.append(EpisodeBlock(rows, records, peer.instance_id))
+        self.blocks.append(EpisodeBlock(rows, records, peer.instance_id, rejected))
 
 
 class _Held:
@@ -170,11 +182,13 @@ class _Held:
 
     Attributes:
         rows: Rows whose record has not arrived.
+        rejected: Rejected ones.
         since: When it began its present episode, in monotonic s.
     """
 
     def __init__(self) -> None:
         self.rows: Batch = {}
+        self.rejected: list[Batch] = []
         self.since = 0.0
         self._leases: list[tuple[Lease, range]] = []  # with numbers that have not ended
         self._parts: dict[int, int] = {}  # number of an episode that has begun to its next part
@@ -255,6 +269,16 @@ def _check_rows(rows: Batch, records: list[EpisodeRecord]) -> None:
     numbers = np.concatenate([_numbers(record) for record in records])
     if rows["env_id"].any() or not np.array_equal(rows["episode"], numbers):
         raise ConnectionRefusedByPeerError("It sent rows of other episodes.")
+
+
+def _check_rejected(rows: Batch, records: list[EpisodeRecord]) -> None:
+    """Check that rejected rows are of the episodes that have ended."""
+    if not rows:
+        return
+    ended = (each for each in records if each.status is not EpisodeStatus.MORE)
+    numbers = {n for each in ended for n in range(each.episode, each.episode + each.count)}
+    if rows["env_id"].any() or not numbers.issuperset(rows["episode"].tolist()):
+        raise ConnectionRefusedByPeerError("It sent rejected rows of other episodes.")
 
 
 def _numbers(record: EpisodeRecord) -> Index:
