@@ -108,6 +108,7 @@ class DataGeneration(NewSessionPipeline):
     _episodes: EpisodeSource | None = field(init=False, repr=False, default=None)
     _first_row: int = field(init=False, repr=False, default=0)
     _failed: int = field(init=False, repr=False, default=0)
+    _has_rows: bool = field(init=False, repr=False, default=False)
     _proof: IndependenceProof = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
@@ -162,7 +163,8 @@ class DataGeneration(NewSessionPipeline):
     def _simulate_episodes(self) -> None:
         while self._queue is not None and not self._queue.is_done:
             self._store_episodes(self._queue)
-        if self._queue is not None and self._queue.finished > self._failed and not self._rows():
+        ended = 0 if self._queue is None else self._queue.finished
+        if ended > self._failed and not self._has_rows and not self._rows():
             warnings.warn(
                 "All episodes that have finished ended without a row: call set_training_data() in "
                 "each step, also in that which calls end_episode().",
@@ -176,6 +178,7 @@ class DataGeneration(NewSessionPipeline):
         before, campaign = queue.finished, self._campaign.number
         block = self._episodes.take()
         self._proof.note(block)
+        self._has_rows |= bool(block.rows)
         if self._mode not in self.dataset.modes:
             self.dataset.define_fields(self._mode, self._episodes.fields)
         records = [replace(record, campaign=campaign) for record in block.records]
@@ -279,7 +282,7 @@ class DataGeneration(NewSessionPipeline):
 
     def _begin(self) -> None:
         self._first_row += self.batch_id * (self.batch_size or 0)
-        self.batch_id = self._failed = 0
+        self.batch_id, self._failed, self._has_rows = 0, 0, False
         if isinstance(self._queue, RowQueue):
             self._queue.goal = self._first_row + self._amount()[0]
         end_generation(self.dataset)
