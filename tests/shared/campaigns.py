@@ -15,7 +15,7 @@ from physx_core.net.link import SOCKETS
 from physx_core.sources import ClientSource, LocalSource
 
 ENVS = Path(__file__).parents[1] / "core" / "programs" / "campaign_envs.py"
-TROUBLED = f"{ENVS}:Troubled"
+TROUBLED, UNCHECKED = f"{ENVS}:Troubled", f"{ENVS}:Unchecked"
 FAILS = ("raises", "raises early", "raises late", "is not finite", "is rejected")
 """Troubles because of which an episode fails."""
 

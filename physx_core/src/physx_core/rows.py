@@ -82,7 +82,7 @@ class RowBuffer:
         self,
         sample: Mapping[str, Any],
         instance_id: int = 0,
-        episode: int = 0,
+        episode: int | None = 0,
         step: int = -1,
         *,
         finite: bool = False,
@@ -92,7 +92,8 @@ class RowBuffer:
         Args:
             sample: Field name to value, for exactly the fields that the buffer was created with.
             instance_id: Instance that generated the sample; 0: unknown.
-            episode: The instance's trajectory that the sample belongs to.
+            episode: The instance's trajectory that the sample belongs to; None: `number_rows` sets
+                what physx adds.
             step: The instance's step that generated it.
             finite: Whether to check now that all values are finite; otherwise `take` does.
 
@@ -118,7 +119,7 @@ class RowBuffer:
             if finite and not is_finite(value):
                 raise field.not_finite(instance_id=instance_id, step=step)
             array[row] = value
-        if self._numbers:
+        if self._numbers and episode is not None:
             env_ids, episodes, steps = self._numbers
             env_ids[row] = instance_id
             episodes[row] = episode
@@ -126,6 +127,18 @@ class RowBuffer:
         if finite and self._finite == row:
             self._finite = row + 1
         self.count = row + 1
+
+    def number_rows(self, first: int, episode: int) -> None:
+        """Number rows from one to the last one, each of which is an episode of its own.
+
+        Args:
+            first: The first of the rows.
+            episode: Number of its episode.
+        """
+        for name, value in (("env_id", 0), ("step", 0)):
+            self._arrays[name][first : self.count] = value
+        numbers = np.arange(episode, episode + self.count - first)
+        self._arrays["episode"][first : self.count] = numbers
 
     def take(self) -> Batch:
         """Return the rows as views, valid until the next `put`, and empty the buffer.
@@ -224,6 +237,10 @@ class RejectedSamples:
             copies = {name: np.array(value) for name, value in sample.items()}
             self.waiting.append((copies, episode, step))
 
+    def __len__(self) -> int:
+        """Return how many samples there are."""
+        return len(self.waiting)
+
     def discard(self, count: int) -> None:
         """Discard the first samples."""
         del self.waiting[:count]
@@ -235,14 +252,16 @@ class RejectedSamples:
                 return infer_shapes(fields, sample)
         return list(fields)
 
-    def take(self, fields: Sequence[Field], instance_id: int) -> Batch:
+    def take(self, fields: Sequence[Field], instance_id: int, keep: int | None = None) -> Batch:
         """Return the samples as rows, with the fields that physx adds, and discard them.
 
         Args:
             fields: The environment's fields; no sample fits while a shape is open.
             instance_id: Instance that generated the samples.
+            keep: Episode whose samples stay; None: there is none.
         """
-        waiting, self.waiting = self.waiting, []
+        waiting = [each for each in self.waiting if each[1] != keep]
+        self.waiting = [each for each in self.waiting if each[1] == keep]
         if any(field.shape is None for field in fields):
             waiting = []
         buffer = RowBuffer(fields, len(waiting))

@@ -168,14 +168,6 @@ def test_replaced_production_of_batches_gets_a_stream():
         assert dataset.recorded_episodes("training") is None
 
 
-def test_rejected_samples_are_recorded_by_streams():
-    config = dataclasses.replace(CONFIG, record_wrong_samples=True)
-    generate(2, config=config, env_kwargs={"least": 1})
-    with Dataset.open("sessions/run") as dataset:
-        assert dataset.num_samples("training") == 10
-        assert dataset.recorded_episodes("training") is None
-
-
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_interrupted_batches_are_resumed_without_repeating_what_has_ended(how):
     kwargs = {"least": 1, "sleep": 0.03, "log": "log"}

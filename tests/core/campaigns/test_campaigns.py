@@ -402,12 +402,6 @@ def test_stream_has_no_episodes(clients):
         generate("run", 3, config, clients=clients)
 
 
-@pytest.mark.parametrize(("option", "value"), [("record_wrong_samples", True)])
-def test_options_of_streams_are_not_for_episodes(option, value):
-    with pytest.raises(ConfigError, match=f"{option} is for streams"):
-        generate("run", 6, dataclasses.replace(LOCAL, **{option: value}))
-
-
 def test_resumed_session_must_exist_and_have_episodes():
     with pytest.raises(SessionError):
         generate("nothing", 3, resume=True)

@@ -6,7 +6,7 @@ import itertools
 
 import pytest
 import sizes
-from campaigns import FAILS, TROUBLED, Results, leased, rows_of
+from campaigns import FAILS, TROUBLED, UNCHECKED, Results, leased, rows_of
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -19,10 +19,12 @@ from physx_core.workers.episode_queue import EpisodeQueue
 SEED = [5, 2]
 
 
-def simulate(total, env_kwargs, recorded=(), **options):
+def simulate(total, env_kwargs, recorded=(), environment=TROUBLED, **options):
     """Return what a source in this process has simulated."""
     queue = EpisodeQueue(total, recorded)
-    config = EnvironmentConfig(TROUBLED, as_tcp_ip_client=False, env_kwargs=env_kwargs, **options)
+    config = EnvironmentConfig(
+        environment, as_tcp_ip_client=False, env_kwargs=env_kwargs, **options
+    )
     with leased(config, SEED, queue) as source:
         return Results().take_all(source, queue)
 
@@ -89,19 +91,36 @@ def test_failed_episode_leaves_no_rows_of_its_parts(at):
 # Episodes of one row -----------------------------------------------------------------------------
 
 
-@given(st.sets(st.integers(0, 120), max_size=8), TROUBLES)
-@settings(max_examples=sizes.size(40, 10))
-def test_records_of_one_row_are_joined(recorded, troubles):
+@given(
+    st.sets(st.integers(0, 120), max_size=8),
+    TROUBLES,
+    st.sampled_from([TROUBLED, UNCHECKED]),
+    st.integers(0, 1),
+)
+@settings(max_examples=sizes.size(80, 20))
+def test_records_of_one_row_are_joined(recorded, troubles, environment, least):
     troubles = {number: [kind, 0] for number, (kind, _) in troubles.items()}
-    single = {"least": 1, "most": 3}
-    results = simulate(100, {"troubles": troubles, **single}, recorded, episode_steps=1)
+    if environment == UNCHECKED:  # these happen in check_sample()
+        unknown = "raises late", "is rejected"
+        troubles = {n: trouble for n, trouble in troubles.items() if trouble[0] not in unknown}
+    single = {"least": least, "most": 3}
+    kwargs = {"troubles": troubles, **single}
+    results = simulate(100, kwargs, recorded, environment, episode_steps=1)
     check(results, 100, recorded, troubles, episode_steps=1, **single)
-    assert {record.rows for record in results.records} <= {record.count for record in
-                                                           results.records} | {0}  # fmt: skip
+    assert all(record.rows in (0, record.count) for record in results.records)
 
 
-def test_joined_records_hold_the_parameters_of_each():
-    results = simulate(20, {"least": 1, "parameters": True}, episode_steps=1, sampler="physx/sobol")
+@pytest.mark.parametrize("environment", [TROUBLED, UNCHECKED])
+@pytest.mark.parametrize("kind", ["asks for the wrong", "lacks a field"])
+def test_mistake_in_one_row_ends_the_campaign(environment, kind):
+    with pytest.raises((UsageError, MissingFieldError)):
+        simulate(50, {"least": 1, "troubles": {"30": [kind, 0]}}, (), environment, episode_steps=1)
+
+
+@pytest.mark.parametrize("environment", [TROUBLED, UNCHECKED])
+def test_joined_records_hold_the_parameters_of_each(environment):
+    results = simulate(20, {"least": 1, "parameters": True}, (), environment, episode_steps=1,
+                       sampler="physx/sobol")  # fmt: skip
     assert len(results.records) < 10
     heights = [results.parameters[number]["height"] for number in range(20)]
     assert len(set(heights)) == 20

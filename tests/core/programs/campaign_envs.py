@@ -115,6 +115,12 @@ class Troubled(Environment):
         simulation.sleep(0)
 
 
+class Unchecked(Troubled):
+    """One that accepts all samples."""
+
+    check_sample = Environment.check_sample
+
+
 def current():
     """Return the simulation that this client is in."""
     try:

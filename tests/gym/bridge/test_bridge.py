@@ -60,7 +60,7 @@ def test_transitions_are_stored_with_episodes_and_both_ends(tmp_path):
 def test_independent_episodes_are_those_that_reset_begins_with_a_seed(tmp_path):
     found = []
     for instances in (1, 2):
-        options = {"num_clients": instances, "independent_episodes": True}
+        options = {"num_clients": instances}
         with generate(tmp_path, "gym/CartPole-v1", f"run{instances}", **options) as dataset:
             rows = {name: dataset["training"][name][:] for name in dataset.fields("training")}
         found.append({name: values.tolist() for name, values in rows.items()})

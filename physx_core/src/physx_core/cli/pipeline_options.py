@@ -20,7 +20,13 @@ import tyro
 
 from physx_core.cli.arguments import argument_registry, take_changes
 from physx_core.config import configuration_in, from_plain, read_toml, set_option
-from physx_core.errors import ConfigFileError, UnknownOptionError, UsageError, listed
+from physx_core.errors import (
+    ConfigFileError,
+    SessionError,
+    UnknownOptionError,
+    UsageError,
+    listed,
+)
 from physx_core.pipelines.pipeline import Pipeline
 from physx_core.session import Session
 
@@ -136,12 +142,17 @@ def resumed(words: Sequence[str]) -> list[str]:
         words: The words after the command, one of which is ``--resume``.
 
     Raises:
-        SessionError: If the session does not exist.
+        SessionError: If the session does not exist, or has nothing to resume.
     """
     session, words = take_session(words)
     if session is None:
         return list(words)
-    Session.existing(session.parent, session.name)
+    path = Session.existing(session.parent, session.name).path
+    if not (path / "config.toml").exists():
+        raise SessionError(
+            f"The run of {path} ended before it began, so there is nothing to go on with: start it "
+            "again with the same options, without --resume."
+        )
     given = [] if "--config" in words else ["--config", str(session)]
     return [*given, *words]
 

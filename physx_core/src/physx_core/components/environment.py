@@ -94,11 +94,11 @@ class Services(Protocol):
         ...
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
-        """Save values of one instance for later runs on the same dataset."""
+        """Save values of one instance, or of all (0), for later runs on the same dataset."""
         ...
 
     def load_parameters(self, instance_id: int) -> dict[str, Any]:
-        """Return the values that one instance saved; empty if it saved none."""
+        """Return the values that one instance, or 0, saved; empty if it saved none."""
         ...
 
     def show(self, instance_id: int, step: int, events: list[Event]) -> None:
@@ -431,12 +431,31 @@ class Environment(Closeable):
         self._has_open_shapes = any(field.shape is None for field in self._fields.values())
 
     def save_parameters(self, **values: Any) -> None:
-        """Save numbers, strings, lists, dictionaries and arrays of this instance in the dataset."""
-        self._run().save_parameters(self.instance_id, values)
+        """Save numbers, strings, lists, dictionaries and arrays of this instance in the dataset.
+
+        If episodes are independent, all instances have the same: the first one saves them, and
+        what others save must be equal.
+
+        Raises:
+            UsageError: If another instance has saved another value, or an independent episode has
+                begun.
+        """
+        if self.independent_episodes and self._has_begun_episodes:
+            raise UsageError(
+                f"{type(self).__name__} called save_parameters() in an independent episode: call "
+                "it in create() or init(), and store what belongs to an episode in an additional "
+                "field."
+            )
+        self._run().save_parameters(self._saves_as, values)
 
     def load_parameters(self) -> dict[str, Any]:
         """Return the values that this instance saved with `save_parameters`, if any."""
-        return self._run().load_parameters(self.instance_id)
+        return self._run().load_parameters(self._saves_as)
+
+    @property
+    def _saves_as(self) -> int:
+        """The instance whose values these are; 0: all of them."""
+        return 0 if self.independent_episodes else self.instance_id
 
     def update_visualization(self) -> None:
         """Send the drawing events that `factory` collected since the last call to the viewers.

@@ -10,11 +10,11 @@ from typing import Any, Self
 import numpy as np
 
 from physx_core.components.parameter import Parameter
-from physx_core.config import EnvironmentConfig
+from physx_core.config import WRONG, EnvironmentConfig
 from physx_core.dataset import Dataset, EpisodeRecord, EpisodeStatus
 from physx_core.errors import ConfigError, DatasetError, listed
 from physx_core.pipelines.storage import describe_environment
-from physx_core.typing import Index
+from physx_core.typing import Batch, Index
 from physx_core.workers.lease import Lease
 from physx_core.workers.parameter_sets import ParameterSets
 
@@ -47,6 +47,30 @@ class Campaign:
     def count(dataset: Dataset, mode: str) -> int:
         """Return how many campaigns a mode of a dataset has."""
         return sum(each.mode == mode for each in _recorded(dataset))
+
+    def store_rejected(
+        self, dataset: Dataset, rows: Batch, records: Sequence[EpisodeRecord]
+    ) -> None:
+        """Store samples that `check_sample` rejected, by number.
+
+        They are stored before the records of their episodes: if a run is killed in between, an
+        episode is simulated again, and its samples replace these.
+
+        Args:
+            dataset: The dataset, open for writing, in which the mode has its fields.
+            rows: The samples.
+            records: Records of the episodes that they belong to.
+        """
+        campaign, numbers = _recorded(dataset).index(self), rows["episode"]
+        begins = np.flatnonzero(np.diff(numbers, prepend=-1))
+        counts, found = np.diff(begins, append=len(numbers)).tolist(), []
+        for number, count in zip(numbers[begins].tolist(), counts, strict=True):
+            of = next(each for each in records if 0 <= number - each.episode < each.count)
+            where: Any = number - of.episode if of.count > 1 else ()
+            values = {name: np.asarray(each)[where] for name, each in of.parameters.items()}
+            own = {"episode": number, "rows": count, "campaign": campaign}
+            found.append(EpisodeRecord(**own, parameters=values))
+        dataset.append_episodes(WRONG, rows, found, checked=True)
 
     @classmethod
     def begin(

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
+from physx_core.config import WRONG
 from physx_core.dataset import Dataset, EpisodeStatus
 from physx_core.errors import FailedEpisodesError
 from physx_core.pipelines.campaign import Campaign
@@ -26,7 +27,13 @@ class CampaignWriter:
     """
 
     def __init__(
-        self, dataset: Dataset, campaign: Campaign, queue: EpisodeQueue, max_failed: int
+        self,
+        dataset: Dataset,
+        campaign: Campaign,
+        queue: EpisodeQueue,
+        max_failed: int,
+        *,
+        keeps_rejected: bool,
     ) -> None:
         """Prepare; `open` gives it what simulates.
 
@@ -35,9 +42,11 @@ class CampaignWriter:
             campaign: The campaign.
             queue: The numbers that are missing.
             max_failed: How many episodes of this run may fail.
+            keeps_rejected: Whether to store the samples that `check_sample` rejects.
         """
         self.campaign, self.queue, self.failed = campaign, queue, 0
         self._dataset, self._max_failed = dataset, max_failed
+        self._keeps_rejected = keeps_rejected
         self._source: Source | None = None
         self._episodes: EpisodeSource | None = None
         self._proof = IndependenceProof()
@@ -65,6 +74,9 @@ class CampaignWriter:
         if mode not in self._dataset.modes:
             self._dataset.define_fields(mode, self._episodes.fields)
         records = [replace(record, campaign=self.campaign.number) for record in block.records]
+        if block.rejected and self._keeps_rejected:
+            self._dataset.define_fields(WRONG, self._episodes.fields)
+            self.campaign.store_rejected(self._dataset, block.rejected, records)
         self._dataset.append_episodes(mode, block.rows, records, checked=True)
         failed = [record for record in records if record.status is EpisodeStatus.FAILED]
         self.failed += len(failed)
@@ -84,15 +96,19 @@ class CampaignWriter:
 
         When this returns, a kill of the process loses nothing of it.
         """
-        known = None
-        if self.campaign.mode in self._dataset.modes:
-            known = self._dataset.recorded_episodes(self.campaign.mode)
-        if known is None or self._source is None:
-            return
-        surplus = int(np.sum(known.rows[known.campaign == self.campaign.number])) - rows
-        if surplus > 0:
+        surplus = self.rows - rows
+        if surplus > 0 and self._source is not None:
             self.campaign.cut(self._dataset, surplus, self._source.sets)
         self._dataset.flush()
+
+    @property
+    def rows(self) -> int:
+        """How many rows the campaign has."""
+        if self.campaign.mode not in self._dataset.modes:
+            return 0
+        known = self._dataset.recorded_episodes(self.campaign.mode)
+        own = known and known.rows[known.campaign == self.campaign.number]
+        return 0 if own is None else int(np.sum(own))
 
     def prove_independence(self) -> None:
         """Simulate an episode again, if that costs little, and compare its rows.

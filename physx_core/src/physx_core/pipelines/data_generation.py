@@ -4,12 +4,21 @@ from __future__ import annotations
 
 import contextlib
 import shlex
+import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
-from physx_core.config import MODES, WRONG, DatasetConfig, EnvironmentConfig, at_least, options
+from physx_core.config import (
+    MODES,
+    WRONG,
+    DatasetConfig,
+    EnvironmentConfig,
+    at_least,
+    options,
+    read_toml,
+)
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, listed
 from physx_core.pipelines.campaign import Campaign
@@ -22,13 +31,12 @@ from physx_core.pipelines.run_description import (
 )
 from physx_core.pipelines.storage import (
     check_client_writers,
-    check_episodes,
     describe_environment,
     end_generation,
     open_own,
     record_beside_rows,
+    reject_client_writers,
     store_sets,
-    stream_options,
 )
 from physx_core.session import Session
 from physx_core.sources.source import Source
@@ -146,8 +154,15 @@ class DataGeneration(NewSessionPipeline):
         self._check_condition(more, "batch_condition")
 
     def _simulate_episodes(self) -> None:
-        while self._writer is not None and not self._writer.queue.is_done:
-            self.observers.advance(self._writer.store())
+        writer = self._writer
+        while writer is not None and not writer.queue.is_done:
+            self.observers.advance(writer.store())
+        if writer is not None and writer.queue.finished > writer.failed and not writer.rows:
+            warnings.warn(
+                "All episodes that have finished ended without a row: call set_training_data() in "
+                "each step, also in that which calls end_episode().",
+                stacklevel=2,
+            )
 
     def _cut(self, kind: type[BaseException] | None, *_: object) -> None:
         """Leave out what the last episodes have more than the batches, when the run is closed."""
@@ -237,7 +252,7 @@ class DataGeneration(NewSessionPipeline):
                 "Training, Prediction and Replay."
             )
         if self.episodes is not None or self.resume:
-            check_episodes(config, dataset_config)
+            reject_client_writers(dataset_config, "a generation of independent episodes")
         if dataset_config.writers == "clients":
             check_client_writers(config)
         if self._mode == WRONG:
@@ -267,7 +282,7 @@ class DataGeneration(NewSessionPipeline):
             seed = derive_seed(self._seed, self._mode, self._offset())
         else:
             self._seed, seed = campaign.environment["seed"], campaign.seed
-        self._record_config(self._seed)
+        self._record_config(self._seed, **self._larger_number())
         self._observe(resources, config)
         if campaign is not None:
             self._writer = self._make_writer(campaign)
@@ -296,6 +311,15 @@ class DataGeneration(NewSessionPipeline):
                 f"{describe_environment_config(config)} is a stream: leave it out."
             )
 
+    def _larger_number(self) -> dict[str, int]:
+        """Return the number of episodes to record if it is larger than what this run asks for."""
+        file = self.session.path / "config.toml"
+        former = read_toml(file).get(self.kind) if self.resume and file.exists() else None
+        known = former if isinstance(former, dict) else {}
+        mode = known.get("mode") or known.get("dataset", {}).get("mode", "training")
+        wanted = known.get("episodes") if mode == self._mode and self.episodes else None
+        return {} if not wanted else {"episodes": max(int(wanted), self.episodes or 0)}
+
     def _offset(self) -> int:
         """Return how many rows or campaigns there are already, which get other random numbers."""
         return max(self.dataset.num_samples(self._mode), Campaign.count(self.dataset, self._mode))
@@ -309,15 +333,17 @@ class DataGeneration(NewSessionPipeline):
         else:
             numbers = campaign.simulated(self.dataset, failed=failed)
             queue = EpisodeQueue(self.episodes, numbers, self.retries)
-        return CampaignWriter(self.dataset, campaign, queue, self.max_failed)
+        keeps_rejected = self.environment_config.record_wrong_samples
+        return CampaignWriter(
+            self.dataset, campaign, queue, self.max_failed, keeps_rejected=keeps_rejected
+        )
 
     def _simulates_episodes(self, dataset_config: DatasetConfig) -> bool:
         """Return whether episodes are simulated by number, instead of streams."""
-        config = self.environment_config
         return self.episodes is not None or (
             self.source.is_independent
             and self._is_own(DataGeneration.batch_produce)
-            and not stream_options(config, dataset_config)
+            and dataset_config.writers == "server"
         )
 
     def _plan(self) -> Iterable[str]:

@@ -333,11 +333,11 @@ class Pipeline(ABC):
             )
         return resources.enter_context(source)
 
-    def _record_config(self, seed: int) -> None:
-        """Write the options and the actual seed to the session."""
+    def _record_config(self, seed: int, **others: object) -> None:
+        """Write the options, some of them changed, and the actual seed to the session."""
         if not self._is_main:
             return
-        plain = {**to_plain(self), "session_name": self.session.name}
+        plain = {**to_plain(self), **others, "session_name": self.session.name}
         plain = {name.removesuffix("_config"): value for name, value in plain.items()}
         (plain if hasattr(self, "seed") else plain["environment"])["seed"] = seed
         self.session.record(self.kind, plain, seed)

@@ -59,9 +59,21 @@ class RunServices:
         return self._predict(batch)
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
-        """Save an instance's values next to the dataset; earlier values of other names are kept."""
+        """Save an instance's values next to the dataset; earlier values of other names are kept.
+
+        Raises:
+            UsageError: If the values are those of all instances (0), and there are other ones.
+        """
         path = self._dir / PARAMETERS.format(instance_id)
-        content = encode({**self.load_parameters(instance_id), **values})
+        known = self.load_parameters(instance_id)
+        for name in known.keys() & values.keys() if not instance_id else ():
+            if encode(known[name]) != encode(values[name]):
+                raise UsageError(
+                    f'save_parameters() got another value of "{name}" than an instance saved '
+                    "before, but independent episodes may be simulated by any of them: save what "
+                    "is the same in all."
+                )
+        content = encode({**known, **values})
         with files.storing(str(path)):
             path.parent.mkdir(parents=True, exist_ok=True)
             files.replace(path, content)

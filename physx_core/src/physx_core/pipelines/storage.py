@@ -163,27 +163,6 @@ def check_client_writers(config: EnvironmentConfig) -> None:
         )
 
 
-def stream_options(config: EnvironmentConfig, dataset_config: DatasetConfig) -> dict[str, str]:
-    """Return the options that are set but only for streams: name to what to do instead."""
-    advice = {
-        "record_wrong_samples": "rejected samples of episodes are not kept",
-    }
-    found = {name: advice[name] for name in advice if getattr(config, name)}
-    if dataset_config.writers != "server":
-        found["writers"] = "the run stores the rows"
-    return found
-
-
-def check_episodes(config: EnvironmentConfig, dataset_config: DatasetConfig) -> None:
-    """Check that a data generation of independent episodes has no options of streams."""
-    reject_client_writers(dataset_config, "a generation of independent episodes")
-    for option, instead in stream_options(config, dataset_config).items():
-        raise ConfigError(
-            f"EnvironmentConfig.{option} is for streams, not for episodes: leave it out "
-            f"({instead})."
-        )
-
-
 def reject_client_writers(config: DatasetConfig, what: str) -> None:
     """Reject the option that clients write their own rows if the run itself needs the rows."""
     if config.writers != "server":

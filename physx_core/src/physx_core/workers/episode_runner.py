@@ -2,14 +2,18 @@
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
+
+import numpy as np
 
 from physx_core.clock import SYSTEM_CLOCK, Clock
 from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.errors import (
     EnvironmentFailedError,
+    FieldShapeError,
     NotFiniteError,
     PhysxError,
     ProgramError,
@@ -22,7 +26,7 @@ from physx_core.workers.instance import Instance
 from physx_core.workers.lease import AIM, Lease
 
 OF_EPISODES = (EnvironmentFailedError, ProgramError, NotFiniteError, WrongSamplesError)
-"""Errors that end an episode; others end the run."""
+"""Errors that end an episode."""
 _FINISHED, _MORE = EpisodeStatus.FINISHED, EpisodeStatus.MORE  # looking members up takes long
 _PART_TIME = 10.0  # s
 
@@ -35,11 +39,14 @@ class EpisodeBlock(NamedTuple):
             fields if there are no rows.
         records: The episodes, or parts of them, that the rows belong to, in order.
         instance_id: The instance that has simulated them.
+        rejected: The samples that `check_sample` rejected in the episodes that have ended, if they
+            are recorded; ``step`` counts all of an episode's.
     """
 
     rows: Batch
     records: list[EpisodeRecord]
     instance_id: int = 1
+    rejected: Batch = {}  # noqa: RUF012 - never changed
 
 
 @dataclass(slots=True)
@@ -99,6 +106,7 @@ class EpisodeRunner:
         self._joined: _Part | None = None  # the last part, if an episode of one row can be added
         self._first = 0  # row of the buffer with which the episode's part begins
         self._began = 0.0
+        self._makes_single_rows = instance.makes_single_rows
 
     def run(self) -> EpisodeBlock:
         """Simulate until rows fill a block, episodes took 20 ms, or no number is left.
@@ -115,7 +123,12 @@ class EpisodeRunner:
                 if self._number is None and not self._begin():
                     break
                 self._make_row()
-            except OF_EPISODES as error:
+                if self._makes_single_rows and self._number is None:
+                    self._make_single_rows(until)
+            except PhysxError as error:
+                if not self._concerns_one(error):
+                    error.add_note(f"in {self._described()}")
+                    raise
                 self._fail(error)
             if self._number is None and self._began >= until:
                 break
@@ -157,28 +170,77 @@ class EpisodeRunner:
             self._end(_FINISHED)
             self._number = None
 
+    def _make_single_rows(self, until: float) -> None:
+        """Simulate episodes of one row while there are numbers, space, and time."""
+        buffer = self._buffer
+        if buffer is None or buffer.full or self._began >= until:
+            return
+        put, now, start, first = buffer.put, self._now, buffer.count, self._instance.number + 1
+        sample: Mapping[str, Any] | None = None
+        try:
+            following = itertools.islice(self._episodes, buffer.capacity - start)
+            for sample in self._instance.single_rows(following):
+                if not sample:
+                    break
+                put(sample, 0, None, 0)
+                if now() >= until:
+                    break
+        finally:
+            if count := buffer.count - start:
+                buffer.number_rows(start, first)
+                self._number, self._part = first, 0
+                self._end(_FINISHED, count)
+            has_ended = self._instance.number < first + count
+            self._number, self._part = None if has_ended else first + count, 0
+        if not has_ended:  # without a row
+            self._end(_FINISHED)
+            self._number = None
+
     def _make_buffer(self, sample: dict[str, Any]) -> RowBuffer:
         buffer = self._buffer = RowBuffer(infer_shapes(self._instance.fields, sample))
         self.fields = buffer.fields
         return buffer
 
-    def _end(self, status: EpisodeStatus) -> None:
-        """Note the rows of the episode since its last part, which ends with this status."""
+    def _end(self, status: EpisodeStatus, count: int = 1) -> None:
+        """Note the rows of the episode since its last part, which ends with this status.
+
+        Args:
+            status: The status.
+            count: Number of episodes, of one row each if they are several.
+        """
         end = 0 if self._buffer is None else self._buffer.count
         rows, self._first = end - self._first, end
         now = self._now()
         seconds, self._began = now - self._began, now
-        is_single, joined = rows == 1 and not self._part and status is _FINISHED, self._joined
+        is_single = rows == count and not self._part and status is _FINISHED
+        joined = self._joined
         if is_single and joined is not None:
-            joined.count += 1
-            joined.rows += 1
+            joined.count += count
+            joined.rows += rows
             joined.seconds += seconds
             return
         assert self._number is not None
-        part = _Part(self._number, rows, seconds, self._part, self._lease, status=status)
+        part = _Part(self._number, rows, seconds, self._part, self._lease, count, status)
         self._parts.append(part)
         self._joined = part if is_single else None
         self._part += 1
+
+    def _concerns_one(self, error: PhysxError) -> bool:
+        """Return whether an error ends its episode; others end the run.
+
+        What has another shape than an earlier episode's may be right, if the field has none.
+        """
+        if isinstance(error, FieldShapeError):
+            fields = self._instance.fields
+            return any(f.name == error.field and f.shape is not None for f in fields)
+        return isinstance(error, OF_EPISODES)
+
+    def _described(self) -> str:
+        """Return the number of the episode and its first parameters, for an error."""
+        number = self._number or 0
+        values = self._lease.parameters(number, 1).items()
+        texts = [f"{name} = {value}" for name, value in values if not np.ndim(value)]
+        return f"episode {number}" + (f", with {', '.join(texts[:8])}" if texts else "")
 
     def _fail(self, error: PhysxError) -> None:
         """Note that the episode has failed, without its rows."""
@@ -196,7 +258,18 @@ class EpisodeRunner:
             except NotFiniteError as error:
                 self._leave_out(self._buffer, self._buffer.count, count, str(error))
         parts, self._parts, self._first, self._joined = self._parts, [], 0, None
-        return EpisodeBlock(rows, [_record(part) for part in parts])
+        records, who = [_record(part) for part in parts], self._instance.instance_id
+        return EpisodeBlock(rows, records, who, self._take_rejected())
+
+    def _take_rejected(self) -> Batch:
+        """Return the rejected samples of all episodes but the one that goes on."""
+        rejected = self._instance.rejected
+        if not rejected:
+            return {}
+        if self._buffer is None:
+            self.fields = [*rejected.infer_shapes(self._instance.fields), *ROW_FIELDS]
+        rows = rejected.take(self.fields[: -len(ROW_FIELDS)], 0, self._number)
+        return rows if len(rows["step"]) else {}
 
     def _leave_out(self, buffer: RowBuffer, row: int, count: int, reason: str) -> None:
         """Note that the episode of an invalid row, of `count`, has failed, without its rows."""

@@ -26,8 +26,9 @@ class GymEnvironment(Environment):
     One sample is one transition: ``observation``, ``action``, ``reward``, ``next_observation``,
     ``terminated`` and ``truncated``. A space of several parts has a field for each, for example
     ``observation_states_agent_q``. Episodes are trajectories: `Dataset.episodes` returns them. When
-    stored samples are loaded, their actions are replayed. If the configuration says that episodes
-    are independent, ``reset`` gets a seed for each, and not only for the first.
+    stored samples are loaded, their actions are replayed. Episodes are independent if the
+    environment has a time limit and no network acts, or if the configuration says so: ``reset``
+    gets a seed for each then, and not only for the first.
     """
 
     def __init__(
@@ -59,6 +60,9 @@ class GymEnvironment(Environment):
                 a fixed shape.
         """
         self.env = make_env(self._id, self._options)
+        spec = self.env.spec
+        if spec is not None and spec.max_episode_steps and self._policy != "network":
+            self.independent_episodes = True
         self._observations = SpaceFields(self.env.observation_space, "observation")
         self._next = SpaceFields(self.env.observation_space, "next_observation")
         self._actions = SpaceFields(self.env.action_space, "action")

@@ -6,7 +6,7 @@ of a mode with records are those of its episodes, in order of campaign and numbe
 
 A record holds the fields `TABLE_FIELDS`, and a column for each parameter of the environment:
 
-- ``mode_index``: index of the mode it speaks of in `physx_core.config.MODES`.
+- ``mode_index``: index of the mode it speaks of in `RECORDED`.
 - ``campaign``, ``episode``: the campaign, 0 for the first, and the episode's number in it.
 - ``count``: for how many numbers it stands. If there are several, each has one row, in order, and
   they count together or not at all.
@@ -31,13 +31,17 @@ those of an unfinished episode do not.
 
 from __future__ import annotations
 
-from physx_core.config import MODES
+from physx_core.config import MODES, WRONG
 from physx_core.dataset.store.manifest import Manifest
 from physx_core.errors import ConfigError, listed
 from physx_core.fields import Field
 
 EPISODES = "episodes"
 """Mode of the table of episodes."""
+
+RECORDED = (*MODES, WRONG)
+"""Modes that can hold episodes. The campaigns of the rejected samples of an episode, in the mode
+"wrong", are those of all modes."""
 
 LOST = "lost_episodes"
 """Entry in a dataset's info: records were lost, so no row of a mode without any counts."""
@@ -73,6 +77,6 @@ def mode_index(mode: str) -> int:
     Raises:
         ConfigError: If there can be no episodes in it.
     """
-    if mode not in MODES:
-        raise ConfigError(f'Mode "{mode}" cannot hold episodes: only {listed(MODES)} can.')
-    return MODES.index(mode)
+    if mode not in RECORDED:
+        raise ConfigError(f'Mode "{mode}" cannot hold episodes: only {listed(RECORDED)} can.')
+    return RECORDED.index(mode)

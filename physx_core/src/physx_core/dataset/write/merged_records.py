@@ -6,12 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
-from physx_core.config import MODES
 from physx_core.dataset.read.order.addresses import Addresses
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.store import failure_file
 from physx_core.dataset.store.episode_record import OPEN, EpisodeStatus
-from physx_core.dataset.store.episode_table import EPISODES, has_table, mode_index
+from physx_core.dataset.store.episode_table import EPISODES, RECORDED, has_table, mode_index
 from physx_core.dataset.store.manifest import Manifest
 from physx_core.dataset.write.recording import Recorder, stream_record
 from physx_core.typing import Batch
@@ -38,9 +37,9 @@ class MergedRecords:
         """
         self._recorder, self._source = recorder, source
         self._manifest, self._given = recorder.manifest, given
-        self._campaigns = {mode: recorder.next_campaign(mode) for mode in MODES}
+        self._campaigns = {mode: recorder.next_campaign(mode) for mode in RECORDED}
         self._other = self._read(source)
-        parts = [part for mode in MODES for part in self._merge(mode)]
+        parts = [part for mode in RECORDED for part in self._merge(mode)]
         self.rows: Batch = (
             {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
             if parts

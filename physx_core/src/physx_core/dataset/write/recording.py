@@ -9,12 +9,17 @@ from typing import Any, Protocol
 import numpy as np
 
 from physx_core import files
-from physx_core.config import MODES
 from physx_core.dataset.read.order.addresses import Addresses
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.store import failure_file
 from physx_core.dataset.store.episode_record import OPEN, EpisodeRecord, EpisodeStatus
-from physx_core.dataset.store.episode_table import EPISODES, TABLE_FIELDS, has_table, mode_index
+from physx_core.dataset.store.episode_table import (
+    EPISODES,
+    RECORDED,
+    TABLE_FIELDS,
+    has_table,
+    mode_index,
+)
 from physx_core.dataset.store.failure_file import FailedEpisode
 from physx_core.dataset.store.manifest import Manifest, Mode
 from physx_core.dataset.store.manifest_store import ManifestStore
@@ -70,10 +75,10 @@ class Recorder:
             known.clear()
         total = self._reader.stored_rows(EPISODES)
         columns = [self._reader.read(EPISODES, f.name, 0, total).tolist() for f in _OWN]
-        places = {mode: Addresses(self.manifest.modes.get(mode, Mode({}))) for mode in MODES}
+        places = {mode: Addresses(self.manifest.modes.get(mode, Mode({}))) for mode in RECORDED}
         for about, campaign, episode, first, rows, part, status in zip(*columns, strict=True):
-            if 0 <= about < len(MODES):
-                mode = MODES[about]
+            if 0 <= about < len(RECORDED):
+                mode = RECORDED[about]
                 self._note(mode, campaign, episode, first, rows, part, status)
                 if status == EpisodeStatus.MORE and not places[mode].has_all(first, rows):
                     self._parts.pop((mode, campaign, episode), None)

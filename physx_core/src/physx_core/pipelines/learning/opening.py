@@ -34,7 +34,6 @@ from physx_core.pipelines.storage import (
     describe_environment,
     open_existing,
     open_own,
-    stream_options,
 )
 from physx_core.plugins.networks import resolve_network
 from physx_core.session import Session
@@ -215,7 +214,7 @@ class DataOpening:
         mode, number = self.start.config.mode, generation.campaign
         if number is not None:
             campaign = Campaign.last(dataset, mode, environment, number)
-        elif source.is_independent and not stream_options(environment, self.start.config):
+        elif source.is_independent:
             seed = self._seed_of(environment)
             seeds, parameters = derive_seed(seed, "training", generation.offset), source.sets
             campaign = Campaign.begin(
@@ -226,7 +225,13 @@ class DataOpening:
         else:
             return None
         queue = RowQueue(self.buffer.total, campaign.records(dataset), self.retries)
-        writer = CampaignWriter(dataset, campaign, queue, self.max_failed)
+        writer = CampaignWriter(
+            dataset,
+            campaign,
+            queue,
+            self.max_failed,
+            keeps_rejected=environment.record_wrong_samples,
+        )
         source.sets.follow(queue, self.buffer.needed, self.buffer.batch_nb, self.run_ahead)
         writer.open(source)
         return writer

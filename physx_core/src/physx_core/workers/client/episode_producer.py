@@ -14,6 +14,8 @@ from physx_core.workers.instance import Instance
 from physx_core.workers.lease import Lease
 from physx_core.workers.row_codec import pack_rows
 
+_MOST_REJECTED = 256
+
 
 class EpisodeProducer:
     """Runs an instance for a campaign."""
@@ -39,13 +41,16 @@ class EpisodeProducer:
         return self._leased.popleft() if self._leased else None
 
     def _send(self, block: EpisodeBlock, runner: EpisodeRunner) -> None:
-        count = len(block.rows.get("step", ()))
-        if count and not self._announced:
+        count, rejected = (len(rows.get("step", ())) for rows in (block.rows, block.rejected))
+        if (count or rejected) and not self._announced:
             self._announced = True
             table = [field.to_dict() for field in runner.fields]
             self._link.send(pack(Kind.FIELDS, encode(table)))
         if count:
             self._link.send_parts(pack_rows(block.rows, count))
+        for start in range(0, rejected, _MOST_REJECTED):
+            part = {n: each[start : start + _MOST_REJECTED] for n, each in block.rejected.items()}
+            self._link.send_parts(pack_rows(part, len(part["step"]), Kind.WRONG))
         records = [_plain(record) for record in block.records]
         self._link.send(pack(Kind.EPISODES, encode(records), count))
 

@@ -220,11 +220,11 @@ class RemoteServices:
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
         """Save values of the instance: see `Services.save_parameters`."""
-        self._ask(Kind.SAVE, values, "save_parameters()")
+        self._ask(Kind.SAVE, values if instance_id else {"": values}, "save_parameters()")
 
     def load_parameters(self, instance_id: int) -> dict[str, Any]:
         """Return the values that the instance saved: see `Services.load_parameters`."""
-        values: dict[str, Any] = self._ask(Kind.LOAD, None, "load_parameters()")
+        values: dict[str, Any] = self._ask(Kind.LOAD, not instance_id, "load_parameters()")
         return values
 
     def choose(self, episode: int) -> dict[str, Any]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from collections import deque
 from collections.abc import Callable
 from dataclasses import replace
@@ -14,6 +15,7 @@ from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
 from physx_core.net.frames import Frame, Kind, pack
 from physx_core.net.values import decode, encode
+from physx_core.rows import concatenate
 from physx_core.typing import Batch, Index
 from physx_core.workers.episode_queue import EpisodeQueue
 from physx_core.workers.episode_runner import EpisodeBlock
@@ -53,6 +55,7 @@ class Leases:
         self.blocks: deque[EpisodeBlock] = deque()
         self.dispatch: dict[Kind, Callable[[Peer, Frame], None]] = {
             Kind.ROWS: self._take_rows,
+            Kind.WRONG: self._take_rejected,
             Kind.EPISODES: self._take_episodes,
         }
         self._queue, self._choose = queue, choose
@@ -62,7 +65,7 @@ class Leases:
     @property
     def holders(self) -> list[int]:
         """The instances whose clients simulate something."""
-        return [instance_id for instance_id, held in self._held.items() if held.numbers]
+        return [instance_id for instance_id, held in self._held.items() if held.count]
 
     def grant(self, peer: Peer, clients: int) -> None:
         """Give a client numbers if it has few.
@@ -74,17 +77,20 @@ class Leases:
         held = self._held.setdefault(peer.instance_id, _Held())
         wanted = held.wanted(most_numbers(peer.parameters))
         wanted = max(1, min(wanted, self._queue.waiting // (2 * clients)))
-        if len(held.numbers) > wanted // 2 or not self._suspects.isdisjoint(held.numbers):
+        if held.count > wanted // 2 or self._has_suspect(*held.left):
             return
-        while len(held.numbers) < wanted:
-            numbers = self._queue.take_range(wanted - len(held.numbers))
-            is_suspect = not self._suspects.isdisjoint(numbers)
-            if is_suspect and held.numbers:
+        while held.count < wanted:
+            numbers = self._queue.take_range(wanted - held.count)
+            is_suspect = self._has_suspect(numbers)
+            if is_suspect and held.count:
                 self._queue.put_back(numbers[0])
             elif numbers:
                 self._lease(peer, numbers)
             if is_suspect or not numbers:
                 return
+
+    def _has_suspect(self, *numbers: range) -> bool:
+        return any(number in each for number in self._suspects for each in numbers)
 
     def _lease(self, peer: Peer, numbers: range) -> None:
         values = self._choose(numbers) if peer.parameters else {}
@@ -102,26 +108,26 @@ class Leases:
             The number that was lost too often, so that it has failed; else None.
         """
         held = self._held.pop(instance_id, _Held())
-        if len(held.numbers) > 1:  # any of them may be the cause
-            self._suspects |= held.numbers
-            for number in held.numbers:
-                self._queue.put_back(number)
-            return None
-        lost = next(iter(held.numbers), None)
-        return None if lost is None or self._queue.give_back(lost) else lost
+        if held.count == 1:
+            lost = held.first
+            return None if self._queue.give_back(lost) else lost
+        for number in itertools.chain(*held.left):  # any of them may be the cause
+            self._suspects.add(number)
+            self._queue.put_back(number)
+        return None
 
     def release(self, instance_id: int) -> None:
         """Return the numbers of a client that leaves to the queue."""
-        for number in self._held.pop(instance_id, _Held()).numbers:
+        for number in itertools.chain(*self._held.pop(instance_id, _Held()).left):
             self._queue.put_back(number)
 
     def simulated(self) -> list[tuple[int, int, float]]:
         """Return what clients simulate: an instance, its episode, and for how long, in s."""
         now = self._clock.monotonic()
         return [
-            (instance_id, min(held.numbers), now - held.since)
+            (instance_id, held.first, now - held.since)
             for instance_id, held in self._held.items()
-            if held.numbers
+            if held.count
         ]
 
     def fail(self, number: int, reason: str) -> None:
@@ -142,41 +148,66 @@ class Leases:
             raise ConnectionRefusedByPeerError(f"It sent {count} rows that belong to no episode.")
         held.rows = unpack_rows(frame.payload, peer.row_fields, count)
 
+    def _take_rejected(self, peer: Peer, frame: Frame) -> None:
+        held, count = self._held.get(peer.instance_id), frame.number
+        if held is None or not peer.row_fields or count < 1:
+            raise ConnectionRefusedByPeerError(f"It sent {count} rejected rows of no episode.")
+        rows = unpack_rows(frame.payload, peer.row_fields, count)
+        check_values(rows, peer.row_fields, peer.instance_id)
+        held.rejected.append(rows)
+
     def _take_episodes(self, peer: Peer, frame: Frame) -> None:
         held = self._held.get(peer.instance_id, _Held())
         rows, held.rows = held.rows, {}
+        rejected, held.rejected = concatenate(held.rejected), []
         try:
             records = [_parse(plain) for plain in decode(frame.payload)]
         except (TypeError, ValueError, ConfigError) as error:
             raise ConnectionRefusedByPeerError(f"It sent impossible episodes: {error}.") from error
-        before = len(held.numbers)
+        before = held.count
         records = [held.settled(record) for record in records]
-        if len(held.numbers) < before:
+        if held.count < before:
             held.since = self._clock.monotonic()
         _check_rows(rows, records)
         if rows:
             check_values(rows, peer.row_fields, peer.instance_id)
+        _check_rejected(rejected, records)
         peer.received += len(rows.get("step", ()))
         held.note_pace(records)
-        self.blocks.append(EpisodeBlock(rows, records, peer.instance_id))
+        self.blocks.append(EpisodeBlock(rows, records, peer.instance_id, rejected))
 
 
 class _Held:
     """What a client has leased.
 
     Attributes:
-        numbers: The numbers that have not ended.
         rows: Rows whose record has not arrived.
+        rejected: Rejected ones.
         since: When it began its present episode, in monotonic s.
     """
 
     def __init__(self) -> None:
-        self.numbers: set[int] = set()
         self.rows: Batch = {}
+        self.rejected: list[Batch] = []
         self.since = 0.0
-        self._leases: list[Lease] = []
+        self._leases: list[tuple[Lease, range]] = []  # with numbers that have not ended
         self._parts: dict[int, int] = {}  # number of an episode that has begun to its next part
         self._pace: float | None = None  # seconds of an episode
+
+    @property
+    def left(self) -> list[range]:
+        """The numbers that have not ended."""
+        return [left for _, left in self._leases]
+
+    @property
+    def count(self) -> int:
+        """How many numbers have not ended."""
+        return sum(map(len, self.left))
+
+    @property
+    def first(self) -> int:
+        """The least of them."""
+        return min(each[0] for each in self.left)
 
     def wanted(self, most: int) -> int:
         """Return how many numbers it should have: for 20 ms, and as many for the meantime.
@@ -195,10 +226,8 @@ class _Held:
 
     def add(self, lease: Lease, now: float) -> None:
         """Give it more numbers."""
-        self.since = self.since if self.numbers else now
-        kept = [each for each in self._leases if not self.numbers.isdisjoint(each.numbers)]
-        self._leases = [*kept, lease]
-        self.numbers.update(lease.numbers)
+        self.since = self.since if self._leases else now
+        self._leases.append((lease, lease.numbers))
 
     def settled(self, record: EpisodeRecord) -> EpisodeRecord:
         """Return a record with its parameters, and take the numbers that have ended.
@@ -208,11 +237,12 @@ class _Held:
                 it is not about the next part.
         """
         first, ended = record.episode, range(record.episode, record.episode + record.count)
-        lease = next((each for each in self._leases if first in each.numbers), None)
-        if lease is None or ended[-1] not in lease.numbers or not self.numbers.issuperset(ended):
+        having = (k for k, left in enumerate(self.left) if first in left and ended[-1] in left)
+        if (place := next(having, None)) is None:
             raise ConnectionRefusedByPeerError(
                 f"It sent episode {first}, which it does not have, or those that follow it."
             )
+        lease, left = self._leases[place]
         part = self._parts.get(first, 0)
         if record.rows and record.part != part:
             raise ConnectionRefusedByPeerError(
@@ -222,7 +252,8 @@ class _Held:
             self._parts[first] = part + 1
         else:
             self._parts.pop(first, None)
-            self.numbers.difference_update(ended)
+            rest = range(left.start, first), range(ended.stop, left.stop)
+            self._leases[place : place + 1] = [(lease, each) for each in rest if each]
         if not lease.values:
             return record
         return replace(record, parameters=lease.parameters(first, record.count))
@@ -238,6 +269,16 @@ def _check_rows(rows: Batch, records: list[EpisodeRecord]) -> None:
     numbers = np.concatenate([_numbers(record) for record in records])
     if rows["env_id"].any() or not np.array_equal(rows["episode"], numbers):
         raise ConnectionRefusedByPeerError("It sent rows of other episodes.")
+
+
+def _check_rejected(rows: Batch, records: list[EpisodeRecord]) -> None:
+    """Check that rejected rows are of the episodes that have ended."""
+    if not rows:
+        return
+    ended = (each for each in records if each.status is not EpisodeStatus.MORE)
+    numbers = {n for each in ended for n in range(each.episode, each.episode + each.count)}
+    if rows["env_id"].any() or not numbers.issuperset(rows["episode"].tolist()):
+        raise ConnectionRefusedByPeerError("It sent rejected rows of other episodes.")
 
 
 def _numbers(record: EpisodeRecord) -> Index:

@@ -11,11 +11,16 @@ from physx_core.components.environment import Services
 from physx_core.errors import ConnectionRefusedByPeerError, PhysxError, UsageError
 from physx_core.net.frames import Frame, Kind, pack
 from physx_core.net.remote_errors import encode_error
-from physx_core.net.values import pack_value
+from physx_core.net.values import decode, pack_value
 from physx_core.typing import Batch, Sample
 from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.server.peer import Peer
-from physx_core.workers.server.validation import parse_choice, parse_events, parse_values
+from physx_core.workers.server.validation import (
+    parse_choice,
+    parse_events,
+    parse_saved,
+    parse_values,
+)
 
 _MOST_UNREAD = 1 << 26
 _KEPT = "the saved parameters"
@@ -85,12 +90,13 @@ class ServiceRequests:
         if frame.kind is Kind.PREDICT:
             self._keep(peer, frame)
         elif frame.kind is Kind.SAVE:
-            values = parse_values(frame.payload)
-            save = self._services.save_parameters
-            self._answer(peer, frame.number, _KEPT, save, peer.instance_id, values)
+            of_all, values = parse_saved(frame.payload)
+            who = 0 if of_all else peer.instance_id
+            self._answer(peer, frame.number, _KEPT, self._services.save_parameters, who, values)
         elif frame.kind is Kind.LOAD:
             load = self._services.load_parameters
-            self._answer(peer, frame.number, _KEPT, load, peer.instance_id)
+            who = 0 if decode(frame.payload) is True else peer.instance_id
+            self._answer(peer, frame.number, _KEPT, load, who)
         elif frame.kind is Kind.CHOOSE:
             self._choose(peer, frame)
         else:

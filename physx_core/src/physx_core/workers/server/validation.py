@@ -122,6 +122,17 @@ def parse_values(payload: bytes | bytearray) -> dict[str, Any]:
     return values
 
 
+def parse_saved(payload: bytes | bytearray) -> tuple[bool, dict[str, Any]]:
+    """Return whether saved values are those of all instances, under no name, and the values."""
+    values = parse_values(payload)
+    of_all = values.get("")
+    if not isinstance(of_all, dict):
+        return False, values
+    if not {*map(type, of_all)} <= {str}:
+        raise ConnectionRefusedByPeerError("It saved values without names.")
+    return True, of_all
+
+
 def parse_events(payload: bytes | bytearray) -> list[Event]:
     """Return the drawing events of a message."""
     plain = decode(payload)

@@ -9,7 +9,6 @@ from functools import cached_property
 
 import numpy as np
 
-from physx_core.config import MODES
 from physx_core.dataset.read.order.addresses import Addresses
 from physx_core.dataset.read.order.growing import GrowingRecords
 from physx_core.dataset.read.order.records import (
@@ -20,7 +19,7 @@ from physx_core.dataset.read.order.records import (
     RecordedEpisodes,
     Records,
 )
-from physx_core.dataset.store.episode_table import EPISODES, LOST, has_table, mode_index
+from physx_core.dataset.store.episode_table import EPISODES, LOST, RECORDED, has_table, mode_index
 from physx_core.dataset.store.manifest import Manifest, Mode
 from physx_core.errors import DatasetError
 from physx_core.typing import Array, Index
@@ -123,7 +122,7 @@ class Orders:
         Raises:
             DatasetError: If the table of episodes cannot be read or is invalid.
         """
-        if mode not in MODES or not has_table(self._manifest):
+        if mode not in RECORDED or not has_table(self._manifest):
             return None
         with self._lock:
             return self._newest(mode)
@@ -165,7 +164,7 @@ class Orders:
             return
         table = Records(*(self._column(name, total) for name in _COLUMNS))
         about = self._column("mode_index", total)
-        for mode in MODES:
+        for mode in RECORDED:
             which = np.flatnonzero(about == mode_index(mode))
             if len(which):
                 records = self._records.setdefault(mode, GrowingRecords())
