@@ -14,6 +14,7 @@ import re
 import sys
 from collections import OrderedDict, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping
+from hashlib import blake2b
 from pathlib import PurePath
 from types import (
     BuiltinFunctionType,
@@ -25,7 +26,6 @@ from types import (
 from typing import Any, TypeAlias
 
 import numpy as np
-import xxhash
 
 from physx_core.config import SCRIPT_PREFIX
 from physx_core.errors import StateError, listed
@@ -48,6 +48,8 @@ _BITS = {
     )
 }
 _BASES = {each.__name__: each for each in (dict, list, tuple, set, frozenset, deque, object)}
+
+_digest = functools.partial(blake2b, digest_size=7)  # fits a whole number of 8 bytes
 
 
 class Baseline:
@@ -201,12 +203,12 @@ class _Graph:
             if number:
                 name = self._origins[top][1].removeprefix(".")
                 text = f"{number} {label} {_name_of(type(self.nodes[number]))} "
-                digest = found.setdefault(name, xxhash.xxh3_64())
+                digest = found.setdefault(name, _digest())
                 digest.update(text.encode() + _as_bytes(content))
         root = self.contents[0]
         for name, part in root.items():
-            found.setdefault(name, xxhash.xxh3_64(_as_bytes([part])))
-        return {name: found[name].intdigest() for name in root}
+            found.setdefault(name, _digest(_as_bytes([part])))
+        return {name: int.from_bytes(found[name].digest(), "little") for name in root}
 
     def _part(self, owner: int, value: Any, label: str) -> Any:
         """Return an atom itself, and the number of any other object."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any, ClassVar, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias
 
 import numpy as np
 
@@ -27,8 +27,10 @@ from physx_core.errors import (
 from physx_core.fields import NO_ARRAY, Field, FieldLike, as_fields, is_finite
 from physx_core.random_streams import NumberedStreams
 from physx_core.rows import infer_shapes
-from physx_core.states import Baseline, as_lists
 from physx_core.typing import Array, Sample
+
+if TYPE_CHECKING:
+    from physx_core.states import Baseline
 
 _OTHER_NAMES = {
     "sample_training": "sample",
@@ -485,6 +487,8 @@ class Environment(Closeable):
         if len(own) == 1:
             raise UsageError(f"{kind.__name__} defines {own[0]}(), but needs both: {methods}.")
         if not own:
+            from physx_core.states import Baseline  # most runs take no states
+
             _ = self.rng  # which is created on first use
             self._baseline = Baseline(self, [*_OF_THE_RUN, *_COUNTERS, *_constants_of(kind)])
 
@@ -504,6 +508,8 @@ class Environment(Closeable):
     def get_place(self) -> dict[str, Any]:
         """Return the counters and the state of `rng`, which are not in `get_state`."""
         place = {name: getattr(self, name) for name in _COUNTERS}
+        from physx_core.states import as_lists
+
         return {**place, "rng": as_lists(self.rng.bit_generator.state)}
 
     def set_place(self, place: Mapping[str, Any]) -> None:
