@@ -19,7 +19,7 @@ from environments.heat import CELLS, FRAMES, Heat
 from environments.heat_picture import draw
 from rivals import linear_map, table, verdict
 
-from physx_core import EnvironmentConfig, NetworkConfig, Training
+from physx_core import Dataset, EnvironmentConfig, NetworkConfig, Training
 
 BATCH, VIEWS, WIDTH = 32, 8, 128
 
@@ -42,7 +42,10 @@ def online(sampler, rows, seed, folder, given):
     with training:
         training.execute()
         (guess,) = training.learner.predict_in_training({"input": given}).values()
-    return samples(training.session.path, "episodes", "width", "diffusivity"), guess
+    with Dataset.open(training.session.path) as dataset:
+        table = dataset.episode_table(["training"])
+    is_episode = table["episode"] >= 0  # not the record of the samples before the first one
+    return [table[name][is_episode] for name in ("width", "diffusivity")], guess
 
 
 def main() -> int:
