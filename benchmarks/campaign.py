@@ -13,7 +13,6 @@
 
 from __future__ import annotations
 
-import heapq
 import itertools
 import os
 import statistics
@@ -23,7 +22,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from measure import claim, finish, rates, report
+from measure import claim, finish, list_schedule, rates, report
 
 from physx_core import DataGeneration, Environment, EnvironmentConfig, Parameter
 from physx_core.plugins import resolve
@@ -113,14 +112,6 @@ def generation(
     return DataGeneration(
         config, session_dir=str(folder), session_name=name, episodes=episodes, quiet=True
     )
-
-
-def list_schedule(durations: np.ndarray, workers: int) -> float:
-    """Return when the last simulation ends if each worker takes the next one at once."""
-    free = [0.0] * workers
-    for duration in durations:
-        heapq.heappush(free, heapq.heappop(free) + float(duration))
-    return max(free)
 
 
 def uneven(folder: Path, size: int, target: float) -> bool:

@@ -3,10 +3,19 @@
 from __future__ import annotations
 
 import argparse
+import heapq
 import statistics
 import sys
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
+
+
+def list_schedule(durations: Iterable[float], workers: int) -> float:
+    """Return when the last simulation ends if each worker takes the next one at once."""
+    free = [0.0] * workers
+    for duration in durations:
+        heapq.heappush(free, heapq.heappop(free) + float(duration))
+    return max(free)
 
 
 def rates(

@@ -128,6 +128,22 @@ class Resonance(Environment):
         self.set_training_data(input=scaled, output=[response.real, response.imag])
 
 
+class Uneven(Resonance):
+    """The same problem, with simulations of very different durations, which are stored."""
+
+    def init_database(self) -> None:
+        """Define a field for the duration, too."""
+        super().init_database()
+        self.define_additional_fields(Field("seconds", shape=()))
+
+    def step(self) -> None:
+        """Wait for a log-normal time of median 50 ms, then compute."""
+        seconds = 0.05 * self.rng.lognormal(sigma=1.2)
+        time.sleep(seconds)
+        super().step()
+        self.set_additional_data(seconds=seconds)
+
+
 class Late(Resonance):
     """The same problem, with simulations whose duration varies from run to run."""
 

@@ -543,7 +543,7 @@ ONE = ["--batch-nb", "1", "--batch-size", "1", "--environment.no-as-tcp-ip-clien
     [
         (["train", "sessions/none", "--resume"], 'no session "none" in sessions'),
         (["train", "sessions/spring", "--resume"], "config.toml has no table [training]"),
-        (["train", "sessions/empty", "--resume"], "There is no configuration file sessions/empty"),
+        (["train", "sessions/empty", "--resume"], "sessions/empty ended before it began"),
         (["train", "--config", "sessions/spring"], "It has: data_generation."),
         (["train", "--config", "sessions"], "There is no configuration file sessions/config.toml"),
         (["train", "--config", "odd"], "odd/config.toml cannot be read: Is a directory"),

@@ -70,8 +70,10 @@ class Apprentice(Pupil):
 
     def create(self):
         self.define_parameters([Parameter("slope", 0.5, 1.5)])
-        self.runs = self.load_parameters().get("runs", 0) + 1
-        self.save_parameters(runs=self.runs)
+        self.runs = 1
+        if not self.independent_episodes:  # their instances share what they save
+            self.runs += self.load_parameters().get("runs", 0)
+            self.save_parameters(runs=self.runs)
 
     def reset_parameters(self, slope):
         self.slope = slope * self.runs

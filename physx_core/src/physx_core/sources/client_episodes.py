@@ -16,7 +16,8 @@ from physx_core.workers.server.client_group import ClientGroup
 from physx_core.workers.server.leases import Leases
 from physx_core.workers.server.peer import Peer
 
-_TICK = 0.02  # s
+_TICK = 0.005
+"""How long the losses that the next parameters depend on may go unnoticed, in s."""
 
 
 class ClientEpisodes(EpisodeSource):
@@ -61,11 +62,13 @@ class ClientEpisodes(EpisodeSource):
 
     def take(self) -> EpisodeBlock:
         """Wait until something has ended: see `EpisodeSource.take`."""
+        learned = self._sets.learned
         while not self._leases.blocks and not self._queue.is_done:
-            self._group.wait(self._busy)
-            if self._leases.blocks or self._sets.learned is None:
+            if learned is None:
+                self._group.wait(self._busy)
                 break
-            self._sets.learned.wait(_TICK)
+            self._group.wait(self._busy, _TICK)
+            learned.wait(0.0 if self._leases.blocks else _TICK)
         if not self._leases.blocks:
             return EpisodeBlock({}, [])
         return self._settled(self._leases.blocks.popleft())

@@ -161,11 +161,12 @@ class ClientGroup:
         ready = {peer.instance_id for peer in self.ready}
         return [number for number in self._numbers if number not in ready]
 
-    def wait(self, missing: Callable[[], Sequence[int]]) -> None:
+    def wait(self, missing: Callable[[], Sequence[int]], tick: float = _TICK) -> None:
         """Serve the clients until no instance is missing.
 
         Args:
             missing: Returns the instances to wait for; called after each round.
+            tick: Longest time of a round, in s.
         """
         began = self._clock.monotonic()
         was_busy = began - self._served > _BUSY
@@ -178,7 +179,7 @@ class ClientGroup:
         if began - self._served > _TICK / 10:
             self._serve(0.0)
         while waited := missing():
-            self._serve(_TICK)
+            self._serve(tick)
             self._look_for_laggards(waited)
             if self._served - began < min(_SAY_EVERY, self.config.timeout):
                 continue
