@@ -13,7 +13,7 @@ SAMPLERS = [
     ("OutOfBounds", "chooses every parameter within its bounds", "stiffness"),
     ("Incomplete", "chooses every parameter within its bounds", "cells"),
     ("Cached", "hands out copies of its sets", "changed by its user"),
-    ("LearnsAtOnce", "learns from counted batches", "another is told"),
+    ("LearnsByChance", "learns the same again", "differently"),
     ("ForgetsLosses", "continues from a state", "differently"),
     ("RestoresAnything", "refuses an invalid state", "ValueError"),
 ]

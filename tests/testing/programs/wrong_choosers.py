@@ -56,44 +56,41 @@ class Cached(Right):
 
 
 class Learns(LearningSampler):
-    """Moves with the sum of the losses, which it keeps for the last batches."""
+    """Moves with the sum of the losses."""
 
     def begin(self, parameters, seed):
         super().begin(parameters, seed)
-        self.sums = {0: 0.0}
+        self.sum = 0.0
 
-    def tell(self, batches, numbers, values, losses):
-        self.sums[batches] = self.sums[batches - 1] + float(np.sum(losses))
+    def tell(self, numbers, values, losses):
+        self.sum += float(np.sum(losses))
 
-    def ask_after(self, number, batches):
-        share = (self.random(number).random(self.size) + self.sums[batches]) % 1.0
-        return self.values(share)
+    def ask(self, number):
+        return self.values((self.random(number).random(self.size) + self.sum) % 1.0)
 
-    def state(self, batches):
-        return np.array([each for n in self.sums if n <= batches for each in (n, self.sums[n])])
+    def state(self):
+        return np.array([self.sum])
 
-    def restore(self, batches, state):
-        pairs = np.asarray(state)
-        if len(pairs) % 2 or pairs[-2] != batches:
-            raise ValueError("it is the state after other batches")
-        self.sums = {int(n): float(total) for n, total in pairs.reshape(-1, 2)}
+    def restore(self, state):
+        if np.shape(state) != (1,):
+            raise ValueError("it is the state of another sampler")
+        self.sum = float(state[0])
 
 
-class LearnsAtOnce(Learns):
-    def ask_after(self, number, batches):
-        return super().ask_after(number, max(self.sums))
+class LearnsByChance(Learns):
+    def tell(self, numbers, values, losses):
+        super().tell(numbers, values, losses * np.random.default_rng().random(len(losses)))
 
 
 class ForgetsLosses(Learns):
-    def restore(self, batches, state):
-        super().restore(batches, state)
-        self.sums = dict.fromkeys(self.sums, 0.0)
+    def restore(self, state):
+        super().restore(0 * state)
 
 
 class RestoresAnything(Learns):
-    def restore(self, batches, state):
+    def restore(self, state):
         with contextlib.suppress(ValueError):
-            super().restore(batches, state)
+            super().restore(state)
 
 
 class Ring(Buffer):
