@@ -22,7 +22,7 @@ MAX_PAYLOAD = 1 << 30
 
 
 class Kind(enum.IntEnum):
-    """Kind of a frame; the meaning of `number`, if it has one, is in brackets."""
+    """Kind of a frame; the meaning of ``number``, if it has one, is in brackets."""
 
     HELLO = 1
     """Client: magic, version, challenge."""
