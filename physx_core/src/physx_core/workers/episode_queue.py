@@ -65,6 +65,10 @@ class EpisodeQueue:
             self._gap += self._next == end
         return numbers
 
+    def needs(self, number: int) -> bool:
+        """Return whether a number that has ended is known to be needed."""
+        return number < self.total
+
     def note(self, record: EpisodeRecord) -> None:
         """Note what became of a number, or of several."""
         if record.status is not EpisodeStatus.MORE:

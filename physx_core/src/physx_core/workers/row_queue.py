@@ -97,6 +97,10 @@ class RowQueue(EpisodeQueue):
                 "call set_training_data() in the step that calls end_episode()."
             )
 
+    def needs(self, number: int) -> bool:
+        """Return whether a number is known to be needed: those before it have too few rows."""
+        return number < self.missing and self.rows_before(number) < self.goal
+
     def rows_before(self, number: int) -> int:
         """Return how many rows the episodes before a number have, of those that have ended."""
         place = bisect_right(self._firsts, max(0, number)) - 1
