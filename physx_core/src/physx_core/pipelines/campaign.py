@@ -180,7 +180,8 @@ class Campaign:
 
     def _are_own(self, known: RecordedEpisodes) -> Flags:
         """Return which of a mode's episodes are its own; a stream before it has its number."""
-        return (known.campaign == self.number) & (known.status != EpisodeStatus.STREAM)
+        own: Flags = (known.campaign == self.number) & (known.status != EpisodeStatus.STREAM)
+        return own
 
     def cut(self, dataset: Dataset, rows: int) -> None:
         """Leave out what follows the first rows: the episodes there are recorded as cut.
