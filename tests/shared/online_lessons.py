@@ -42,7 +42,7 @@ def train(name, clients=0, *, cls=Training, training=None, **options):
     return run
 
 
-LESSON_OPTIONS = ("delay", "fails", "dies", "asks")
+LESSON_OPTIONS = ("delay", "fails", "dies", "asks", "rejects")
 
 
 def result(run):

@@ -233,7 +233,7 @@ class FailedEpisodesError(PhysxError):
         super().__init__(
             f"{count} failed, the last one number {episode}: {first.rstrip('.')}. What has been "
             "simulated is stored. To go on with the others: --resume, and --max-failed for more "
-            "failures; --retry-failed simulates those that failed again."
+            "failures; physx generate --retry-failed simulates those that failed again."
         )
 
 

@@ -81,6 +81,21 @@ def test_last_episode_is_cut_and_completed_by_more_batches(clients):
     assert status == dict.fromkeys(range(7), 0) | {7: EpisodeStatus.CUT}
 
 
+def test_fewer_batches_lose_nothing():
+    generate(6, env_kwargs={"least": 4, "most": 4})
+    before = stored()
+    for batches in (3, 2):
+        generate(batches, env_kwargs={"least": 4, "most": 4}, resume=True)
+        assert stored() == before
+
+
+def test_batches_follow_the_rows_of_a_stream():
+    for independent in (False, True):
+        config = dataclasses.replace(CONFIG, independent_episodes=independent)
+        generate(4, config=config, new_session=False)
+    assert len(stored()[0]) == 40
+
+
 @pytest.mark.parametrize("clients", [0, 2])
 def test_episodes_of_one_row_are_cut_between_two(clients):
     config = dataclasses.replace(CONFIG, episode_steps=1)

@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 import online_lessons
 import pytest
-from online_lessons import RESERVOIR, result, train
+from online_lessons import LESSON, RESERVOIR, result, train
 from sizes import seed, trials
 
-from physx_core import Dataset, Training
+from physx_core import DataGeneration, Dataset, EnvironmentConfig, Training
 from physx_core.dataset import EpisodeStatus
 from physx_core.errors import FailedEpisodesError, UsageError
 
@@ -128,3 +128,67 @@ def test_error_of_the_training_ends_clients_that_run_ahead(nothing_stays_behind)
     with pytest.raises(RuntimeError, match="on purpose"):
         train("failing", 2, cls=Failing)
     assert Path("sessions/failing/dataset").is_dir()
+
+
+def test_failures_of_episodes_that_no_batch_needs_do_not_count():
+    expected = result(train("whole", 1))
+    with Dataset.open("sessions/whole/dataset") as dataset:
+        surplus = [*range(int(dataset["training"]["episode"][-1]) + 1, 200)]
+    for clients in (0, 2):
+        run = train(f"run_{clients}", clients, fails=surplus)
+        assert result(run) == expected
+        with Dataset.open(run.session.dataset_dir) as dataset:
+            assert dataset.failed_episodes("training") == []
+
+
+def test_resumed_training_may_have_more_failures():
+    options = {"batch_nb": 20}
+    lesson = {"fails": (20, 21), "delay": 0.01}
+    expected = result(train("whole", 1, training={**options, "max_failed": 2}, **lesson))
+    with pytest.raises(FailedEpisodesError, match="--max-failed"):
+        train("run", 1, training=options, **lesson)
+    options |= {"resume": True, "max_failed": 2, "retries": 0}
+    assert result(train("run", 2, training=options, **lesson)) == expected
+
+
+def test_rejected_samples_do_not_depend_on_the_number_of_clients():
+    runs = [train(f"run_{n}", n, rejects=0.3, record_wrong_samples=True) for n in (0, 1, 3)]
+    found = []
+    for run in runs:
+        with Dataset.open(run.session.dataset_dir) as dataset:
+            found.append({name: dataset["wrong"][name][:].tobytes() for name in dataset["wrong"]})
+    assert found[0]["x"]
+    assert found == [found[0]] * 3
+
+
+@pytest.mark.parametrize("clients", [0, 2])
+def test_resumed_training_leaves_out_surplus_episodes_that_a_sampler_chose_before(clients):
+    class Stopped(Training):
+        def batch_end(self):
+            if self.batch_id == self.batch_nb:
+                raise OSError("on purpose")
+
+        def _save_after(self, error):
+            pass  # killed
+
+    options = {"sampler": "physx/active", "training": {"run_ahead": 1000}}
+    expected = result(train("whole", clients, **options))
+    with pytest.raises(OSError, match="on purpose"):
+        train("run", clients, cls=Stopped, **options)
+    options["training"] |= {"resume": True}
+    assert result(train("run", clients, **options)) == expected
+
+
+def test_episodes_follow_the_rows_of_a_stream():
+    expected = result(train("alone", 2))
+    config = EnvironmentConfig(LESSON, as_tcp_ip_client=False, independent_episodes=False, seed=1)
+    DataGeneration(config, batch_nb=3, batch_size=10, session_name="run", quiet=True).execute()
+    with Dataset.open("sessions/run") as dataset:
+        stream = dataset["training"]["x"][:]
+    options = {"new_session": False, "epoch_nb": 2}
+    run = train("run", 2, training=options)
+    with Dataset.open("sessions/run") as dataset:
+        found = dataset["training"]["x"][:]
+    assert np.array_equal(found[:30], stream)
+    assert found[30:].nbytes == len(expected["x"])
+    assert run.epoch_id == 2

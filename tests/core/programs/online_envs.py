@@ -89,9 +89,10 @@ class Lesson(Environment):
 
     independent_episodes = True
 
-    def __init__(self, *, delay=0.0, fails=(), dies=(), asks=False, **kwargs):
+    def __init__(self, *, delay=0.0, fails=(), dies=(), asks=False, rejects=0.0, **kwargs):
         super().__init__(**kwargs)
         self.delay, self.fails, self.dies, self.asks = delay, fails, dies, asks
+        self.rejects = rejects
 
     def create(self):
         self.define_parameters([Parameter("slope", 0.5, 1.5)])
@@ -114,10 +115,14 @@ class Lesson(Environment):
         if self.asks:
             self.get_prediction(x=x)
         self.set_training_data(x=x, y=self.slope * x.sum(keepdims=True))
+        self.is_good = not self.rejects or self.rng.random() >= self.rejects
         self.left -= 1
         if not self.left:
             self.end_episode()
             self.note("ended")
+
+    def check_sample(self):
+        return self.is_good
 
     def note(self, what):
         with Path("simulated.txt").open("a") as file:

@@ -113,6 +113,14 @@ def test_each_set_is_chosen_after_exactly_the_batches_of_earlier_episodes(
     assert chosen == {number: wanted[number] for number in chosen}
 
 
+def test_only_what_is_simulated_is_chosen():
+    sets, queue = begun(2, 5, 10**9), RowQueue(10)
+    queue.choose, asked = sets.choose, []
+    ask = sets._sampler.ask
+    sets._sampler.ask = lambda number: asked.append(number) or ask(number)
+    assert [queue.take() for _ in range(3)] == [0, 1, 2] == asked
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -129,7 +137,7 @@ def test_state_of_another_sampler_is_refused(change, message):
         queue.take()
         queue.note(EpisodeRecord(episode=number, rows=1))
     sets.tell(np.array([0, 1]), np.array([1.0, 2.0]))
-    sets.choose(queue)
+    sets.choose(queue, 10)
     state = sets.state(1)
     begun(2, 5, 3).restore(1, state)
     with pytest.raises(ValueError, match=message):

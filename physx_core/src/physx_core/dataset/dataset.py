@@ -29,7 +29,7 @@ from physx_core.dataset.repair import recovery, repair
 from physx_core.dataset.repair.report import find_problems, summarize
 from physx_core.dataset.store import failure_file, locks
 from physx_core.dataset.store.episode_record import EpisodeRecord, EpisodeStatus
-from physx_core.dataset.store.episode_table import EPISODES, LOST, has_table
+from physx_core.dataset.store.episode_table import EPISODES, LOST, TABLE_FIELDS, has_table
 from physx_core.dataset.store.failure_file import FailedEpisode
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition, to_plain_info
 from physx_core.dataset.write.appender import Appender
@@ -42,7 +42,7 @@ from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError, UsageError
 from physx_core.fields import Field
 from physx_core.statistics import Normalization
-from physx_core.typing import Batch
+from physx_core.typing import Batch, Index
 
 MAX_FILE_SIZE = 0.25
 
@@ -363,6 +363,28 @@ class Dataset(Closeable):
                 places = self._reader.orders.places(mode)
                 parts.append(records_at(order, places, whole, table, is_open=False))
         return {name: np.concatenate([part[name] for part in parts]) for name in table}
+
+    def episode_parameters(self, mode: str, entries: Index) -> Batch:
+        """Return the parameters of some recorded episodes, by name; empty without any.
+
+        Args:
+            mode: Name of a mode with records.
+            entries: Which entries of `recorded_episodes`, shape (n,).
+
+        Returns:
+            Arrays of shape (n, *shape of the parameter).
+
+        Raises:
+            DatasetError: If there is no such mode, or the table of episodes is damaged.
+        """
+        self._prepare_reading()
+        order = self._reader.order(mode)
+        if order is None or not len(entries):
+            return {}
+        places = self._reader.orders.places(mode)[order.found.last[entries]]
+        first, stop = int(places.min()), int(places.max()) + 1
+        names = self._reader.mode(EPISODES).fields.keys() - {field.name for field in TABLE_FIELDS}
+        return {n: self._reader.read(EPISODES, n, first, stop)[places - first] for n in names}
 
     def progress(self, mode: str) -> list[Progress]:
         """Return how many episodes of each campaign of a mode have ended; none without records.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Self
 
 import numpy as np
@@ -12,11 +12,10 @@ import numpy as np
 from physx_core.components.parameter import Parameter
 from physx_core.config import WRONG, EnvironmentConfig
 from physx_core.dataset import Dataset, EpisodeRecord, EpisodeStatus
+from physx_core.dataset.read.order.records import Flags, RecordedEpisodes
 from physx_core.errors import ConfigError, DatasetError, listed
 from physx_core.pipelines.storage import describe_environment
 from physx_core.typing import Batch, Index
-from physx_core.workers.lease import Lease
-from physx_core.workers.parameter_sets import ParameterSets
 
 CAMPAIGNS = "campaigns"
 """Entry in a dataset's info: what its campaigns simulated, in order."""
@@ -164,49 +163,81 @@ class Campaign:
 
     def _ended(self, dataset: Dataset, failed: bool) -> tuple[Index, Index, Index]:
         """Return the first number, the number of episodes and that of rows of each entry."""
-        known = dataset.recorded_episodes(self.mode) if self.mode in dataset.modes else None
+        known = self._recorded_episodes(dataset)
         if known is None:
             return (np.zeros(0, np.int64),) * 3
         status = [EpisodeStatus.FINISHED, *([EpisodeStatus.FAILED] if failed else [])]
-        chosen = np.isin(known.status, status) & (known.campaign == self.number)
+        chosen = np.isin(known.status, status) & self._are_own(known)
         return known.episode[chosen], known.numbers[chosen], known.rows[chosen]
 
-    def cut(self, dataset: Dataset, surplus: int, sets: ParameterSets) -> None:
-        """Leave out the last rows: the episodes that they belong to are recorded as cut.
+    def rows(self, dataset: Dataset) -> int:
+        """Return how many rows it has."""
+        known = self._recorded_episodes(dataset)
+        return 0 if known is None else int(known.rows[self._are_own(known)].sum())
+
+    def _recorded_episodes(self, dataset: Dataset) -> RecordedEpisodes | None:
+        return dataset.recorded_episodes(self.mode) if self.mode in dataset.modes else None
+
+    def _are_own(self, known: RecordedEpisodes) -> Flags:
+        """Return which of a mode's episodes are its own; a stream before it has its number."""
+        own: Flags = (known.campaign == self.number) & (known.status != EpisodeStatus.STREAM)
+        return own
+
+    def cut(self, dataset: Dataset, rows: int) -> None:
+        """Leave out what follows the first rows: the episodes there are recorded as cut.
+
+        How many were simulated beyond these rows is up to chance, so nothing of them stays: no
+        rows, no rejected samples, and not that they have failed.
 
         Args:
             dataset: The dataset, open for writing.
-            surplus: How many rows to leave out.
-            sets: Chooses the parameters of each number.
+            rows: How many rows to keep.
         """
-        known = dataset.recorded_episodes(self.mode)
-        assert known is not None
-        columns = known.first, known.rows, known.episode, known.numbers
-        own = np.flatnonzero((known.campaign == self.number) & (known.rows > 0))
-        for place in own[::-1].tolist():
-            first, rows, number, count = (int(column[place]) for column in columns)
-            left_out = min(surplus, rows)
-            if count > 1:  # of one row each
-                kept, cut = 0, range(number + count - left_out, number + count)
-            else:
-                kept, cut = rows - left_out, range(number, number + 1)
-            lease = Lease(cut, sets.values_of(cut))
-            records = [
-                EpisodeRecord(
-                    episode=each,
-                    rows=kept,
-                    campaign=self.number,
-                    status=EpisodeStatus.CUT,
-                    parameters=lease.parameters(each, 1),
-                )
-                for each in cut
-            ]
-            mode = dataset[self.mode]
-            stored = {name: mode[name][first : first + kept] for name in mode} if kept else {}
-            dataset.append_episodes(self.mode, stored, records, checked=True)
-            surplus -= left_out
-            if not surplus:
-                return
+        known = self._recorded_episodes(dataset)
+        if known is None:
+            return
+        own = np.flatnonzero(self._are_own(known))
+        counts = known.rows[own]
+        before = np.cumsum(counts) - counts
+        kept = np.clip(rows - before, 0, counts)
+        changes = (kept < counts) | ((before >= rows) & (known.status[own] != EpisodeStatus.CUT))
+        entries = own[changes]
+        parameters = dataset.episode_parameters(self.mode, entries)
+        records: list[EpisodeRecord] = []
+        for place, (entry, stays) in enumerate(zip(entries, kept[changes].tolist(), strict=True)):
+            record = EpisodeRecord(
+                episode=int(known.episode[entry]),
+                rows=0,
+                campaign=self.number,
+                status=EpisodeStatus.CUT,
+                parameters={name: column[place] for name, column in parameters.items()},
+            )
+            count = int(known.numbers[entry])
+            if count == 1 and stays:
+                self._shorten(dataset, replace(record, rows=stays), int(known.first[entry]))
+                continue
+            numbers = range(record.episode + stays, record.episode + count)  # of one row each
+            records += (replace(record, episode=number) for number in numbers)
+        if records:
+            dataset.append_episodes(self.mode, {}, records, checked=True)
+            self._drop_rejected(dataset, records)
+
+    def _shorten(self, dataset: Dataset, record: EpisodeRecord, first: int) -> None:
+        """Store the first rows of an episode again, as all that it has."""
+        mode = dataset[self.mode]
+        rows = {name: mode[name][first : first + record.rows] for name in mode}
+        dataset.append_episodes(self.mode, rows, [record], checked=True)
+
+    def _drop_rejected(self, dataset: Dataset, records: Sequence[EpisodeRecord]) -> None:
+        """Leave out the rejected samples of some episodes."""
+        known = dataset.recorded_episodes(WRONG) if WRONG in dataset.modes else None
+        if known is None:
+            return
+        campaign = _recorded(dataset).index(self)
+        numbers = set(known.episode[(known.campaign == campaign) & (known.rows > 0)].tolist())
+        gone = [replace(each, campaign=campaign) for each in records if each.episode in numbers]
+        if gone:
+            dataset.append_episodes(WRONG, {}, gone, checked=True)
 
 
 def _plain(parameters: Sequence[Parameter]) -> Any:

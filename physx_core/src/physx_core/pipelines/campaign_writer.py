@@ -2,12 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import replace
 
-import numpy as np
-
 from physx_core.config import WRONG
-from physx_core.dataset import Dataset, EpisodeStatus
+from physx_core.dataset import Dataset, EpisodeRecord, EpisodeStatus
 from physx_core.errors import FailedEpisodesError
 from physx_core.pipelines.campaign import Campaign
 from physx_core.pipelines.independence import IndependenceProof
@@ -23,7 +22,8 @@ class CampaignWriter:
     Attributes:
         campaign: The campaign.
         queue: The numbers that nobody has simulated yet.
-        failed: Number of episodes that have failed in this run.
+        failed: Number of episodes that have failed in this run. Of those beyond the last row that
+            is needed, of which there are more or fewer by chance, none counts.
     """
 
     def __init__(
@@ -47,7 +47,7 @@ class CampaignWriter:
         self.campaign, self.queue, self.failed = campaign, queue, 0
         self._dataset, self._max_failed = dataset, max_failed
         self._keeps_rejected = keeps_rejected
-        self._source: Source | None = None
+        self._unsure: list[EpisodeRecord] = []  # failed, but perhaps not needed
         self._episodes: EpisodeSource | None = None
         self._proof = IndependenceProof()
 
@@ -58,7 +58,7 @@ class CampaignWriter:
             ConfigError: If they define other parameters than when the campaign began.
         """
         self.campaign.check_parameters(source.sets.parameters)
-        self._source, self._episodes = source, source.lease(self.queue)
+        self._episodes = source.lease(self.queue)
 
     def store(self) -> int:
         """Store the episodes that end next; return how many have ended.
@@ -78,11 +78,21 @@ class CampaignWriter:
             self._dataset.define_fields(WRONG, self._episodes.fields)
             self.campaign.store_rejected(self._dataset, block.rejected, records)
         self._dataset.append_episodes(mode, block.rows, records, checked=True)
-        failed = [record for record in records if record.status is EpisodeStatus.FAILED]
-        self.failed += len(failed)
-        if failed and self.failed > self._max_failed:
-            raise FailedEpisodesError(self.failed, failed[-1].episode, failed[-1].reason)
+        self._count_failed(record for record in records if record.status is EpisodeStatus.FAILED)
         return self.queue.finished - before
+
+    def _count_failed(self, failed: Iterable[EpisodeRecord]) -> None:
+        """Count the failed episodes that are known to be needed.
+
+        Raises:
+            FailedEpisodesError: If there are too many.
+        """
+        unsure = [*self._unsure, *failed]
+        needed = [record for record in unsure if self.queue.needs(record.episode)]
+        self._unsure = [record for record in unsure if record not in needed]
+        self.failed += len(needed)
+        if needed and self.failed > self._max_failed:
+            raise FailedEpisodesError(self.failed, needed[-1].episode, needed[-1].reason)
 
     def store_rows(self, rows: int) -> None:
         """Store episodes until those before the first missing one have enough rows."""
@@ -96,19 +106,14 @@ class CampaignWriter:
 
         When this returns, a kill of the process loses nothing of it.
         """
-        surplus = self.rows - rows
-        if surplus > 0 and self._source is not None:
-            self.campaign.cut(self._dataset, surplus, self._source.sets)
+        if self._episodes is not None:
+            self.campaign.cut(self._dataset, rows)
         self._dataset.flush()
 
     @property
     def rows(self) -> int:
         """How many rows the campaign has."""
-        if self.campaign.mode not in self._dataset.modes:
-            return 0
-        known = self._dataset.recorded_episodes(self.campaign.mode)
-        own = known and known.rows[known.campaign == self.campaign.number]
-        return 0 if own is None else int(np.sum(own))
+        return self.campaign.rows(self._dataset)
 
     def prove_independence(self) -> None:
         """Simulate an episode again, if that costs little, and compare its rows.

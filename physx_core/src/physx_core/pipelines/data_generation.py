@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import math
 import shlex
 import warnings
 from collections.abc import Iterable, Mapping
@@ -102,6 +103,7 @@ class DataGeneration(NewSessionPipeline):
     _mode: str = field(init=False, repr=False, default="")
     _writer: CampaignWriter | None = field(init=False, repr=False, default=None)
     _first_row: int = field(init=False, repr=False, default=0)
+    _former_rows: int = field(init=False, repr=False, default=0)
 
     def __post_init__(self) -> None:
         """Check that the options ask for batches or for episodes.
@@ -167,7 +169,8 @@ class DataGeneration(NewSessionPipeline):
     def _cut(self, kind: type[BaseException] | None, *_: object) -> None:
         """Leave out what the last episodes have more than the batches, when the run is closed."""
         if kind is None and self._writer is not None:
-            self._writer.cut(self._first_row + self.batch_id * (self.batch_size or 0))
+            rows = self._first_row + self.batch_id * (self.batch_size or 0)
+            self._writer.cut(max(rows, self._former_rows))
 
     def data_generation_begin(self) -> None:
         """Called before the first batch."""
@@ -265,7 +268,7 @@ class DataGeneration(NewSessionPipeline):
         else:
             self.session = self._create_session()
         self.dataset = resources.enter_context(open_own(self.session, dataset_config))
-        self._writer, self._first_row, self.batch_id = None, 0, 0
+        self._writer, self._first_row, self.batch_id, self._former_rows = None, 0, 0, 0
         campaign = Campaign.last(self.dataset, self._mode, config) if self.resume else None
         self._open_environments(resources, config, dataset_config, campaign)
 
@@ -312,13 +315,18 @@ class DataGeneration(NewSessionPipeline):
             )
 
     def _larger_number(self) -> dict[str, int]:
-        """Return the number of episodes to record if it is larger than what this run asks for."""
+        """Return how much to record if the campaign was to have more than this run asks for."""
         file = self.session.path / "config.toml"
         former = read_toml(file).get(self.kind) if self.resume and file.exists() else None
         known = former if isinstance(former, dict) else {}
         mode = known.get("mode") or known.get("dataset", {}).get("mode", "training")
-        wanted = known.get("episodes") if mode == self._mode and self.episodes else None
-        return {} if not wanted else {"episodes": max(int(wanted), self.episodes or 0)}
+        if mode != self._mode:
+            return {}
+        if self.episodes:
+            return {"episodes": max(int(known.get("episodes", 0)), self.episodes)}
+        batches = {name: int(known.get(name, 0)) for name in ("batch_nb", "batch_size")}
+        self._former_rows = math.prod(batches.values())
+        return batches if self._former_rows > self._amount()[0] else {}
 
     def _offset(self) -> int:
         """Return how many rows or campaigns there are already, which get other random numbers."""

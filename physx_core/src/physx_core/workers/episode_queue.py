@@ -58,12 +58,21 @@ class EpisodeQueue:
             return range(number, number + 1)
         if self._gap == len(self._begins):
             return range(0)
-        first, end = max(self._next, int(self._begins[self._gap])), int(self._ends[self._gap])
+        first, end = self._first, int(self._ends[self._gap])
         numbers = range(first, min(first + most, end, self.end))
         if numbers:
             self._next = numbers.stop
             self._gap += self._next == end
         return numbers
+
+    @property
+    def _first(self) -> int:
+        """The first number that was never given out; there must be one."""
+        return max(self._next, int(self._begins[self._gap]))
+
+    def needs(self, number: int) -> bool:
+        """Return whether a number that has ended is known to be needed."""
+        return number < self.total
 
     def note(self, record: EpisodeRecord) -> None:
         """Note what became of a number, or of several."""

@@ -67,10 +67,15 @@ class LearnedSets:
         self._values: dict[int, Mapping[str, Any]] = {}
         self._before = self._state()
 
-    def choose(self, queue: RowQueue) -> int:
-        """Choose what can be chosen by now; return the first number that must wait."""
+    def choose(self, queue: RowQueue, stop: int) -> int:
+        """Choose for the numbers below `stop`, as far as possible; return the first one without.
+
+        Args:
+            queue: Knows which episodes have ended.
+            stop: Nothing is chosen from this number on, as it may not be needed.
+        """
         with self._changed:
-            while self._next - self._run_ahead <= queue.missing and self._has_losses(queue):
+            while self._next < stop and self._can_choose(queue):
                 while self._applied < self._known:
                     self._apply()
                 values = self._sampler.ask(self._next)
@@ -142,8 +147,10 @@ class LearnedSets:
         self._told = batches
         self._before = self._state()
 
-    def _has_losses(self, queue: RowQueue) -> bool:
+    def _can_choose(self, queue: RowQueue) -> bool:
         """Return whether the network has learned from all that the next set depends on."""
+        if self._next - self._run_ahead > queue.missing:
+            return False
         rows = queue.rows_before(self._next - self._run_ahead)
         while self._known < self._batch_nb and self._needed(self._known) <= rows:
             self._known += 1

@@ -126,10 +126,10 @@ class ParameterSets:
             self.learned = LearnedSets(self._sampler, self.parameters, needed, batch_nb, run_ahead)
             queue.choose = self._choose_learned
 
-    def _choose_learned(self, queue: RowQueue) -> int:
+    def _choose_learned(self, queue: RowQueue, stop: int) -> int:
         assert self.learned is not None
         with self._naming("of the next episode"):
-            return self.learned.choose(queue)
+            return self.learned.choose(queue, stop)
 
     def values_of(self, numbers: range) -> Batch:
         """Return the values of the parameters for episodes of a campaign; empty without any.

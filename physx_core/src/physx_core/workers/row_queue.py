@@ -27,10 +27,11 @@ class RowQueue(EpisodeQueue):
         goal: How many rows are wanted.
         rows: How many the episodes before the first missing number have.
         missing: The first missing number.
-        choose: Returns the first number whose parameters cannot be chosen yet; None: all can.
+        choose: Chooses parameters of numbers below another one; returns the first number without.
+            None: all can be chosen at any time.
     """
 
-    choose: Callable[[RowQueue], int] | None = None
+    choose: Callable[[RowQueue, int], int] | None = None
 
     def __init__(
         self, goal: int, recorded: Collection[EpisodeRecord] = (), retries: int = 1
@@ -70,9 +71,10 @@ class RowQueue(EpisodeQueue):
         fills_gap = self._returned or self._next <= self._last
         if not fills_gap and self._expected >= self.goal:
             return range(0)
+        most = min(most, max(1, self.waiting))
         if self.choose is not None:
-            self.end = self.choose(self)
-        found = super().take_range(min(most, max(1, self.waiting)))
+            self.end = self.choose(self, self._first + most)
+        found = super().take_range(most)
         self._taken += len(found)
         return found
 
@@ -96,6 +98,10 @@ class RowQueue(EpisodeQueue):
                 f"{_MOST_EMPTY} episodes have no row, so there would never be {self.goal} rows: "
                 "call set_training_data() in the step that calls end_episode()."
             )
+
+    def needs(self, number: int) -> bool:
+        """Return whether a number is known to be needed: those before it have too few rows."""
+        return number < self.missing and self.rows_before(number) < self.goal
 
     def rows_before(self, number: int) -> int:
         """Return how many rows the episodes before a number have, of those that have ended."""
