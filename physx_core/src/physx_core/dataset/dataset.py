@@ -42,7 +42,7 @@ from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError, UsageError
 from physx_core.fields import Field
 from physx_core.statistics import Normalization
-from physx_core.typing import Batch
+from physx_core.typing import Array, Batch
 
 MAX_FILE_SIZE = 0.25
 
@@ -364,6 +364,34 @@ class Dataset(Closeable):
                 parts.append(records_at(order, places, whole, table, is_open=False))
         return {name: np.concatenate([part[name] for part in parts]) for name in table}
 
+    def episode_values(self, mode: str, name: str, rows: Any) -> Array:
+        """Return what the episode of each row has once: a parameter, or a field of its own.
+
+        Args:
+            mode: Name of a mode of independent episodes.
+            name: Name of a field of the mode ``episodes``.
+            rows: Numbers of rows, shape (n,), or a slice.
+
+        Returns:
+            Shape (n, *field shape); 0 for rows of streams.
+
+        Raises:
+            DatasetError: If there is no such mode or field, the mode has no episodes, or the table
+                of episodes is damaged.
+            IndexError: If there is no such row.
+        """
+        self._prepare_reading()
+        order = self._reader.order(mode)
+        if order is None:
+            self._reader.mode(mode)  # there must be one
+            raise DatasetError(f'The rows of mode "{mode}" have no recorded episodes.')
+        numbers = row_numbers(rows, order.rows)
+        entries = np.searchsorted(order.episodes.first, numbers, "right") - 1
+        records = self._reader.orders.places(mode)[order.found.last]
+        once, places = np.unique(entries, return_inverse=True)
+        values: Array = self[EPISODES][name][records[once]][places]
+        return values
+
     def progress(self, mode: str) -> list[Progress]:
         """Return how many episodes of each campaign of a mode have ended; none without records.
 
@@ -530,6 +558,7 @@ class Dataset(Closeable):
         rows: Mapping[str, Any],
         episodes: Sequence[EpisodeRecord],
         *,
+        episode_fields: Iterable[Field] = (),
         checked: bool = False,
     ) -> None:
         """Store rows of independent episodes, and what is recorded of these.
@@ -548,6 +577,8 @@ class Dataset(Closeable):
                 there are no rows.
             episodes: The episodes, or parts of them, that the rows belong to, in order. The first
                 ones of a dataset determine which parameters all must have.
+            episode_fields: Those of role ``episode`` that records may have, all or none; the first
+                call for a dataset determines them. Of a record without them, 0 is stored.
             checked: Whether the rows are known to be finite, as in `append`.
 
         Raises:
@@ -559,7 +590,9 @@ class Dataset(Closeable):
                 one before, or if the dataset is closed, open for reading only, or shared.
         """
         self._as_only_writer("store episodes")
-        self._for_writing().append_episodes(mode, rows, episodes, checked=checked)
+        self._for_writing().append_episodes(
+            mode, rows, episodes, episode_fields=episode_fields, checked=checked
+        )
 
     def stripes(self, mode: str, count: int) -> Stripes:
         """Let `count` other processes write the rows of a mode from now on, in turn.

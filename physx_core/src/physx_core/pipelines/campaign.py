@@ -11,8 +11,9 @@ import numpy as np
 
 from physx_core.components.parameter import Parameter
 from physx_core.config import WRONG, EnvironmentConfig
-from physx_core.dataset import Dataset, EpisodeRecord, EpisodeStatus
+from physx_core.dataset import EPISODES, Dataset, EpisodeRecord, EpisodeStatus
 from physx_core.errors import ConfigError, DatasetError, listed
+from physx_core.fields import Field
 from physx_core.pipelines.storage import describe_environment
 from physx_core.typing import Batch, Index
 from physx_core.workers.lease import Lease
@@ -49,7 +50,11 @@ class Campaign:
         return sum(each.mode == mode for each in _recorded(dataset))
 
     def store_rejected(
-        self, dataset: Dataset, rows: Batch, records: Sequence[EpisodeRecord]
+        self,
+        dataset: Dataset,
+        rows: Batch,
+        records: Sequence[EpisodeRecord],
+        episode_fields: Sequence[Field],
     ) -> None:
         """Store samples that `check_sample` rejected, by number.
 
@@ -59,18 +64,19 @@ class Campaign:
         Args:
             dataset: The dataset, open for writing, in which the mode has its fields.
             rows: The samples.
-            records: Records of the episodes that they belong to.
+            records: Records of the episodes that they belong to, the last part of each last.
+            episode_fields: What each episode has once.
         """
         campaign, numbers = _recorded(dataset).index(self), rows["episode"]
         begins = np.flatnonzero(np.diff(numbers, prepend=-1))
         counts, found = np.diff(begins, append=len(numbers)).tolist(), []
         for number, count in zip(numbers[begins].tolist(), counts, strict=True):
-            of = next(each for each in records if 0 <= number - each.episode < each.count)
+            of = next(each for each in records[::-1] if 0 <= number - each.episode < each.count)
             where: Any = number - of.episode if of.count > 1 else ()
             values = {name: np.asarray(each)[where] for name, each in of.parameters.items()}
             own = {"episode": number, "rows": count, "campaign": campaign}
-            found.append(EpisodeRecord(**own, parameters=values))
-        dataset.append_episodes(WRONG, rows, found, checked=True)
+            found.append(EpisodeRecord(**own, parameters=values, fields=of.fields))
+        dataset.append_episodes(WRONG, rows, found, episode_fields=episode_fields, checked=True)
 
     @classmethod
     def begin(
@@ -191,6 +197,8 @@ class Campaign:
             else:
                 kept, cut = rows - left_out, range(number, number + 1)
             lease = Lease(cut, sets.values_of(cut))
+            names = [f.name for f in dataset.fields(EPISODES).values() if f.role == "episode"]
+            fields = {n: dataset.episode_values(self.mode, n, [first])[0] for n in names}
             records = [
                 EpisodeRecord(
                     episode=each,
@@ -198,6 +206,7 @@ class Campaign:
                     campaign=self.number,
                     status=EpisodeStatus.CUT,
                     parameters=lease.parameters(each, 1),
+                    fields=fields,
                 )
                 for each in cut
             ]
