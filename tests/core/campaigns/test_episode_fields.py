@@ -74,6 +74,10 @@ def meet(case, trouble):
 class Single(Case):
     episode_steps = 1
 
+class Picky(Case):
+    def check_sample(self):
+        return self.left == 0
+
 class Stream(Case):
     independent_episodes = False
 
@@ -248,6 +252,17 @@ def test_replayed_rows_get_parameters_without_them():
     with Dataset.open("sessions/chosen") as dataset:
         found = find_sets(dataset, "training").of(np.arange(2), {})
     assert list(found)[1:] == ["parameters/p"]
+
+
+def test_rejected_samples_have_those_of_their_episode():
+    made = dataclasses.replace(config("Picky"), record_wrong_samples=True)
+    generate(made)
+    with Dataset.open("sessions/run") as dataset:
+        numbers = dataset["wrong"]["episode"][:]
+        assert len(numbers) > 2
+        found = dataset.episode_values("wrong", "fixed", slice(None))
+        assert found.tolist() == (10 * numbers).tolist()
+    check()
 
 
 # Mistakes ----------------------------------------------------------------------------------------

@@ -364,13 +364,20 @@ class Dataset(Closeable):
                 parts.append(records_at(order, places, whole, table, is_open=False))
         return {name: np.concatenate([part[name] for part in parts]) for name in table}
 
+    @property
+    def episode_fields(self) -> dict[str, Field]:
+        """The fields that each independent episode has once, by name."""
+        mode = self._manifest.modes.get(EPISODES)
+        fields = mode.fields if mode is not None and self.has_episodes else {}
+        return {name: field for name, field in fields.items() if field.role == "episode"}
+
     def episode_values(self, mode: str, name: str, rows: Any) -> Array:
         """Return what the episode of each row has once: a parameter, or a field of its own.
 
         Args:
             mode: Name of a mode of independent episodes.
             name: Name of a field of the mode ``episodes``.
-            rows: Numbers of rows, shape (n,), or a slice.
+            rows: A row's number, numbers of shape (n,), or a slice.
 
         Returns:
             Shape (n, *field shape); 0 for rows of streams.

@@ -11,7 +11,7 @@ import numpy as np
 
 from physx_core.components.parameter import Parameter
 from physx_core.config import WRONG, EnvironmentConfig
-from physx_core.dataset import EPISODES, Dataset, EpisodeRecord, EpisodeStatus
+from physx_core.dataset import Dataset, EpisodeRecord, EpisodeStatus
 from physx_core.errors import ConfigError, DatasetError, listed
 from physx_core.fields import Field
 from physx_core.pipelines.storage import describe_environment
@@ -197,8 +197,8 @@ class Campaign:
             else:
                 kept, cut = rows - left_out, range(number, number + 1)
             lease = Lease(cut, sets.values_of(cut))
-            names = [f.name for f in dataset.fields(EPISODES).values() if f.role == "episode"]
-            fields = {n: dataset.episode_values(self.mode, n, [first])[0] for n in names}
+            names = dataset.episode_fields
+            fields = {n: dataset.episode_values(self.mode, n, first)[0] for n in names}
             records = [
                 EpisodeRecord(
                     episode=each,

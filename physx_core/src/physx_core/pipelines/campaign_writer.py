@@ -7,7 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from physx_core.config import WRONG
-from physx_core.dataset import EPISODES, TABLE_FIELDS, Dataset, EpisodeStatus
+from physx_core.dataset import TABLE_FIELDS, Dataset, EpisodeStatus
 from physx_core.dataset.store.definitions import compare_fields
 from physx_core.errors import ConfigError, FailedEpisodesError
 from physx_core.pipelines.campaign import Campaign
@@ -74,9 +74,8 @@ class CampaignWriter:
                 "something else that is recorded of each episode: rename it."
             )
         if self._dataset.has_episodes:
-            stored = self._dataset.fields(EPISODES).values()
-            known = {field.name: field for field in stored if field.role == "episode"}
-            own = {field.name: field for field in source.episode_fields}
+            known, given = self._dataset.episode_fields, source.episode_fields
+            own = {field.name: field for field in given}
             compare_fields(f"The table of episodes in {self._dataset.directory}", known, own)
 
     def store(self) -> int:

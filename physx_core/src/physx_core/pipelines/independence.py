@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from physx_core.dataset import EPISODES, Dataset, EpisodeStatus
+from physx_core.dataset import Dataset, EpisodeStatus
 from physx_core.errors import DependentEpisodeError
 from physx_core.sources.episode_source import EpisodeSource
 from physx_core.typing import Array, Batch
@@ -90,6 +90,5 @@ def _stored(dataset: Dataset, mode: str, campaign: int, number: int) -> Batch:
     first = int(known.first[place] + (number - known.episode[place] if several else 0))
     end = first + (1 if several else int(known.rows[place]))
     data = dataset[mode]
-    names = [f.name for f in dataset.fields(EPISODES).values() if f.role == "episode"]
-    once = {name: dataset.episode_values(mode, name, [first]) for name in names}
+    once = {name: dataset.episode_values(mode, name, first) for name in dataset.episode_fields}
     return {name: data[name][first:end] for name in data} | once

@@ -125,9 +125,8 @@ def find_sets(dataset: Dataset, mode: str) -> StoredSets | RecordedSets | None:
 
 def _parameters(dataset: Dataset) -> list[str]:
     """Return the names of the parameters in the table of episodes."""
-    own = {field.name for field in TABLE_FIELDS}
-    fields = dataset.fields(EPISODES).values()
-    return [field.name for field in fields if field.name not in own and field.role != "episode"]
+    others = {field.name for field in TABLE_FIELDS} | dataset.episode_fields.keys()
+    return [name for name in dataset.fields(EPISODES) if name not in others]
 
 
 def _runs(first: Index, order: Array, count: int) -> Index:

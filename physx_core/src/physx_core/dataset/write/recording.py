@@ -232,8 +232,9 @@ def table_rows(
         episodes: The records.
     """
     own = [field.name for field in TABLE_FIELDS]
-    once = {name: field for name, field in fields.items() if field.role == "episode"}
-    parameters = {n: field for n, field in fields.items() if n not in own and n not in once}
+    others = {name: field for name, field in fields.items() if name not in own}
+    once = {name: field for name, field in others.items() if field.role == "episode"}
+    parameters = {name: field for name, field in others.items() if name not in once}
     for each in episodes:
         if each.parameters or parameters:
             check_names(parameters, each.parameters)
