@@ -4,19 +4,24 @@ import h5py
 import numpy as np
 import pytest
 
-from physx_core import Dataset
+from physx_core import Dataset, Field
 from physx_core.dataset import EPISODES, EpisodeRecord, EpisodeStatus
 from physx_formats import ExchangeError, episodes, export, import_file
 
 pytestmark = pytest.mark.processes
+MESH = Field("mesh", (2,), "f4", "m", role="episode")
 
 
 def store(dataset, mode, episode, values, **options):
     parameters = {"mass": 0.1 * episode, "at": np.array([episode, -1.0], "f4")}
+    has_ended = options.get("status") not in (EpisodeStatus.FAILED, EpisodeStatus.MORE)
+    fields = {"mesh": [episode, 0.5]} if has_ended else {}
     record = EpisodeRecord(
-        episode=episode, rows=len(values), parameters=parameters, seconds=0.3, **options
-    )
-    dataset.append_episodes(mode, {"x": np.array(values, float)}, [record])
+        episode=episode, rows=len(values), parameters=parameters, fields=fields, seconds=0.3,
+        **options,
+    )  # fmt: skip
+    rows = {"x": np.array(values, float)}
+    dataset.append_episodes(mode, rows, [record], episode_fields=[MESH])
 
 
 @pytest.fixture
@@ -40,7 +45,8 @@ def look(dataset, modes=("training", "validation")):
     table = dataset.episode_table(modes)
     kept = table["rows"] + (table["status"] != EpisodeStatus.STREAM) > 0  # no stream without rows
     table = {name: column[kept] for name, column in table.items()}
-    fields = {name: field.dtype for name, field in dataset.fields(EPISODES).items()}
+    fields = dict(dataset.fields(EPISODES))
+    assert fields["mesh"] == MESH
     rows = [dataset[mode]["x"][:].tobytes() for mode in modes]
     stream = table["status"] == EpisodeStatus.STREAM
     for name in ("campaign", *(table.keys() - {"mode_index", "rows", "first_row", "status"})):

@@ -47,11 +47,13 @@ class Results:
         rows: Number of an episode that finished to its rows.
         failed: Number of an episode that failed to the reason.
         parameters: Number to parameters.
+        fields: Number to the fields that the episode has once.
         records: All records.
     """
 
     def __init__(self):
         self.rows, self.failed, self.parameters, self.records = {}, {}, {}, []
+        self.fields = {}
         self._parts = {}
 
     def take_all(self, source, queue):
@@ -102,6 +104,7 @@ class Results:
         assert columns.get("episode", []) == [number] * len(parts[-1])
         if record.status is EpisodeStatus.FINISHED:
             self.rows[number] = [row for part in self._parts.pop(number) for row in part]
+            self.fields[number] = dict(record.fields)
             own = () if record.count == 1 else number - record.episode
             self.parameters[number] = {n: np.asarray(v)[own] for n, v in record.parameters.items()}
 

@@ -51,6 +51,8 @@ def result(run):
         assert dataset.verify() == []
         data = dataset["training"]
         found = {name: data[name][:].tobytes() for name in data}
+        numbers = dataset.episode_values("training", "number", slice(None))
+        assert numbers.tolist() == data["episode"][:].tolist()
     if run.online != "physx/stream":
         found["drawn"] = read_drawn_rows(run.session.path).tobytes()
     return found | {"weights": run.learner.network.weights.tobytes()}

@@ -6,7 +6,7 @@ import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal, TypeAlias, get_args
 
 import numpy as np
 from numpy.typing import DTypeLike
@@ -15,7 +15,8 @@ from physx_core import checks
 from physx_core.errors import ConfigError, FieldShapeError, FieldTypeError, NotFiniteError
 from physx_core.typing import Array
 
-Role: TypeAlias = Literal["training", "additional"]
+Role: TypeAlias = Literal["training", "additional", "episode"]
+ROLES: tuple[Role, ...] = get_args(Role)
 
 RESERVED = ("env_id", "episode", "step")
 """Fields that physx adds to each row: number of the instance, its trajectory, and its step."""
@@ -41,7 +42,8 @@ class Field:
         shape: Shape of one sample's value. None: taken from the first sample.
         dtype: NumPy type: any plain boolean, integer, floating-point, or complex type.
         unit: Unit of the values, for example ``"N m"``; empty for dimensionless numbers.
-        role: ``training`` for data that networks read, ``additional`` for everything else.
+        role: ``training`` for data that networks read, ``episode`` for what a whole independent
+            episode has once, ``additional`` for everything else.
     """
 
     name: str

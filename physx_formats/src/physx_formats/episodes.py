@@ -58,6 +58,7 @@ class EpisodeCopier:
         mode: str,
         fields: Mapping[str, Field],
         columns: Columns,
+        table: Mapping[str, Field],
         advance: Advance,
     ) -> None:
         """Prepare the mode.
@@ -67,12 +68,14 @@ class EpisodeCopier:
             mode: Name of the mode.
             fields: Its fields.
             columns: Its columns, read from the first row on.
+            table: The fields of the records.
             advance: Called with the number of bytes stored.
         """
         dataset.define_fields(mode, fields.values())
         self._dataset, self._mode, self._columns = dataset, mode, columns
         self._step = rows_per_block(sum(field.nbytes for field in fields.values()), BLOCK)
         self._advance, self._done = advance, 0
+        self._once = [field for field in table.values() if field.role == "episode"]
         known = dataset.recorded_episodes(mode)
         self._shift = int(dataset.num_samples(mode) > 0)
         if known is not None:
@@ -104,6 +107,7 @@ class EpisodeCopier:
     def _parts(self, record: Batch) -> Iterator[EpisodeRecord]:
         """Yield the record of episodes, or several if they have many rows: parts, or ranges."""
         rows, is_range = int(record["rows"]), record["count"] > 1
+        taken = [*_OWN, *(field.name for field in self._once)]
         status = EpisodeStatus(int(record["status"]))
         for part, start in enumerate(range(0, max(rows, 1), self._step)):
             size, is_last = min(self._step, rows - start), start + self._step >= rows
@@ -115,13 +119,14 @@ class EpisodeCopier:
                 part=0 if is_range else part,
                 status=status if is_last or is_range else EpisodeStatus.MORE,
                 seconds=float(record["seconds"]) if is_last else 0.0,
-                parameters={name: value for name, value in record.items() if name not in _OWN},
+                parameters={name: value for name, value in record.items() if name not in taken},
+                fields={} if is_range else {each.name: record[each.name] for each in self._once},
             )
 
     def _store(self, waiting: list[EpisodeRecord]) -> None:
         """Store episodes, and forget them."""
         rows = self._read(sum(each.rows for each in waiting))
-        self._dataset.append_episodes(self._mode, rows, waiting)
+        self._dataset.append_episodes(self._mode, rows, waiting, episode_fields=self._once)
         waiting.clear()
 
     def _store_stream(self, rows: int) -> None:

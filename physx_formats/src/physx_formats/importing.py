@@ -79,8 +79,8 @@ def import_file(
                 if name not in records
             }
             for name, entries in records.items():
-                copier = EpisodeCopier(dataset, name, tables[name], modes[name], advance)
-                done[name] = copier.copy(entries)
+                own = (tables[name], modes[name], tables[EPISODES])
+                done[name] = EpisodeCopier(dataset, name, *own, advance).copy(entries)
             return done
 
 

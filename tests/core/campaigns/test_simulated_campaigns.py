@@ -126,7 +126,8 @@ def test_rows_do_not_depend_on_who_is_lost(choose, total, fates, count, pace):
     given = {number: each for number, each in enumerate(fates, 1) if number <= count}
     with Simulation(choose) as simulation:
         try:
-            results = simulate(simulation, total, count, fates=given, env_kwargs={"pace": pace})
+            kwargs = {"pace": pace, "once": True}
+            results = simulate(simulation, total, count, fates=given, env_kwargs=kwargs)
         except PhysxError as error:
             # More idle clients were lost than there are: something else is wrong with them.
             idle = [f for each in given.values() for f in each if f.began is not None]
@@ -134,6 +135,7 @@ def test_rows_do_not_depend_on_who_is_lost(choose, total, fates, count, pace):
             return
     met = [fate for each in given.values() for fate in each if fate.began is not None]
     check(results, total, lost=range(total))
+    assert results.fields == {number: {"number": number} for number in results.rows}
     assert len(results.failed) <= len(met) // 2  # each was lost twice
 
 

@@ -7,12 +7,13 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from physx_core import Dataset, files
+from physx_core import Dataset, Field, files
 from physx_core.dataset import EPISODES, EpisodeRecord, EpisodeStatus
 from physx_core.errors import DatasetError, DatasetLockedError, UsageError
 
 SIZE = (2**14 + 8 * 40) * 1e-9
 MORE, FAILED = EpisodeStatus.MORE, EpisodeStatus.FAILED
+MESH = Field("mesh", (2,), role="episode")
 
 
 @pytest.fixture
@@ -22,10 +23,14 @@ def folder(tmp_path):
 
 def store(dataset, episode, values, mass=None, **options):
     parameters = {"mass": float(episode if mass is None else mass)}
+    has_ended = options.get("status") not in (FAILED, MORE)
+    fields = {"mesh": [episode, len(values)]} if has_ended else {}
     record = EpisodeRecord(
-        episode=episode, rows=len(values), parameters=parameters, seconds=0.5, **options
-    )
-    dataset.append_episodes("training", {"x": np.array(values, float)}, [record])
+        episode=episode, rows=len(values), parameters=parameters, fields=fields, seconds=0.5,
+        **options,
+    )  # fmt: skip
+    rows = {"x": np.array(values, float)}
+    dataset.append_episodes("training", rows, [record], episode_fields=[MESH])
 
 
 def fill(dataset):
@@ -49,6 +54,7 @@ def contents(dataset):
         dataset["training"]["x"][:].tolist(),
         [column.tolist() for column in known],
         [masses[episode] for episode in known.episode.tolist() if episode >= 0],
+        dataset.episode_values("training", "mesh", slice(None)).tolist(),
         dataset.failed_episodes("training"),
         [array.tobytes() for array in dataset.normalization["x"].arrays().values()],
     )

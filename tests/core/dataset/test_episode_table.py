@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from physx_core import Dataset
+from physx_core import Dataset, Field
 from physx_core.dataset import EPISODES, EpisodeRecord, EpisodeStatus, FailedEpisode, Progress
 from physx_core.dataset.read import virtual_index
 from physx_core.dataset.store import locks
@@ -18,7 +18,9 @@ from physx_core.dataset.write.stripe_writer import StripeWriter
 from physx_core.errors import (
     ConfigError,
     DatasetError,
+    FieldShapeError,
     FieldsMismatchError,
+    FieldTypeError,
     MissingFieldError,
     NotFiniteError,
     UnknownFieldError,
@@ -405,3 +407,67 @@ def test_the_virtual_index_says_that_rows_lie_in_too_many_pieces(folder, monkeyp
     with h5py.File(folder / "run.h5") as file:
         assert not list(file["training"]) and file["training"].attrs["pieces"] == 3
         assert file[EPISODES]["episode"][:].tolist() == [-1, 2, 1, 0]
+
+
+# Fields of episodes -----------------------------------------------------------------------------
+
+MESH = [
+    Field("mesh", (2,), "float32", "m", role="episode"),
+    Field("sets", (), "int8", role="episode"),
+]
+
+
+def meshed(dataset, episode, *values, fields=None, **options):
+    fields = {"mesh": [episode, -1], "sets": episode} if fields is None else fields
+    record = EpisodeRecord(episode=episode, rows=len(values), fields=fields, **options)
+    dataset.append_episodes("training", x(*values), [record], episode_fields=MESH)
+
+
+def test_fields_that_an_episode_has_once_are_found_by_row(folder):
+    with Dataset.create(folder) as dataset:
+        dataset.append("training", x(-1))
+        meshed(dataset, 2, 20, 21)
+        meshed(dataset, 0, fields={}, status=FAILED)
+        meshed(dataset, 1, 10, fields={}, status=MORE)
+        meshed(dataset, 3)
+        meshed(dataset, 1, 11, 12, part=1)
+        expected = [0, 1, 1, 1, 2, 2]
+        assert dataset.episode_values("training", "sets", slice(None)).tolist() == expected
+        found = dataset.episode_values("training", "mesh", [5, 0, -3])
+        assert (found.tolist(), found.dtype) == ([[2, -1], [0, 0], [1, -1]], np.float32)
+        assert dataset.episode_values("training", "mesh", []).shape == (0, 2)
+        with pytest.raises(IndexError):
+            dataset.episode_values("training", "mesh", [6])
+    Dataset.rebuild(folder)
+    with Dataset.open(folder) as dataset:
+        assert dataset.verify() == []
+        assert [dataset.fields(EPISODES)[field.name] for field in MESH] == MESH
+        assert dataset.episode_values("training", "sets", slice(None)).tolist() == expected
+
+
+def test_fields_that_an_episode_has_once_are_checked(folder):
+    with Dataset.create(folder) as dataset:
+        meshed(dataset, 0, 1)
+        for error, fields in [
+            (MissingFieldError, {"mesh": [0, 0]}),
+            (UnknownFieldError, {"mesh": [0, 0], "sets": 0, "more": 0}),
+            (FieldShapeError, {"mesh": [0, 0, 0], "sets": 0}),
+            (FieldTypeError, {"mesh": [0, 0], "sets": 1000}),
+            (NotFiniteError, {"mesh": [0, np.inf], "sets": 0}),
+        ]:
+            with pytest.raises(error):
+                meshed(dataset, 1, 2, fields=fields)
+        with pytest.raises(ConfigError, match="no such episode"):
+            meshed(dataset, 1, 2, 3, count=2)
+        meshed(dataset, 1, 2, 3, count=2, fields={})
+        assert read(dataset) == [1, 2, 3]
+        assert dataset.episode_values("training", "sets", slice(None)).tolist() == [0, 0, 0]
+
+
+def test_values_of_episodes_need_episodes(folder):
+    with Dataset.create(folder) as dataset:
+        dataset.append("training", x(1))
+        with pytest.raises(DatasetError, match="no recorded episodes"):
+            dataset.episode_values("training", "mesh", [0])
+        with pytest.raises(DatasetError):
+            dataset.episode_values("validation", "mesh", [0])

@@ -32,12 +32,13 @@ class Troubled(Environment):
         parameters=False,
         log="",
         long=0.0,
+        once=False,
         **kwargs,
     ):
         super().__init__(**kwargs)
         self.troubles, self.least, self.most, self.width = troubles or {}, least, most, width
         self.pace, self.sleep, self.has_parameters, self.log = pace, sleep, parameters, log
-        self.long = long
+        self.long, self.once = long, once
         self.stepped = 0
 
     def create(self):
@@ -46,12 +47,16 @@ class Troubled(Environment):
 
     def init_database(self):
         self.define_training_fields([("x", np.ndarray), ("n", int)])
+        if self.once:
+            self.define_episode_fields(("number", int))
 
     def reset_parameters(self, height=0.0):
         number = self.episode_index
         if simulation := current():
             simulation.ready.append(simulation.running)
         self.kind, self.at = self.troubles.get(str(number), ("", 0))
+        if self.once:
+            self.set_episode_data(number=number)
         if self.log:
             with Path(self.log).open("a") as file:
                 file.write(f"{number}\n")

@@ -99,9 +99,13 @@ class Lesson(Environment):
 
     def init_database(self):
         self.define_training_fields([Field("x", (2,)), Field("y", (1,))])
+        if not self.asks:
+            self.define_episode_fields(("number", int))
 
     def reset_parameters(self, slope):
         self.slope, self.left = slope, int(self.rng.integers(1, 6))
+        if not self.asks:
+            self.set_episode_data(number=self.episode_index)
         self.note("begun")
 
     def step(self):

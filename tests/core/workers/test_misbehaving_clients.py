@@ -7,15 +7,20 @@ it misbehaves.
 from __future__ import annotations
 
 import contextlib
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 from simulated import HOST
 
 from physx_core import Dataset, Field
-from physx_core.errors import ClientError, NotFiniteError
+from physx_core.dataset import EpisodeStatus
+from physx_core.errors import ClientError, ConnectionRefusedByPeerError, NotFiniteError
 from physx_core.net import HEADER, Kind, encode, introduce, pack, retry
+from physx_core.net.frames import Frame
 from physx_core.rows import ROW_FIELDS
+from physx_core.workers.episode_queue import EpisodeQueue
+from physx_core.workers.server.leases import Leases
 
 TOKEN, PORT = "a token for this test", 1
 DEFINED = [Field("x", shape=(2,)), Field("flag", shape=(), dtype="bool")]
@@ -176,6 +181,15 @@ BEFORE = {
         "shape is (-1,) but must not be negative",
     ),
     "a shape in words": (plain_fields(Kind.READY, {**X, "shape": "2"}), "is malformed"),
+    "fields of episodes alone": (plain_fields(Kind.READY, {**X, "role": "episode"}), "only fields"),
+    "an open field of episodes": (
+        plain_fields(Kind.READY, X, {"name": "y", "dtype": "<f8", "role": "episode"}),
+        "without shape",
+    ),
+    "a field of episodes that is too large": (
+        plain_fields(Kind.READY, X, {**X, "name": "y", "role": "episode", "shape": [2**40]}),
+        "the limit is",
+    ),
 }
 
 
@@ -231,3 +245,41 @@ def test_client_that_reads_no_answers_is_disconnected(run_with, services):
     requests = b"".join(pack(Kind.LOAD, encode(None), number) for number in range(1, 20))
     error, _ = run_with((0, READY), (1, requests), deaf=True)
     assert "does not read the answers" in str(error)
+
+
+MESH = [Field("mesh", (2,), role="episode"), Field("good", (), "bool", role="episode")]
+VALUES = {"mesh": np.zeros(2), "good": np.array(True)}
+ENDED = {
+    "without its fields": ({}, "the fields"),
+    "of other fields": ({"mesh": np.zeros(2), "bad": np.array(True)}, "the fields"),
+    "of further fields": ({**VALUES, "more": np.zeros(2)}, "the fields"),
+    "of another shape": ({**VALUES, "mesh": np.zeros(3)}, "the fields"),
+    "of another type": ({**VALUES, "mesh": np.zeros(2, "f4")}, "the fields"),
+    "of lists": ({**VALUES, "mesh": [0.0, 0.0]}, "impossible episodes"),
+    "of no dictionary": ([1], "impossible episodes"),
+    "that is not finite": ({**VALUES, "mesh": np.array([0, np.inf])}, "infinite"),
+    "neither true nor false": ({**VALUES, "good": np.array(2, "u1").view("?")}, "neither 0 nor 1"),
+}
+
+
+@pytest.mark.parametrize("case", ["good", "failed with fields", *ENDED])
+def test_malformed_fields_of_episodes_are_refused(case):
+    pace = SimpleNamespace(go_on=lambda: None)
+    peer = SimpleNamespace(instance_id=1, parameters=[], row_fields=[], episode_fields=MESH,
+                           send=lambda message: None, pace=pace, received=0)  # fmt: skip
+    leases = Leases(EpisodeQueue(3), lambda numbers: {})
+    leases.grant(peer, 1)
+    values, text = ENDED.get(case, (VALUES, "the fields"))
+    status = EpisodeStatus.FAILED if case.startswith("failed") else EpisodeStatus.FINISHED
+    payload = encode([(0, 1, 0, 0, int(status), 0.5, "", values)])
+    frame = Frame(Kind.EPISODES, 0, bytearray(payload))
+    if case == "good":
+        leases.dispatch[Kind.EPISODES](peer, frame)
+        (record,) = leases.blocks[0].records
+        assert {name: value.tolist() for name, value in record.fields.items()} == {
+            "mesh": [0, 0],
+            "good": True,
+        }
+        return
+    with pytest.raises((ConnectionRefusedByPeerError, NotFiniteError), match=text):
+        leases.dispatch[Kind.EPISODES](peer, frame)

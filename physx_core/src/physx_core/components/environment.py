@@ -26,7 +26,7 @@ from physx_core.errors import (
 )
 from physx_core.fields import NO_ARRAY, Field, FieldLike, as_fields, is_finite
 from physx_core.random_streams import NumberedStreams
-from physx_core.rows import infer_shapes
+from physx_core.rows import check_names, infer_shapes
 from physx_core.typing import Array, Sample
 
 if TYPE_CHECKING:
@@ -184,6 +184,8 @@ class Environment(Closeable):
         self._has_read_sample = False
         self._sample: Sample | None = None
         self._fields: dict[str, Field] = {}
+        self._episode_fields: dict[str, Field] = {}
+        self._episode_data: dict[str, Array] = {}
         self._has_open_shapes = False
         self._training: dict[str, Any] | None = None
         self._additional: dict[str, Any] | None = None
@@ -313,8 +315,13 @@ class Environment(Closeable):
 
     @property
     def fields(self) -> list[Field]:
-        """The defined fields, in the order of definition."""
+        """The defined fields of rows, in the order of definition."""
         return list(self._fields.values())
+
+    @property
+    def episode_fields(self) -> list[Field]:
+        """The defined fields of episodes, in the order of definition."""
+        return list(self._episode_fields.values())
 
     def define_training_fields(self, fields: FieldLike | Iterable[FieldLike]) -> None:
         """Define fields that networks read: see `physx_core.fields.as_fields`.
@@ -331,6 +338,27 @@ class Environment(Closeable):
             ConfigError: If a field is malformed, reserved or defined twice.
         """
         self._define(as_fields(fields, "additional"))
+
+    def define_episode_fields(self, fields: FieldLike | Iterable[FieldLike]) -> None:
+        """Define fields that an independent episode has once, for example its geometry.
+
+        They are stored in the mode ``episodes``; `set_episode_data` sets them.
+
+        Raises:
+            ConfigError: If a field is malformed, reserved or defined twice, or has no shape.
+            UsageError: If episodes are not independent.
+        """
+        given = as_fields(fields, "episode")
+        if not self.independent_episodes:
+            raise UsageError(
+                f"{type(self).__name__} called define_episode_fields(), but is a stream: define "
+                "additional fields, which each row has, or set independent_episodes = True if "
+                "nothing but an episode's parameters and random stream influences its rows."
+            )
+        for field in given:
+            if field.shape is None:
+                raise ConfigError(f'The field "{field.name}" of episodes needs a shape.')
+        self._define(given, self._episode_fields)
 
     def define_parameters(self, parameters: Parameter | Iterable[Parameter]) -> None:
         """Define properties of the simulation that are chosen for each episode.
@@ -397,6 +425,31 @@ class Environment(Closeable):
         """Set this step's additional data: every additional field, as arrays or numbers."""
         self._additional = fields
 
+    def set_episode_data(self, **fields: Any) -> None:
+        """Set fields of this independent episode, all at once or one by one, at any time in it.
+
+        The last value of each counts; its array may be changed afterwards. Where rows are not
+        stored with their episode, as in a prediction, this does nothing else than to check them.
+
+        Raises:
+            SampleError: If a field is not one of `episode_fields`, of the wrong shape or type, or
+                holds NaN or infinity.
+            UsageError: If no episode has begun.
+        """
+        if not self._has_begun_episodes:
+            raise UsageError(
+                "set_episode_data() was called before the first episode: call it in "
+                "reset_parameters() or step()."
+            )
+        for name, value in fields.items():
+            if name not in self._episode_fields:
+                check_names(self._episode_fields, [name])
+            field = self._episode_fields[name]
+            values = np.array(field.convert(value))
+            if not is_finite(values):
+                raise field.not_finite()
+            self._episode_data[name] = values
+
     def get_prediction(self, **fields: Any) -> Sample:
         """Return the network's prediction within a step, in physical units.
 
@@ -445,8 +498,8 @@ class Environment(Closeable):
         if self.independent_episodes and self._has_begun_episodes:
             raise UsageError(
                 f"{type(self).__name__} called save_parameters() in an independent episode: call "
-                "it in create() or init(), and store what belongs to an episode in an additional "
-                "field."
+                "it in create() or init(), and set what belongs to an episode with "
+                "set_episode_data()."
             )
         self._run().save_parameters(self._saves_as, values)
 
@@ -541,6 +594,7 @@ class Environment(Closeable):
         self._earlier_steps += self.step_index
         self.step_index, self.episode_index = 0, number
         self._has_begun_episodes, self._episode_is_over = True, False
+        self._episode_data = {}
         self._check_generator()
         self._episode_streams.seek(number)
         self.reset_parameters(**values)
@@ -606,11 +660,11 @@ class Environment(Closeable):
             f"{type(self).__name__} does not implement {method}().{nearest(method, own)}"
         )
 
-    def _define(self, fields: list[Field]) -> None:
+    def _define(self, fields: list[Field], known: dict[str, Field] | None = None) -> None:
         for field in fields:
-            if field.name in self._fields:
+            if field.name in self._fields or field.name in self._episode_fields:
                 raise ConfigError(f'The field "{field.name}" is defined twice.')
-            self._fields[field.name] = field
+            (self._fields if known is None else known)[field.name] = field
             self._has_open_shapes |= field.shape is None
 
     def _run(self) -> Services:
@@ -635,6 +689,18 @@ class Environment(Closeable):
             )
         self._training = self._additional = None
         return sample if additional is None else {**sample, **additional}
+
+    def take_episode_data(self) -> dict[str, Array]:
+        """Return the fields of the episode that has ended.
+
+        Raises:
+            MissingFieldError: If one was not set.
+        """
+        for name in self._episode_fields:
+            if name not in self._episode_data:
+                text = f'field "{name}" of the episode was not set: call set_episode_data() before'
+                raise MissingFieldError(f"{text} it ends.", field=name)
+        return self._episode_data
 
 
 def _is_finite(value: Any) -> bool:

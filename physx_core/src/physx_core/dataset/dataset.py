@@ -42,7 +42,7 @@ from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError, UsageError
 from physx_core.fields import Field
 from physx_core.statistics import Normalization
-from physx_core.typing import Batch, Index
+from physx_core.typing import Array, Batch, Index
 
 MAX_FILE_SIZE = 0.25
 
@@ -364,15 +364,15 @@ class Dataset(Closeable):
                 parts.append(records_at(order, places, whole, table, is_open=False))
         return {name: np.concatenate([part[name] for part in parts]) for name in table}
 
-    def episode_parameters(self, mode: str, entries: Index) -> Batch:
-        """Return the parameters of some recorded episodes, by name; empty without any.
+    def recorded_values(self, mode: str, entries: Index) -> Batch:
+        """Return the parameters and fields of some recorded episodes, by name; empty without any.
 
         Args:
             mode: Name of a mode with records.
             entries: Which entries of `recorded_episodes`, shape (n,).
 
         Returns:
-            Arrays of shape (n, *shape of the parameter).
+            Arrays of shape (n, *shape of the parameter or field).
 
         Raises:
             DatasetError: If there is no such mode, or the table of episodes is damaged.
@@ -382,9 +382,43 @@ class Dataset(Closeable):
         if order is None or not len(entries):
             return {}
         places = self._reader.orders.places(mode)[order.found.last[entries]]
-        first, stop = int(places.min()), int(places.max()) + 1
         names = self._reader.mode(EPISODES).fields.keys() - {field.name for field in TABLE_FIELDS}
-        return {n: self._reader.read(EPISODES, n, first, stop)[places - first] for n in names}
+        return {name: self[EPISODES][name][places] for name in names}
+
+    @property
+    def episode_fields(self) -> dict[str, Field]:
+        """The fields that each independent episode has once, by name."""
+        mode = self._manifest.modes.get(EPISODES)
+        fields = mode.fields if mode is not None and self.has_episodes else {}
+        return {name: field for name, field in fields.items() if field.role == "episode"}
+
+    def episode_values(self, mode: str, name: str, rows: Any) -> Array:
+        """Return what the episode of each row has once: a parameter, or a field of its own.
+
+        Args:
+            mode: Name of a mode of independent episodes.
+            name: Name of a field of the mode ``episodes``.
+            rows: A row's number, numbers of shape (n,), or a slice.
+
+        Returns:
+            Shape (n, *field shape); 0 for rows of streams.
+
+        Raises:
+            DatasetError: If there is no such mode or field, the mode has no episodes, or the table
+                of episodes is damaged.
+            IndexError: If there is no such row.
+        """
+        self._prepare_reading()
+        order = self._reader.order(mode)
+        if order is None:
+            self._reader.mode(mode)  # there must be one
+            raise DatasetError(f'The rows of mode "{mode}" have no recorded episodes.')
+        numbers = row_numbers(rows, order.rows)
+        entries = np.searchsorted(order.episodes.first, numbers, "right") - 1
+        records = self._reader.orders.places(mode)[order.found.last]
+        once, places = np.unique(entries, return_inverse=True)
+        values: Array = self[EPISODES][name][records[once]][places]
+        return values
 
     def progress(self, mode: str) -> list[Progress]:
         """Return how many episodes of each campaign of a mode have ended; none without records.
@@ -552,6 +586,7 @@ class Dataset(Closeable):
         rows: Mapping[str, Any],
         episodes: Sequence[EpisodeRecord],
         *,
+        episode_fields: Iterable[Field] = (),
         checked: bool = False,
     ) -> None:
         """Store rows of independent episodes, and what is recorded of these.
@@ -570,6 +605,8 @@ class Dataset(Closeable):
                 there are no rows.
             episodes: The episodes, or parts of them, that the rows belong to, in order. The first
                 ones of a dataset determine which parameters all must have.
+            episode_fields: Those of role ``episode`` that records may have, all or none; the first
+                call for a dataset determines them. Of a record without them, 0 is stored.
             checked: Whether the rows are known to be finite, as in `append`.
 
         Raises:
@@ -581,7 +618,9 @@ class Dataset(Closeable):
                 one before, or if the dataset is closed, open for reading only, or shared.
         """
         self._as_only_writer("store episodes")
-        self._for_writing().append_episodes(mode, rows, episodes, checked=checked)
+        self._for_writing().append_episodes(
+            mode, rows, episodes, episode_fields=episode_fields, checked=checked
+        )
 
     def stripes(self, mode: str, count: int) -> Stripes:
         """Let `count` other processes write the rows of a mode from now on, in turn.

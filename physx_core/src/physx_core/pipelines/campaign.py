@@ -14,6 +14,7 @@ from physx_core.config import WRONG, EnvironmentConfig
 from physx_core.dataset import Dataset, EpisodeRecord, EpisodeStatus
 from physx_core.dataset.read.order.records import Flags, RecordedEpisodes
 from physx_core.errors import ConfigError, DatasetError, listed
+from physx_core.fields import Field
 from physx_core.pipelines.storage import describe_environment
 from physx_core.typing import Batch, Index
 
@@ -48,7 +49,11 @@ class Campaign:
         return sum(each.mode == mode for each in _recorded(dataset))
 
     def store_rejected(
-        self, dataset: Dataset, rows: Batch, records: Sequence[EpisodeRecord]
+        self,
+        dataset: Dataset,
+        rows: Batch,
+        records: Sequence[EpisodeRecord],
+        episode_fields: Sequence[Field],
     ) -> None:
         """Store samples that `check_sample` rejected, by number.
 
@@ -58,18 +63,19 @@ class Campaign:
         Args:
             dataset: The dataset, open for writing, in which the mode has its fields.
             rows: The samples.
-            records: Records of the episodes that they belong to.
+            records: Records of the episodes that they belong to, the last part of each last.
+            episode_fields: What each episode has once.
         """
         campaign, numbers = _recorded(dataset).index(self), rows["episode"]
         begins = np.flatnonzero(np.diff(numbers, prepend=-1))
         counts, found = np.diff(begins, append=len(numbers)).tolist(), []
         for number, count in zip(numbers[begins].tolist(), counts, strict=True):
-            of = next(each for each in records if 0 <= number - each.episode < each.count)
+            of = next(each for each in records[::-1] if 0 <= number - each.episode < each.count)
             where: Any = number - of.episode if of.count > 1 else ()
             values = {name: np.asarray(each)[where] for name, each in of.parameters.items()}
             own = {"episode": number, "rows": count, "campaign": campaign}
-            found.append(EpisodeRecord(**own, parameters=values))
-        dataset.append_episodes(WRONG, rows, found, checked=True)
+            found.append(EpisodeRecord(**own, parameters=values, fields=of.fields))
+        dataset.append_episodes(WRONG, rows, found, episode_fields=episode_fields, checked=True)
 
     @classmethod
     def begin(
@@ -202,7 +208,7 @@ class Campaign:
         kept = np.clip(rows - before, 0, counts)
         changes = (kept < counts) | ((before >= rows) & (known.status[own] != EpisodeStatus.CUT))
         entries = own[changes]
-        parameters = dataset.episode_parameters(self.mode, entries)
+        recorded, own_fields = dataset.recorded_values(self.mode, entries), dataset.episode_fields
         records: list[EpisodeRecord] = []
         for place, (entry, stays) in enumerate(zip(entries, kept[changes].tolist(), strict=True)):
             record = EpisodeRecord(
@@ -210,7 +216,8 @@ class Campaign:
                 rows=0,
                 campaign=self.number,
                 status=EpisodeStatus.CUT,
-                parameters={name: column[place] for name, column in parameters.items()},
+                parameters={n: recorded[n][place] for n in recorded.keys() - own_fields.keys()},
+                fields={name: recorded[name][place] for name in own_fields},
             )
             count = int(known.numbers[entry])
             if count == 1 and stays:

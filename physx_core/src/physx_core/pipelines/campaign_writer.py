@@ -6,8 +6,9 @@ from collections.abc import Iterable
 from dataclasses import replace
 
 from physx_core.config import WRONG
-from physx_core.dataset import Dataset, EpisodeRecord, EpisodeStatus
-from physx_core.errors import FailedEpisodesError
+from physx_core.dataset import TABLE_FIELDS, Dataset, EpisodeRecord, EpisodeStatus
+from physx_core.dataset.store.definitions import compare_fields
+from physx_core.errors import ConfigError, FailedEpisodesError
 from physx_core.pipelines.campaign import Campaign
 from physx_core.pipelines.independence import IndependenceProof
 from physx_core.sources.episode_source import EpisodeSource
@@ -48,6 +49,7 @@ class CampaignWriter:
         self._dataset, self._max_failed = dataset, max_failed
         self._keeps_rejected = keeps_rejected
         self._unsure: list[EpisodeRecord] = []  # failed, but perhaps not needed
+        self._source: Source | None = None
         self._episodes: EpisodeSource | None = None
         self._proof = IndependenceProof()
 
@@ -55,10 +57,27 @@ class CampaignWriter:
         """Simulate with open environments, whose episodes are independent.
 
         Raises:
-            ConfigError: If they define other parameters than when the campaign began.
+            ConfigError: If they define other parameters than when the campaign began, or two names
+                of what is recorded of an episode are the same.
+            FieldsMismatchError: If the dataset's episodes have other fields of their own.
         """
         self.campaign.check_parameters(source.sets.parameters)
-        self._episodes = source.lease(self.queue)
+        self._check_episode_fields(source)
+        self._source, self._episodes = source, source.lease(self.queue)
+
+    def _check_episode_fields(self, source: Source) -> None:
+        """Check what is recorded of episodes before any is simulated."""
+        names = [each.name for each in (*TABLE_FIELDS, *source.episode_fields)]
+        names += [each.name for each in source.sets.parameters]
+        if twice := [name for name in names if names.count(name) > 1]:
+            raise ConfigError(
+                f'The name "{twice[0]}" of a parameter, or of a field of episodes, is that of '
+                "something else that is recorded of each episode: rename it."
+            )
+        if self._dataset.has_episodes:
+            known, given = self._dataset.episode_fields, source.episode_fields
+            own = {field.name: field for field in given}
+            compare_fields(f"The table of episodes in {self._dataset.directory}", known, own)
 
     def store(self) -> int:
         """Store the episodes that end next; return how many have ended.
@@ -67,6 +86,7 @@ class CampaignWriter:
             FailedEpisodesError: If too many episodes have failed.
             PhysxError: If an environment or client fails in a way that concerns all episodes.
         """
+        assert self._source is not None
         assert self._episodes is not None
         before, mode = self.queue.finished, self.campaign.mode
         block = self._episodes.take()
@@ -76,8 +96,13 @@ class CampaignWriter:
         records = [replace(record, campaign=self.campaign.number) for record in block.records]
         if block.rejected and self._keeps_rejected:
             self._dataset.define_fields(WRONG, self._episodes.fields)
-            self.campaign.store_rejected(self._dataset, block.rejected, records)
-        self._dataset.append_episodes(mode, block.rows, records, checked=True)
+            self.campaign.store_rejected(
+                self._dataset, block.rejected, records, self._source.episode_fields
+            )
+        fields = self._source.episode_fields
+        self._dataset.append_episodes(
+            mode, block.rows, records, episode_fields=fields, checked=True
+        )
         self._count_failed(record for record in records if record.status is EpisodeStatus.FAILED)
         return self.queue.finished - before
 

@@ -37,6 +37,7 @@ from physx_core.pipelines.storage import (
     open_own,
     record_beside_rows,
     reject_client_writers,
+    reject_episode_fields,
     store_sets,
 )
 from physx_core.session import Session
@@ -308,11 +309,13 @@ class DataGeneration(NewSessionPipeline):
             self._writer.open(self.source)
             if self.episodes is None:
                 resources.push(self._cut)
-        elif self.max_failed:
-            raise ConfigError(
-                "DataGeneration.max_failed is for independent episodes, but "
-                f"{describe_environment_config(config)} is a stream: leave it out."
-            )
+        else:
+            reject_episode_fields(self.source)
+            if self.max_failed:
+                raise ConfigError(
+                    "DataGeneration.max_failed is for independent episodes, but "
+                    f"{describe_environment_config(config)} is a stream: leave it out."
+                )
 
     def _larger_number(self) -> dict[str, int]:
         """Return how much to record if the campaign was to have more than this run asks for."""

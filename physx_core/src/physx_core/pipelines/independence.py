@@ -81,7 +81,7 @@ def _explain(number: int, what: str) -> str:
 
 
 def _stored(dataset: Dataset, mode: str, campaign: int, number: int) -> Batch:
-    """Return the stored rows of an episode."""
+    """Return the stored rows of an episode, and what it has once: see `EpisodeSource.repeat`."""
     known = dataset.recorded_episodes(mode)
     assert known is not None
     own = (known.campaign == campaign) & (known.episode <= number)
@@ -90,4 +90,5 @@ def _stored(dataset: Dataset, mode: str, campaign: int, number: int) -> Batch:
     first = int(known.first[place] + (number - known.episode[place] if several else 0))
     end = first + (1 if several else int(known.rows[place]))
     data = dataset[mode]
-    return {name: data[name][first:end] for name in data}
+    once = {name: dataset.episode_values(mode, name, first) for name in dataset.episode_fields}
+    return {name: data[name][first:end] for name in data} | once

@@ -89,9 +89,8 @@ class RecordedSets:
             episodes: The episodes of this mode.
         """
         view = dataset[EPISODES]
-        own = {field.name for field in TABLE_FIELDS}
         self._episodes = episodes
-        self._values = {name: view[name][:] for name in dataset.fields(EPISODES) if name not in own}
+        self._values = {name: view[name][:] for name in _parameters(dataset)}
         stream = view["status"][:] == EpisodeStatus.STREAM
         places = np.flatnonzero((view["mode_index"][:] == MODES.index(mode)) & ~stream)[::-1]
         campaign, episode = (view[name][:][places] for name in ("campaign", "episode"))
@@ -117,12 +116,17 @@ def find_sets(dataset: Dataset, mode: str) -> StoredSets | RecordedSets | None:
         return None
     episodes = dataset.recorded_episodes(mode)
     if episodes is not None:
-        has_parameters = len(dataset.fields(EPISODES)) > len(TABLE_FIELDS)
-        return RecordedSets(dataset, mode, episodes) if has_parameters else None
+        return RecordedSets(dataset, mode, episodes) if _parameters(dataset) else None
     if not dataset.num_samples(SETS):
         return None
     is_about = dataset[SETS]["mode_index"][:] == MODES.index(mode)
     return StoredSets(dataset, mode) if is_about.any() else None
+
+
+def _parameters(dataset: Dataset) -> list[str]:
+    """Return the names of the parameters in the table of episodes."""
+    others = {field.name for field in TABLE_FIELDS} | dataset.episode_fields.keys()
+    return [name for name in dataset.fields(EPISODES) if name not in others]
 
 
 def _runs(first: Index, order: Array, count: int) -> Index:

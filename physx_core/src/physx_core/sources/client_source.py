@@ -132,6 +132,7 @@ class ClientSource(Source):
             self._opened = [*first.fields, *ROW_FIELDS]
             for peer in others:
                 self._agree(peer.instance_id, first.fields, peer.fields)
+                self._agree(peer.instance_id, first.episode_fields, peer.episode_fields)
             parameters = [peer.parameters for peer in (first, *others)]
             if self._written is not None and any(parameters):
                 raise ConfigError(
@@ -141,6 +142,7 @@ class ClientSource(Source):
             self.sets.begin(parameters)
             self.is_plain = not (self.sets.parameters or self._rejections)
             self.is_independent = first.is_independent
+            self.episode_fields = first.episode_fields
             if self._group.config.is_elastic:
                 self.check_independent()
         except BaseException:
@@ -159,6 +161,7 @@ class ClientSource(Source):
     def _check_guest(self, peer: Peer) -> None:
         """Check that a client that has joined the run runs the same environment as the others."""
         self._agree(peer.instance_id, self._opened[: -len(ROW_FIELDS)], peer.fields)
+        self._agree(peer.instance_id, self.episode_fields, peer.episode_fields)
         self.sets.check_same(peer.instance_id, peer.parameters)
 
     def batch(self, size: int, stored: Batch | None = None) -> Batch:

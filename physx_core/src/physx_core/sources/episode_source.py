@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 
+import numpy as np
+
 from physx_core.dataset import EpisodeStatus
 from physx_core.fields import Field
 from physx_core.rows import concatenate
@@ -59,7 +61,8 @@ class EpisodeSource(ABC):
             instance_id: The instance that has simulated it.
 
         Returns:
-            Its rows; of no fields if it fails now.
+            Its rows, and each field that it has once with a first axis of length 1; of no fields
+            if it fails now.
 
         Raises:
             PhysxError: See `take`.
@@ -75,7 +78,8 @@ class EpisodeSource(ABC):
                     part = {name: rows[begin:end].copy() for name, rows in block.rows.items()}
                     parts = [*parts, part] if record.part else [part]
                     if record.status is not EpisodeStatus.MORE:
-                        return concatenate([part for part in parts if part])
+                        own = {n: np.asarray(v)[None] for n, v in record.fields.items()}
+                        return concatenate([part for part in parts if part]) | own
                 begin = end
 
     @abstractmethod

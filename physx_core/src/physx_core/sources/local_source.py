@@ -81,6 +81,7 @@ class LocalSource(Source):
         self.ignores_predictions = all(instance.ignores_predictions for instance in self._instances)
         self.sets.begin([instance.parameters for instance in self._instances])
         self.is_independent = self._instances[0].is_independent
+        self.episode_fields = self._instances[0].episode_fields
         self.is_plain = not (self.sets.parameters or self._config.record_wrong_samples)
 
     def batch(self, size: int, stored: Batch | None = None) -> Batch:

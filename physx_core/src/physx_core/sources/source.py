@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from abc import abstractmethod
+from collections.abc import Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -68,6 +69,7 @@ class Source(Opened):
         ignores_predictions: Whether `apply` is known to have no effect; unknown for clients.
         is_independent: Whether the environment's episodes are independent, so that `lease` can be
             used; known once the source is open.
+        episode_fields: The fields that each independent episode has once; known once it is open.
         is_plain: Whether all that an open source produces are rows: there are no parameters, and
             rejected samples are not recorded.
     """
@@ -76,6 +78,7 @@ class Source(Opened):
     sets: ParameterSets
     ignores_predictions = False
     is_independent = False
+    episode_fields: Sequence[Field] = ()
     is_plain = False
     _is_canceled = False
     _name = ""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
@@ -17,6 +18,7 @@ from physx_core.errors import (
     NotFiniteError,
     PhysxError,
     ProgramError,
+    SampleError,
     WrongSamplesError,
 )
 from physx_core.fields import Field
@@ -29,6 +31,7 @@ OF_EPISODES = (EnvironmentFailedError, ProgramError, NotFiniteError, WrongSample
 """Errors that end an episode."""
 _FINISHED, _MORE = EpisodeStatus.FINISHED, EpisodeStatus.MORE  # looking members up takes long
 _PART_TIME = 10.0  # s
+_MOST_BYTES = 2**22  # of the fields of episodes in a block
 
 
 class EpisodeBlock(NamedTuple):
@@ -61,6 +64,7 @@ class _Part:
     count: int = 1
     status: EpisodeStatus = EpisodeStatus.FINISHED
     reason: str = ""
+    fields: Batch | None = None
 
     def some(self, first: int, count: int) -> _Part:
         """Return some of its episodes, counted from 0, which have one row each."""
@@ -107,6 +111,9 @@ class EpisodeRunner:
         self._first = 0  # row of the buffer with which the episode's part begins
         self._began = 0.0
         self._makes_single_rows = instance.makes_single_rows
+        self._episode_fields = {field.name for field in instance.episode_fields}
+        nbytes = sum(field.nbytes for field in instance.episode_fields)
+        self._most_parts = _MOST_BYTES / nbytes if nbytes else math.inf
 
     def run(self) -> EpisodeBlock:
         """Simulate until rows fill a block, episodes took 20 ms, or no number is left.
@@ -132,13 +139,19 @@ class EpisodeRunner:
                 self._fail(error)
             if self._number is None and self._began >= until:
                 break
-            if self._buffer is not None and self._buffer.full:
+            if self._is_full:
                 break
             if self._number is not None and self._now() - self._began >= _PART_TIME:
                 break
         if self._number is not None:
             self._end(_MORE)
         return self._take_block()
+
+    @property
+    def _is_full(self) -> bool:
+        """Whether the block can take no further rows, or no further episodes."""
+        is_full = self._buffer is not None and self._buffer.full
+        return is_full or (self._number is None and len(self._parts) >= self._most_parts)
 
     def _begin(self) -> bool:
         """Begin the next number; return whether there is one."""
@@ -167,7 +180,8 @@ class EpisodeRunner:
             buffer.put(sample, 0, self._number or 0, self._step)
             self._step += 1
         if not sample or self._instance.has_ended:
-            self._end(_FINISHED)
+            fields = self._instance.take_episode_data() if self._episode_fields else None
+            self._end(_FINISHED, fields=fields)
             self._number = None
 
     def _make_single_rows(self, until: float) -> None:
@@ -201,18 +215,19 @@ class EpisodeRunner:
         self.fields = buffer.fields
         return buffer
 
-    def _end(self, status: EpisodeStatus, count: int = 1) -> None:
+    def _end(self, status: EpisodeStatus, count: int = 1, fields: Batch | None = None) -> None:
         """Note the rows of the episode since its last part, which ends with this status.
 
         Args:
             status: The status.
             count: Number of episodes, of one row each if they are several.
+            fields: What the episode has once, if there is such; then it has a record of its own.
         """
         end = 0 if self._buffer is None else self._buffer.count
         rows, self._first = end - self._first, end
         now = self._now()
         seconds, self._began = now - self._began, now
-        is_single = rows == count and not self._part and status is _FINISHED
+        is_single = rows == count and not (self._part or fields) and status is _FINISHED
         joined = self._joined
         if is_single and joined is not None:
             joined.count += count
@@ -220,7 +235,9 @@ class EpisodeRunner:
             joined.seconds += seconds
             return
         assert self._number is not None
-        part = _Part(self._number, rows, seconds, self._part, self._lease, count, status)
+        part = _Part(
+            self._number, rows, seconds, self._part, self._lease, count, status, fields=fields
+        )
         self._parts.append(part)
         self._joined = part if is_single else None
         self._part += 1
@@ -230,6 +247,8 @@ class EpisodeRunner:
 
         What has another shape than an earlier episode's may be right, if the field has none.
         """
+        if isinstance(error, SampleError) and error.field in self._episode_fields:
+            return True
         if isinstance(error, FieldShapeError):
             fields = self._instance.fields
             return any(f.name == error.field and f.shape is not None for f in fields)
@@ -307,5 +326,6 @@ def _record(part: _Part) -> EpisodeRecord:
         status=part.status,
         seconds=part.seconds,
         parameters=part.lease.parameters(part.episode, part.count),
+        fields=part.fields or {},
         reason=part.reason,
     )

@@ -34,7 +34,7 @@ from physx_core.plugins.references import adapters_hint
 from physx_core.processes.endings import describe_ending, is_ending
 from physx_core.rows import RejectedSamples
 from physx_core.states import Baseline
-from physx_core.typing import Batch, Sample
+from physx_core.typing import Array, Batch, Sample
 
 PARAMETER = "parameters/"
 """Name prefix of a stored row's entries that hold the parameters it was generated with; no field
@@ -173,6 +173,11 @@ class Instance(Closeable):
     def fields(self) -> list[Field]:
         """The environment's fields; shapes that it leaves open are None. Empty if it is closed."""
         return self.environment.fields if self.environment is not None else []
+
+    @property
+    def episode_fields(self) -> list[Field]:
+        """The fields that each episode has once. Empty if the environment is closed."""
+        return [] if self.environment is None else self.environment.episode_fields
 
     @property
     def ignores_predictions(self) -> bool:
@@ -317,7 +322,8 @@ class Instance(Closeable):
     def makes_single_rows(self) -> bool:
         """Whether each step is an episode, and nothing is asked of it but its sample."""
         kept = type(self._alive()).check_sample is Environment.check_sample
-        return self._episode_steps == 1 and kept and not (self._sub_steps or self._draws)
+        more = self._sub_steps or self._draws or self.episode_fields
+        return self._episode_steps == 1 and kept and not more
 
     def single_rows(
         self, episodes: Iterator[tuple[int, Mapping[str, Any]]]
@@ -405,6 +411,10 @@ class Instance(Closeable):
                 self._reject(sample, wrong)
             if environment._episode_is_over and not self._prepare(environment, stored):
                 return {}
+
+    def take_episode_data(self) -> dict[str, Array]:
+        """Return the fields of the episode that has ended: see `Environment.take_episode_data`."""
+        return self._alive().take_episode_data()
 
     def track_states(self) -> None:
         """Prepare `get_state` and `set_state`, after `open` if nothing is drawn.

@@ -48,6 +48,8 @@ class EpisodeRecord:
         seconds: What it cost, in s.
         parameters: Values of the environment's parameters by name; of several episodes, arrays
             with one more axis, the first, which has one entry for each.
+        fields: Values by name of the fields that an episode has once, in the record of its last
+            part; of several episodes, and of one that has failed, none.
         reason: Why it failed.
     """
 
@@ -59,6 +61,7 @@ class EpisodeRecord:
     status: EpisodeStatus = EpisodeStatus.FINISHED
     seconds: float = 0.0
     parameters: Mapping[str, Any] = field(default_factory=dict)
+    fields: Mapping[str, Any] = field(default_factory=dict)
     reason: str = ""
 
     def __post_init__(self) -> None:
@@ -71,7 +74,7 @@ class EpisodeRecord:
         least = min(self.episode, self.rows, self.campaign, self.part, self.count - 1)
         several = self.count == 1 or (
             self.rows == self.count
-            and not self.part
+            and not (self.part or self.fields)
             and all(np.shape(each)[:1] == (self.count,) for each in self.parameters.values())
             and self.status is EpisodeStatus.FINISHED
         )

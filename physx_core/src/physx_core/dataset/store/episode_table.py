@@ -4,7 +4,9 @@ The rows of independent episodes are stored as they come. A record of this table
 an episode lie, and commits them: rows that no record covers do not exist for any reader. The rows
 of a mode with records are those of its episodes, in order of campaign and number.
 
-A record holds the fields `TABLE_FIELDS`, and a column for each parameter of the environment:
+A record holds the fields `TABLE_FIELDS`, a column for each parameter of the environment, and one of
+role ``episode`` for each field that an episode has once, which is 0 in records of failed episodes,
+of parts that are not the last one, and of streams:
 
 - ``mode_index``: index of the mode it speaks of in `RECORDED`.
 - ``campaign``, ``episode``: the campaign, 0 for the first, and the episode's number in it.
@@ -57,7 +59,7 @@ TABLE_FIELDS = (
     Field("status", (), "int8", role="additional"),
     Field("seconds", (), "float64", "s", role="additional"),
 )
-"""Fields of the table, in addition to the parameters."""
+"""Fields of the table, in addition to the parameters and the fields of role ``episode``."""
 
 
 def has_table(manifest: Manifest) -> bool:

@@ -8,7 +8,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from physx_core.fields import Field
+from physx_core.fields import ROLES, Field
 
 SESSION = re.compile(r"[A-Za-z0-9][A-Za-z0-9_.-]{0,199}")
 """Valid prefix of file names; it cannot form a path."""
@@ -42,7 +42,7 @@ def parse_field(plain: Any) -> Field:
         if len(checked(list, shape, f"the shape of {name!r}")) > _MOST_AXES:
             raise ValueError(f"the shape of {name!r} cannot be {shape!r:.60}")
         shape = tuple(whole(count, f"the shape of {name!r}") for count in shape)
-    if role not in ("training", "additional"):
+    if role not in ROLES:
         raise ValueError(f"the role of {name!r} cannot be {role!r:.60}")
     unit = checked(str, plain.get("unit", ""), f"the unit of {name!r}")
     field = Field(name, shape, checked(str, plain["dtype"], f"the type of {name!r}"), unit, role)

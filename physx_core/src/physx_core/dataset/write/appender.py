@@ -87,6 +87,7 @@ class Appender:
         rows: Mapping[str, Any],
         episodes: Sequence[EpisodeRecord],
         *,
+        episode_fields: Iterable[Field] = (),
         checked: bool = False,
     ) -> None:
         """Store rows with the records that commit them: see `Dataset.append_episodes`."""
@@ -94,7 +95,7 @@ class Appender:
         mode_index(mode)  # it must be one that can hold episodes
         self.writer.check_alone([mode, EPISODES])
         recorder.check(mode, episodes)
-        table = self._check_table(mode, episodes) if episodes else {}
+        table = self._check_table(mode, episodes, episode_fields) if episodes else {}
         block, count = self._check_rows(mode, rows, checked=checked) if rows else ({}, 0)
         total = sum(each.rows for each in episodes)
         if total != count:
@@ -103,7 +104,9 @@ class Appender:
         if episodes:
             recorder.append(mode, block, count, episodes, table)
 
-    def _check_table(self, mode: str, episodes: Sequence[EpisodeRecord]) -> Batch:
+    def _check_table(
+        self, mode: str, episodes: Sequence[EpisodeRecord], episode_fields: Iterable[Field]
+    ) -> Batch:
         """Return the records of a mode for the table of episodes, which is defined if needed."""
         own = {field.name: field for field in TABLE_FIELDS}
         known = self._manifest.modes.get(EPISODES)
@@ -113,7 +116,8 @@ class Appender:
             fields = known.fields
         else:
             axes = int(episodes[0].count > 1)
-            fields = {f.name: f for f in infer_fields(episodes[0].parameters, axes)} | own
+            parameters = infer_fields(episodes[0].parameters, axes)
+            fields = {f.name: f for f in (*parameters, *episode_fields)} | own
         table, _ = check_rows(fields, table_rows(mode, fields, episodes))
         if not self._is_settled(EPISODES):
             self.define_fields(EPISODES, infer_shapes(fields.values(), table, axes=1))

@@ -232,19 +232,24 @@ def table_rows(
         episodes: The records.
     """
     own = [field.name for field in TABLE_FIELDS]
-    parameters = {name: field for name, field in fields.items() if name not in own}
+    others = {name: field for name, field in fields.items() if name not in own}
+    once = {name: field for name, field in others.items() if field.role == "episode"}
+    parameters = {name: field for name, field in others.items() if name not in once}
     for each in episodes:
         if each.parameters or parameters:
             check_names(parameters, each.parameters)
+        if each.fields:
+            check_names(once, each.fields)
     fixed = {"mode_index": mode_index(mode), "first_row": 0}
     found: dict[str, Any] = {
         name: np.array([fixed.get(name, getattr(each, name, 0)) for each in episodes], of.dtype)
         for name, of in fields.items()
         if name in own
     }
-    if parameters and any(each.count > 1 for each in episodes):
+    if (parameters or once) and any(each.count > 1 for each in episodes):
         found = _one_by_one(found)
-    return found | {name: _values(name, of, episodes) for name, of in parameters.items()}
+    found |= {name: _values(name, of, episodes) for name, of in parameters.items()}
+    return found | {name: _values_once(name, of, episodes) for name, of in once.items()}
 
 
 def _one_by_one(table: Batch) -> Batch:
@@ -267,6 +272,12 @@ def _values(name: str, field: Field, episodes: Sequence[EpisodeRecord]) -> Any:
         each.parameters[name] if each.count > 1 else [each.parameters[name]] for each in episodes
     ]
     return np.concatenate([field.convert(values, axes=1) for values in given])
+
+
+def _values_once(name: str, field: Field, episodes: Sequence[EpisodeRecord]) -> list[Any]:
+    """Return the values of a field that an episode has once, for each number; 0 if it has none."""
+    none = np.zeros(field.shape or (), field.dtype)
+    return [value for e in episodes for value in [e.fields.get(name, none)] * e.count]
 
 
 def stream_record(

@@ -34,6 +34,7 @@ from physx_core.pipelines.storage import (
     describe_environment,
     open_existing,
     open_own,
+    reject_episode_fields,
 )
 from physx_core.plugins.networks import resolve_network
 from physx_core.session import Session
@@ -223,6 +224,7 @@ class DataOpening:
             self._generation = dataclasses.replace(generation, campaign=campaign.number)
             self._generation.store(dataset)
         else:
+            reject_episode_fields(source)
             return None
         queue = RowQueue(self.buffer.total, campaign.records(dataset), self.retries)
         writer = CampaignWriter(

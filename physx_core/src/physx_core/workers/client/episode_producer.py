@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
+from typing import Any
 
 from physx_core.dataset import EpisodeRecord
 from physx_core.errors import ConnectionRefusedByPeerError
@@ -66,7 +67,7 @@ class EpisodeProducer:
             )
 
 
-def _plain(record: EpisodeRecord) -> tuple[int | float | str, ...]:
+def _plain(record: EpisodeRecord) -> tuple[Any, ...]:
     """Return what the server cannot know of an episode."""
     numbers = record.episode, record.count, record.rows, record.part, int(record.status)
-    return (*numbers, record.seconds, record.reason)
+    return (*numbers, record.seconds, record.reason, dict(record.fields))

@@ -160,7 +160,8 @@ class _Client:
             parameters = [parameter.to_dict() for parameter in self._instance.parameters]
             if parameters:
                 self._link.send(pack(Kind.PARAMETERS, encode(parameters)))
-            fields = [field.to_dict() for field in self._instance.fields]
+            defined = [*self._instance.fields, *self._instance.episode_fields]
+            fields = [field.to_dict() for field in defined]
             self._link.send(pack(Kind.READY, encode(fields), int(self._instance.is_independent)))
             self._run()
         except (KeyboardInterrupt, Terminated):

@@ -13,6 +13,7 @@ import numpy as np
 from physx_core.clock import SYSTEM_CLOCK, Clock
 from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
+from physx_core.fields import Field
 from physx_core.net.frames import Frame, Kind, pack
 from physx_core.net.values import decode, encode
 from physx_core.rows import concatenate
@@ -161,8 +162,8 @@ class Leases:
         rows, held.rows = held.rows, {}
         rejected, held.rejected = concatenate(held.rejected), []
         try:
-            records = [_parse(plain) for plain in decode(frame.payload)]
-        except (TypeError, ValueError, ConfigError) as error:
+            records = [_parse(plain, peer.episode_fields) for plain in decode(frame.payload)]
+        except (AttributeError, TypeError, ValueError, ConfigError) as error:
             raise ConnectionRefusedByPeerError(f"It sent impossible episodes: {error}.") from error
         before = held.count
         records = [held.settled(record) for record in records]
@@ -171,6 +172,7 @@ class Leases:
         _check_rows(rows, records)
         if rows:
             check_values(rows, peer.row_fields, peer.instance_id)
+        _check_fields(records, peer)
         _check_rejected(rejected, records)
         peer.received += len(rows.get("step", ()))
         held.note_pace(records)
@@ -289,18 +291,38 @@ def _numbers(record: EpisodeRecord) -> Index:
     return np.full(record.rows, first)
 
 
-def _parse(plain: Any) -> EpisodeRecord:
-    """Return the record that a client described.
+def _check_fields(records: list[EpisodeRecord], peer: Peer) -> None:
+    """Check the values of fields that episodes have once.
 
     Raises:
-        TypeError, ValueError, ConfigError: If there can be none such.
+        NotFiniteError: If one is NaN or infinity.
     """
-    episode, count, rows, part, status, seconds, reason = plain
+    for each in records:
+        if each.fields:
+            block = {name: value[None] for name, value in each.fields.items()}
+            check_values({**block, "step": np.array([-1])}, peer.episode_fields, peer.instance_id)
+
+
+def _parse(plain: Any, fields: list[Field]) -> EpisodeRecord:
+    """Return the record that a client described.
+
+    Args:
+        plain: What it sent.
+        fields: The fields that each of its episodes has once.
+
+    Raises:
+        AttributeError, TypeError, ValueError, ConfigError: If there can be none such.
+    """
+    episode, count, rows, part, status, seconds, reason, values = plain
     if type(reason) is not str:
         raise TypeError("a reason is no text")
     known = EpisodeStatus(status)
     if known not in _STATUS:
         raise ValueError(f"the status {known.name}")
+    wanted = fields if known is EpisodeStatus.FINISHED else []
+    kinds = {name: (of.dtype.str, of.shape) for name, of in values.items()}
+    if kinds != {field.name: (field.dtype, field.shape) for field in wanted}:
+        raise ValueError(f"an episode with the fields {kinds!r:.200}")
     return EpisodeRecord(
         episode=episode,
         count=count,
@@ -308,5 +330,6 @@ def _parse(plain: Any) -> EpisodeRecord:
         part=part,
         status=known,
         seconds=seconds,
+        fields=values,
         reason=reason,
     )

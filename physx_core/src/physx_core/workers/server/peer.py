@@ -26,6 +26,7 @@ class Peer(Connection):
         reader: Reads its frames.
         instance_id: Number of its instance, counted from 1; 0 while it is a stranger.
         fields: The environment's fields; empty before it is ready.
+        episode_fields: Those that each of its episodes has once.
         is_independent: Whether the environment's episodes are independent.
         row_fields: Fields of its rows, all shapes known; empty before the first sample.
         rows: Rows that arrived.
@@ -64,6 +65,7 @@ class Peer(Connection):
         super().__init__(link, FrameReader(HANDSHAKE_LIMIT), name, clock)
         self.instance_id = 0
         self.fields: list[Field] = []
+        self.episode_fields: list[Field] = []
         self.is_independent = False
         self.row_fields: list[Field] = []
         self.rows = RowQueue()

@@ -344,7 +344,9 @@ def _take_ready(peer: Peer, frame: Frame) -> None:
     if peer.fields:
         raise ConnectionRefusedByPeerError("It defined its fields twice.")
     check_environment_fields(fields)
-    peer.fields, peer.is_independent = fields, bool(frame.number)
+    peer.episode_fields = [field for field in fields if field.role == "episode"]
+    peer.fields = [field for field in fields if field.role != "episode"]
+    peer.is_independent = bool(frame.number)
 
 
 def _take_fields(peer: Peer, frame: Frame) -> None:

@@ -14,14 +14,13 @@ from typing import Any
 from physx_core.components.parameter import Parameter
 from physx_core.components.scene.event import ACTIONS, Event
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
-from physx_core.fields import RESERVED, Field, first_not_finite
+from physx_core.fields import RESERVED, ROLES, Field, first_not_finite
 from physx_core.net.frames import MAX_PAYLOAD
 from physx_core.net.values import decode
 from physx_core.rows import ROW_FIELDS
 from physx_core.typing import Batch
 
 _DTYPE = re.compile(r"[<>|=]?[biufc]\d{1,2}")
-_ROLES = ("training", "additional")
 _MOST_PARAMETERS = 4096
 _MOST_EPISODES = 2**48
 
@@ -80,7 +79,7 @@ def _is_field(plain: Any) -> bool:
         and isinstance(shape, list)
         and all(type(size) is int for size in shape)
         and isinstance(plain.get("unit", ""), str)
-        and plain.get("role", "training") in _ROLES
+        and plain.get("role", "training") in ROLES
     )
 
 
@@ -89,6 +88,13 @@ def check_environment_fields(fields: Sequence[Field]) -> None:
     reserved = [field.name for field in fields if field.name in RESERVED]
     if reserved:
         raise ConnectionRefusedByPeerError(f'It defined the reserved field "{reserved[0]}".')
+    of_episodes = [field for field in fields if field.role == "episode"]
+    if len(of_episodes) == len(fields) or any(field.shape is None for field in of_episodes):
+        raise ConnectionRefusedByPeerError("It defined only fields of episodes, or without shape.")
+    if (size := sum(field.nbytes for field in of_episodes)) > MAX_PAYLOAD // 2:
+        raise ConnectionRefusedByPeerError(
+            f"The fields of an episode have {size} bytes; the limit is {MAX_PAYLOAD // 2}."
+        )
 
 
 def check_row_fields(fields: Sequence[Field], environment: Sequence[Field]) -> None:
