@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+import signal
 import sys
 import threading
 from pathlib import Path
@@ -125,3 +127,26 @@ class Changing(Stream):
     def create(self):
         super().create()
         self.marker = getattr(current(), "events", 0)
+
+
+class Mortal(Environment):
+    """A stream whose processes do not get further than some rows each."""
+
+    made = 0  # by this process
+
+    def __init__(self, *, life=0, **kwargs):
+        super().__init__(**kwargs)
+        self.life, self.position = life, np.zeros(3)
+
+    def create(self):
+        pass
+
+    def init_database(self):
+        self.define_training_fields(Field("position", (3,)))
+
+    def step(self):
+        if self.life and Mortal.made == self.life:
+            os.kill(os.getpid(), signal.SIGKILL)
+        Mortal.made += 1
+        self.position = self.position + self.rng.normal(size=3)
+        self.set_training_data(position=self.position)

@@ -7,9 +7,15 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from simulated import ROOM, Simulation, drawn
+from sizes import size
 
+from physx_core import EnvironmentConfig
 from physx_core.errors import ConnectionRefusedByPeerError, StateError
 from physx_core.net import Kind, encode, pack
+from physx_core.sources import ClientSource
 from physx_core.workers.server.journal import Journal
 from physx_core.workers.server.validation import parse_state
 
@@ -127,6 +133,55 @@ def test_only_rows_after_the_state_are_repeated(states, simulation, every):
         for _ in range(200):
             source.batch(1)
     assert simulation.steps < 200 + 200 * 6 if every else simulation.steps > 10_000
+
+
+@pytest.fixture(scope="module")
+def undisturbed():
+    """The rows of two streams with states, computed once."""
+    with Simulation() as simulation:
+        return run(drawn_source(simulation))
+
+
+def drawn_source(simulation, **options):
+    config = EnvironmentConfig(
+        STREAM,
+        num_clients=2,
+        launcher="simulated:SimulatedLauncher",
+        record_wrong_samples=True,
+        state_every=3,
+        **options,
+    )
+    return ClientSource(config, NoNetwork(), [5, 0, 7], run_ahead=0, transport=simulation)
+
+
+class NoNetwork:
+    """Predictions of several samples at once; the fields are doubled."""
+
+    def predict(self, fields):
+        return {"y": 2 * np.asarray(fields["x"])}
+
+    def predict_batch(self, batch):
+        return {"y": 2 * batch["x"]}
+
+    def save_parameters(self, instance_id, values):
+        """Keep nothing."""
+
+    def load_parameters(self, instance_id):
+        return {}
+
+
+@settings(max_examples=size(40, 6), deadline=None)
+@given(drawn, st.sampled_from([100, 3000, ROOM]), st.lists(st.integers(1, 600), max_size=5))
+def test_rows_are_the_same_in_any_order_of_events_and_kills(undisturbed, choose, room, events):
+    with Simulation(choose, room) as simulation:
+
+        def kill():
+            if simulation.alive:
+                [*simulation.alive.values()][choose(len(simulation.alive))].kill()
+
+        simulation.plan.update(dict.fromkeys(events, kill))
+        source = drawn_source(simulation, restarts=10)
+        assert run(source) == undisturbed
 
 
 # What cannot be captured -------------------------------------------------------------------------

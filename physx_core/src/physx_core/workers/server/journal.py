@@ -29,6 +29,7 @@ class Journal:
 
     Attributes:
         given_up: Why, as a sentence; empty: it is complete.
+        size: Size in bytes.
         created: How many requests the first client sent before its first row.
         first_order: Index of the first order that it has, counted from 0 since the run began.
     """
@@ -43,7 +44,7 @@ class Journal:
         self._instance_id, self._limit = instance_id, limit
         self.given_up = ""
         self._messages = tempfile.SpooledTemporaryFile(_IN_MEMORY)  # noqa: SIM115 - see close
-        self._size = 0
+        self.size = 0
         self._answers = array("Q")  # request number - 1 to the offset of its answer + 1; 0: none
         self._orders = array("Q")
         self._credits = bytearray()  # whether an order is a credit
@@ -99,7 +100,7 @@ class Journal:
             fresh.close()
             return
         self.close()
-        self._messages, self._size = fresh._messages, fresh._size
+        self._messages, self.size = fresh._messages, fresh.size
         self._answers, self._orders = fresh._answers, fresh._orders
         self._credits = self._credits[begin:]
         self.first_order, self._obeyed, self._gap = first, obeyed, requests - self.created
@@ -125,7 +126,7 @@ class Journal:
             if is_read:
                 raise self._failure(error) from error
             self._give_up(f"cannot grow in {_folder()}: {error.strerror}")
-        if self._size > self._limit and not is_read:
+        if self.size > self._limit and not is_read:
             limit = f"{self._limit / 1e9:g} GB"
             self._give_up(f"has reached its limit, EnvironmentConfig.journal_size = {limit}")
         return kind in _ORDERS
@@ -205,11 +206,11 @@ class Journal:
         )
 
     def _write(self, message: bytes) -> int:
-        place = self._size
+        place = self.size
         self._messages.seek(place)
         self._messages.write(message)
         self._messages.flush()  # a full disk is noticed now, not when a client needs the message
-        self._size += len(message)
+        self.size += len(message)
         return place
 
     def _read(self, place: int) -> bytes:
