@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import errno
 import hashlib
+import io
+import tempfile
 from pathlib import Path
 
 import numpy as np
@@ -184,6 +187,14 @@ def test_rows_are_the_same_in_any_order_of_events_and_kills(undisturbed, choose,
         assert run(source) == undisturbed
 
 
+@pytest.mark.parametrize("every", [0, 2])
+def test_a_long_past_that_is_repeated_is_said(states, said, every):
+    kwargs = {"pace": 30.0, "kills": ["step 4"]}
+    with states(every, env_kwargs=kwargs, restarts=1, timeout=100.0) as source:
+        source.batch(10)
+    assert len(said("It repeats 3 rows first; with EnvironmentConfig.state_every")) == 2 * (not every)
+
+
 # What cannot be captured -------------------------------------------------------------------------
 
 
@@ -251,6 +262,23 @@ def test_journal_forgets_what_comes_before_a_state():
     assert [journal.answer(number) for number in (1, 2, 8)] == [answers[1], answers[2], None]
     assert journal.order(10) is None
     assert journal.find_order(6) is None
+    journal.close()
+
+
+def test_a_journal_that_cannot_keep_a_state_stays_as_it_is(monkeypatch):
+    journal = Journal(1, 1e9)
+    journal.keep_state(b"first", 0, 0)
+    order = pack(Kind.APPLY, b"order", 1)
+    journal.record(order)
+
+    class Full(io.BytesIO):
+        def write(self, data):
+            raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(tempfile, "SpooledTemporaryFile", lambda *_: Full())
+    journal.keep_state(b"second", 1, 0)
+    assert bytes(journal.state) == b"first"
+    assert journal.order(0) == order
     journal.close()
 
 
