@@ -6,8 +6,13 @@ from collections import deque
 from collections.abc import Mapping
 from typing import Any
 
-from physx_core.errors import ConnectionRefusedByPeerError, DatasetError, NotFiniteError
-from physx_core.errors import PhysxError, StateError
+from physx_core.errors import (
+    ConnectionRefusedByPeerError,
+    DatasetError,
+    NotFiniteError,
+    PhysxError,
+    StateError,
+)
 from physx_core.net.frames import Frame, Kind, pack
 from physx_core.net.remote_errors import encode_error
 from physx_core.net.values import decode, encode
