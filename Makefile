@@ -50,6 +50,7 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/dataset.py
 	$(BIN)/python benchmarks/larger_than_memory.py
 	$(BIN)/python benchmarks/online.py
+	$(BIN)/python benchmarks/states.py
 	$(BIN)/python benchmarks/crash.py
 	$(BIN)/python benchmarks/checkpoint.py
 	$(BIN)/python benchmarks/cluster_sweep.py

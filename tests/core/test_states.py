@@ -333,6 +333,14 @@ def test_what_cannot_be_captured_is_named(attribute, value):
     assert caught.value.kind.split(".")[-1] in str(caught.value)
 
 
+def test_dtypes_that_are_computed_later_are_captured():
+    def change(one):
+        one.kinds = [np.dtype("f4"), np.dtype([("a", "<f8"), ("b", "i4", 2)])]
+
+    one, other = continued(change)
+    assert other.kinds == one.kinds
+
+
 def test_new_views_stay_views():
     def change(one):
         one.part, one.field = one.grid[1:, ::-2], one.records["b"]

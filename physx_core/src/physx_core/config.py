@@ -230,10 +230,15 @@ class EnvironmentConfig:
     restarts: int = at_least(0, 0)
     """Number of times that each client is restarted after a failure; the samples are the same as
     without the failure."""
+    state_every: int = at_least(0, 0)
+    """Number of rows after which each stream gives a state, from which a restarted client goes on;
+    0: there are none, and it repeats all rows. Where an engine keeps memory of its last step, rows
+    depend on this number in the last bits."""
     journal_size: float = at_least(1e-6, 1.0)
     """Largest size in GB of the journal of an instance that can be restarted, in the folder for
-    temporary files: all predictions and stored samples that its client was given. Beyond it, the
-    run goes on, but the instance can no longer be restarted."""
+    temporary files: all predictions and stored samples that its client was given, since the last
+    state if there are states. Beyond it, the run goes on, but the instance can no longer be
+    restarted."""
     launcher: str | type[Any] = "physx/subprocess"
     """Launcher of the clients: "physx/subprocess" on this machine; "physx/manual" if you start them
     with ``physx client``; or a plugin's launcher."""

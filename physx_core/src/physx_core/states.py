@@ -470,6 +470,18 @@ class _Generator(_Kind):
         return np.random.Generator(value(content[0]))
 
 
+class _Dtype(_Kind):
+    """A dtype, such as one that an object computes when it is first needed."""
+
+    def recipe(self, value: Any) -> Any:
+        if value.hasobject:
+            raise _RefusedError("was added after creation")
+        return _descr(value)
+
+    def make(self, recipe: Any, content: Any, value: Value) -> Any:
+        return _dtype(recipe)
+
+
 class _Enum(_Kind):
     def read(self, value: Any, part: Part) -> Any:
         return part(value.value, ".value")
@@ -524,6 +536,7 @@ _KINDS: dict[str, _Kind] = {
     "view": _View(),
     "bits": _Bits(),
     "generator": _Generator(),
+    "dtype": _Dtype(),
     "enum": _Enum(),
     "function": _Function(),
     "method": _Method(),
@@ -535,7 +548,8 @@ _OF_TYPES: tuple[tuple[Any, str], ...] = (
     (enum.Enum, "enum"),
     (MethodType, "method"),
     ((FunctionType, BuiltinFunctionType, functools.partial), "function"),
-    ((type, ModuleType, np.dtype, np.ufunc, range, slice, re.Pattern), "fixed"),
+    (np.dtype, "dtype"),
+    ((type, ModuleType, np.ufunc, range, slice, re.Pattern), "fixed"),
 )
 
 

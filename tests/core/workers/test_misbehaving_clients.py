@@ -53,6 +53,7 @@ def changed(position, **changes):
     return plain_fields(Kind.FIELDS, *listed)
 
 
+STATE = {"orders": 0, "shown": 0, "rejected": 0, "state": b""}
 READY = fields(Kind.READY, DEFINED)
 FIELDS = fields(Kind.FIELDS, [*DEFINED, *ROW_FIELDS])
 X = DEFINED[0].to_dict()
@@ -129,6 +130,13 @@ LATER = {
     "a request of no names": (pack(Kind.PREDICT, encode([1]), 1), "not a dictionary of names"),
     "parameters without names": (pack(Kind.SAVE, encode({1: 2}), 1), "not a dictionary of names"),
     "a deep request": (pack(Kind.SAVE, b"\x40\x0d\x03\0" + b"[" * 200_000, 1), "damaged"),
+    "a state of nothing": (pack(Kind.STATE, encode([]), 1), "sent a state that is none"),
+    "a state of the future": (pack(Kind.STATE, encode(STATE), 9), "rows that it has not sent"),
+    "a state after drawings": (
+        pack(Kind.STATE, encode(STATE | {"shown": 1}), 1),
+        "rows that it has not sent",
+    ),
+    "a reason that is none": (pack(Kind.STATE, encode([])), "does not describe an error"),
     "drawing nothing": (pack(Kind.SHOW, encode([("add", "mesh")]), 1), "malformed drawing events"),
     "drawing otherwise": (
         pack(Kind.SHOW, encode([("eval", "mesh", "a", {})]), 1),

@@ -8,11 +8,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from physx_core import DataGeneration, Dataset, EnvironmentConfig
+from physx_core import DataGeneration, Dataset, DatasetConfig, EnvironmentConfig
 
 pytestmark = pytest.mark.processes
 
 WANDERER = f"{Path(__file__).parents[1] / 'programs' / 'restart_envs.py'}:Wanderer"
+MORTAL = f"{Path(__file__).parents[1] / 'programs' / 'state_envs.py'}:Mortal"
 ASKS = {"num_clients": 2, "env_kwargs": {"asks": True}}
 
 
@@ -61,6 +62,28 @@ def test_a_pipeline_stores_the_same_rows_whatever_happens(nothing_stays_behind):
         for note in notes:
             note.unlink()
     assert len(sums) == 1
+
+
+@pytest.mark.parametrize("writers", ["server", "clients"])
+def test_a_stream_ends_though_each_of_its_processes_makes_few_rows(nothing_stays_behind, writers):
+    found = []
+    for life in (0, 12):
+        config = EnvironmentConfig(
+            MORTAL,
+            env_kwargs={"life": life},
+            num_clients=2,
+            restarts=20,
+            state_every=5,
+            seed=3,
+        )
+        dataset_config = DatasetConfig(writers=writers)
+        generation = DataGeneration(config, dataset_config, batch_nb=8, batch_size=10)
+        generation.execute()
+        with Dataset.open(generation.session.path) as dataset:
+            assert dataset.num_samples("training") == 80
+            fields = dataset.fields("training")
+            found.append(digest([{name: dataset["training"][name][:] for name in fields}]))
+    assert found[0] == found[1]
 
 
 def digest(batches):

@@ -95,6 +95,8 @@ class Kind(enum.IntEnum):
     """Server: numbers of episodes to simulate, with their parameters [how many]."""
     EPISODES = 35
     """Client: what became of episodes, after their rows [number of these rows]."""
+    STATE = 36
+    """Client: its state before its next row [number of rows so far; 0: why there can be none]."""
 
 
 _KINDS = {int(kind): kind for kind in Kind}

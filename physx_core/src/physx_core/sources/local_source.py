@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from physx_core.components.environment import Services
 from physx_core.config import EnvironmentConfig
-from physx_core.errors import ConfigError, PhysxError, UsageError
+from physx_core.errors import ConfigError, PhysxError, StateError, UsageError
 from physx_core.fields import Field
 from physx_core.rows import ROW_FIELDS, RowBuffer, concatenate, copy_row, infer_shapes
 from physx_core.sources.source import Source, check_stored
@@ -110,8 +110,9 @@ class LocalSource(Source):
         return LocalEpisodes(self._instances[0], self.sets, queue)
 
     def _open(self, instance: Instance) -> None:
-        draw = self._config.visualizer is not None
-        instance.open(self._services, draw, partial(self._choose, instance.instance_id))
+        draw, with_states = self._config.visualizer is not None, self._config.state_every > 0
+        choose = partial(self._choose, instance.instance_id)
+        instance.open(self._services, draw, choose, with_states=with_states)
 
     def _choose(self, instance_id: int, episode: int) -> dict[str, Any]:
         return self.sets.choose(instance_id, episode)
@@ -123,12 +124,15 @@ class LocalSource(Source):
             buffer = self._buffer = RowBuffer(buffer.fields[: -len(ROW_FIELDS)], size)
         elif buffer is not None and buffer.count:  # an error ended the last batch
             buffer.clear()
-        instances = self._instances
+        instances, every = self._instances, self._config.state_every
         while self._next < first + size:
             place = self._next % count
             instance = instances[place]
             given = None if stored is None else copy_row(stored, self._next - first)
             try:
+                if every and (row := self._next // count) and row % every == 0:
+                    with contextlib.suppress(StateError):  # after the same rows as in a client
+                        instance.get_state()
                 sample = instance.step(given)
             except PhysxError as error:
                 if instance.environment is not None:

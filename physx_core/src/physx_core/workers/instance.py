@@ -167,6 +167,7 @@ class Instance(Closeable):
         self._simulate: Callable[[], Any] = self._alive
         self._draws = False
         self._drawing: Baseline | None = None
+        self._refusal: StateError | None = None
         self._runner: Any = None
 
     @property
@@ -215,7 +216,8 @@ class Instance(Closeable):
             draw: Whether there is a visualizer.
             choose: Chooses the parameters of an episode; None: they are drawn from their
                 distributions.
-            with_states: Whether to call `track_states`.
+            with_states: Whether to prepare `get_state` and `set_state`, which say so if something
+                cannot be captured.
 
         Raises:
             EnvironmentFailedError: If the environment cannot be imported or one of its methods
@@ -237,15 +239,25 @@ class Instance(Closeable):
                 "call define_training_fields()."
             )
         if with_states:
-            self.track_states()
+            self._try(self.track_states)
         self._draws = draw
         if draw:
             environment.factory, before = Factory(), set(vars(environment))
             self._call("init_visualization", environment.init_visualization)
             environment.update_visualization()
             if with_states:
-                self._drawing = Baseline(environment.factory)
+                self._try(self._track_drawing)
                 environment.leave_out_of_state(vars(environment).keys() - before)
+
+    def _track_drawing(self) -> None:
+        self._drawing = Baseline(self._alive().factory)
+
+    def _try(self, track: Callable[[], None]) -> None:
+        """Prepare states, or note why there can be none."""
+        try:
+            track()
+        except StateError as error:
+            self._refusal = error
 
     def _create(self) -> Environment:
         """Create the environment, and check that its constructor passed on its arguments."""
@@ -439,6 +451,8 @@ class Instance(Closeable):
             EnvironmentFailedError: If the environment raises.
         """
         environment, rejected = self._alive(), self.rejected
+        if self._refusal is not None:
+            raise self._refusal
         self._check_tasks()
         return {
             "environment": self._call("get_state", environment.get_state),

@@ -42,6 +42,8 @@ class WorkerLink:
         spins: Whether to spin-wait for an answer for up to 0.2 ms.
         heartbeat: How often to tell the server, while `beat` is in effect, that this process is
             alive, in s; None: never.
+        requests: How many requests this client sent, with those before the state that it began
+            with.
     """
 
     def __init__(
@@ -62,7 +64,7 @@ class WorkerLink:
         self._reader = reader
         self._buffered: Collection[Any] = getattr(connection, "buffered", ())  # see SecureSocket
         self._postponed: deque[Frame] = deque()
-        self._requests = 0
+        self.requests = 0
         self._poll = transport.poll(connection)
         self._over = threading.Event()
 
@@ -135,8 +137,8 @@ class WorkerLink:
         Returns:
             The value of the answer.
         """
-        message = pack_value(kind, value, what, self._requests + 1)
-        self._requests += 1
+        message = pack_value(kind, value, what, self.requests + 1)
+        self.requests += 1
         self.send(message)
         self._spin()
         while True:
@@ -145,7 +147,7 @@ class WorkerLink:
                 raise RunEnded
             if frame.kind not in (Kind.ANSWER, Kind.REFUSAL):
                 self._postponed.append(frame)
-            elif frame.number == self._requests:
+            elif frame.number == self.requests:
                 if frame.kind is Kind.REFUSAL:
                     raise decode_error(frame.payload)
                 return decode(frame.payload)

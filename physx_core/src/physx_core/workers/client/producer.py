@@ -3,9 +3,18 @@
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
+from typing import Any
 
-from physx_core.errors import ConnectionRefusedByPeerError, NotFiniteError, PhysxError
+from physx_core.errors import (
+    ConnectionRefusedByPeerError,
+    DatasetError,
+    NotFiniteError,
+    PhysxError,
+    StateError,
+)
 from physx_core.net.frames import Frame, Kind, pack
+from physx_core.net.remote_errors import encode_error
 from physx_core.net.values import decode, encode
 from physx_core.rows import ROW_FIELDS, RowBuffer, copy_row, infer_shapes
 from physx_core.typing import Sample
@@ -23,6 +32,7 @@ class Producer:
     Attributes:
         made: Number of generated rows, which is also the index of the next one.
         failure: Why generated rows cannot be sent; None while they can.
+        shown: Number of messages with drawing events.
     """
 
     def __init__(
@@ -33,6 +43,7 @@ class Producer:
         *,
         rows: int = 0,
         rejected: int = 0,
+        state_every: int = 0,
     ) -> None:
         """Store what generates and sends the rows.
 
@@ -42,13 +53,16 @@ class Producer:
             sink: Takes the rows.
             rows: How many rows the server has from earlier clients. They are generated again, but
                 not sent.
-            rejected: How many of the rejected rows that it has are generated again.
+            rejected: How many rejected rows the server has from earlier clients.
+            state_every: Number of rows after which to send a state; 0: never.
         """
-        self.made = 0
+        self.made = self.shown = 0
         self.failure: PhysxError | None = None
         self._link, self._instance, self._sink = link, instance, sink
         self._clock = link.clock
         self._skip, self._skip_rejected = rows, rejected
+        self._state_every, self._last_state, self._has_refused = state_every, 0, False
+        self._orders = self._rejected = 0  # how many there have been
         self._buffer: RowBuffer | None = None
         self._announced = False
         self._stored: deque[Sample] = deque()
@@ -59,6 +73,28 @@ class Producer:
         """Open the sink; rows that it already has are generated again, but not put."""
         self._skip = self._sink.open(self._skip)
 
+    def resume(self, state: Mapping[str, Any]) -> None:
+        """Go on from the state that an earlier client sent.
+
+        Args:
+            state: Its counters, and what `_send_state` has sent.
+
+        Raises:
+            DatasetError: If rows before it have been lost.
+            StateError: If the environment was created differently.
+        """
+        if self._skip < state["rows"]:
+            raise DatasetError(
+                f"Of the {state['rows']} rows before the state of instance "
+                f"{self._instance.instance_id}, the dataset's folder has only {self._skip}."
+            )
+        kept = decode(state["state"])
+        self._instance.set_state(kept["instance"])
+        self._stored.extend(kept["stored"])
+        self.made = self._last_state = state["rows"]
+        self._orders, self._rejected = state["orders"], state["rejected"]
+        self.shown, self._link.requests = state["shown"], state["requests"]
+
     def run(self) -> None:
         """Generate rows until the server ends the run."""
         while True:
@@ -66,6 +102,8 @@ class Producer:
                 while self.made >= self._credit:
                     self._obey(self._link.receive())
                 self._sent_at = self._clock.monotonic()
+            if self._state_every and self.made % self._state_every == 0:
+                self._send_state()
             try:
                 self._make_row()
             except PhysxError:
@@ -122,6 +160,27 @@ class Producer:
         self._announce(buffer)
         self.made += 1
 
+    def _send_state(self) -> None:
+        """Send the state before the next row, and the rows before it.
+
+        It is always taken after the same rows, as the next ones may depend on that: see
+        `Instance.get_state`.
+        """
+        if self.made == self._last_state:
+            return
+        self.flush()
+        self._last_state = self.made
+        try:
+            state = self._instance.get_state()
+        except StateError as error:
+            if not self._has_refused:
+                self._link.send(pack(Kind.STATE, encode_error(error)))
+            self._has_refused = True
+            return
+        counts = {"orders": self._orders, "shown": self.shown, "rejected": self._rejected}
+        kept = encode({"instance": state, "stored": list(self._stored)}, "the state")
+        self._link.send(pack(Kind.STATE, encode({**counts, "state": kept}), self.made))
+
     def _announce(self, buffer: RowBuffer) -> None:
         """Send the fields of the rows, once."""
         if not self._announced:
@@ -135,8 +194,8 @@ class Producer:
         if rejected is None or buffer is None or not self._announced:
             return
         rows = rejected.take(buffer.fields[: -len(ROW_FIELDS)], self._instance.instance_id)
-        skipped = min(self._skip_rejected, len(rows["step"]))
-        self._skip_rejected -= skipped
+        skipped = max(0, min(self._skip_rejected - self._rejected, len(rows["step"])))
+        self._rejected += len(rows["step"])
         for start in range(skipped, len(rows["step"]), buffer.capacity):
             part = {name: values[start : start + buffer.capacity] for name, values in rows.items()}
             self._link.send_parts(pack_rows(part, len(part["step"]), Kind.WRONG))
@@ -173,6 +232,7 @@ class Producer:
             self._obey(frame)
 
     def _obey(self, frame: Frame) -> None:
+        self._orders += frame.kind in (Kind.APPLY, Kind.STORED)
         if frame.kind is Kind.CREDIT:
             self._credit = frame.number
         elif self._sink.take(frame):

@@ -6,7 +6,7 @@ import contextlib
 import os
 import re
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,6 +87,7 @@ def run_instance(
         ServerGone: If the server is gone without having ended the run.
     """
     draw, skip, stripes = setup.pop("draw"), setup.pop("skip"), setup.pop("stripes", None)
+    every, state = setup.pop("state_every"), setup.pop("state")
     sink: RowSink = SentRows(link)
     if stripes is not None:
         # Importing datasets takes a quarter of a client's start time, and most clients need none.
@@ -95,12 +96,13 @@ def run_instance(
         sink = StripedRows(link, stripes)
     say(
         f"running {setup['environment']}, instance {setup['instance_id']} of {setup['instance_nb']}"
-        + (f"; {skip['rows']} stored rows are generated again" if skip["rows"] else "")
+        + _describe_past(skip["rows"], 0 if state is None else state["rows"])
     )
     link.spins = has_core_for_each(setup["instance_nb"])
-    client = _Client(link, Instance(**setup), sink, skip.pop("shown"), skip)
+    shown, skip["state_every"] = skip.pop("shown"), every
+    client = _Client(link, Instance(**setup), sink, shown, skip)
     try:
-        client.live(draw)
+        client.live(draw, state)
     finally:
         client.close()
     if client.is_forsaken:
@@ -111,6 +113,11 @@ def run_instance(
     say("the run has ended" if failure is None else f"{type(failure).__name__}: {failure}")
     link.finish()
     return 0 if failure is None else 1
+
+
+def _describe_past(rows: int, restored: int) -> str:
+    text = f"; it goes on from its state after {restored} rows" if restored else ""
+    return text + (f"; {rows - restored} rows are generated again" if rows > restored else "")
 
 
 def _take_place(path: list[str], directory: str) -> None:
@@ -150,19 +157,28 @@ class _Client:
         self._link, self._instance, self._sink = link, instance, sink
         self._producer = Producer(link, instance, sink, **skip)
         self._services = RemoteServices(link, self._producer, shown)
+        self._has_states = skip["state_every"] > 0
         self._leased: EpisodeProducer | None = None
 
-    def live(self, draw: bool) -> None:
-        """Open the environment and generate rows until the run ends or the environment fails."""
+    def live(self, draw: bool, state: Mapping[str, Any] | None) -> None:
+        """Open the environment and generate rows until the run ends or the environment fails.
+
+        Args:
+            draw: Whether there is a visualizer.
+            state: What an earlier client sent, to go on from; None: begin.
+        """
+        services, with_states = self._services, self._has_states
         try:
             self._producer.open()
-            self._instance.open(self._services, draw, self._services.choose)
+            self._instance.open(services, draw, services.choose, with_states=with_states)
             parameters = [parameter.to_dict() for parameter in self._instance.parameters]
             if parameters:
                 self._link.send(pack(Kind.PARAMETERS, encode(parameters)))
             defined = [*self._instance.fields, *self._instance.episode_fields]
             fields = [field.to_dict() for field in defined]
             self._link.send(pack(Kind.READY, encode(fields), int(self._instance.is_independent)))
+            if state is not None:
+                self._producer.resume(state)
             self._run()
         except (KeyboardInterrupt, Terminated):
             with contextlib.suppress(ServerGone):
@@ -209,9 +225,9 @@ class RemoteServices:
         Args:
             link: Connection to the server.
             producer: Generates the rows; pending ones are sent before each wait for an answer.
-            shown: How many messages with drawing events a predecessor sent.
+            shown: How many messages with drawing events predecessors sent.
         """
-        self._link, self._producer, self._to_skip = link, producer, shown
+        self._link, self._producer, self._skip = link, producer, shown
 
     def predict(self, fields: Sample) -> Sample:
         """Return the network's prediction: see `Services.predict`."""
@@ -235,8 +251,8 @@ class RemoteServices:
 
     def show(self, instance_id: int, step: int, events: list[Event]) -> None:
         """Send drawing events: see `Services.show`."""
-        if self._to_skip:
-            self._to_skip -= 1
+        self._producer.shown += 1
+        if self._producer.shown <= self._skip:
             return
         plain = [(event.action, event.kind, event.names, dict(event.values)) for event in events]
         self._link.send(pack(Kind.SHOW, encode(plain, "update_visualization()"), step))

@@ -24,7 +24,7 @@ from physx_core.net.addresses import format_address, is_loopback, parse_address
 from physx_core.net.handshake import TOKEN_VARIABLE
 from physx_core.net.link import SOCKETS, Transport
 from physx_core.net.tokens import choose_token, find_token
-from physx_core.net.values import encode
+from physx_core.net.values import decode, encode
 from physx_core.plugins import reference_of, resolve
 from physx_core.plugins.references import locate
 from physx_core.workers.instance import NOTHING, Skip, instance_arguments
@@ -44,6 +44,7 @@ _GRACE = 1.0
 _BUSY = 1.0
 _EXIT_TIME = 5.0
 _SAY_EVERY = 5.0
+_LONG_PAST = 60.0
 _PASSING = (EnvironmentFailedError, ProgramError, ClientError)  # errors that may not recur
 _LOG = logging.getLogger("physx")
 
@@ -428,7 +429,18 @@ class ClientGroup:
                 f"place, at {self._public_address()}."
             )
         restart = f"Restart {self._restarts[number]} of {self.config.restarts}."
+        if not self.config.state_every and self._has_long_past(number):
+            text += (
+                f" It repeats {self.server.peers[number].received} rows first; with "
+                "EnvironmentConfig.state_every it would go on from a state."
+            )
         return text if left else f"{restart} {text}"
+
+    def _has_long_past(self, number: int) -> bool:
+        """Return whether an instance has taken so long that its user may not want it repeated."""
+        peer, now = self.server.peers.get(number), self._clock.monotonic()
+        took = now - self._launched.get(number, now)
+        return peer is not None and peer.received > 1 and took > _LONG_PAST
 
     def _report_missing(self, waited: Sequence[int], began: float) -> None:
         """Report from time to time which clients are missing."""
@@ -487,6 +499,8 @@ class ClientGroup:
             first["stripes"] = self._written.describe(peer)
         if self._pool is not None:
             skip = dict.fromkeys(skip, 0)
+        state = None if peer.journal is None else peer.journal.state
+        first["state"] = None if state is None else decode(state)
         return self._encode(peer.instance_id, skip=skip, **first)
 
     def _encode(self, instance_id: int, **progress: Any) -> bytes:
@@ -496,6 +510,7 @@ class ClientGroup:
                 **instance_arguments(config, instance_id, self._seed, self._accepts_all),
                 "environment": locate("environment", config.environment),
                 "draw": config.visualizer is not None,
+                "state_every": config.state_every,
                 "path": [str(Path(entry).resolve()) for entry in sys.path],
                 "directory": str(Path.cwd()),
                 **progress,

@@ -6,15 +6,17 @@ import contextlib
 
 from physx_core.clock import SYSTEM_CLOCK, Clock
 from physx_core.components.parameter import Parameter
-from physx_core.errors import PhysxError
+from physx_core.errors import ConnectionRefusedByPeerError, PhysxError
 from physx_core.fields import Field
 from physx_core.net.connection import Connection
 from physx_core.net.frames import FrameReader
 from physx_core.net.handshake import HANDSHAKE_LIMIT
 from physx_core.net.link import Link
+from physx_core.net.values import encode
 from physx_core.workers.row_codec import RejectedRows, RowQueue
 from physx_core.workers.server.journal import Journal
 from physx_core.workers.server.pace import Pace
+from physx_core.workers.server.validation import ClientState
 
 _PIECE = 1 << 16
 
@@ -50,6 +52,8 @@ class Peer(Connection):
         parameters: The parameters that its environment defines.
         episode: Last episode that it was given parameters for; -1: none.
         pace: How fast this client generates rows.
+        resumed_requests: How many requests there were before the state that it begins with; None:
+            it begins without one.
     """
 
     reader: FrameReader
@@ -84,6 +88,7 @@ class Peer(Connection):
         self.episode = -1
         self.pace = Pace(clock)
         self._arrived = 0  # of a long frame, when the peer was last heard from
+        self.resumed_requests: int | None = None
         self._next_order: int | None = None  # of the journal's, for this client; None: it got all
 
     @property
@@ -112,7 +117,32 @@ class Peer(Connection):
         self.row_fields, self.last_step = former.row_fields, former.last_step
         self.shown, self.journal = former.shown, former.journal
         self.episode = former.episode
-        self._next_order = None if self.journal is None else 0
+        if self.journal is not None:
+            self._next_order = self.journal.first_order
+            self.resumed_requests = self.journal.resumed_requests
+
+    def keep_state(self, rows: int, state: ClientState) -> None:
+        """Keep a state for a client that takes its place.
+
+        Args:
+            rows: How many rows came before it.
+            state: The state, and counts that come with it.
+
+        Raises:
+            ConnectionRefusedByPeerError: If the counts cannot be right.
+        """
+        journal = self.journal
+        if not 0 < rows <= self.received or not (
+            state["shown"] <= self.shown and state["rejected"] <= self.rejected.count
+        ):
+            raise ConnectionRefusedByPeerError("Its state is after rows that it has not sent.")
+        if journal is None or journal.given_up:
+            return
+        order, sent = journal.find_order(state["orders"]), self._next_order
+        if order is None or (sent is not None and order > sent):
+            raise ConnectionRefusedByPeerError("Its state is after orders that nobody gave.")
+        plain = {**state, "rows": rows, "requests": self.requests}
+        journal.keep_state(encode(plain), state["orders"], self.requests)
 
     def hear(self, *, whole: bool) -> None:
         """Note a sign of life: a whole frame, or a substantial part of a long one.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import selectors
 from collections.abc import Callable, Collection, Iterable, Mapping
 from types import MappingProxyType
@@ -33,6 +34,7 @@ from physx_core.workers.server.validation import (
     check_rows,
     parse_fields,
     parse_parameters,
+    parse_state,
 )
 
 _HANDSHAKE_TIME = 5.0
@@ -40,6 +42,7 @@ _SPIN_TIME = 5e-5  # for the next requests of clients that were just answered
 _MAX_STRANGERS = 128
 _TURNS = 64
 _LONG = 1 << 16
+_LOG = logging.getLogger("physx")
 _REQUESTS = (Kind.PREDICT, Kind.SAVE, Kind.LOAD, Kind.SHOW, Kind.CHOOSE)
 
 
@@ -96,7 +99,7 @@ class Server:
         self._setup, self._replaces, self._skip = setup, replaces, skip
         self._journal_size = journal_size
         self._reserved = reserved
-        self._ending = self._has_news = False
+        self._ending = self._has_news = self._has_no_states = False
         self._listener = Listener[Peer](
             self._meet, self._give_up, encrypts=True, transport=transport
         )
@@ -109,6 +112,7 @@ class Server:
             Kind.FIELDS: _take_fields,
             Kind.WRONG: _take_wrong,
             Kind.ERROR: _take_error,
+            Kind.STATE: self._take_state,
             Kind.BYE: self._take_bye,
             Kind.AGAIN: _take_sign_of_life,
             Kind.PING: _take_sign_of_life,
@@ -332,6 +336,18 @@ class Server:
         peer.finished = self._ending and peer.failure is None
         self._drop(peer)  # it waits for this
 
+    def _take_state(self, peer: Peer, frame: Frame) -> None:
+        if frame.number:
+            peer.keep_state(frame.number, parse_state(frame.payload))
+        elif not self._has_no_states:
+            self._has_no_states = True
+            _LOG.warning(
+                "A client that takes the place of another one will repeat all rows since the last "
+                "state, as instance %d gives none. %s",
+                peer.instance_id,
+                decode_error(frame.payload),
+            )
+
 
 def _take_parameters(peer: Peer, frame: Frame) -> None:
     if peer.fields or peer.parameters:
@@ -347,6 +363,10 @@ def _take_ready(peer: Peer, frame: Frame) -> None:
     peer.episode_fields = [field for field in fields if field.role == "episode"]
     peer.fields = [field for field in fields if field.role != "episode"]
     peer.is_independent = bool(frame.number)
+    if peer.resumed_requests is not None:
+        peer.requests = peer.resumed_requests
+    elif peer.journal is not None:
+        peer.journal.created = peer.requests
 
 
 def _take_fields(peer: Peer, frame: Frame) -> None:

@@ -9,7 +9,7 @@ from __future__ import annotations
 import re
 from collections.abc import Sequence
 from dataclasses import replace
-from typing import Any
+from typing import Any, TypedDict, cast
 
 from physx_core.components.parameter import Parameter
 from physx_core.components.scene.event import ACTIONS, Event
@@ -67,6 +67,31 @@ def parse_choice(payload: bytes | bytearray, last: int) -> int:
     if type(episode) is not int or not last < episode < _MOST_EPISODES:
         raise ConnectionRefusedByPeerError("It asked for the parameters of an impossible episode.")
     return episode
+
+
+class ClientState(TypedDict):
+    """A state of an instance, with what its client has counted."""
+
+    orders: int
+    """How many orders other than credit it had obeyed."""
+    shown: int
+    """How many messages with drawing events there had been."""
+    rejected: int
+    """How many rejected rows there had been."""
+    state: bytes
+    """The state, for a client."""
+
+
+def parse_state(payload: bytes | bytearray) -> ClientState:
+    """Return the state that a message holds."""
+    plain = decode(payload)
+    kinds = {"orders": int, "shown": int, "rejected": int, "state": bytes}
+    if not isinstance(plain, dict) or {n: type(value) for n, value in plain.items()} != kinds:
+        raise ConnectionRefusedByPeerError("It sent a state that is none.")
+    state = cast(ClientState, plain)
+    if min(state["orders"], state["shown"], state["rejected"]) < 0:
+        raise ConnectionRefusedByPeerError("It sent a state with a negative count.")
+    return state
 
 
 def _is_field(plain: Any) -> bool:
