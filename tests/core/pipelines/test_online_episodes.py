@@ -181,7 +181,9 @@ def test_resumed_training_leaves_out_surplus_episodes_that_a_sampler_chose_befor
 
 def test_episodes_follow_the_rows_of_a_stream():
     expected = result(train("alone", 2))
-    config = EnvironmentConfig(LESSON, as_tcp_ip_client=False, independent_episodes=False, seed=1)
+    config = EnvironmentConfig(
+        LESSON, {"plain": True}, as_tcp_ip_client=False, independent_episodes=False, seed=1
+    )
     DataGeneration(config, batch_nb=3, batch_size=10, session_name="run", quiet=True).execute()
     with Dataset.open("sessions/run") as dataset:
         stream = dataset["training"]["x"][:]

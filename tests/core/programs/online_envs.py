@@ -89,22 +89,24 @@ class Lesson(Environment):
 
     independent_episodes = True
 
-    def __init__(self, *, delay=0.0, fails=(), dies=(), asks=False, rejects=0.0, **kwargs):
+    def __init__(
+        self, *, delay=0.0, fails=(), dies=(), asks=False, rejects=0.0, plain=False, **kwargs
+    ):
         super().__init__(**kwargs)
         self.delay, self.fails, self.dies, self.asks = delay, fails, dies, asks
-        self.rejects = rejects
+        self.rejects, self.is_plain = rejects, plain or asks
 
     def create(self):
         self.define_parameters([Parameter("slope", 0.5, 1.5)])
 
     def init_database(self):
         self.define_training_fields([Field("x", (2,)), Field("y", (1,))])
-        if not self.asks:
+        if not self.is_plain:
             self.define_episode_fields(("number", int))
 
     def reset_parameters(self, slope):
         self.slope, self.left = slope, int(self.rng.integers(1, 6))
-        if not self.asks:
+        if not self.is_plain:
             self.set_episode_data(number=self.episode_index)
         self.note("begun")
 
