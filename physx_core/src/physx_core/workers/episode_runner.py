@@ -189,7 +189,7 @@ class EpisodeRunner:
         buffer = self._buffer
         if buffer is None or buffer.full or self._began >= until:
             return
-        put, now, start, first = buffer.put, self._now, buffer.count, self._instance.number + 1
+        put, now, start, first = buffer.put, self._now, buffer.count, self._instance.episode + 1
         sample: Mapping[str, Any] | None = None
         try:
             following = itertools.islice(self._episodes, buffer.capacity - start)
@@ -204,7 +204,7 @@ class EpisodeRunner:
                 buffer.number_rows(start, first)
                 self._number, self._part = first, 0
                 self._end(_FINISHED, count)
-            has_ended = self._instance.number < first + count
+            has_ended = self._instance.episode < first + count
             self._number, self._part = None if has_ended else first + count, 0
         if not has_ended:  # without a row
             self._end(_FINISHED)

@@ -191,7 +191,7 @@ class Instance(Closeable):
         return self._alive().independent_episodes and self._independent is not False
 
     @property
-    def number(self) -> int:
+    def episode(self) -> int:
         """Number of the last episode that has begun."""
         return self._alive().episode_index
 
