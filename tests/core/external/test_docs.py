@@ -57,7 +57,7 @@ def test_the_program_in_c(compiler):
     before = (rows["env_id"] == 1) & (rows["step"] % 100 < 99)
     np.testing.assert_array_equal(rows["state"][goes_on], rows["next_state"][before])
     assert set(rows["episode"]) == set(range(5))
-    run(block("sh", "sampler physx/sobol"))
+    run(block("sh", "physx/sobol \\\n"))
     assert len({*rows_of("data_generation_1", "parameters")["stiffness"]}) == 10
 
 
