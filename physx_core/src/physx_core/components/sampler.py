@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Mapping, Sequence
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import Any
 
 import numpy as np
 
@@ -25,13 +25,11 @@ class Sampler(ABC):
     on the arguments of `begin` and on the set's number, except for a `LearningSampler`.
 
     Attributes:
-        learns: Whether it is told the losses of the samples generated with its sets.
         parameters: The parameters to choose.
         seed: Seed of the run.
         size: Number of elements of all parameters.
     """
 
-    learns: ClassVar[bool] = False
     parameters: Sequence[Parameter]
     seed: Sequence[int]
     size: int
@@ -95,7 +93,6 @@ class LearningSampler(Sampler):
         memory: Number of sets, up to the latest one with losses, that the sampler is told of.
     """
 
-    learns: ClassVar[bool] = True
     memory: int = 512
 
     @abstractmethod

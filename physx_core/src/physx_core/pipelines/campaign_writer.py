@@ -112,9 +112,10 @@ class CampaignWriter:
         Raises:
             FailedEpisodesError: If there are too many.
         """
-        unsure = [*self._unsure, *failed]
-        needed = [record for record in unsure if self.queue.needs(record.episode)]
-        self._unsure = [record for record in unsure if record not in needed]
+        needed: list[EpisodeRecord] = []
+        unsure, self._unsure = [*self._unsure, *failed], []
+        for record in unsure:
+            (needed if self.queue.needs(record.episode) else self._unsure).append(record)
         self.failed += len(needed)
         if needed and self.failed > self._max_failed:
             raise FailedEpisodesError(self.failed, needed[-1].episode, needed[-1].reason)

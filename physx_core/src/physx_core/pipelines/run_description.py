@@ -10,8 +10,6 @@ from physx_core.dataset import EPISODES, Dataset
 from physx_core.errors import PhysxError
 from physx_core.pipelines.learning.learner import Learner
 
-_MOST_NAMED = 5
-
 
 def describe_component(component: object) -> str:
     """Return a component's text, or the name of its class if it defines none."""

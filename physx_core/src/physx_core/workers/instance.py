@@ -6,7 +6,7 @@ import inspect
 import traceback
 import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from physx_core.closeable import Closeable
 from physx_core.components.environment import (
@@ -33,8 +33,10 @@ from physx_core.plugins import resolve
 from physx_core.plugins.references import adapters_hint
 from physx_core.processes.endings import describe_ending, is_ending
 from physx_core.rows import RejectedSamples
-from physx_core.states import Baseline
 from physx_core.typing import Array, Batch, Sample
+
+if TYPE_CHECKING:
+    from physx_core.states import Baseline
 
 PARAMETER = "parameters/"
 """Name prefix of a stored row's entries that hold the parameters it was generated with; no field
@@ -250,6 +252,8 @@ class Instance(Closeable):
                 environment.leave_out_of_state(vars(environment).keys() - before)
 
     def _track_drawing(self) -> None:
+        from physx_core.states import Baseline  # most runs take no states
+
         self._drawing = Baseline(self._alive().factory)
 
     def _try(self, track: Callable[[], None]) -> None:
