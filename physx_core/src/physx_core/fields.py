@@ -86,6 +86,11 @@ class Field:
         count = math.prod(self.shape) if self.shape is not None else 0
         return count * self.numpy_dtype.itemsize
 
+    def converted_dtype(self, dtype: np.dtype[Any] | None) -> np.dtype[Any]:
+        """Return the type of the values if floating-point fields are converted to `dtype`."""
+        own = self.numpy_dtype
+        return own if dtype is None or own.kind != "f" else dtype
+
     def convert(self, values: Any, *, axes: int = 0, instance_id: int = 0, step: int = -1) -> Array:
         """Return values as an array of the field's shape and type.
 

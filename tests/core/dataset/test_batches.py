@@ -5,7 +5,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from physx_core import Dataset
-from physx_core.dataset.read.strategies import memory
+from physx_core.dataset.read.access import memory
 from physx_core.errors import ConfigError, DatasetError
 
 N = 1003

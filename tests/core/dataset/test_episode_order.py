@@ -21,7 +21,8 @@ from sizes import trials
 
 from physx_core import Dataset
 from physx_core.dataset import EPISODES, EpisodeRecord, EpisodeStatus
-from physx_core.dataset.read.strategies import disk, prefetch, windows
+from physx_core.dataset.read import shuffling
+from physx_core.dataset.read.access import disk, memory
 from physx_core.dataset.store import locks
 from physx_core.errors import UsageError
 
@@ -37,9 +38,9 @@ FINISHED, FAILED, CUT, MORE = (
 @pytest.fixture(autouse=True)
 def little_at_a_time(monkeypatch):
     monkeypatch.setattr(disk, "_OPEN_FILES", 2)
-    monkeypatch.setattr(prefetch, "_AHEAD", 200)
-    monkeypatch.setattr(windows, "_BLOCK", 100)
-    monkeypatch.setattr(windows, "_WINDOW_BLOCKS", 3)
+    monkeypatch.setattr(shuffling, "_CHUNK", 200)
+    monkeypatch.setattr(shuffling, "_BLOCK", 100)
+    monkeypatch.setattr(shuffling, "_WINDOW", 3)
     for name in ("fsync", "fdatasync"):  # nothing here depends on what has reached the disk
         monkeypatch.setattr(os, name, lambda descriptor: None)
 
@@ -111,7 +112,6 @@ EPISODE = st.tuples(
     st.sampled_from([1, 1, 1, 2, 4]),
     st.booleans(),
 )
-STRATEGIES = st.sampled_from(["memory", "disk exact", "disk windowed"])
 
 
 def look(dataset, mode):
@@ -399,23 +399,24 @@ class Machine(RuleBasedStateMachine):
         assert view[-1] == expected[-1]
 
     @rule(
-        strategy=STRATEGIES, shuffle=st.booleans(), key=st.integers(0, 3), size=st.integers(1, 9),
-        block=st.sampled_from([None, 1, 4]),
+        order=st.sampled_from(["stored", "exact", "blocks"]), key=st.integers(0, 3),
+        size=st.integers(1, 9), free=st.sampled_from([0, 10**9]),
     )  # fmt: skip
-    def batches(self, strategy, shuffle, key, size, block):
+    def batches(self, order, key, size, free):
         expected = np.array(self.model.rows(), np.int64)
         if not len(expected):
             return
-        options = {"shuffle": shuffle, "seed": key, "strategy": strategy, "block": block}
-        found = list(self.dataset.batches(self.mode, size, **options))
+        with mock.patch.object(memory, "available_memory", lambda: free):
+            found = list(
+                self.dataset.batches(
+                    self.mode, size, shuffle=order != "stored", seed=key, order=order
+                )
+            )
         rows = np.concatenate([batch["n"] for batch in found])
-        if not shuffle:
-            assert rows.tolist() == expected.tolist()
-        elif strategy == "disk windowed":
-            assert sorted(rows.tolist()) == sorted(expected.tolist())
-        else:
-            order = np.random.default_rng(key).permutation(len(expected))
-            assert rows.tolist() == expected[order].tolist()
+        nbytes = sum(field.nbytes for field in self.dataset.fields(self.mode).values())
+        chosen = shuffling.key_of(shuffling.key_of(key), 0)
+        drawn = shuffling.make_order(order, len(expected), nbytes, chosen)
+        assert rows.tolist() == expected[drawn.items(0, len(expected))].tolist()
         x = np.concatenate([batch["x"] for batch in found])
         np.testing.assert_array_equal(x, self.block(rows)["x"])
 

@@ -28,8 +28,8 @@ from sizes import trials
 
 from physx_core import Dataset, Field
 from physx_core.dataset.read import reader as reading
-from physx_core.dataset.read import splits
-from physx_core.dataset.read.strategies import disk, memory, prefetch, windows
+from physx_core.dataset.read import shuffling, splits
+from physx_core.dataset.read.access import disk, memory
 from physx_core.dataset.store.partition import segment
 from physx_core.errors import (
     ConfigError,
@@ -55,9 +55,11 @@ def little_at_a_time(monkeypatch):
     for module in (reading, segment, splits):
         monkeypatch.setattr(module, "rows_per_block", lambda nbytes: max(1, 400 // max(1, nbytes)))
     monkeypatch.setattr(disk, "_OPEN_FILES", 2)
-    monkeypatch.setattr(prefetch, "_AHEAD", 200)
-    monkeypatch.setattr(windows, "_BLOCK", 200)
-    monkeypatch.setattr(windows, "_WINDOW_BLOCKS", 3)
+    monkeypatch.setattr(shuffling, "_CHUNK", 200)
+    monkeypatch.setattr(shuffling, "_BLOCK", 200)
+    monkeypatch.setattr(shuffling, "_WINDOW", 3)
+    monkeypatch.setattr(shuffling, "_MOST_SORTED", 40)
+    monkeypatch.setattr(shuffling, "_SLAB", 16)
     for name in ("fsync", "fdatasync"):  # nothing here depends on what has reached the disk
         monkeypatch.setattr(os, name, lambda descriptor: None)
 
@@ -224,7 +226,7 @@ INDEXES = st.one_of(
 )
 BYTES = st.sampled_from([1, 100, 200, 300, 600, 2000])  # rows of a partition, about
 SELDOM = precondition(lambda self: self.turn % 3 == 0)
-STRATEGIES = st.sampled_from(["auto", "memory", "disk exact", "disk windowed"])
+HOW = st.sampled_from([None, "exact", "blocks"])
 
 
 def index_of(drawn, total):
@@ -583,11 +585,11 @@ class Machine(RuleBasedStateMachine):
     @rule(
         mode=KNOWN, count=st.integers(1, 30), shuffle=st.booleans(), key=st.integers(0, 5),
         epochs=st.integers(0, 2), fields=st.integers(0, 2**7), dtype=st.sampled_from([None, "f4"]),
-        reuse=st.booleans(), normalize=st.booleans(), strategy=STRATEGIES,
+        reuse=st.booleans(), normalize=st.booleans(), how=HOW,
         free=st.sampled_from([None, 0, 2000]),
     )  # fmt: skip
     def batches(
-        self, mode, count, shuffle, key, epochs, fields, dtype, reuse, normalize, strategy, free
+        self, mode, count, shuffle, key, epochs, fields, dtype, reuse, normalize, how, free
     ):
         mode = self.known(mode)
         self.committed()
@@ -595,7 +597,7 @@ class Machine(RuleBasedStateMachine):
         names = ["n", *(n for k, n in enumerate(model.fields) if k and fields >> k & 1)]
         options = {
             "shuffle": shuffle, "seed": key, "epochs": epochs, "dtype": dtype, "reuse": reuse,
-            "normalize": normalize, "strategy": strategy, "fields": names if fields else None,
+            "normalize": normalize, "order": how, "fields": names if fields else None,
         }  # fmt: skip
         if not model.rows:
             with pytest.raises(DatasetError, match="no samples"):
@@ -616,10 +618,13 @@ class Machine(RuleBasedStateMachine):
             order = self.order_of(model, rows["n"])
             if not shuffle:
                 assert order.tolist() == list(range(model.rows))
-            elif strategy != "disk windowed" and free is None:
-                random = np.random.default_rng(key)
-                expected = [random.permutation(model.rows) for _ in range(epoch + 1)][-1]
-                assert order.tolist() == expected.tolist()
+            else:  # whatever is read, of whatever type, with whatever memory and size of batches
+                nbytes = sum(field.nbytes for field in model.fields.values())
+                name = how or shuffling.choose_order(model.rows, nbytes)
+                drawn = shuffling.make_order(
+                    name, model.rows, nbytes, shuffling.key_of(shuffling.key_of(key), epoch)
+                )
+                assert order.tolist() == drawn.items(0, model.rows).tolist()
             self.check_rows(model, rows, order, dtype, normalize)
 
     def order_of(self, model, n):
@@ -648,17 +653,17 @@ class Machine(RuleBasedStateMachine):
     @precondition(lambda self: len(self.iterations) < 3)
     @rule(
         mode=KNOWN, count=st.integers(1, 9), shuffle=st.booleans(), key=st.integers(0, 5),
-        dtype=st.sampled_from([None, "f4"]), reuse=st.booleans(), strategy=STRATEGIES,
+        dtype=st.sampled_from([None, "f4"]), reuse=st.booleans(), how=HOW,
         free=st.sampled_from([None, 0]),
     )  # fmt: skip
-    def begin_iteration(self, mode, count, shuffle, key, dtype, reuse, strategy, free):
+    def begin_iteration(self, mode, count, shuffle, key, dtype, reuse, how, free):
         mode = self.known(mode)
         self.committed()
         model = self.modes[mode]
         if not model.rows:
             return
         options = {
-            "shuffle": shuffle, "seed": key, "dtype": dtype, "reuse": reuse, "strategy": strategy,
+            "shuffle": shuffle, "seed": key, "dtype": dtype, "reuse": reuse, "order": how,
         }  # fmt: skip
         with memory_of(free):
             whole = self.dataset.batches(mode, count, **options)
@@ -737,9 +742,9 @@ class Machine(RuleBasedStateMachine):
         self.subsets = [*self.subsets[-3:], *parts.values()]
 
     @precondition(lambda self: self.subsets)
-    @rule(which=st.integers(0, 5), count=st.integers(1, 20), strategy=STRATEGIES,
+    @rule(which=st.integers(0, 5), count=st.integers(1, 20), how=HOW,
           shuffle=st.booleans(), index=INDEXES, free=st.sampled_from([None, 0]))  # fmt: skip
-    def read_subset(self, which, count, strategy, shuffle, index, free):
+    def read_subset(self, which, count, how, shuffle, index, free):
         subset = self.subsets[which % len(self.subsets)]
         model = self.modes[subset.mode]
         index = index_of(index, len(subset.rows))
@@ -748,7 +753,7 @@ class Machine(RuleBasedStateMachine):
             assert subset[name].shape == expected.shape
             np.testing.assert_array_equal(subset[name][index], expected[index])
         with memory_of(free):
-            batches = subset.batches(count, shuffle=shuffle, seed=1, strategy=strategy)
+            batches = subset.batches(count, shuffle=shuffle, seed=1, order=how)
             found = [{n: block.copy() for n, block in batch.items()} for batch in batches]
         rows = {name: np.concatenate([b[name] for b in found]) for name in model.fields}
         place = {number: row for row, number in enumerate(model.numbers["n"].tolist())}
@@ -794,8 +799,8 @@ class Machine(RuleBasedStateMachine):
         self.removed = False
 
     @precondition(lambda self: self.reader is not None)
-    @rule(mode=MODES, count=st.integers(1, 30), index=INDEXES, strategy=STRATEGIES)
-    def read_beside(self, mode, count, index, strategy):
+    @rule(mode=MODES, count=st.integers(1, 30), index=INDEXES, free=st.sampled_from([None, 0]))
+    def read_beside(self, mode, count, index, free):
         if mode not in self.seen:
             assert mode not in self.reader
             return
@@ -807,7 +812,8 @@ class Machine(RuleBasedStateMachine):
         fields = self.modes[mode].fields.values()
         try:
             by_index = {each.name: self.reader[mode][each.name][index] for each in fields}
-            batches = list(self.reader.batches(mode, count, strategy=strategy))
+            with memory_of(free):
+                batches = list(self.reader.batches(mode, count))
         except DatasetError:
             assert self.removed  # its files are gone
             return
@@ -1033,8 +1039,8 @@ class SharedMachine(RuleBasedStateMachine):
         writer.part = None
         self.parts += [numbers[k : k + rows].tolist() for k in range(0, count, rows)]
 
-    @rule(which=st.integers(0, 2), strategy=STRATEGIES)
-    def refresh(self, which, strategy):
+    @rule(which=st.integers(0, 2))
+    def refresh(self, which):
         writer = self.writer(which)
         writer.dataset.refresh()
         self.committed(writer)
@@ -1057,16 +1063,17 @@ class SharedMachine(RuleBasedStateMachine):
         assert dataset.verify() == []
         self.see(writer)
 
-    @rule(which=st.integers(0, 2), strategy=STRATEGIES)
-    def look(self, which, strategy):
+    @rule(which=st.integers(0, 2), free=st.sampled_from([None, 0]))
+    def look(self, which, free):
         """Without refreshing, a writer sees its own rows, and those of others that it knew."""
         writer = self.writer(which)
         writer.dataset.flush()
         self.committed(writer)
         self.see(writer)
         if writer.dataset.num_samples("training"):
-            batches = writer.dataset.batches("training", 7, strategy=strategy)
-            found = [np.column_stack([b["n"], b["x"]]) for b in batches]
+            with memory_of(free):
+                batches = writer.dataset.batches("training", 7)
+                found = [np.column_stack([b["n"], b["x"]]) for b in batches]
             rows = np.concatenate(found)
             np.testing.assert_array_equal(rows[:, 1:], values(OTHERS[0], rows[:, 0]))
             assert rows[:, 0].tolist() == writer.dataset["training"]["n"][:].tolist()

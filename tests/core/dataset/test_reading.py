@@ -10,11 +10,12 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from physx_core import Dataset, Field
+from physx_core.dataset.read.access import memory
 from physx_core.errors import DatasetError
 
 pytestmark = pytest.mark.processes
 
-STRATEGIES = ["memory", "disk exact", "disk windowed"]
+ORDERS = ["exact", "blocks"]
 WRITER = """
 import os, sys, time
 import numpy as np
@@ -100,9 +101,10 @@ def large_rows(tmp_path):
         yield dataset
 
 
-@pytest.mark.parametrize("strategy", STRATEGIES)
+@pytest.mark.parametrize("free", [0, 10**9])
 @pytest.mark.parametrize("damage", ["truncated", "missing", "damaged"])
-def test_damage_before_reading(large_rows, strategy, damage):
+def test_damage_before_reading(large_rows, monkeypatch, free, damage):
+    monkeypatch.setattr(memory, "available_memory", lambda: free)
     path = large_rows.directory / "run_training_x_7.h5"
     if damage == "truncated":
         os.truncate(path, 100_000)
@@ -111,15 +113,16 @@ def test_damage_before_reading(large_rows, strategy, damage):
     else:
         path.write_bytes(bytes(path.stat().st_size))
     with pytest.raises(DatasetError, match=rf"x_7\.h5.* {damage}"):
-        list(large_rows.batches("training", 10, shuffle=True, strategy=strategy))
+        list(large_rows.batches("training", 10, shuffle=True))
     with pytest.raises(DatasetError, match=rf"x_7\.h5.* {damage}"):
         large_rows["training"]["x"][[1, 2]]
 
 
-@pytest.mark.parametrize("strategy", STRATEGIES[1:])
-@pytest.mark.parametrize("shuffle", [False, True])
-def test_truncation_during_read_is_an_error(large_rows, strategy, shuffle):
-    batches = large_rows.batches("training", 10, shuffle=shuffle, epochs=None, strategy=strategy)
+@pytest.mark.parametrize("order", ["stored", "exact", "blocks"])
+def test_truncation_during_read_is_an_error(large_rows, monkeypatch, order):
+    monkeypatch.setattr(memory, "available_memory", lambda: 0)
+    options = {"shuffle": order != "stored", "order": order}
+    batches = large_rows.batches("training", 10, epochs=None, **options)
     next(batches)
     for number in range(20):
         os.truncate(large_rows.directory / f"run_training_x_{number}.h5", 100_000)
@@ -154,8 +157,8 @@ def test_new_rows_are_seen_after_refresh(tmp_path):
                 assert reader.num_samples("training") == count
                 index = np.arange(count - 1, -1, -1)
                 assert_array_equal(reader["training"]["x"][index][:, 1], 2 * index)
-                for strategy in STRATEGIES:
-                    batches = reader.batches("training", 64, shuffle=True, strategy=strategy)
+                for order in ORDERS:
+                    batches = reader.batches("training", 64, shuffle=True, order=order)
                     found = np.concatenate([batch["id"] for batch in batches])
                     assert_array_equal(np.sort(found), np.arange(count))
 
@@ -193,9 +196,9 @@ def check_all_rows(dataset, rng):
     index = rng.integers(0, count, 100)
     assert_array_equal(dataset["training"]["x"][index][:, 2], index)
     assert_array_equal(dataset["training"]["id"][-50:], np.arange(count)[-50:])
-    for strategy in STRATEGIES:
+    for order in ORDERS:
         total = 0
-        for batch in dataset.batches("training", 256, shuffle=True, seed=0, strategy=strategy):
+        for batch in dataset.batches("training", 256, shuffle=True, seed=0, order=order):
             assert_array_equal(batch["x"], batch["id"][:, None] + np.zeros(batch["x"].shape[1]))
             total += batch["id"].sum()
         assert total == count * (count - 1) // 2

@@ -196,11 +196,11 @@ def test_a_part_is_read_like_a_mode(dataset):
         part["y"]
 
 
-@pytest.mark.parametrize("strategy", ["memory", "disk exact", "disk windowed"])
+@pytest.mark.parametrize("order", ["exact", "blocks"])
 @pytest.mark.parametrize("shuffle", [True, False])
-def test_batches_of_a_part_are_exactly_its_rows(dataset, strategy, shuffle):
+def test_batches_of_a_part_are_exactly_its_rows(dataset, order, shuffle):
     part = dataset.split("training", {"a": 0.4}, by="episode")["a"]
-    options = {"shuffle": shuffle, "seed": 5, "strategy": strategy}
+    options = {"shuffle": shuffle, "seed": 5, "order": order}
     batches = list(part.batches(32, epochs=2, **options))
     assert [len(b["number"]) for b in batches] == 2 * ([32] * 37 + [16])
     epochs = np.concatenate([b["number"] for b in batches]).reshape(2, -1)
@@ -218,7 +218,7 @@ def test_a_part_of_many_blocks_on_the_disk(folder):
     with Dataset.create(folder, max_file_size=1e-3) as dataset:
         dataset.append("training", {"number": number, "x": np.outer(number, np.ones(9))})
         part = dataset.split("training", {"a": 0.3, "b": 0.001})["b"]
-        batches = list(part.batches(7, shuffle=True, seed=0, strategy="disk windowed"))
+        batches = list(part.batches(7, shuffle=True, seed=0, order="blocks"))
     assert_array_equal(np.sort(np.concatenate([b["number"] for b in batches])), part.rows)
     assert all((b["x"] == b["number"][:, None]).all() for b in batches)
 

@@ -34,7 +34,8 @@ from sizes import trials
 
 from physx_core import Dataset, Field
 from physx_core.dataset.read import reader as reading
-from physx_core.dataset.read.strategies import disk, prefetch, windows
+from physx_core.dataset.read import shuffling
+from physx_core.dataset.read.access import disk
 from physx_core.dataset.repair.report import find_problems
 from physx_core.dataset.store import locks, manifest_file
 from physx_core.dataset.store.manifest import whole_stripes
@@ -71,9 +72,9 @@ def little_at_a_time(monkeypatch):
     """A few rows fill blocks and windows, and a few partitions all files that may be open."""
     monkeypatch.setattr(reading, "rows_per_block", lambda nbytes: max(1, 200 // max(1, nbytes)))
     monkeypatch.setattr(disk, "_OPEN_FILES", 3)
-    monkeypatch.setattr(prefetch, "_AHEAD", 200)
-    monkeypatch.setattr(windows, "_BLOCK", 200)
-    monkeypatch.setattr(windows, "_WINDOW_BLOCKS", 3)
+    monkeypatch.setattr(shuffling, "_CHUNK", 200)
+    monkeypatch.setattr(shuffling, "_BLOCK", 200)
+    monkeypatch.setattr(shuffling, "_WINDOW", 3)
     for name in ("fsync", "fdatasync"):
         monkeypatch.setattr(os, name, sync)
     SYNCED.clear()
@@ -114,9 +115,9 @@ def check(dataset, numbers):
     np.testing.assert_array_equal(view["n"][1::3], wanted["n"][1::3])
     middle = slice(len(numbers) // 3, len(numbers) // 3 * 2 + 1)
     np.testing.assert_array_equal(view["x"][middle], wanted["x"][middle])
-    for strategy in ("memory", "disk exact", "disk windowed"):
+    for order in ("exact", "blocks"):
         for shuffle in (False, True):
-            options = {"shuffle": shuffle, "seed": 0, "strategy": strategy}
+            options = {"shuffle": shuffle, "seed": 0, "order": order}
             batches = [
                 {name: rows.copy() for name, rows in batch.items()}
                 for batch in dataset.batches("training", 4, **options)

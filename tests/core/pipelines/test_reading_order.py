@@ -1,12 +1,14 @@
-"""The order of a training's stored samples: kept by a resumed training, whatever memory is free."""
+"""The order of a training's stored samples: the same whatever memory is free, and when resumed."""
 
 from __future__ import annotations
 
 import numpy as np
 import pytest
 
-from physx_core import Dataset, DatasetConfig, NetworkConfig, Training, checkpoint
-from physx_core.dataset.read.strategies import prefetch, strategy
+from physx_core import Dataset, DatasetConfig, NetworkConfig, Training
+from physx_core.dataset.read import shuffling
+from physx_core.dataset.read.access import memory
+from physx_core.dataset.read.sampling import BatchReader
 
 PLENTY, LITTLE = 10**12, 10
 
@@ -16,18 +18,14 @@ def data(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     with Dataset.create("data") as dataset:
         x = np.arange(2000.0)
-        dataset.append("training", {"x": x[:, None], "y": 2 * x[:, None], "unused": x})
+        dataset.append("training", {"x": x[:, None], "y": 2 * x[:, None], "unused": x[:, None]})
 
 
 @pytest.fixture
 def free(monkeypatch):
     """Return a function that sets the number of free bytes."""
 
-    def set_free(nbytes):
-        for module in (strategy, prefetch):
-            monkeypatch.setattr(module, "memory_budget", lambda: nbytes)
-
-    return set_free
+    return lambda nbytes: monkeypatch.setattr(memory, "available_memory", lambda: nbytes)
 
 
 class Followed(Training):
@@ -43,7 +41,8 @@ class Followed(Training):
 
 
 def train(epoch_nb, name="run", before=lambda epoch: None, existing="data", **options):
-    network = NetworkConfig("toy/linear", {"net_fields": ["x"], "opt_fields": ["y"]})
+    fields = options.pop("fields", ["x"])
+    network = NetworkConfig("toy/linear", {"net_fields": fields, "opt_fields": ["y"]})
     training = Followed(
         network, DatasetConfig(existing_dir=existing, **options.pop("config", {})),
         epoch_nb=epoch_nb, batch_size=300, seed=0, session_name=name, **options,
@@ -72,37 +71,29 @@ def test_the_order_stays_if_memory_becomes_free_or_scarce_between_epochs(free):
     assert changing.rows == whole.rows
 
 
-def test_the_order_is_in_the_checkpoint_and_another_speed_is_told(free, capsys):
-    free(PLENTY)
-    training = train(1)
-    found = checkpoint.read(training.checkpoint_path).progress.order
-    assert found["strategy"] == "memory"
+def test_a_resumed_training_reads_no_batch_again(free, monkeypatch):
+    monkeypatch.setattr(shuffling, "_MOST_SORTED", 100)
     free(LITTLE)
-    capsys.readouterr()
-    resumed = train(2, resume=True)
-    said = "by the strategy 'disk exact' instead of 'memory'"
-    assert said in capsys.readouterr().err
-    assert said in (resumed.session.path / "info.txt").read_text()
+    train(2)
+    begun = []
+    begin = BatchReader._begin
+    monkeypatch.setattr(
+        BatchReader,
+        "_begin",
+        lambda self, number, count: begun.append(number) or begin(self, number, count),
+    )
+    assert len(train(3, resume=True).rows) == 2000
+    assert begun == [2]
 
 
-def test_blocks_keep_their_size_although_other_fields_are_read(free):
+def test_other_inputs_change_no_batch(free, monkeypatch):
+    monkeypatch.setattr(shuffling, "_MOST_SORTED", 100)
     free(LITTLE)
-    training = train(1)
-    order = checkpoint.read(training.checkpoint_path).progress.order
-    assert order["strategy"] == "disk windowed"
-    with Dataset.open("data") as dataset:
-        for block in (7, order["block"]):
-            read = [
-                [*dataset.batches("training", 300, shuffle=True, seed=0, fields=fields,
-                                  strategy="disk windowed", block=block)]
-                for fields in (["x"], ["x", "y", "unused"])
-            ]  # fmt: skip
-            for one, other in zip(*read, strict=True):
-                np.testing.assert_array_equal(one["x"], other["x"])
+    fewer = train(2)
+    more = train(2, "more", fields=["x", "unused"])
+    assert fewer.rows == more.rows
 
 
-def test_rows_in_the_order_of_writing_need_no_record(free):
+def test_rows_in_the_order_of_writing(free):
     free(LITTLE)
-    training = train(1, config={"shuffle": False})
-    assert checkpoint.read(training.checkpoint_path).progress.order == {}
-    assert training.rows == [*range(2000)]
+    assert train(1, config={"shuffle": False}).rows == [*range(2000)]

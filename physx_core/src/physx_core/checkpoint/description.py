@@ -52,8 +52,6 @@ class Progress:
         blocks: Number of batches whose rows environments generated.
         best: State of `BestEpoch`.
         record: State of `TrainingRecord`.
-        order: The `ReadingOrder` of the stored samples; empty before the first is read, or if they
-            are not shuffled.
         options: Options that a resumed training must have, as returned by `bound_options`; empty
             if an older physx wrote the checkpoint.
         data: The data that the network was trained on, as returned by `record_data`; likewise.
@@ -66,7 +64,6 @@ class Progress:
     blocks: int = 0
     best: dict[str, Any] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
-    order: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
     data: dict[str, Any] = field(default_factory=dict)
 

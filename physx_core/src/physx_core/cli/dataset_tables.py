@@ -75,7 +75,7 @@ def _print_mode(dataset: Dataset, mode: str, rows: Sequence[dict[str, Any]]) -> 
         stored = dataset.num_samples(mode)
         _print_progress(dataset, mode)
         if stored:
-            show(f"  reading strategy: {dataset.reading_strategy(mode)}")
+            show(f"  shuffled by default: {dataset.default_order(mode)}")
             _print_episodes(dataset, mode, stored)
     except DatasetError as error:
         show(textwrap.fill(f"damaged: {error}", width(), initial_indent="  "))

@@ -7,10 +7,10 @@ from pathlib import Path
 from typing import Any, Self, Unpack
 
 import numpy as np
-from numpy.typing import DTypeLike
 
 from physx_core import files
 from physx_core.closeable import Closeable
+from physx_core.dataset.read.access.columns import ColumnCache
 from physx_core.dataset.read.episodes import Episode, find_episodes
 from physx_core.dataset.read.mode_statistics import compute_statistics
 from physx_core.dataset.read.order.addresses import Addresses
@@ -20,10 +20,8 @@ from physx_core.dataset.read.ordered_statistics import compute_in_order, store_i
 from physx_core.dataset.read.progress import Progress, find_progress
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.sampling import BatchOptions, BatchReader
+from physx_core.dataset.read.shuffling import OrderName, choose_order
 from physx_core.dataset.read.splits import Subset, split
-from physx_core.dataset.read.strategies.cache import ColumnCache
-from physx_core.dataset.read.strategies.strategy import ReadingOrder, Strategy
-from physx_core.dataset.read.strategies.windows import block_rows
 from physx_core.dataset.read.views import ModeView, row_numbers
 from physx_core.dataset.repair import recovery, repair
 from physx_core.dataset.repair.report import find_problems, summarize
@@ -236,10 +234,15 @@ class Dataset(Closeable):
 
                 shuffle (bool): Whether each epoch visits all samples in a new random order. False
                 by default.
+                order (str | None): How they are shuffled, ``"exact"`` or ``"blocks"``: see
+                `OrderName`; None, the default: see `default_order`.
                 seed (int | Sequence[int] | None): Seed of the orders; None, the default: a
-                different one each time.
+                different one each time. The orders depend on nothing else but the number of
+                samples and, with ``"blocks"``, the size of a stored one.
                 epochs (int | None): Number of passes over all samples, 1 by default; None:
                 endless. An epoch covers the samples that are committed when it begins.
+                first (int): Number of the first batch, counted from 0 over all epochs of as many
+                samples as there are now. 0 by default.
                 fields (Sequence[str] | None): Names of the fields to read; None, the default: all.
                 dtype (DTypeLike | None): Type to convert floating-point fields to; None, the
                 default: no conversion.
@@ -248,57 +251,29 @@ class Dataset(Closeable):
                 normalize (bool | Mapping[str, Normalization]): Whether to normalize floating-point
                 fields in place by the mean and standard deviation of all samples of the mode; or
                 the normalization to use. False by default.
-                strategy (str): How samples are read, see `physx_core.dataset.read.strategies`;
-                ``"auto"``, the default: chosen by the fields' sizes and the free memory.
-                block (int | None): Number of rows in a block of ``disk windowed``; None, the
-                default: by the fields' sizes. See `reading_order`.
 
         Returns:
             An iterator over batches: field name to array of shape (samples, *field shape).
 
         Raises:
             DatasetError: If there is no such mode or field, or the mode has no samples.
-            ConfigError: If `batch_size` or `epochs` is out of range, or there is no such strategy.
+            ConfigError: If a number is out of range, or there is no such order.
         """
         self._prepare_reading()
         if options.get("normalize") is True:
             options["normalize"] = self.normalization_of(mode)
         return iter(BatchReader(self._columns, mode, batch_size, **options))
 
-    def reading_strategy(self, mode: str, fields: Sequence[str] | None = None) -> Strategy:
-        """Return how `batches` reads by default: ``memory``, ``disk exact`` or ``disk windowed``.
+    def default_order(self, mode: str) -> OrderName:
+        """Return how `batches` shuffles all samples of a mode by default: by their number and size.
 
-        Args:
-            mode: Name of the mode.
-            fields: Names of the fields to read together; None: all.
+        Up to two million samples, and any number of at least 4 kB each, are shuffled exactly.
 
         Raises:
-            DatasetError: If there is no such mode or field.
+            DatasetError: If there is no such mode.
         """
         self._prepare_reading()
-        names = list(self._reader.mode(mode).fields if fields is None else fields)
-        return self._columns.choose_strategy(mode, names)
-
-    def reading_order(
-        self, mode: str, fields: Sequence[str], dtype: DTypeLike | None = None
-    ) -> ReadingOrder:
-        """Return what the order of shuffled rows depends on now, besides the seed.
-
-        `batches` with this ``strategy`` and ``block`` gives the same order whatever memory is free.
-
-        Args:
-            mode: Name of the mode.
-            fields: Names of the fields to read together.
-            dtype: Type to convert floating-point fields to; None: no conversion.
-
-        Raises:
-            DatasetError: If there is no such mode or field.
-        """
-        self._prepare_reading()
-        kind = None if dtype is None else np.dtype(dtype)
-        row_nbytes = sum(self._reader.field(mode, name).nbytes for name in fields)
-        chosen = self._columns.choose_strategy(mode, fields, kind)
-        return ReadingOrder(chosen, block_rows(row_nbytes))
+        return choose_order(self._reader.rows(mode), self._reader.row_nbytes(mode))
 
     def episodes(self, mode: str) -> list[Episode]:
         """Return the trajectories of a mode, each with the numbers of its rows in temporal order.

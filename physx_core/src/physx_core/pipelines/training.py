@@ -178,7 +178,6 @@ class Training(NewSessionPipeline):
     _saw_nan: bool = field(init=False, repr=False, default=False)
     _fields_reported: bool = field(init=False, repr=False, default=False)
     _blocks: int = field(init=False, repr=False, default=0)
-    _order_reported: bool = field(init=False, repr=False, default=False)
     _told: Sequence[str] = field(init=False, repr=False, default=())
     _recorded: dict[str, float] | None = field(init=False, repr=False, default=None)
     _batches_read: int = field(init=False, repr=False, default=0)
@@ -242,15 +241,9 @@ class Training(NewSessionPipeline):
             return
         names = self.learner.batch_fields
         self._epoch_batches = self.data.begin_epoch(self.epoch_id, names, self.batch_id)
-        if self.data.stored.notice and not self._order_reported and self._is_main:
-            self.observers.note(self.data.stored.notice)
-            self.session.note(self.data.stored.notice)
-            self._order_reported = True
         if self.data.stored.has_changed:
             self.learner.normalize(self.data.normalization())
         if self.epoch_id == self._resumed.epoch:
-            for _ in range(self._resumed.batches_read):  # skipped
-                self.data.next_batch()
             self._batches_read = self.data.stored.count
             left = (self.epoch_nb - self.epoch_id) * self._epoch_batches - self.batch_id
             self.observers.begin("training", max(0, left), "batches")
@@ -444,7 +437,6 @@ class Training(NewSessionPipeline):
             self._blocks,
             self.best.state,
             self._record.state,
-            self.data.stored.order,
             bound_options(self, self._resumed.seed, self.group.size),
             self._data_record(),
         )

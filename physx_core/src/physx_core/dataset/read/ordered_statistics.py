@@ -11,9 +11,9 @@ import contextlib
 
 from xxhash import xxh3_64, xxh3_64_intdigest
 
+from physx_core.dataset.read.access.columns import ColumnCache
 from physx_core.dataset.read.order.order import Order
 from physx_core.dataset.read.reader import Reader
-from physx_core.dataset.read.strategies.cache import ColumnCache
 from physx_core.dataset.read.views import FieldView, ModeView
 from physx_core.dataset.store import order_file
 from physx_core.dataset.store.manifest import Mode

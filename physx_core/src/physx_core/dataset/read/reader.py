@@ -72,6 +72,10 @@ class Reader:
             )
         return fields[name]
 
+    def row_nbytes(self, mode: str) -> int:
+        """Return the bytes of a stored row of a mode, of all its fields."""
+        return sum(field.nbytes for field in self.mode(mode).fields.values())
+
     def stored_rows(self, mode: str) -> int:
         """Return the number of stored rows of a mode."""
         return self.mode(mode).rows

@@ -1,22 +1,23 @@
-"""Reads batches of rows, in the order of writing or shuffled, into arrays that may be reused.
-
-`physx_core.dataset.read.strategies.strategy` lists the read strategies; each is an `Epoch`.
-"""
+"""Reads batches of rows, in the order of the rows or shuffled, into arrays that may be reused."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
-from typing import Protocol, TypedDict
+import secrets
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from typing import TypedDict
 
 import numpy as np
 from numpy.typing import DTypeLike
 
-from physx_core.dataset.read.strategies.cache import ColumnCache, MemoryColumn, converted_dtype
-from physx_core.dataset.read.strategies.disk import DiskColumn
-from physx_core.dataset.read.strategies.ordered import in_order, ordered_rows, shuffled_rows
-from physx_core.dataset.read.strategies.prefetch import ExactEpoch
-from physx_core.dataset.read.strategies.strategy import Choice, Strategy, check_strategy
-from physx_core.dataset.read.strategies.windows import WindowedEpoch
+from physx_core.dataset.read.access.columns import ColumnCache
+from physx_core.dataset.read.epochs import Epoch, begin_epoch
+from physx_core.dataset.read.shuffling import (
+    OrderName,
+    check_order,
+    choose_order,
+    key_of,
+    make_order,
+)
 from physx_core.errors import ConfigError, DatasetError
 from physx_core.statistics import Normalization
 from physx_core.typing import Batch, Index
@@ -26,14 +27,14 @@ class BatchOptions(TypedDict, total=False):
     """Options of `Dataset.batches`, where they are described, and of `Subset.batches`."""
 
     shuffle: bool
+    order: OrderName | None
     seed: int | Sequence[int] | None
     epochs: int | None
+    first: int
     fields: Sequence[str] | None
     dtype: DTypeLike | None
     reuse: bool
     normalize: bool | Mapping[str, Normalization]
-    strategy: Choice
-    block: int | None
 
 
 class BatchReader:
@@ -47,14 +48,14 @@ class BatchReader:
         subset: Index | None = None,
         *,
         shuffle: bool = False,
+        order: OrderName | None = None,
         seed: int | Sequence[int] | None = None,
         epochs: int | None = 1,
+        first: int = 0,
         fields: Sequence[str] | None = None,
         dtype: DTypeLike | None = None,
         reuse: bool = False,
         normalize: bool | Mapping[str, Normalization] = False,
-        strategy: Choice = "auto",
-        block: int | None = None,
     ) -> None:
         """Check the options, which are those of `Dataset.batches`; `subset` must be ascending.
 
@@ -64,6 +65,8 @@ class BatchReader:
             raise ConfigError(f"batch_size is {batch_size} but must be at least 1.")
         if epochs is not None and epochs < 0:
             raise ConfigError(f"epochs is {epochs} but cannot be negative.")
+        if first < 0:
+            raise ConfigError(f"first is {first} but cannot be negative.")
         reader = columns.reader
         self._names = list(dict.fromkeys(reader.mode(mode).fields if fields is None else fields))
         if not self._names:
@@ -72,12 +75,12 @@ class BatchReader:
         if not reader.rows(mode):
             raise DatasetError(f'Mode "{mode}" has no samples yet, so there are no batches.')
         self._columns, self._mode, self._subset = columns, mode, subset
-        self._size, self._epochs = batch_size, epochs
-        self._random = np.random.default_rng(seed) if shuffle else None
+        self._size, self._epochs, self._first = batch_size, epochs, first
+        self._order: OrderName | None = "stored" if not shuffle else order and check_order(order)
+        self._key = key_of(secrets.randbits(64) if seed is None else seed)
         self._dtype = None if dtype is None else np.dtype(dtype)
-        self._strategy, self._block = check_strategy(strategy), block
         self._kinds = {
-            field.name: (field.shape or (), converted_dtype(field, self._dtype)) for field in known
+            field.name: (field.shape or (), field.converted_dtype(self._dtype)) for field in known
         }
         self._buffers = self._allocate(batch_size) if reuse else None
         scales = normalize if isinstance(normalize, Mapping) else {}
@@ -89,15 +92,14 @@ class BatchReader:
 
     def __iter__(self) -> Iterator[Batch]:
         """Yield the batches of all epochs."""
-        strategy, size, count = self._strategy, self._size, 0
-        while self._epochs is None or count < self._epochs:
-            if self._strategy is None and strategy in (None, "memory"):
-                strategy = self._columns.choose_strategy(self._mode, self._names, self._dtype)
-            epoch = self._begin(strategy or "memory")
+        size = self._size
+        number, skipped = divmod(self._first, -(-self._count // size))
+        while self._epochs is None or number < self._epochs:
+            count = self._count
+            epoch = self._begin(number, count)
             try:
-                rows = epoch.rows
-                for start in range(0, rows, size):
-                    batch = self._new_batch(size if start + size <= rows else rows - start)
+                for start in range(skipped * size, count, size):
+                    batch = self._new_batch(size if start + size <= count else count - start)
                     epoch.fill(start, batch)
                     for name, mean, std in self._scales:
                         values = batch[name]
@@ -106,27 +108,31 @@ class BatchReader:
                     yield batch
             finally:
                 epoch.close()
-            count += 1
+            number, skipped = number + 1, 0
 
-    def _begin(self, strategy: Strategy) -> Epoch:
-        mode, names, dtype, random = self._mode, self._names, self._dtype, self._random
-        reader = self._columns.reader
-        if strategy == "memory":
-            loaded = [self._columns.load(mode, name, dtype) for name in names]
-            return MemoryEpoch(loaded, self._order(), reader.rows(mode))
-        for name in names:
-            reader.check(mode, name)
-        if strategy == "disk exact" and random is not None:
-            return ExactEpoch(self._columns, mode, names, dtype, random, self._subset)
-        disk = [in_order(reader, mode, DiskColumn(reader, mode, name, dtype)) for name in names]
-        return WindowedEpoch(disk, random, self._subset, self._block)
+    @property
+    def _count(self) -> int:
+        """Number of rows of an epoch that begins now."""
+        reader, subset = self._columns.reader, self._subset
+        return reader.rows(self._mode) if subset is None else len(subset)
 
-    def _order(self) -> Index | None:
-        """Return the stored rows of an epoch; None for the first stored rows."""
-        reader, mode = self._columns.reader, self._mode
-        if self._random is None:
-            return ordered_rows(reader, mode, self._subset)
-        return shuffled_rows(reader, mode, self._subset, self._random)
+    def _begin(self, number: int, count: int) -> Epoch:
+        row_nbytes = self._columns.reader.row_nbytes(self._mode)
+        name = self._order or choose_order(count, row_nbytes)
+        order = make_order(name, count, row_nbytes, key_of(self._key, number))
+        return begin_epoch(
+            self._columns, self._mode, self._names, self._dtype, order, self._stored_rows()
+        )
+
+    def _stored_rows(self) -> Callable[[Index], Index] | None:
+        """Return the function that gives the stored rows of some rows; None: they are the same."""
+        order, subset = self._columns.reader.order(self._mode), self._subset
+        index = None if order is None or order.index is None else order
+        if subset is None:
+            return None if index is None else index.stored
+        if index is None:
+            return subset.__getitem__
+        return lambda rows: index.stored(subset[rows])
 
     def _new_batch(self, size: int) -> Batch:
         if self._buffers is None:
@@ -137,60 +143,3 @@ class BatchReader:
 
     def _allocate(self, size: int) -> Batch:
         return {name: np.empty((size, *shape), kind) for name, (shape, kind) in self._kinds.items()}
-
-
-class Epoch(Protocol):
-    """One pass over all rows; raises a `DatasetError` if a partition cannot be read.
-
-    Attributes:
-        rows: Number of rows.
-    """
-
-    rows: int
-
-    def fill(self, start: int, batch: Batch) -> None:
-        """Copy the next rows of each field into the arrays of a batch.
-
-        Args:
-            start: Number of rows read so far.
-            batch: The fields in the requested order, with arrays of equal length.
-        """
-
-    def close(self) -> None:
-        """Close open files."""
-
-
-class MemoryEpoch:
-    """A pass over rows in memory, in an exact permutation.
-
-    Attributes:
-        rows: Number of rows.
-    """
-
-    def __init__(self, columns: list[MemoryColumn], order: Index | None, rows: int) -> None:
-        """Begin a pass.
-
-        Args:
-            columns: The fields.
-            order: The stored rows to read; None: the first `rows`.
-            rows: Number of rows of the mode.
-        """
-        self.rows = rows if order is None else len(order)
-        self._arrays = [column.array for column in columns]
-        self._takes = [array.take for array in self._arrays]
-        self._order = order
-
-    def fill(self, start: int, batch: Batch) -> None:
-        """Copy the next rows: see `Epoch`."""
-        outs = list(batch.values())
-        stop = start + len(outs[0])
-        if self._order is None:
-            for array, out in zip(self._arrays, outs):  # noqa: B905 (the hot path)
-                out[...] = array[start:stop]
-        else:
-            index = self._order[start:stop]
-            for take, out in zip(self._takes, outs):  # noqa: B905
-                take(index, 0, out, "clip")  # all modes but the default write directly to `out`
-
-    def close(self) -> None:
-        """Do nothing: the columns are kept for the next epoch."""

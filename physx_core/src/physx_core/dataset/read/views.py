@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import DTypeLike
 
-from physx_core.dataset.read.strategies.cache import ColumnCache
+from physx_core.dataset.read.access.columns import ColumnCache
 from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.fields import Field
 from physx_core.typing import Array, Index

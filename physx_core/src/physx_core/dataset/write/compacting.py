@@ -13,10 +13,10 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 from physx_core import files
+from physx_core.dataset.read.access.columns import ColumnCache
 from physx_core.dataset.read.order.order import Order
 from physx_core.dataset.read.ordered_statistics import store_in_order
 from physx_core.dataset.read.reader import Reader
-from physx_core.dataset.read.strategies.cache import ColumnCache
 from physx_core.dataset.read.views import ModeView
 from physx_core.dataset.read.virtual_index import write_index
 from physx_core.dataset.repair.report import find_problem

@@ -131,7 +131,7 @@ class DataOpening:
             validation_batch_size=(self.validation_batch_size or 0) * self.group.size or size,
             seed=self.progress.seed,
             data_type=self.data_type,
-            order=self.progress.order,
+            first=self.progress.batches_read,
         )
         made: GeneratedBatches | ReplayedBatches | None = None
         always = False

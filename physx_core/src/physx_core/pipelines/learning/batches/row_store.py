@@ -7,7 +7,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from physx_core.dataset import Dataset
-from physx_core.dataset.read.strategies.cache import converted_dtype
 from physx_core.fields import Field
 from physx_core.typing import Batch, Index
 
@@ -35,7 +34,7 @@ class RowStore:
             data_type: Floating-point type of the batches.
         """
         kinds = {
-            name: (fields[name].shape or (), converted_dtype(fields[name], np.dtype(data_type)))
+            name: (fields[name].shape or (), fields[name].converted_dtype(np.dtype(data_type)))
             for name in names
             if name in fields
         }

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from functools import partial
-from typing import Any
 
 import numpy as np
 
 from physx_core.config import DatasetConfig, EnvironmentConfig
 from physx_core.dataset import Dataset, Subset
-from physx_core.dataset.read.strategies.strategy import ReadingOrder
 from physx_core.errors import ConfigError, DatasetError, UsageError, listed
 from physx_core.fields import Field
 from physx_core.pipelines.storage import other_samples
@@ -29,11 +27,8 @@ class StoredBatches:
         mode: Mode of the samples to train on.
         parts: The samples to train on and those held back, ``training`` and ``validation``; empty
             if none are held back.
-        count: Number of batches read.
+        count: Number of batches read, also before the training was resumed.
         has_changed: Whether samples were replaced since the last call of `normalization`.
-        order: What the order of the samples depends on, besides the seed, as plain data; empty
-            before the first is read.
-        notice: Why reading differs from that before the training was resumed; empty: it does not.
     """
 
     def __init__(
@@ -46,7 +41,7 @@ class StoredBatches:
         validation_batch_size: int,
         seed: int,
         data_type: str,
-        order: Mapping[str, Any],
+        first: int,
     ) -> None:
         """Check that the samples are available, and hold some back if configured.
 
@@ -58,19 +53,18 @@ class StoredBatches:
             validation_batch_size: Samples in a validation batch.
             seed: Seed of the order of samples.
             data_type: Floating-point type of the batches.
-            order: The `order` before the training was resumed; empty: it is chosen.
+            first: Number of batches that the training read before it was resumed.
 
         Raises:
             ConfigError: If samples should be held back, but environments generate them.
             DatasetError: If there are no samples to read.
         """
         self.dataset, self.mode = dataset, config.mode
-        self.count = 0
+        self.count = first
         self.has_changed = False
         self._config, self._batch_size = config, batch_size
         self._validation_batch_size = validation_batch_size
         self._seed, self._data_type = seed, data_type
-        self.order, self.notice = dict(order), ""
         self._reader: Iterator[Batch] | None = None
         if environment is None and not self.has_samples:
             raise DatasetError(
@@ -99,7 +93,6 @@ class StoredBatches:
         if self._reader is None:
             part = self.parts.get("training")
             read = part.batches if part else partial(self.dataset.batches, self.mode)
-            strategy, block = self._choose_order(names)
             self._reader = read(
                 self._batch_size,
                 shuffle=self._config.shuffle,
@@ -108,29 +101,8 @@ class StoredBatches:
                 fields=names,
                 dtype=self._data_type,
                 reuse=True,
-                strategy=strategy,
-                block=block,
+                first=self.count,
             )
-
-    def _choose_order(self, names: Sequence[str]) -> ReadingOrder:
-        """Return how to read, in the order of the training so far, whatever memory is free."""
-        chosen = self.dataset.reading_order(self.mode, names, self._data_type)
-        if not self._config.shuffle:
-            return chosen
-        if self.order:
-            before = ReadingOrder(**self.order)
-            if before.strategy == "disk windowed":
-                chosen = before
-            elif chosen.strategy != "memory":
-                chosen = before._replace(strategy="disk exact")
-            if chosen.strategy != before.strategy:
-                self.notice = (
-                    f"Stored samples are read by the strategy {chosen.strategy!r} instead of "
-                    f"{before.strategy!r} because the free memory has changed: in the same order, "
-                    "at another speed."
-                )
-        self.order = chosen._asdict()
-        return chosen
 
     def next(self) -> Batch:
         """Return the next batch, in physical units; valid until the next call."""

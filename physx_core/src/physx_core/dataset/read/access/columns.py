@@ -1,4 +1,4 @@
-"""Caches columns of a dataset that are in memory or mapped."""
+"""Caches columns of a dataset that are in memory or mapped, and chooses between memory and disk."""
 
 from __future__ import annotations
 
@@ -7,9 +7,11 @@ from typing import Any
 
 import numpy as np
 
+from physx_core.dataset.read.access import memory
+from physx_core.dataset.read.access.disk import DiskColumn
+from physx_core.dataset.read.access.mapping import MappedColumn
 from physx_core.dataset.read.reader import Reader
-from physx_core.dataset.read.strategies.mapping import MappedColumn
-from physx_core.dataset.read.strategies.strategy import Strategy, choose_strategy
+from physx_core.dataset.read.shuffling import LARGE_ROW
 from physx_core.fields import Field
 from physx_core.typing import Array, Index
 
@@ -19,9 +21,11 @@ class MemoryColumn:
 
     Attributes:
         shape: (rows, *field shape).
+        dtype: Type of the rows.
     """
 
     def __init__(self, reader: Reader, mode: str, field: Field, dtype: np.dtype[Any]) -> None:
+        self.dtype = dtype
         self.shape: tuple[int, ...] = (0, *(field.shape or ()))
         self._reader = reader
         self._mode, self._name = mode, field.name
@@ -67,24 +71,37 @@ class ColumnCache:
         self._loaded: dict[tuple[str, str, np.dtype[Any]], MemoryColumn] = {}
         self._mapped: dict[tuple[str, str], MappedColumn] = {}
 
-    def choose_strategy(
-        self, mode: str, names: Sequence[str], dtype: np.dtype[Any] | None = None
-    ) -> Strategy:
-        """Return the best strategy to read the rows of fields now.
+    def open(
+        self, mode: str, names: Sequence[str], dtype: np.dtype[Any] | None, *, loads: bool
+    ) -> list[MemoryColumn | DiskColumn]:
+        """Return fields in memory if they are there, or may be, and else on disk.
 
         Args:
             mode: Name of the mode.
             names: Names of the fields.
             dtype: Type that floating-point fields are converted to; None: no conversion.
+            loads: Whether to read fields into memory, smallest fields first, if they fit there;
+                those with large rows only if all fit.
         """
-        fields = [self.reader.field(mode, name) for name in names]
-        return choose_strategy(sum(self.missing(mode, name, dtype) for name in names), fields)
+        sizes = {name: self.missing(mode, name, dtype) for name in names}
+        left = memory.memory_budget() if loads and any(sizes.values()) else 0
+        fits = sum(sizes.values()) <= left
+        found: dict[str, MemoryColumn | DiskColumn] = {}
+        for name in sorted(names, key=sizes.__getitem__):
+            is_small = self.reader.field(mode, name).nbytes < LARGE_ROW
+            if sizes[name] <= left and (fits or is_small or not sizes[name]):
+                left -= sizes[name]
+                found[name] = self.load(mode, name, dtype)
+            else:
+                self.reader.check(mode, name)
+                found[name] = DiskColumn(self.reader, mode, name, dtype)
+        return [found[name] for name in names]
 
     def load(self, mode: str, name: str, dtype: np.dtype[Any] | None = None) -> MemoryColumn:
         """Load all currently committed rows of a field into memory and return them."""
         self._drop_stale()
         field = self.reader.field(mode, name)
-        key = mode, name, converted_dtype(field, dtype)
+        key = mode, name, field.converted_dtype(dtype)
         column = self._loaded.get(key)
         if column is None:
             column = self._loaded[key] = MemoryColumn(self.reader, mode, field, key[2])
@@ -108,7 +125,7 @@ class ColumnCache:
         """Return the number of bytes of memory that loading a field would take."""
         self._drop_stale()
         field = self.reader.field(mode, name)
-        kind = converted_dtype(field, dtype)
+        kind = field.converted_dtype(dtype)
         loaded = self._loaded.get((mode, name, kind))
         rows = self.reader.stored_rows(mode) - (loaded.shape[0] if loaded else 0)
         return rows * (field.nbytes // np.dtype(field.dtype).itemsize) * kind.itemsize
@@ -122,9 +139,3 @@ class ColumnCache:
         if self._generation != self.reader.manifest.generation:
             self._generation = self.reader.manifest.generation
             self.clear()
-
-
-def converted_dtype(field: Field, dtype: np.dtype[Any] | None) -> np.dtype[Any]:
-    """Return the type of a field's rows if floating-point fields are converted to `dtype`."""
-    own = np.dtype(field.dtype)
-    return own if dtype is None or own.kind != "f" else dtype

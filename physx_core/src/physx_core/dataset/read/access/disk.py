@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import builtins
+import itertools
 import os
 from collections.abc import Iterator
 from io import FileIO
@@ -12,7 +12,6 @@ import numpy as np
 
 from physx_core import files
 from physx_core.dataset.read.reader import Reader
-from physx_core.dataset.read.strategies.cache import converted_dtype
 from physx_core.dataset.store.partition.spans import FlatIndex
 from physx_core.typing import Array, Index
 
@@ -43,7 +42,7 @@ class DiskColumn:
         """
         field = reader.field(mode, name)
         self.shape: tuple[int, ...] = (reader.stored_rows(mode), *(field.shape or ()))
-        self.dtype = converted_dtype(field, dtype)
+        self.dtype = field.converted_dtype(dtype)
         self.row_nbytes = field.nbytes
         self._own = np.dtype(field.dtype)
         self._scratch = np.empty((0, *self.shape[1:]), self._own)
@@ -51,34 +50,37 @@ class DiskColumn:
         self._index = FlatIndex([segment.span for segment in self._segments])
         self._opened: dict[int, tuple[FileIO, int]] = {}
 
-    def announce(self, start: int, count: int = 1) -> None:
-        """Tell the operating system that `count` rows from `start` on will be read soon."""
+    def announce(self, index: Index) -> None:
+        """Tell the operating system that rows will be read soon.
+
+        Args:
+            index: The rows, shape (n,); consecutive ones are announced together.
+        """
         size = self.row_nbytes
         if not size or not hasattr(os, "posix_fadvise"):
             return
-        for number, first, part, _ in self._parts(start, count):
-            file, offset = self._open(number)
-            place = offset + first * size
-            os.posix_fadvise(file.fileno(), place, part * size, os.POSIX_FADV_WILLNEED)
+        for start, stop in _runs(index):
+            for number, first, part, _ in self._parts(int(index[start]), stop - start):
+                file, offset = self._open(number)
+                place = offset + first * size
+                os.posix_fadvise(file.fileno(), place, part * size, os.POSIX_FADV_WILLNEED)
 
     def gather(self, index: Index, out: Array) -> None:
-        """Copy single rows into a contiguous array, shape (rows, *field shape)."""
-        size, rows = self.row_nbytes, self._target(out)
-        view = files.as_bytes(rows)
-        for number, row in enumerate(index.tolist()):
-            self._read(*self._index.find(row)[:2], view[number * size : (number + 1) * size])
-        if rows is not out:
-            out[...] = rows
+        """Copy rows into a contiguous array, shape (rows, *field shape).
 
-    def slice(self, start: int, out: Array) -> None:
-        """Copy consecutive rows into a contiguous array, shape (rows, *field shape)."""
+        Args:
+            index: The rows, shape (n,); consecutive ones are read together.
+            out: Receives them.
+        """
         rows = self._target(out)
-        for number, first, _, where in self._parts(start, len(rows)):
-            target = rows[where]
-            part = target if where.step == 1 else np.empty(target.shape, target.dtype)
-            self._read(number, first, files.as_bytes(part))
-            if part is not target:
-                target[...] = part
+        for start, stop in _runs(index):
+            target = rows[start:stop]
+            for number, first, _, where in self._parts(int(index[start]), stop - start):
+                part = target[where]
+                whole = part if where.step == 1 else np.empty(part.shape, part.dtype)
+                self._read(number, first, files.as_bytes(whole))
+                if whole is not part:
+                    part[...] = whole
         if rows is not out:
             out[...] = rows
 
@@ -102,7 +104,7 @@ class DiskColumn:
             file, offset = self._open(number)
             self._segments[number].read(file, offset + first * self.row_nbytes, view)
 
-    def _parts(self, start: int, count: int) -> Iterator[tuple[int, int, int, builtins.slice]]:
+    def _parts(self, start: int, count: int) -> Iterator[tuple[int, int, int, slice]]:
         """Locate `count` rows of the mode, from `start` on, in the segments.
 
         Yields:
@@ -112,7 +114,7 @@ class DiskColumn:
             return
         number, place, follow = self._index.find(start)
         if count <= follow:
-            yield number, place, count, builtins.slice(0, count, 1)
+            yield number, place, count, slice(0, count, 1)
             return
         number, stop = number - self._segments[number].span.place, start + count
         while number < len(self._segments) and self._segments[number].span.start < stop:
@@ -130,3 +132,9 @@ class DiskColumn:
                 self._opened.pop(next(iter(self._opened)))[0].close()
             found = self._opened[number] = self._segments[number].open()
         return found
+
+
+def _runs(index: Index) -> Iterator[tuple[int, int]]:
+    """Yield where each run of consecutive rows begins, and where it ends."""
+    ends = np.flatnonzero(np.diff(index) != 1) + 1
+    return itertools.pairwise([0, *ends.tolist(), len(index)]) if len(index) else iter(())

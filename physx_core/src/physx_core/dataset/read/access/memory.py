@@ -9,6 +9,7 @@ from pathlib import Path
 
 _PROC = Path("/proc")
 _CGROUPS = Path("/sys/fs/cgroup")
+_SHARE = 0.5
 
 
 def available_memory() -> int:
@@ -23,6 +24,11 @@ def available_memory() -> int:
         pages = (_PROC / "self/statm").read_text(encoding="ascii").split()[0]
         bounds.append(limit - int(pages) * resource.getpagesize())
     return max(0, min(bounds))
+
+
+def memory_budget() -> int:
+    """Return the number of bytes of memory that rows may take now."""
+    return int(_SHARE * available_memory())
 
 
 def _machine() -> int:

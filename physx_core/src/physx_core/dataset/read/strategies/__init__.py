@@ -1,1 +1,0 @@
-"""Read strategies: from memory, exactly shuffled from disk, or windowed from disk."""
