@@ -28,3 +28,5 @@ from .pipelines import Replay as Replay
 from .pipelines import Training as Training
 from .statistics import Normalization as Normalization
 from .version import __version__ as __version__
+from .views import Batches as Batches
+from .views import View as View

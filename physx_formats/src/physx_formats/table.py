@@ -88,7 +88,7 @@ class Table:
         """
         if not isinstance(self.view, ModeView):
             raise ExchangeError(f'The mode "{self.mode}" holds records, not trajectories.')
-        return find_episodes(self.view, self.rows)
+        return find_episodes(self.view.rows)
 
     def column(self, name: str, step: int | None = None) -> Iterator[tuple[int, Array]]:
         """Yield the rows of one field in blocks, each with the number of its first row.

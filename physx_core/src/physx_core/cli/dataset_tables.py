@@ -76,7 +76,7 @@ def _print_mode(dataset: Dataset, mode: str, rows: Sequence[dict[str, Any]]) -> 
         _print_progress(dataset, mode)
         if stored:
             show(f"  shuffled by default: {dataset.default_order(mode)}")
-            _print_episodes(dataset, mode, stored)
+            _print_episodes(dataset, mode)
     except DatasetError as error:
         show(textwrap.fill(f"damaged: {error}", width(), initial_indent="  "))
         stored = 0
@@ -99,11 +99,11 @@ def _print_mode(dataset: Dataset, mode: str, rows: Sequence[dict[str, Any]]) -> 
         _print_normalization(dataset, mode)
 
 
-def _print_episodes(dataset: Dataset, mode: str, samples: int) -> None:
+def _print_episodes(dataset: Dataset, mode: str) -> None:
     view = dataset[mode]
     if mode == EPISODES or ("step" not in view and "episode" not in view):
         return
-    lengths, instances = episode_lengths(view, samples)
+    lengths, instances = episode_lengths(view.rows)
     least, most = lengths.min(), lengths.max()
     steps = f"{least:,}" if least == most else f"{least:,} to {most:,}"
     of = count(instances, "instance")

@@ -5,7 +5,11 @@ The format is documented in `physx_core.dataset.store`: `partition.format` and `
 
 from .dataset import Dataset as Dataset
 from .read.episodes import Episode as Episode
+from .read.episodes import Trajectories as Trajectories
 from .read.episodes import find_episodes as find_episodes
+from .read.episodes import find_trajectories as find_trajectories
+from .read.mode_rows import ModeRows as ModeRows
+from .read.mode_rows import Snapshot as Snapshot
 from .read.order.records import RecordedEpisodes as RecordedEpisodes
 from .read.progress import Progress as Progress
 from .read.splits import Subset as Subset

@@ -12,6 +12,7 @@ from physx_core import files
 from physx_core.closeable import Closeable
 from physx_core.dataset.read.access.columns import ColumnCache
 from physx_core.dataset.read.episodes import Episode, find_episodes
+from physx_core.dataset.read.mode_rows import ModeRows, Snapshot
 from physx_core.dataset.read.mode_statistics import compute_statistics
 from physx_core.dataset.read.order.addresses import Addresses
 from physx_core.dataset.read.order.records import RecordedEpisodes
@@ -285,7 +286,16 @@ class Dataset(Closeable):
             DatasetError: If there is no such mode, or its rows do not record where trajectories
                 begin.
         """
-        return find_episodes(self[mode], self.num_samples(mode))
+        return find_episodes(self.rows(mode))
+
+    def rows(self, mode: str, snapshot: Snapshot | None = None) -> ModeRows:
+        """Return the rows of a mode as they are now, or were at a snapshot: see `ModeRows`.
+
+        Raises:
+            DatasetError: If there is no such mode, or rows of the snapshot are missing.
+        """
+        self._prepare_reading()
+        return ModeRows(self._columns, mode, snapshot)
 
     def recorded_episodes(self, mode: str) -> RecordedEpisodes | None:
         """Return the recorded episodes of a mode, in order; None if its rows have no records.
@@ -384,16 +394,8 @@ class Dataset(Closeable):
             IndexError: If there is no such row.
         """
         self._prepare_reading()
-        order = self._reader.order(mode)
-        if order is None:
-            self._reader.mode(mode)  # there must be one
-            raise DatasetError(f'The rows of mode "{mode}" have no recorded episodes.')
-        numbers = row_numbers(rows, order.rows)
-        entries = np.searchsorted(order.episodes.first, numbers, "right") - 1
-        records = self._reader.orders.places(mode)[order.found.last]
-        once, places = np.unique(entries, return_inverse=True)
-        values: Array = self[EPISODES][name][records[once]][places]
-        return values
+        known = self.rows(mode)
+        return known.episode_values(name, row_numbers(rows, known.count))
 
     def progress(self, mode: str) -> list[Progress]:
         """Return how many episodes of each campaign of a mode have ended; none without records.

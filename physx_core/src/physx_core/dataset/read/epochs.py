@@ -59,7 +59,7 @@ def begin_epoch(
         order: The order.
         stored: Returns the stored rows of some items.
     """
-    columns = cache.open(mode, names, dtype, loads=isinstance(order, ExactOrder))
+    columns = cache.open(mode, names, dtype, loads=not isinstance(order, BlockOrder))
     loaded = [column for column in columns if isinstance(column, MemoryColumn)]
     if len(loaded) == len(columns):
         if isinstance(order, ExactOrder) and order.is_sorted:
@@ -206,13 +206,13 @@ class ChunkedEpoch:
 
     def _go_to(self, position: int) -> None:
         """Take the chunk with a position, and have the one after it read."""
-        former = self._current.rows
-        if self._helper.pending:
-            self._current = self._helper.take()
-        else:
-            self._current = self._load(position, self._spare)
-        if self._current.chunk.stop < self._order.count:
-            following = self._current.chunk.stop
+        former, spare = self._current.rows, self._spare
+        loaded = self._helper.take() if self._helper.pending else None
+        if loaded is None or not loaded.chunk.start <= position < loaded.chunk.stop:
+            loaded = self._load(position, spare if loaded is None else loaded.rows)
+        self._current, self._spare = loaded, former
+        if loaded.chunk.stop < self._order.count:
+            following = loaded.chunk.stop
             self._helper.give(lambda: self._load(following, former))
 
     def _load(self, position: int, arrays: list[Array]) -> _Loaded:

@@ -207,9 +207,22 @@ def check_order(name: str) -> OrderName:
     return cast(OrderName, name)
 
 
+def scramble(numbers: Numbers, key: int) -> Numbers:
+    """Replace numbers, in place, by others that look random; no two become equal."""
+    numbers ^= np.uint64(key)
+    for factor, shift in ((_STEP, 32), (_FIRST, 29), (_SECOND, 32)):
+        numbers *= np.uint64(factor)
+        numbers ^= numbers >> np.uint64(shift)
+    numbers += np.uint64(key)
+    numbers *= np.uint64(_FIRST)
+    numbers ^= numbers >> np.uint64(31)
+    return numbers
+
+
 def key_of(*numbers: int | Sequence[int]) -> int:
     """Return a key of 64 bits that depends on all bits of some numbers and lists of numbers."""
-    plain = [[int(e) for e in n] if isinstance(n, Sequence) else int(n) for n in numbers]
+    several: Sequence[Any] = numbers
+    plain = [[int(e) for e in each] if np.ndim(each) else int(each) for each in several]
     return int.from_bytes(blake2b(repr(plain).encode(), digest_size=8).digest(), "little")
 
 
@@ -217,7 +230,7 @@ def permutation(count: int, key: int) -> Index:
     """Return the numbers from 0 to ``count - 1`` in an order that depends on `count` and `key`."""
     numbers = np.arange(count, dtype=np.uint64)
     bits = np.uint64(count.bit_length())
-    hashed = _hash(numbers.copy(), key)
+    hashed = scramble(numbers.copy(), key)
     hashed >>= bits
     hashed <<= bits
     hashed |= numbers  # sorting these is twice as fast as argsort, and there are no ties
@@ -245,7 +258,7 @@ def scatter(positions: Index, count: int, key: int) -> Index:
         digits = [*np.divmod(found[outside], np.uint64(low))]
         for turn, each in enumerate(keys):
             mine, base = turn % 2, (high, low)[turn % 2]
-            digits[mine] += _below(_hash(digits[1 - mine].copy(), each), base)
+            digits[mine] += _below(scramble(digits[1 - mine].copy(), each), base)
             digits[mine] -= np.uint64(base) * (digits[mine] >= np.uint64(base))
         found[outside] = digits[0] * np.uint64(low) + digits[1]
         outside = np.flatnonzero(found >= np.uint64(count))
@@ -259,15 +272,3 @@ def _below(hashed: Numbers, base: int) -> Numbers:
     hashed *= np.uint64(base)
     hashed >>= np.uint64(32)
     return hashed
-
-
-def _hash(numbers: Numbers, key: int) -> Numbers:
-    """Replace numbers by others, as many; no two become equal."""
-    numbers ^= np.uint64(key)
-    for factor, shift in ((_STEP, 32), (_FIRST, 29), (_SECOND, 32)):
-        numbers *= np.uint64(factor)
-        numbers ^= numbers >> np.uint64(shift)
-    numbers += np.uint64(key)
-    numbers *= np.uint64(_FIRST)
-    numbers ^= numbers >> np.uint64(31)
-    return numbers

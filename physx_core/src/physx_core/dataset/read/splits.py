@@ -8,6 +8,7 @@ from typing import Any, Unpack
 import numpy as np
 
 from physx_core.dataset.read.episodes import find_episodes
+from physx_core.dataset.read.mode_rows import ModeRows, Snapshot
 from physx_core.dataset.read.order.order import Order
 from physx_core.dataset.read.sampling import BatchOptions, BatchReader
 from physx_core.dataset.read.views import FieldView, ModeView
@@ -179,7 +180,11 @@ def _shuffle_episodes(
     Each part has at least one trajectory and ends with the one that brings it closest to its
     share of the rows.
     """
-    episodes = find_episodes(view, total)
+    episodes = find_episodes(
+        ModeRows(
+            view.columns, view.mode, Snapshot(total, view.columns.reader.orders.count(view.mode))
+        )
+    )
     if len(episodes) < len(shares):
         raise ConfigError(
             f'Mode "{view.mode}" has {len(episodes)} trajectories, which cannot be split into '

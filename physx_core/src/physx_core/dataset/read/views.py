@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from physx_core.dataset.read.access.columns import ColumnCache
+from physx_core.dataset.read.mode_rows import ModeRows
 from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.fields import Field
 from physx_core.typing import Array, Index
@@ -138,6 +139,11 @@ class ModeView:
     def items(self) -> list[tuple[str, FieldView]]:
         """Return names and fields."""
         return [(name, self[name]) for name in self.keys()]
+
+    @property
+    def rows(self) -> ModeRows:
+        """The rows as they are now."""
+        return ModeRows(self.columns, self.mode)
 
     def __repr__(self) -> str:
         return f"<{self.mode}: {self.columns.reader.rows(self.mode)} samples of {self.keys()}>"

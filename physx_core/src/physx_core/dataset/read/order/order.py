@@ -136,8 +136,29 @@ class Orders:
         state = known.rows, records.count, self.until_gap
         found = self._orders.get(mode)
         if found is None or found[0] != state:
-            found = self._orders[mode] = state, self._find(mode, records, Addresses(known))
+            found = self._orders[mode] = state, self._find(mode, records)
         return found[1]
+
+    def count(self, mode: str) -> int:
+        """Return the number of valid records of a mode so far; 0 if it has none."""
+        return self._records[mode].count if mode in self._records else 0
+
+    def at(self, mode: str, records: int) -> Order:
+        """Return the order of a mode that has one, by the first of its records.
+
+        Raises:
+            DatasetError: If there are not so many, or the table of episodes is invalid.
+        """
+        with self._lock:
+            now = self._newest(mode)
+            if self.count(mode) < records:
+                raise DatasetError(f'Records of the episodes of mode "{mode}" are missing.')
+            if now is not None and self.count(mode) == records and not self.until_gap:
+                return now
+            fresh, known = GrowingRecords(), self._records[mode]
+            first = slice(records)
+            fresh.add(known.records.take(first), known.places[first])
+            return Order(self._resolved(mode, fresh))
 
     def places(self, mode: str) -> Index:
         """Return which rows of the table are the records of a mode, as `Found.record` counts."""
@@ -174,14 +195,17 @@ class Orders:
     def _column(self, name: str, stop: int) -> Index:
         return self._read(name, self._done, stop).astype(np.int64)
 
-    def _find(self, mode: str, records: GrowingRecords, addresses: Addresses) -> Order:
+    def _resolved(self, mode: str, records: GrowingRecords) -> Found:
         try:
-            found = records.find(addresses)
+            return records.find(Addresses(self._manifest.modes.get(mode, Mode({}))))
         except ValueError as error:
             raise DatasetError(
                 f'The table of episodes does not fit mode "{mode}": {error}. Restore it from a '
                 "backup, or remove its records."
             ) from error
+
+    def _find(self, mode: str, records: GrowingRecords) -> Order:
+        found = self._resolved(mode, records)
         if not self.until_gap:
             self._seen[mode] = records.count
             return Order(found)

@@ -28,7 +28,7 @@ class Records(NamedTuple):
     part: Index
     status: Index
 
-    def take(self, index: Index | Flags) -> Records:
+    def take(self, index: Index | Flags | slice) -> Records:
         """Return some of the records."""
         return Records(*(column[index] for column in self))
 

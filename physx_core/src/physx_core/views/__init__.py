@@ -1,0 +1,7 @@
+"""Views: which rows of which datasets a network learns from, in which form and order."""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)

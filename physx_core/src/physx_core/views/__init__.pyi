@@ -1,0 +1,4 @@
+"""Views: which rows of which datasets a network learns from, in which form and order."""
+
+from .batches import Batches as Batches
+from .view import View as View

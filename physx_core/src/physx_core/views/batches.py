@@ -1,0 +1,394 @@
+"""Batches: a view bound to data, a batch size and a seed; any batch can be had by its number."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from hashlib import blake2b
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import DTypeLike
+
+from physx_core.closeable import Closeable
+from physx_core.config import to_plain
+from physx_core.dataset import Dataset, Snapshot, rows_per_block
+from physx_core.dataset.read.epochs import Epoch
+from physx_core.dataset.read.shuffling import ItemOrder, key_of
+from physx_core.dataset.store.definitions import compare_fields
+from physx_core.dataset.store.manifest import has_statistics
+from physx_core.errors import ConfigError, DatasetError, UsageError
+from physx_core.fields import Field
+from physx_core.statistics import Normalization, RunningStatistics
+from physx_core.typing import Array, Batch, Index
+from physx_core.views.folds import Part
+from physx_core.views.sources import Source, window_of
+from physx_core.views.view import View
+
+_SHARES = 1000
+_PAD = "_is_pad"
+
+
+class Batches(Closeable):
+    """Batches in physical units; batch `number` depends on view, snapshot, size, seed and part.
+
+    It does not depend on free memory, on the other fields that are read, on other processes, or on
+    rows that are added later. ``batches[number]`` is a batch, ``len(batches)`` the number of
+    batches of an epoch; the numbers of later epochs, in other orders, follow. So
+    ``torch.utils.data.DataLoader(batches, batch_size=None)`` reads an epoch, with any number of
+    workers: each opens the files for itself.
+
+    Attributes:
+        view: The view.
+        batch_size: Number of items in a batch; the last of an epoch may have fewer.
+        seed: Seed of the orders.
+        part: Which part of the view.
+        snapshot: The rows of each source, by its folder, when the batches were opened.
+        num_items: Number of items in an epoch.
+    """
+
+    def __init__(
+        self,
+        view: View,
+        batch_size: int,
+        seed: int = 0,
+        *,
+        data: Dataset | str | Path | None = None,
+        mode: str = "training",
+        part: Part = "training",
+        snapshot: Mapping[str, Sequence[int]] | None = None,
+        fields: Sequence[str] | None = None,
+        dtype: DTypeLike | None = None,
+        reuse: bool = False,
+    ) -> None:
+        """Open the data.
+
+        Args:
+            view: The view.
+            batch_size: Number of items in a batch.
+            seed: Seed of the orders.
+            data: The dataset, or its folder, if the view names no sources.
+            mode: Mode of the rows.
+            part: ``training``, ``validation``, ``test``, or ``all`` of them.
+            snapshot: The `snapshot` of other batches: only those rows exist; None: all do.
+            fields: Names of windows or stored fields to read; None: the windows, or without any
+                all stored fields.
+            dtype: Type to convert floating-point fields to; None: no conversion.
+            reuse: Whether every batch is in the same arrays, which is faster where a batch is
+                needed no longer than until the next.
+
+        Raises:
+            ConfigError: If there is nothing to read, or the view does not fit the data.
+            DatasetError: If there is no dataset, mode or field, or rows are missing.
+        """
+        if batch_size < 1:
+            raise ConfigError(f"batch_size is {batch_size} but must be at least 1.")
+        if view.sources and data is not None:
+            raise ConfigError("The data are given twice: leave out View.sources, or `data`.")
+        if not view.sources and data is None:
+            raise ConfigError("View.sources names no data: add a folder with its share.")
+        self.view, self.batch_size, self.seed, self.part = view, batch_size, seed, part
+        self._mode, self._names, self._reuse = mode, fields and list(fields), reuse
+        self._dtype = None if dtype is None else np.dtype(dtype)
+        self._opened = contextlib.ExitStack()
+        given = {None: 1.0} if data is not None else view.sources
+        self._sources = [self._open(name, data, snapshot) for name in given]
+        self.snapshot = {str(s.dataset.directory): s.rows.snapshot for s in self._sources}
+        self.num_items = self._count(np.array(list(given.values())))
+        self._check()
+        self._names = self._names or self._default_names()
+        self.fields: dict[str, Field] = {}
+        for name in self._names:
+            self.fields |= self._described(name)
+        self._buffers = self._allocate(batch_size) if reuse else None
+        self._is_plain = len(self._sources) == 1 and not (view.windows or view.weights)
+        self._epoch: tuple[int, Epoch] | None = None
+        self._process = os.getpid()
+        self._passes: dict[tuple[int, int], ItemOrder] = {}
+
+    def _open(
+        self,
+        name: str | None,
+        data: Dataset | str | Path | None,
+        snapshot: Mapping[str, Sequence[int]] | None,
+    ) -> Source:
+        dataset = data
+        if not isinstance(dataset, Dataset):
+            dataset = self._opened.enter_context(Dataset.open(name or str(dataset)))
+        known: Snapshot | None = None
+        if snapshot is not None:
+            folder = str(dataset.directory)
+            if folder not in snapshot:
+                raise ConfigError(f"The snapshot does not have the source {folder}.")
+            known = Snapshot(*snapshot[folder])
+        return Source(self.view, dataset, self._mode, self.part, known)
+
+    def _count(self, shares: Array) -> int:
+        """Return the number of items of an epoch, and find out which source has which of them."""
+        counts = np.array([source.count for source in self._sources])
+        if not counts.all():
+            empty = self._sources[int(np.argmin(counts))]
+            raise DatasetError(
+                f'There is nothing to read for the part "{self.part}" in '
+                f'{empty.dataset.directory}: mode "{self._mode}" has {empty.rows.count} rows in '
+                f"{empty.trajectories[1]} trajectories, of which the view takes "
+                f"{empty.trajectories[0]}, and no window fits into one."
+            )
+        exact = shares / shares.sum() * _SHARES
+        each = np.floor(exact).astype(int)
+        each[np.argsort(each - exact)[: _SHARES - each.sum()]] += 1
+        if not each.all():
+            raise ConfigError(f"View.sources: a share is less than 1 in {_SHARES}.")
+        places = np.concatenate([(np.arange(count) + 0.5) / count for count in each])
+        of = np.repeat(np.arange(len(each)), each)[np.argsort(places, kind="stable")]
+        self._source_of, self._shares = of, each
+        self._before = np.array([np.cumsum(of == k) - (of == k) for k in range(len(each))])
+        if len(counts) == 1:
+            return int(counts[0])
+        if self.view.epoch == "first":
+            return int((counts * _SHARES // each).min())
+        return int((-(-counts * _SHARES // each)).max())
+
+    def _check(self) -> None:
+        if not len(self):
+            raise ConfigError(
+                f"An epoch has {self.num_items} items, fewer than a batch of {self.batch_size}, "
+                "and View.drop_last leaves out what is left."
+            )
+
+    def _default_names(self) -> list[str]:
+        return list(self.view.windows or self._sources[0].rows.fields)
+
+    def _described(self, name: str) -> dict[str, Field]:
+        """Return the fields of a window or stored field in a batch."""
+        window = window_of(self.view, name)
+        first = self._sources[0]
+        if window.field not in first.rows.fields:
+            raise DatasetError(
+                f'Mode "{self._mode}" of {first.dataset.directory} has no field "{window.field}".'
+            )
+        stored = first.rows.fields[window.field]
+        for other in self._sources[1:]:
+            compare_fields(
+                f"The source {other.dataset.directory}",
+                {n: f for n, f in other.rows.fields.items() if n == window.field},
+                {window.field: stored},
+            )
+        of_window = () if window.is_single else (len(window.at),)
+        found = {name: replace(stored, name=name, shape=(*of_window, *(stored.shape or ())))}
+        if self.view.edges == "pad" and name in self.view.windows:
+            found[name + _PAD] = Field(name + _PAD, of_window, "bool", role="additional")
+        return found
+
+    # Batches --------------------------------------------------------------------------------
+
+    def __len__(self) -> int:
+        whole, rest = divmod(self.num_items, self.batch_size)
+        return whole + (rest > 0 and not self.view.drop_last)
+
+    def __getitem__(self, number: int) -> Batch:
+        """Return a batch: field name to array of shape (items, *field shape).
+
+        Args:
+            number: Its number, from 0; those of each epoch follow those of the one before.
+
+        Raises:
+            IndexError: If it is negative.
+            DatasetError: If rows cannot be read.
+        """
+        if number < 0:
+            raise IndexError(f"There is no batch {number}: the first is 0.")
+        epoch, place = divmod(int(number), len(self))
+        start = place * self.batch_size
+        stop = min(start + self.batch_size, self.num_items)
+        batch = self._new_batch(stop - start)
+        if self._is_plain:
+            self._begin(epoch).fill(start, batch)
+            return batch
+        for k, (slots, items) in enumerate(self._drawn(epoch, start, stop)):
+            if len(slots):
+                self._fill(batch, self._sources[k], slots, items)
+        return batch
+
+    def __iter__(self) -> Iterator[Batch]:
+        """Yield the batches of the first epoch."""
+        return (self[number] for number in range(len(self)))
+
+    def rows(self, number: int) -> list[Index]:
+        """Return the reference rows of a batch's items, by source."""
+        epoch, place = divmod(int(number), len(self))
+        start = place * self.batch_size
+        stop = min(start + self.batch_size, self.num_items)
+        drawn = self._drawn(epoch, start, stop)
+        return [
+            source.items.rows(items)[:, 0]
+            for source, (_, items) in zip(self._sources, drawn, strict=True)
+        ]
+
+    def take(self, items: Index) -> Batch:
+        """Return some of the items of a single source as a batch, whatever their order."""
+        batch = self._allocate(len(items))
+        self._fill(batch, self._only, np.arange(len(items)), items)
+        return batch
+
+    @property
+    def _only(self) -> Source:
+        if len(self._sources) > 1:
+            raise UsageError("This needs a view of a single source.")
+        return self._sources[0]
+
+    def all_rows(self) -> Index:
+        """Return the numbers of all rows of a single source in this part, ascending."""
+        return self._only.items.all_rows()
+
+    def _begin(self, number: int) -> Epoch:
+        """Return an epoch of a single source without windows."""
+        if self._process != os.getpid():  # forked, without the thread that reads ahead
+            self._process, self._epoch = os.getpid(), None
+        if self._epoch is None or self._epoch[0] != number:
+            if self._epoch is not None:
+                self._epoch[1].close()
+                self._epoch = None
+            source = self._sources[0]
+            items = source.items
+            epoch = source.rows.epoch(
+                list(self.fields),
+                self._dtype,
+                self._pass(0, number, 0),
+                None if items.is_plain else lambda chosen: items.rows(chosen)[:, 0],
+            )
+            self._epoch = number, epoch
+        return self._epoch[1]
+
+    def _pass(self, source: int, epoch: int, repeat: int) -> ItemOrder:
+        """Return the order of a pass over a source, one of several in an epoch."""
+        key = self._key(source, epoch, repeat)
+        if (source, key) not in self._passes:
+            kept = [each for each in self._passes if each[0] == source][-1:]
+            others = {k: v for k, v in self._passes.items() if k[0] != source or k in kept}
+            self._passes = {**others, (source, key): self._sources[source].pass_order(key)}
+        return self._passes[source, key]
+
+    def _key(self, source: int, epoch: int, repeat: int) -> int:
+        return key_of(self.seed, epoch, source, repeat)
+
+    def _drawn(self, epoch: int, start: int, stop: int) -> list[tuple[Index, Index]]:
+        """Return for each source which places of a batch it fills, and with which items."""
+        slots = np.arange(start, stop)
+        turns, places = np.divmod(slots, _SHARES)
+        of, found = self._source_of[places], []
+        for k, source in enumerate(self._sources):
+            mine = np.flatnonzero(of == k)
+            positions = turns[mine] * self._shares[k] + self._before[k][places[mine]]
+            items = np.empty(len(mine), np.intp)
+            for repeat in np.unique(positions // source.count).tolist():
+                here = positions // source.count == repeat
+                inside = positions[here] - repeat * source.count
+                order, key = self._pass(k, epoch, repeat), self._key(k, epoch, repeat)
+                first = int(inside[0])
+                drawn = order.items(first, int(inside[-1]) + 1)[inside - first]
+                items[here] = source.drawn(drawn, key)
+            found.append((mine, items))
+        return found
+
+    def _fill(self, batch: Batch, source: Source, slots: Index, items: Index) -> None:
+        for name in self._names or ():
+            window = window_of(self.view, name)
+            values = source.gather(window.field, items, window.at)
+            batch[name][slots] = values[:, 0] if window.is_single else values
+            if name + _PAD in batch:
+                padded = source.items.are_padded(items, window.at)
+                batch[name + _PAD][slots] = padded[:, 0] if window.is_single else padded
+
+    def _new_batch(self, size: int) -> Batch:
+        if self._buffers is None:
+            return self._allocate(size)
+        if size == self.batch_size:
+            return self._buffers.copy()
+        return {name: buffer[:size] for name, buffer in self._buffers.items()}
+
+    def _allocate(self, size: int) -> Batch:
+        return {
+            name: np.empty((size, *(field.shape or ())), field.converted_dtype(self._dtype))
+            for name, field in self.fields.items()
+        }
+
+    # What it is ---------------------------------------------------------------------------------
+
+    @property
+    def digest(self) -> str:
+        """Digest of all that the batches depend on, besides the values of the rows."""
+        known = {Path(name).name: tuple(each) for name, each in self.snapshot.items()}
+        bound = to_plain(self.view), known, self._mode, self.part, self.batch_size, self.seed
+        return blake2b(repr(bound).encode(), digest_size=8).hexdigest()
+
+    def normalization(self) -> dict[str, Normalization]:
+        """Compute the normalization of the floating-point fields from the rows of this part.
+
+        That of a window is that of its stored field, at each offset.
+        """
+        found = {}
+        for name, field in self.fields.items():
+            if has_statistics(field) and not name.endswith(_PAD):
+                window = window_of(self.view, name)
+                found[name] = _repeated(self._statistics(window.field), field.shape or ())
+        return found
+
+    def _statistics(self, name: str) -> Normalization:
+        total = RunningStatistics()
+        for source in self._sources:
+            rows = source.items.all_rows()
+            step = rows_per_block(source.rows.fields[name].nbytes)
+            for start in range(0, len(rows), step):
+                total.update(source.rows.gather(name, rows[start : start + step]))
+        return total.normalization()
+
+    def explain(self) -> str:
+        """Return in words what the batches are made of."""
+        lines = [
+            f"{len(self)} batches of {self.batch_size} of {self.num_items} items in an epoch "
+            f'("{self.part}")'
+        ]
+        for source, share in zip(self._sources, self._shares.tolist(), strict=True):
+            taken, known = source.trajectories
+            lines.append(
+                f"{source.dataset.directory}: {source.count} items of {source.rows.count} rows, "
+                f"{taken} of {known} trajectories, {share / 10:g} % of each batch; order "
+                f'"{source.order}"'
+            )
+        if any(source.order == "blocks" for source in self._sources):
+            lines.append("each batch draws from up to 512 places of a source")
+        lines += [f"{n} = {w.field} at {list(w.at)}" for n, w in self.view.windows.items()]
+        return "\n".join(lines)
+
+    def close(self) -> None:
+        """Close the files; calling it again does nothing."""
+        if self._epoch is not None:
+            self._epoch[1].close()
+            self._epoch = None
+        self._opened.close()
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Let another process open the data for itself, as they are here."""
+        data = None if self.view.sources else str(self._sources[0].dataset.directory)
+        options = {
+            "data": data, "mode": self._mode, "part": self.part, "snapshot": self.snapshot,
+            "fields": self._names, "dtype": self._dtype, "reuse": self._reuse,
+        }  # fmt: skip
+        return _reopen, (self.view, self.batch_size, self.seed, options)
+
+    def __repr__(self) -> str:
+        return f"<{len(self)} batches of {self.batch_size} of {self.num_items} items>"
+
+
+def _reopen(view: View, batch_size: int, seed: int, options: dict[str, Any]) -> Batches:
+    return Batches(view, batch_size, seed, **options)
+
+
+def _repeated(known: Normalization, shape: tuple[int, ...]) -> Normalization:
+    """Return the normalization of a window's shape."""
+    arrays = {name: np.broadcast_to(each, shape).copy() for name, each in known.arrays().items()}
+    return Normalization.from_arrays(arrays, shape)

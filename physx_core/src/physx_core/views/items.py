@@ -1,0 +1,93 @@
+"""Items: what a view learns from in one dataset: reference rows of windows, numbered from 0."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+
+from physx_core.dataset import Trajectories
+from physx_core.dataset.read.episodes import Flags
+from physx_core.typing import Index
+from physx_core.views.view import View
+
+
+class Items:
+    """The windows in some trajectories; finding one takes no memory for the others.
+
+    Attributes:
+        count: Number of items.
+        trajectory: Number of items of each trajectory, shape (trajectories,).
+        is_plain: Whether item k is row k of the mode.
+    """
+
+    def __init__(self, view: View, found: Trajectories) -> None:
+        """Count the windows.
+
+        Args:
+            view: Defines them.
+            found: The trajectories.
+        """
+        offsets = [offset for window in view.windows.values() for offset in window.at] or [0]
+        low, high = min(0, *offsets), max(0, *offsets)
+        self._pads = view.edges == "pad"
+        if self._pads:
+            low = high = 0
+        is_single = low == high == 0 and not view.windows
+        if is_single and view.stride == 1 and found.places is None:
+            found = _joined(found)
+        self._stride, self._low, self._found = view.stride, low, found
+        room = np.maximum(0, found.rows - (high - low))
+        self.trajectory: Index = -(-room // view.stride)
+        self._ends = np.cumsum(self.trajectory)
+        self.count = int(self._ends[-1]) if len(self._ends) else 0
+        self.is_plain = (
+            is_single
+            and view.stride == 1
+            and found.places is None
+            and len(found.rows) == 1
+            and int(found.start[0]) == 0
+        )
+
+    def rows(self, items: Index, offsets: Sequence[int] = (0,)) -> Index:
+        """Return the row numbers of items at some offsets, shape (items, offsets)."""
+        start, size, place = self._locate(items)
+        places = place[:, None] + np.asarray(offsets, np.intp)
+        if self._pads:
+            places = np.clip(places, 0, size[:, None] - 1)
+        places += start[:, None]
+        found = self._found.places
+        return places if found is None else found[places]
+
+    def are_padded(self, items: Index, offsets: Sequence[int]) -> Flags:
+        """Return whether the values of items at some offsets are repeated, as `rows`."""
+        _, size, place = self._locate(items)
+        places = place[:, None] + np.asarray(offsets, np.intp)
+        return (places < 0) | (places >= size[:, None])
+
+    def trajectories(self, items: Index) -> Index:
+        """Return the place of the trajectory of each item, shape (items,)."""
+        return self._ends.searchsorted(items, "right")
+
+    def all_rows(self) -> Index:
+        """Return the numbers of all rows of the trajectories, ascending."""
+        found = self._found
+        steps = np.repeat(found.start - np.cumsum(found.rows) + found.rows, found.rows)
+        places = steps + np.arange(int(found.rows.sum()))
+        return np.sort(places if found.places is None else found.places[places])
+
+    def _locate(self, items: Index) -> tuple[Index, Index, Index]:
+        """Return start and rows of each item's trajectory, and the place of its reference row."""
+        which = self.trajectories(items)
+        inside = items - (self._ends[which] - self.trajectory[which])
+        return self._found.start[which], self._found.rows[which], inside * self._stride - self._low
+
+
+def _joined(found: Trajectories) -> Trajectories:
+    """Return trajectories that follow one another as one."""
+    found = found.take(found.rows > 0)
+    found = found.take(np.argsort(found.start))
+    new = np.append(True, found.start[1:] != (found.start + found.rows)[:-1])[: len(found.start)]
+    begins = np.flatnonzero(new)
+    rows = np.add.reduceat(found.rows, begins) if len(begins) else found.rows
+    return found.take(begins)._replace(rows=rows)

@@ -1,0 +1,201 @@
+"""Source: the items of a view in one dataset, and the order in which each pass visits them."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+import numpy as np
+
+from physx_core.dataset import Dataset, EpisodeStatus, Snapshot, Trajectories
+from physx_core.dataset.read.episodes import Flags, find_trajectories
+from physx_core.dataset.read.shuffling import (
+    ItemOrder,
+    OrderName,
+    choose_order,
+    key_of,
+    make_order,
+)
+from physx_core.errors import ConfigError, DatasetError
+from physx_core.plugins.references import import_component
+from physx_core.typing import Array, Index
+from physx_core.views.folds import Part, choose_part
+from physx_core.views.items import Items
+from physx_core.views.view import View, Window
+
+_BLOCK = 16  # rows that are held back together where nothing is known of episodes
+_STATUS = {"finished": EpisodeStatus.FINISHED, "cut": EpisodeStatus.CUT}
+
+
+class Source:
+    """One dataset of a view.
+
+    Attributes:
+        dataset: The dataset.
+        rows: Its rows at the snapshot.
+        items: The items of the part.
+        trajectories: How many trajectories the part has, and how many there are.
+    """
+
+    def __init__(
+        self, view: View, dataset: Dataset, mode: str, part: Part, snapshot: Snapshot | None
+    ) -> None:
+        """Find the items.
+
+        Args:
+            view: The view.
+            dataset: The dataset.
+            mode: Mode of the rows.
+            part: Which part of the trajectories.
+            snapshot: The rows at some time; None: now.
+
+        Raises:
+            ConfigError: If the view cannot be had of these rows.
+            DatasetError: If rows are missing.
+        """
+        self.dataset = dataset
+        self.rows = dataset.rows(mode, snapshot)
+        self._view, self._drawn = view, (-1, np.zeros(0, np.intp))
+        self._weights: Array | None = None
+        found = self._find(part)
+        chosen = choose_part(view, part, self._chosen(found))
+        self.trajectories = len(chosen.rows), len(found.rows)
+        self.items = Items(view, chosen)
+
+    def _find(self, part: Part) -> Trajectories:
+        """Return the trajectories, or blocks of rows if nothing is known of any."""
+        view, rows = self._view, self.rows
+        divides = part != "all" and (view.fold, view.test_fold) != (None, None)
+        chooses = view.windows or view.stride > 1 or view.episodes or view.where or view.weights
+        if not (divides or chooses):
+            return _blocks(rows.count, max(1, rows.count))
+        try:
+            return find_trajectories(rows)
+        except DatasetError:
+            if chooses:
+                raise
+            return _blocks(rows.count, _BLOCK)
+
+    def _chosen(self, found: Trajectories) -> Trajectories:
+        """Return the trajectories that the view names."""
+        view = self._view
+        if not (view.episodes or view.where):
+            return found
+        if self.rows.order is None or (found.campaign < 0).any():
+            raise ConfigError(
+                f"View.episodes and View.where choose independent episodes, but the rows of "
+                f"{self.dataset.directory} are not recorded as such."
+            )
+        keeps = np.ones(len(found.rows), bool)
+        for name, given in view.episodes.items():
+            if name == "status":
+                keeps &= self._status(found) == _STATUS[given]
+            else:
+                values = found.number if name == "episode" else self._values(name, found)
+                keeps &= _inside(name, values, *given)
+        if view.where is not None:
+            keeps &= self._call(view.where, found)
+        return found.take(keeps)
+
+    def _status(self, found: Trajectories) -> Index:
+        assert self.rows.order is not None
+        known = self.rows.order.episodes
+        return known.status[known.first.searchsorted(found.start, "right") - 1]
+
+    def _values(self, name: str, found: Trajectories) -> Array:
+        return self.rows.episode_values(name, found.start)
+
+    def _call(self, reference: str, found: Trajectories) -> Flags:
+        choose = import_component("function", reference)
+        names = self.rows.episode_names
+        given = {"episode": found.number, "campaign": found.campaign, "rows": found.rows}
+        kept = np.asarray(choose(given | {name: self._values(name, found) for name in names}))
+        if kept.dtype != bool or kept.shape != found.rows.shape:
+            raise ConfigError(
+                f"View.where: {reference} returned {kept.dtype} of shape {kept.shape} for "
+                f"{len(found.rows)} episodes, not one boolean for each."
+            )
+        return kept
+
+    @property
+    def count(self) -> int:
+        """Number of items of a pass."""
+        return self.items.count
+
+    @property
+    def order(self) -> OrderName:
+        """The order of a pass."""
+        given: Any = self._view.order
+        found: OrderName = given or choose_order(self.count, self.rows.row_nbytes)
+        return found
+
+    def pass_order(self, key: int) -> ItemOrder:
+        """Return the order of a pass."""
+        return make_order(self.order, self.count, self.rows.row_nbytes, key)
+
+    def drawn(self, items: Index, key: int) -> Index:
+        """Return the items that a pass draws in place of some, if they have weights.
+
+        Of the sorted weights of all items, places at equal distances are taken, from a random one
+        on: so an item of weight w, of n items of mean weight 1, comes w times, rounded up or down.
+        """
+        if self._view.weights is None:
+            return items
+        if self._drawn[0] != key:
+            ends = np.cumsum(self._weight())
+            begin = key_of(key, 1) / 2**64
+            places = (np.arange(self.count) + begin) * (ends[-1] / self.count)
+            self._drawn = key, np.minimum(ends.searchsorted(places, "right"), self.count - 1)
+        return self._drawn[1][items]
+
+    def _weight(self) -> Array:
+        """Return the weight of each item."""
+        if self._weights is None:
+            kind, _, name = (self._view.weights or "").partition(":")
+            every = np.arange(self.count)
+            if kind == "episode":
+                which = self.items.trajectories(every)
+                self._weights = 1.0 / self.items.trajectory[which]
+            else:
+                values = self.gather(name, every, (0,))[:, 0]
+                self._weights = _weights_of(kind, name, values)
+        return self._weights
+
+    def gather(self, name: str, items: Index, offsets: Sequence[int]) -> Array:
+        """Return a stored field of items at some offsets, shape (items, offsets, *field shape)."""
+        rows = self.items.rows(items, offsets)
+        found = self.rows.gather(name, rows.ravel())
+        return found.reshape(*rows.shape, *found.shape[1:])
+
+
+def window_of(view: View, name: str) -> Window:
+    """Return the window of a name; of a stored field without one, its value at offset 0."""
+    return view.windows.get(name) or Window(name, (0,), is_single=True)
+
+
+def _blocks(count: int, size: int) -> Trajectories:
+    """Return blocks of rows."""
+    start = np.arange(0, count, size)
+    number = np.arange(len(start))
+    return Trajectories(
+        np.full(len(start), -1), number, start, np.minimum(size, count - start), None
+    )
+
+
+def _inside(name: str, values: Array, low: float, high: float) -> Flags:
+    if values.ndim > 1:
+        raise ConfigError(f'View.episodes: "{name}" has several values in each episode.')
+    return (values >= low) & (values <= high)
+
+
+def _weights_of(kind: str, name: str, values: Array) -> Array:
+    """Return weights by the values of a field."""
+    if values.ndim > 1:
+        raise ConfigError(f'View.weights: the field "{name}" has several values in each row.')
+    if kind == "class":
+        _, place, counts = np.unique(values, return_inverse=True, return_counts=True)
+        return np.asarray(1.0 / counts[place])
+    weights = values.astype(np.float64)
+    if not (np.isfinite(weights).all() and (weights >= 0).all() and weights.sum() > 0):
+        raise ConfigError(f'View.weights: the field "{name}" has negative values, or none above 0.')
+    return weights

@@ -1,0 +1,450 @@
+"""Views against the simplest model: lists of rows by trajectory."""
+
+import multiprocessing
+import os
+import pickle
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from unittest import mock
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from numpy.testing import assert_array_equal
+from sizes import trials
+
+from physx_core import Dataset, View
+from physx_core.dataset import EpisodeRecord, EpisodeStatus
+from physx_core.dataset.read import shuffling
+from physx_core.dataset.read.access import memory
+from physx_core.errors import ConfigError, DatasetError
+from physx_core.views.folds import folds_of
+
+MANY = 10**12
+
+
+@pytest.fixture(autouse=True)
+def nothing_reaches_the_disk(monkeypatch):
+    for name in ("fsync", "fdatasync"):  # nothing here depends on that
+        monkeypatch.setattr(os, name, lambda descriptor: None)
+
+
+def episodes(lengths):
+    """Rows of episodes by trajectory: field x tells episode and step."""
+    return [np.stack([np.full(n, e), np.arange(n)], 1) for e, n in enumerate(lengths)]
+
+
+def store(folder, trajectories, first=0):
+    """Store independent episodes, each with a parameter p, a tenth of its number."""
+    make = Dataset.open if (folder / "dataset.json").exists() else Dataset.create
+    options = {"writable": True} if make == Dataset.open else {}
+    new = dict(enumerate(trajectories[first:], first))
+    x = np.concatenate([*new.values()])
+    rows = {
+        "x": x.astype(float), "label": x[:, 0] % 3, "env_id": np.zeros(len(x), int),
+        "episode": x[:, 0], "step": x[:, 1],
+    }  # fmt: skip
+    records = [
+        EpisodeRecord(
+            episode=number, rows=len(one), parameters={"p": number / 10},
+            status=EpisodeStatus.CUT if number == 3 else EpisodeStatus.FINISHED,
+        )
+        for number, one in new.items()
+    ]  # fmt: skip
+    with make(folder, **options) as dataset:
+        dataset.append_episodes("training", rows, records)
+
+
+def store_streams(folder, trajectories, instances):
+    """Store trajectories as those of streams, whose rows take turns."""
+    streams = [[] for _ in range(instances)]
+    for number, x in enumerate(trajectories):
+        streams[number % instances].append(x)
+    joined = [np.concatenate(each) if each else np.zeros((0, 2)) for each in streams]
+    rows = [
+        (place + 1, number, x)
+        for number in range(max(map(len, joined)))
+        for place, each in enumerate(joined)
+        for x in each[number : number + 1]
+    ]
+    with Dataset.create(folder) as dataset:
+        dataset.append(
+            "training",
+            {
+                "x": np.array([x for *_, x in rows], float),
+                "label": [int(x[0]) % 3 for *_, x in rows],
+                "env_id": [place for place, *_ in rows], "step": [step for _, step, _ in rows],
+                "episode": [int(x[0]) for *_, x in rows],
+            },
+        )  # fmt: skip
+
+
+class Model:
+    """What a view is, in lists."""
+
+    def __init__(self, view, trajectories, folds):
+        self.view = view
+        kept = [
+            x for x, fold in zip(trajectories, folds, strict=True)
+            if fold not in (view.fold, view.test_fold)
+        ]  # fmt: skip
+        offsets = [o for window in view.windows.values() for o in window.at] or [0]
+        low, high = min(0, *offsets), max(0, *offsets)
+        if view.edges == "pad":
+            low = high = 0
+        self.items = [(x, at) for x in kept for at in range(-low, len(x) - high, view.stride)]
+
+    def item(self, number):
+        x, at = self.items[number]
+        if not self.view.windows:
+            return {"x": x[at]}
+        found = {}
+        for name, window in self.view.windows.items():
+            places = [at + offset for offset in window.at]
+            inside = [min(max(place, 0), len(x) - 1) for place in places]
+            values = x[inside][0] if window.is_single else x[inside]
+            found[name] = values
+            if self.view.edges == "pad":
+                pad = np.array([p != q for p, q in zip(places, inside, strict=True)])
+                found[f"{name}_is_pad"] = pad[0] if window.is_single else pad
+        return found
+
+
+OFFSETS = st.lists(st.integers(-3, 3), min_size=1, max_size=4)
+WINDOWS = st.dictionaries(
+    st.sampled_from(["past", "next", "now"]),
+    st.tuples(st.just("x"), OFFSETS | st.integers(-2, 2)),
+    max_size=2,
+)
+
+
+@pytest.mark.slow
+@settings(database=None, deadline=None, max_examples=trials(10_000, 25))
+@given(
+    lengths=st.lists(st.integers(1, 9), min_size=1, max_size=14), window=WINDOWS,
+    stride=st.integers(1, 3), edges=st.sampled_from(["inside", "pad"]),
+    instances=st.integers(0, 3), folds=st.integers(2, 6), held=st.booleans(),
+    size=st.integers(1, 7), seed=st.integers(0, 99), free=st.sampled_from([0, MANY]),
+    order=st.sampled_from([None, "exact", "blocks"]),
+)  # fmt: skip
+def test_views_have_the_items_of_the_model(
+    lengths, window, stride, edges, instances, folds, held, size, seed, order, free
+):
+    trajectories = episodes(lengths)
+    view = View(
+        window=window, stride=stride, edges=edges, folds=folds, order=order,
+        fold=0 if held else None, test_fold=1 if held else None, fold_seed=seed,
+    )  # fmt: skip
+    with TemporaryDirectory() as name, mock.patch.object(memory, "available_memory", lambda: free):
+        folder = Path(name, "data")
+        if instances:
+            store_streams(folder, trajectories, instances)
+            trajectories.sort(key=lambda x: first_row(folder, x))
+        else:
+            store(folder, trajectories)
+        if held and instances and len(lengths) < folds:
+            return  # pieces: see below
+        numbers, campaign = np.arange(len(lengths)), np.full(len(lengths), -1 if instances else 0)
+        of = folds_of(campaign, numbers, folds, seed)
+        model = Model(view, trajectories, of.tolist())
+        if instances and not (window or held) and stride == 1:  # all rows, as they were stored
+            model.items.sort(key=lambda item: first_row(folder, item[0][item[1] :]))
+        if not model.items:
+            with pytest.raises((DatasetError, ConfigError)):
+                view.open(size, seed, data=folder)
+            return
+        with view.open(size, seed, data=folder, fields=None if window else ["x"]) as batches:
+            count = len(model.items)
+            assert batches.num_items == count and len(batches) == -(-count // size)
+            expected = [model.item(number) for number in range(count)]
+            nbytes = batches._sources[0].rows.row_nbytes
+            for epoch in range(2):
+                key = shuffling.key_of(seed, epoch, 0, 0)
+                kind = order or "exact"
+                drawn = shuffling.make_order(kind, count, nbytes, key).items(0, count).tolist()
+                assert sorted(drawn) == list(range(count))
+                for place in range(len(batches)):
+                    batch = batches[epoch * len(batches) + place]
+                    wanted = drawn[place * size : (place + 1) * size]
+                    for field, values in batch.items():
+                        assert_array_equal(values, [expected[item][field] for item in wanted])
+
+
+def first_row(folder, x):
+    with Dataset.open(folder) as dataset:
+        return np.flatnonzero((dataset["training"]["x"][:] == x[0]).all(axis=1))[0]
+
+
+# Folds ------------------------------------------------------------------------------------------
+
+
+def test_more_episodes_never_move_one_between_folds():
+    numbers = np.arange(1000)
+    whole = folds_of(np.zeros(1000, int), numbers, 5, 3)
+    for count in (1, 4, 5, 77, 999):
+        some = folds_of(np.zeros(count, int), numbers[:count], 5, 3)
+        assert_array_equal(some, whole[:count])
+    assert set(Counter(whole.tolist()).values()) == {200}
+    alone = folds_of(np.zeros(3, int), np.array([999, 5, 500]), 5, 3)
+    assert_array_equal(alone, whole[[999, 5, 500]])
+    assert not np.array_equal(folds_of(np.ones(1000, int), numbers, 5, 3), whole)
+    assert not np.array_equal(folds_of(np.zeros(1000, int), numbers, 5, 4), whole)
+
+
+def numbers_in(batches):
+    return {int(e) for batch in batches for e in batch["x"][:, 0]}
+
+
+def test_parts_share_no_episode_and_have_all(tmp_path):
+    store(tmp_path, episodes([3] * 40))
+    found = []
+    for fold in range(4):
+        view = View(folds=4, fold=fold, test_fold=(fold + 1) % 4)
+        parts = [numbers_in(view.open(7, data=tmp_path, part=part))
+                 for part in ("training", "validation", "test")]  # fmt: skip
+        assert [len(part) for part in parts] == [20, 10, 10]
+        assert set().union(*parts) == set(range(40))
+        found.append(parts[1])
+        assert parts[2] == numbers_in(
+            View(folds=4, fold=(fold + 1) % 4).open(7, data=tmp_path, part="validation")
+        )
+    assert set().union(*found) == set(range(40))
+
+
+def test_of_few_streams_the_end_is_held_back(tmp_path):
+    store_streams(tmp_path, episodes([50, 50]), 2)
+    view = View(folds=5, fold=0, test_fold=1, window={"x": ("x", [0, 1])})
+    steps = {
+        part: {(int(e), int(s)) for batch in view.open(8, data=tmp_path, part=part)
+               for window in batch["x"] for e, s in window}
+        for part in ("training", "validation", "test")
+    }  # fmt: skip
+    for part, inside in (("training", range(30)), ("test", range(30, 40)),
+                         ("validation", range(40, 50))):  # fmt: skip
+        assert steps[part] == {(e, s) for e in range(2) for s in inside}
+
+
+def test_rows_without_episodes_are_held_back_in_blocks(tmp_path):
+    with Dataset.create(tmp_path) as dataset:
+        dataset.append("training", {"n": np.arange(1600)})
+    view = View(folds=5, fold=2)
+    held = np.concatenate([b["n"] for b in view.open(10, data=tmp_path, part="validation")])
+    rest = np.concatenate([b["n"] for b in view.open(10, data=tmp_path)])
+    assert len(held) == 320 and sorted([*held, *rest]) == list(range(1600))
+    assert set(Counter(held // 16).values()) == {16}
+
+
+# Which episodes ---------------------------------------------------------------------------------
+
+
+def few(values):
+    """Choose episodes by a parameter."""
+    assert values["rows"].shape == values["p"].shape
+    return values["p"] < 0.35
+
+
+def no_flags(values):
+    return values["p"]
+
+
+@pytest.mark.parametrize(
+    ("options", "expected"),
+    [
+        ({"episodes": {"p": [0.45, 0.7]}}, {5, 6, 7}),
+        ({"episodes": {"episode": [2, 4], "status": "finished"}}, {2, 4}),
+        ({"episodes": {"status": "cut"}}, {3}),
+        ({"where": f"{__file__}:few"}, {0, 1, 2, 3}),
+        ({"where": f"{__file__}:few", "episodes": {"episode": [2, 9]}}, {2, 3}),
+    ],
+)
+def test_episodes_are_chosen_by_what_they_are(tmp_path, options, expected):
+    store(tmp_path, episodes([3] * 10))
+    assert numbers_in(View(**options).open(4, data=tmp_path)) == expected
+
+
+def test_wrong_choices_are_named(tmp_path):
+    store(tmp_path / "a", episodes([3] * 10))
+    store_streams(tmp_path / "b", episodes([3] * 10), 2)
+    for options, data, message in (
+        ({"episodes": {"q": [0, 1]}}, "a", 'no field "q"'),
+        ({"episodes": {"p": [5, 6]}}, "a", "nothing to read for the part"),
+        ({"episodes": {"p": [5, 6]}}, "b", "not recorded"),
+        ({"where": f"{__file__}:no_flags"}, "a", "not one boolean for each"),
+        ({"window": {"w": ("y", [0])}}, "a", 'no field "y"'),
+        ({"weights": "class:x"}, "a", "several values"),
+        ({"window": {"w": ("x", [0, 9])}}, "a", "no window fits"),
+    ):
+        with pytest.raises((ConfigError, DatasetError), match=message):
+            View(**options).open(4, data=tmp_path / data)[0]
+    with pytest.raises(ConfigError, match="set View.fold"):
+        View().open(4, data=tmp_path / "a", part="validation")
+
+
+@pytest.mark.parametrize(
+    ("options", "message"),
+    [
+        ({"window": {"w": "x"}}, "w is 'x' but must be a field and its offsets"),
+        ({"window": {"w": ("x", [])}}, "offsets"),
+        ({"window": {"w": ("x", [0.5])}}, "offsets"),
+        ({"fold": 5}, "of 5 folds the last is 4"),
+        ({"fold": 1, "test_fold": 1}, "are the same"),
+        ({"folds": 1}, "at least 2"),
+        ({"weights": "rows"}, "must be"),
+        ({"sources": {"a": 0.0}}, "not positive"),
+        ({"episodes": {"p": 1}}, "smallest and largest"),
+        ({"episodes": {"status": "failed"}}, "finished"),
+        ({"order": "random"}, "exact"),
+        ({"stride": 0}, "at least 1"),
+    ],
+)
+def test_mistakes_in_a_view_are_named(options, message):
+    with pytest.raises(ConfigError, match=message):
+        View(**options)
+
+
+# Sources and weights ----------------------------------------------------------------------------
+
+
+@settings(database=None, deadline=None, max_examples=30)
+@given(
+    shares=st.lists(st.integers(1, 9), min_size=2, max_size=4), seed=st.integers(0, 9),
+    epoch=st.sampled_from(["first", "all"]), size=st.integers(1, 40),
+)  # fmt: skip
+def test_each_batch_has_its_share_of_each_source(shares, seed, epoch, size):
+    with TemporaryDirectory() as name:
+        folders = [str(Path(name, str(k))) for k in range(len(shares))]
+        counts = [30 + 20 * k for k in range(len(shares))]
+        for folder, count in zip(folders, counts, strict=True):
+            with Dataset.create(folder) as dataset:
+                n = np.arange(count)
+                dataset.append("training", {"n": n, "of": np.full(count, folders.index(folder))})
+        view = View(sources=dict(zip(folders, map(float, shares), strict=True)), epoch=epoch)
+        with view.open(size, seed) as batches:
+            pairs = np.concatenate([np.stack([b["of"], b["n"]], 1) for b in batches])
+        total = len(pairs)
+        for k, (share, count) in enumerate(zip(shares, counts, strict=True)):
+            of = share / sum(shares)
+            for start in range(0, total, size):  # of any consecutive slots
+                some = pairs[start : start + size, 0]
+                assert abs((some == k).sum() - of * len(some)) < len(shares) + 1
+            mine = pairs[pairs[:, 0] == k, 1]
+            for first in range(0, len(mine), count):  # each pass has each at most once
+                one = mine[first : first + count]
+                assert len(set(one.tolist())) == len(one)
+            if epoch == "all":
+                assert set(mine.tolist()) == set(range(count))
+        exact = [count * sum(shares) / share for count, share in zip(counts, shares, strict=True)]
+        ends = min(exact) if epoch == "first" else max(exact)
+        assert abs(total - ends) <= 2 + 0.05 * ends
+
+
+def test_weighted_items_come_in_proportion(tmp_path):
+    lengths = [4] * 9 + [40]
+    store(tmp_path, episodes(lengths))
+    with View(weights="episode").open(8, data=tmp_path) as batches:
+        found = Counter(int(e) for b in batches for e in b["x"][:, 0])
+        assert max(found.values()) - min(found.values()) <= 4 and sum(found.values()) == 76
+        again = Counter(int(e) for b in batches for e in b["x"][:, 0])
+        assert found == again
+    with View(weights="class:label").open(8, data=tmp_path) as batches:
+        found = Counter(int(n) for b in batches for n in b["label"])
+        assert max(found.values()) - min(found.values()) <= 2
+    with View(weights="field:step").open(8, data=tmp_path) as batches:
+        steps = np.concatenate([b["step"] for b in batches])
+        assert 0 not in steps
+        total = sum(n * (n - 1) / 2 for n in lengths)
+        assert abs((steps == 39).sum() - 76 * 39 / total) <= 1
+
+
+# Purity -----------------------------------------------------------------------------------------
+
+
+def equal(one, other):
+    return one.keys() == other.keys() and all(np.array_equal(one[n], other[n]) for n in one)
+
+
+def read(batches, number, queue):
+    queue.put(batches[number]["x"].tolist())
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("window", [{}, {"past": ("x", [-1, 0])}])
+@pytest.mark.parametrize("order", ["exact", "blocks"])
+def test_a_batch_depends_on_its_number_alone(tmp_path, monkeypatch, window, order):
+    monkeypatch.setattr(shuffling, "_BLOCK", 100)
+    monkeypatch.setattr(shuffling, "_WINDOW", 3)
+    store(tmp_path, episodes([5, 8, 13] * 10))
+    view = View(window=window, order=order, fold=1)
+    with view.open(16, 7, data=tmp_path) as batches:
+        numbers = range(3 * len(batches))
+        whole = [batches[number] for number in numbers]
+        for number in reversed(numbers):
+            assert equal(batches[number], whole[number])
+        monkeypatch.setattr(memory, "available_memory", lambda: 0)
+        assert equal(pickle.loads(pickle.dumps(batches))[20], whole[20])  # noqa: S301
+        store(tmp_path, episodes([5, 8, 13] * 10 + [7] * 20), first=30)
+        with view.open(16, 7, data=tmp_path, snapshot=batches.snapshot) as again:
+            assert again.digest == batches.digest
+            assert all(equal(again[number], whole[number]) for number in numbers)
+        with view.open(16, 7, data=tmp_path) as more:
+            assert more.num_items > batches.num_items and more.digest != batches.digest
+
+
+def record(number):
+    return EpisodeRecord(episode=number, rows=6, parameters={"p": number / 10})
+
+
+def test_rows_that_come_between_change_nothing_with_a_snapshot(tmp_path):
+    x = episodes([6] * 10)
+    store(tmp_path, x[:5])
+    with Dataset.open(tmp_path, writable=True) as dataset:
+        rows = {"x": x[7].astype(float), "label": np.zeros(6, int), "env_id": np.zeros(6, int),
+                "episode": np.full(6, 7), "step": np.arange(6)}  # fmt: skip
+        dataset.append_episodes("training", rows, [record(7)])
+    view = View(window={"x": ("x", [0, 1])}, fold=0, episodes={"p": [0, 0.7]})
+    with view.open(4, data=tmp_path) as batches:
+        whole, snapshot = [*batches], batches.snapshot
+    with Dataset.open(tmp_path, writable=True) as dataset:
+        rows |= {"x": x[5].astype(float), "episode": np.full(6, 5)}
+        dataset.append_episodes("training", rows, [record(5)])
+    with view.open(4, data=tmp_path, snapshot=snapshot) as again:
+        assert all(equal(*pair) for pair in zip(again, whole, strict=True))
+    with pytest.raises(DatasetError, match="missing"):
+        view.open(4, data=tmp_path, snapshot={str(tmp_path): (900, 90)})
+
+
+@pytest.mark.processes
+@pytest.mark.parametrize("window", [{}, {"x": ("x", [-1, 0])}])
+def test_other_processes_read_the_same(tmp_path, monkeypatch, window):
+    monkeypatch.setattr(memory, "available_memory", lambda: 0)
+    store(tmp_path, episodes([9] * 30))
+    with View(window=window, order="blocks").open(16, 7, data=tmp_path) as batches:
+        expected = batches[5]["x"].tolist()
+        queue = multiprocessing.get_context("fork").Queue()
+        forked = multiprocessing.get_context("fork").Process(target=read, args=(batches, 5, queue))
+        forked.start()
+        assert queue.get(timeout=60) == expected
+        forked.join()
+        code = "import pickle, sys; print(pickle.load(sys.stdin.buffer)[5]['x'].tolist())"
+        words, given = [sys.executable, "-c", code], pickle.dumps(batches)
+        assert (
+            str(expected)
+            == subprocess.check_output(words, input=given, text=False).decode().strip()
+        )
+
+
+def test_normalization_is_that_of_the_part(tmp_path):
+    store(tmp_path, episodes([4, 6] * 10))
+    view = View(window={"past": ("x", [-1, 0])}, fold=0)
+    with view.open(4, data=tmp_path) as batches:
+        found = batches.normalization()
+        rows = batches.all_rows()
+    with Dataset.open(tmp_path) as dataset:
+        x = dataset["training"]["x"][rows]
+    assert found.keys() == {"past"}
+    np.testing.assert_allclose(found["past"].mean, np.broadcast_to(x.mean(axis=0), (2, 2)))
+    np.testing.assert_allclose(found["past"].std, np.broadcast_to(x.std(axis=0), (2, 2)))
