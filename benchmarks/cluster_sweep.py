@@ -64,7 +64,7 @@ def write_study(folder: Path) -> Path:
     training = {
         "epoch_nb": EPOCHS,
         "batch_size": 10,
-        "dataset": {"existing_dir": str(folder / "data"), "validation_split": 0.2},
+        "dataset": {"existing_dir": str(folder / "data"), "view": {"fold": 0}},
         "network": {
             "network": "toy/linear",
             "network_kwargs": {"net_fields": ["state", "force"]},

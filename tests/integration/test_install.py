@@ -32,7 +32,7 @@ epoch_nb = 1
 batch_size = 5
 [pipelines.linear.training.dataset]
 existing_dir = "sessions/data_generation"
-validation_split = 0.5
+view = { folds = 2, fold = 0 }
 [pipelines.linear.training.network]
 network = "toy/linear"
 """

@@ -14,7 +14,6 @@ from .components import Parameter as Parameter
 from .components import Sampler as Sampler
 from .components import Transformation as Transformation
 from .components import Visualizer as Visualizer
-from .config import DatasetConfig as DatasetConfig
 from .config import EnvironmentConfig as EnvironmentConfig
 from .config import NetworkConfig as NetworkConfig
 from .dataset import Dataset as Dataset
@@ -29,4 +28,5 @@ from .pipelines import Training as Training
 from .statistics import Normalization as Normalization
 from .version import __version__ as __version__
 from .views import Batches as Batches
+from .views import DatasetConfig as DatasetConfig
 from .views import View as View

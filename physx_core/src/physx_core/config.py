@@ -30,7 +30,6 @@ __all__ = [
     "MODES",
     "SETS",
     "WRONG",
-    "DatasetConfig",
     "EnvironmentConfig",
     "NetworkConfig",
     "at_least",
@@ -258,35 +257,6 @@ class EnvironmentConfig:
     def places(self) -> int:
         """How many clients there may be at a time."""
         return self.num_clients if self.max_clients is None else self.max_clients
-
-
-@configuration
-class DatasetConfig:
-    """Where samples are stored and how they are read."""
-
-    existing_dir: str | Path | None = None
-    """Folder of an existing session or dataset to read; it is never modified."""
-    mode: str = field(default="training", metadata={"choices": (*MODES, WRONG)})
-    """Mode to write or read: "training", "validation" or "prediction"; "wrong", with the samples
-    that `check_sample` rejected, can only be read."""
-    max_file_size: float = at_least(1e-6, 0.25)
-    """Size of a partition in GB."""
-    writers: str = field(default="server", metadata={"choices": ("server", "clients")})
-    """Who writes the rows in data generation: "server", the run's own process, or "clients", each
-    client its own rows to its own partitions. The clients must then share the dataset's folder. Use
-    this for data rates that the run's connection cannot carry."""
-    shuffle: bool = True
-    """Read each epoch in a new random order; otherwise in the order of writing."""
-    validation_split: float = field(default=0.0, metadata={"minimum": 0.0, "maximum": 0.99})
-    """Fraction of the samples held back from training for validation, if the dataset has no mode
-    "validation"; the same samples every time. The others define the normalization."""
-    split_by: str = field(default="row", metadata={"choices": ("row", "episode")})
-    """Hold back single samples or whole trajectories: "row" or "episode"."""
-    normalize: bool = False
-    """Normalize each component to mean 0 and standard deviation 1 for networks."""
-    recompute_normalization: bool = False
-    """Recompute mean and standard deviation from the stored rows instead of using the stored
-    values."""
 
 
 @configuration

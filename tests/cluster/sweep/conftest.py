@@ -37,7 +37,7 @@ def descent(data):
     return {
         "epoch_nb": EPOCHS,
         "batch_size": 10,
-        "dataset": {"existing_dir": str(data), "validation_split": 0.2},
+        "dataset": {"existing_dir": str(data), "view": {"fold": 0}},
         "network": {
             "network": "toy/linear",
             "network_kwargs": {"net_fields": ["state", "force"]},

@@ -11,9 +11,9 @@ import pytest
 
 from physx_cluster.errors import StudyError
 from physx_cluster.sweep import Definition, Study, run_study
-from physx_core import Dataset, NetworkConfig, Training
-from physx_core.config import DatasetConfig
+from physx_core import Dataset, NetworkConfig, Training, View
 from physx_core.errors import ConfigError
+from physx_core.views.dataset_config import DatasetConfig
 
 pytestmark = pytest.mark.processes
 
@@ -40,7 +40,7 @@ def test_each_pipeline_is_tried_with_each_setting_and_seed(write, training, phys
     network = NetworkConfig(**{**training["network"], "lr": 0.3})
     alone = Training(
         network,
-        DatasetConfig(existing_dir=data, validation_split=0.2),
+        DatasetConfig(existing_dir=data, view=View(fold=0)),
         epoch_nb=4,
         batch_size=10,
         seed=4,

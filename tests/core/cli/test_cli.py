@@ -148,7 +148,7 @@ def test_help_shows_the_arguments_without_names_and_examples(verb, arguments, ca
     ("verb", "text"),
     [
         ("generate", "None: `num_clients`, which the launcher starts."),
-        ("train", "if the dataset has a validation mode or `validation_split` holds samples back;"),
+        ("train", "if the dataset has a validation mode or `View.fold` holds samples"),
     ],
 )
 def test_help_breaks_lines_only_where_they_are_full(verb, text, capsys, monkeypatch):

@@ -17,6 +17,7 @@ from physx_core import (
     Replay,
     Training,
     Transformation,
+    View,
     Visualizer,
 )
 from physx_core.cli import main
@@ -46,7 +47,7 @@ def train(make=Training, network=Linear, data=None, environment=None, **parts):
 
 def train_stored(**parts):
     generate(Spring)
-    train(data=DatasetConfig(existing_dir="sessions/run", validation_split=0.3), **parts)
+    train(data=DatasetConfig(existing_dir="sessions/run", view=View(folds=3, fold=0)), **parts)
 
 
 def predict(own):
@@ -89,7 +90,7 @@ PLACES = {
 
 def train_stored_by(own):
     generate(Spring)
-    data = DatasetConfig(existing_dir="sessions/run", validation_split=0.3)
+    data = DatasetConfig(existing_dir="sessions/run", view=View(folds=3, fold=0))
     train(own, data=data)
 
 

@@ -20,6 +20,7 @@ from physx_core import (
     Prediction,
     Replay,
     Training,
+    View,
 )
 from physx_core.errors import UsageError
 
@@ -132,7 +133,7 @@ def generation(make=DataGeneration, place="plain", **options):
 
 
 def training(make=Training, place="plain", data=None, *, save_each_epoch=True, **options):
-    held_back = DatasetConfig(existing_dir="sessions/run", validation_split=0.2, normalize=True)
+    held_back = DatasetConfig(existing_dir="sessions/run", view=View(fold=0), normalize=True)
     network = dataclasses.replace(NETWORK, save_each_epoch=save_each_epoch)
     options = {"session_dir": place, "epoch_nb": 3, "batch_size": 3, "seed": 5, **options}
     return make(network, held_back if data is None else data, **options)

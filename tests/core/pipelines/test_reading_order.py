@@ -5,10 +5,9 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from physx_core import Dataset, DatasetConfig, NetworkConfig, Training
+from physx_core import Batches, Dataset, DatasetConfig, NetworkConfig, Training, View
 from physx_core.dataset.read import shuffling
 from physx_core.dataset.read.access import memory
-from physx_core.dataset.read.sampling import BatchReader
 
 PLENTY, LITTLE = 10**12, 10
 
@@ -52,7 +51,7 @@ def train(epoch_nb, name="run", before=lambda epoch: None, existing="data", **op
     return training
 
 
-@pytest.mark.parametrize("config", [{}, {"validation_split": 0.2}])
+@pytest.mark.parametrize("config", [{}, {"view": View(fold=0)}])
 @pytest.mark.parametrize(("first", "then"), [(PLENTY, LITTLE), (LITTLE, PLENTY)])
 def test_resume_keeps_reading_order_at_any_free_memory(free, first, then, config):
     free(first)
@@ -75,15 +74,13 @@ def test_a_resumed_training_reads_no_batch_again(free, monkeypatch):
     monkeypatch.setattr(shuffling, "_MOST_SORTED", 100)
     free(LITTLE)
     train(2)
-    begun = []
-    begin = BatchReader._begin
+    read = []
+    get = Batches.__getitem__
     monkeypatch.setattr(
-        BatchReader,
-        "_begin",
-        lambda self, number, count: begun.append(number) or begin(self, number, count),
+        Batches, "__getitem__", lambda self, number: read.append(number) or get(self, number)
     )
     assert len(train(3, resume=True).rows) == 2000
-    assert begun == [2]
+    assert read == [*range(14, 21)]
 
 
 def test_other_inputs_change_no_batch(free, monkeypatch):

@@ -17,6 +17,7 @@ from physx_core import (
     Observer,
     Prediction,
     Training,
+    View,
 )
 from physx_core.checkpoint import read
 from physx_core.components import Group
@@ -220,11 +221,11 @@ def test_held_back_samples_are_taken_in_batches_of_the_same_size():
     rng = np.random.default_rng(0)
     with Dataset.create("data") as dataset:
         dataset.append("training", fields(rng, 3000))
-    config = DatasetConfig(existing_dir="data", validation_split=0.5)
+    config = DatasetConfig(existing_dir="data", view=View(folds=2, fold=0))
     pipeline = Training(NetworkConfig(Measured), config, epoch_nb=1, batch_size=7, seed=0)
     with pipeline:
         pipeline.execute()
-        assert pipeline.learner.network.sizes[False] == {7, 1500 % 7}
+        assert pipeline.learner.network.sizes[False] == {7, 16 * 94 % 7}
 
 
 class Shown(Observer):

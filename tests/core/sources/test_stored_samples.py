@@ -15,6 +15,7 @@ from physx_core import (
     EnvironmentConfig,
     NetworkConfig,
     Training,
+    View,
 )
 from physx_core.cli import main
 from physx_core.errors import (
@@ -240,12 +241,14 @@ def test_normalization_is_that_of_the_rows_that_are_stored(source_dir):
 
 
 def test_samples_that_are_held_back_are_not_replayed(source_dir):
-    training = train(source_dir, through(), data={"mode": "validation", "validation_split": 0.3})
+    training = train(
+        source_dir, through(), data={"mode": "validation", "view": View(folds=3, fold=0)}
+    )
     assert rows_of("sessions/training", "validation")["times"].sum() == 10
     with Dataset.open(source_dir) as source, Dataset.create("one mode") as target:
         target.define_fields("training", source.fields("training").values())
         target.append("training", {name: view[:] for name, view in source["training"].items()})
-    config = {"validation_split": 0.25, "normalize": True}
+    config = {"view": View(folds=4, fold=0), "normalize": True}
     training = train("one mode", through(factor=1.0), "split", data=config, epoch_nb=2)
     times = rows_of("sessions/split")["times"]
     assert times.sum() == 30 and training.validation_loss < 1e-12

@@ -305,7 +305,7 @@ def trained(sessions, folder):
         loss="MSELoss",
         optimizer="Adam",
     )  # fmt: skip
-    data = DatasetConfig(existing_dir=str(dataset), normalize=True, split_by="episode")
+    data = DatasetConfig(existing_dir=str(dataset), normalize=True)
     training = Training(
         network, data, epoch_nb=2, batch_size=8, seed=3, session_dir=str(folder), quiet=True
     )

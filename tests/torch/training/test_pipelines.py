@@ -19,6 +19,7 @@ from physx_core import (
     NetworkConfig,
     Prediction,
     Training,
+    View,
 )
 from physx_core.errors import ConfigError, UsageError
 from physx_core.pipelines import Learner
@@ -108,7 +109,7 @@ class Watching(TorchTransformation):
 
 
 def test_only_what_is_learned_from_has_a_tape(data):
-    data = dataclasses.replace(data, validation_split=0.2)
+    data = dataclasses.replace(data, view=View(fold=0))
     options = {"epoch_nb": 1, "batch_size": 20, "validation_every": 0, "seed": 0}
     training = Training(config(transformation=Watching), data, **options)
     with training:

@@ -52,6 +52,7 @@ class Progress:
         blocks: Number of batches whose rows environments generated.
         best: State of `BestEpoch`.
         record: State of `TrainingRecord`.
+        snapshots: The stored samples that it learns from: see `Batches.snapshot`, by mode.
         options: Options that a resumed training must have, as returned by `bound_options`; empty
             if an older physx wrote the checkpoint.
         data: The data that the network was trained on, as returned by `record_data`; likewise.
@@ -64,6 +65,7 @@ class Progress:
     blocks: int = 0
     best: dict[str, Any] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
+    snapshots: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
     data: dict[str, Any] = field(default_factory=dict)
 

@@ -81,44 +81,50 @@ def pipeline_from(
         prog = f"physx {verb} {arguments}" if asks else f"physx {verb}"
         chosen: Any = tyro.cli(form, args=rest, prog=prog, description=about)
     values = {name: getattr(chosen, name) for name, _, _ in options}
-    for option, path, value in changes:
-        _change(values, option, path, value)
+    for place in dict.fromkeys(path[0] for _, path, _ in changes):
+        tables = _opened(values[place])
+        for option, path, value in changes:
+            if path[0] == place:
+                set_option(option, tables, path[1:], value)
+        values[place] = _closed(values[place], tables)
     return make(**{_python_name(make, name): value for name, value in values.items()})
 
 
 def _argument_path(make: type[Any], option: str) -> tuple[str, ...] | None:
     """Return the path of the argument that ``--OPTION.NAME`` names; None: it names none.
 
-    The path consists of the pipeline's option, that of its configuration if it is one, and the
+    The path consists of the pipeline's option, those of its configurations if it is one, and the
     argument, followed by names in its table, if any.
     """
     first, *others = option.removeprefix("--").split(".")
     place, path = first.replace("-", "_"), others
     hints = {_option_name(name): hint for name, hint in typing.get_type_hints(make).items()}
     found = [place]
-    configuration = configuration_in(hints.get(place))
-    if configuration is not None and path:
+    while (configuration := configuration_in(hints.get(found[-1]))) is not None and path:
         found.append(path.pop(0).replace("-", "_"))
         hints = typing.get_type_hints(configuration)
-    if hints.get(found[-1]) != dict[str, Any] or not path:
+    if typing.get_origin(hints.get(found[-1])) is not dict or not path:
         return None
     if not all(path):
         raise UsageError(f"{option} names no argument: write {option.rstrip('.')}.NAME VALUE.")
     return (*found, path[0].replace("-", "_"), *path[1:])
 
 
-def _change(values: dict[str, Any], option: str, path: Sequence[str], value: Any) -> None:
-    """Set one argument in the options' values, keeping the others."""
-    place, *inner = path
-    config = values[place]
+def _opened(config: Any) -> Any:
+    """Return a copy of a table, or the options of a configuration, nested ones too, as a table."""
     if not dataclasses.is_dataclass(config):
-        values[place] = table = copy.deepcopy(config)
-        set_option(option, table, inner, value)
-        return
-    name, *names = inner
-    table = copy.deepcopy(getattr(config, name))
-    set_option(option, table, names, value)
-    values[place] = dataclasses.replace(config, **{name: table})  # type: ignore[type-var]
+        return copy.deepcopy(config)
+    return {
+        option.name: _opened(getattr(config, option.name)) for option in _dataclass_fields(config)
+    }
+
+
+def _closed(config: Any, tables: Any) -> Any:
+    """Return a table, or a configuration with the options in a table."""
+    if not dataclasses.is_dataclass(config):
+        return tables
+    given = {name: _closed(getattr(config, name), value) for name, value in tables.items()}
+    return dataclasses.replace(config, **given)  # type: ignore[type-var]
 
 
 def take_session(words: Sequence[str]) -> tuple[Path | None, list[str]]:
@@ -259,7 +265,10 @@ def _configuration(make: type[Pipeline], python_name: str) -> Any:
 def _set_help(cls: type[Any]) -> None:
     """Pass a configuration's docstrings to tyro: its own parser would break their lines."""
     docs = _docstrings(cls)
+    hints = typing.get_type_hints(cls)
     for option in _dataclass_fields(cls):
+        if (nested := configuration_in(hints[option.name])) is not None:
+            _set_help(nested)
         option.metadata = MappingProxyType({**option.metadata, "help": docs.get(option.name, "")})
 
 

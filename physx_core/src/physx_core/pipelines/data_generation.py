@@ -11,15 +11,7 @@ from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
 from typing import ClassVar
 
-from physx_core.config import (
-    MODES,
-    WRONG,
-    DatasetConfig,
-    EnvironmentConfig,
-    at_least,
-    options,
-    read_toml,
-)
+from physx_core.config import MODES, WRONG, EnvironmentConfig, at_least, options, read_toml
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, listed
 from physx_core.pipelines.campaign import Campaign
@@ -43,6 +35,7 @@ from physx_core.pipelines.storage import (
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
+from physx_core.views.dataset_config import DatasetConfig
 from physx_core.workers.episode_queue import EpisodeQueue
 from physx_core.workers.row_queue import RowQueue
 

@@ -10,7 +10,7 @@ from dataclasses import KW_ONLY, dataclass, field
 from typing import ClassVar
 
 from physx_core.components.environment import not_finite_prediction
-from physx_core.config import DatasetConfig, EnvironmentConfig, NetworkConfig, at_least, options
+from physx_core.config import EnvironmentConfig, NetworkConfig, at_least, options
 from physx_core.dataset import Dataset
 from physx_core.fields import Field, first_not_finite, is_finite
 from physx_core.pipelines.learning.learner import Learner, load_learner
@@ -33,6 +33,7 @@ from physx_core.processes import deferred_interrupt
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
+from physx_core.views.dataset_config import DatasetConfig
 
 _NOTHING = contextlib.nullcontext()
 

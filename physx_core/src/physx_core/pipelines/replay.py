@@ -8,14 +8,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any, ClassVar
 
-from physx_core.config import (
-    DatasetConfig,
-    EnvironmentConfig,
-    at_least,
-    from_plain,
-    options,
-    to_plain,
-)
+from physx_core.config import EnvironmentConfig, at_least, from_plain, options, to_plain
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, UntrustedReferenceError
 from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
@@ -25,6 +18,7 @@ from physx_core.plugins.references import check_recorded, find, is_recorded_as
 from physx_core.processes import deferred_interrupt
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
+from physx_core.views.dataset_config import DatasetConfig
 
 _RECORDED = (
     *("environment", "env_kwargs", "num_clients"),

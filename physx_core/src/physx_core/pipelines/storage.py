@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from physx_core import files
-from physx_core.config import SETS, WRONG, DatasetConfig, EnvironmentConfig, to_plain
+from physx_core.config import SETS, WRONG, EnvironmentConfig, to_plain
 from physx_core.dataset import Dataset
 from physx_core.dataset.store.locks import LOCK
 from physx_core.dataset.store.manifest_file import FILE
@@ -25,6 +25,7 @@ from physx_core.observers import read_scalars
 from physx_core.plugins import reference_of
 from physx_core.session import NOTES, Session, installed_versions, related_sessions
 from physx_core.sources.source import Source
+from physx_core.views.dataset_config import DatasetConfig
 
 PARAMETERS = "parameters_{}.bin"
 """Name of the file in a dataset's folder that contains an instance's saved parameters."""
@@ -52,10 +53,11 @@ def open_own(session: Session, config: DatasetConfig) -> Dataset:
 
 def open_existing(session: Session, config: DatasetConfig) -> Dataset:
     """Open the dataset that a configuration names, by default the session's own, for reading."""
+    named = next(iter(config.view.sources), config.existing_dir)
     try:
-        return Dataset.open(config.existing_dir or session.dataset_dir)
+        return Dataset.open(named or session.dataset_dir)
     except DatasetNotFoundError as error:
-        if config.existing_dir is None:
+        if named is None:
             error.add_note(
                 "Name a session or dataset in DatasetConfig.existing_dir, or an environment that "
                 f"generates the samples.{other_samples(session.dataset_dir, config.mode)}"
@@ -131,6 +133,11 @@ def _has_samples(directory: Path) -> bool:
 
 def check_sources(config: DatasetConfig, environment: EnvironmentConfig | None) -> None:
     """Check that a training's samples come from one place."""
+    if config.view.sources and config.existing_dir is not None:
+        raise ConfigError(
+            "Training takes its samples from existing_dir or from the sources of its view, not "
+            "both: give existing_dir a share among DatasetConfig.view.sources."
+        )
     if environment is None:
         return
     if config.mode == WRONG:

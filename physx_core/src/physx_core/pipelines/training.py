@@ -17,14 +17,7 @@ from physx_core import checkpoint
 from physx_core.checkpoint import Progress
 from physx_core.components.buffer import Buffer
 from physx_core.components.group import Group
-from physx_core.config import (
-    DatasetConfig,
-    EnvironmentConfig,
-    NetworkConfig,
-    at_least,
-    options,
-    to_plain,
-)
+from physx_core.config import EnvironmentConfig, NetworkConfig, at_least, options, to_plain
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, DivergedError
 from physx_core.observers import REPORT_SECONDS, statistics_observers
@@ -50,6 +43,7 @@ from physx_core.pipelines.storage import (
 from physx_core.processes import Interrupt, deferred_interrupt, is_from_signal
 from physx_core.session import Session
 from physx_core.typing import Batch
+from physx_core.views.dataset_config import DatasetConfig
 
 _ADVICE = (
     "Lower the learning rate, normalize the data (DatasetConfig.normalize) or limit the gradients; "
@@ -131,7 +125,7 @@ class Training(NewSessionPipeline):
     """Number of independent episodes that may fail before the training fails."""
     validation_every: int = at_least(0, 1)
     """Number of epochs between validations, if the dataset has a validation mode or
-    `validation_split` holds samples back; 0: never."""
+    `View.fold` holds samples back; 0: never."""
     validation_batch_size: int | None = at_least(1, None)
     """Number of validation samples predicted at once, in each process; None: `batch_size`. It
     changes the memory and the time that a validation takes, but not its losses."""
@@ -437,6 +431,7 @@ class Training(NewSessionPipeline):
             self._blocks,
             self.best.state,
             self._record.state,
+            self.data.stored.snapshots,
             bound_options(self, self._resumed.seed, self.group.size),
             self._data_record(),
         )
@@ -549,8 +544,9 @@ class Training(NewSessionPipeline):
         buffer = self._create_buffer()
         network_class.set_seed(self._resumed.seed)
         self.learner = Learner(self.network_config, trains=True, stops_at_nan=self.on_nan == "stop")
-        if start.config.existing_dir is not None:  # fail before a session is created
-            Dataset.open(start.config.existing_dir).close()
+        existing = start.config.existing_dir
+        for folder in (*start.config.view.sources, *([] if existing is None else [existing])):
+            Dataset.open(folder).close()  # fail before a session is created
         self.session = start.session or self._open_session()
         dataset = resources.enter_context(open_dataset(self.session, start, self.group))
         self._record_config(self._resumed.seed)
@@ -593,7 +589,8 @@ class Training(NewSessionPipeline):
 
     def _tell_changed_data(self, dataset: Dataset, mode: str) -> None:
         """Warn if the data are not those that the training had, as then it is another one."""
-        changes = describe_changes(self._resumed.data, dataset, mode)
+        fixed = self._resumed.snapshots
+        changes = describe_changes(self._resumed.data, dataset, mode, fixed)
         if changes:
             text = (
                 f"The data in {dataset.directory} changed since the checkpoint was written: "

@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
@@ -46,7 +47,8 @@ class Batches(Closeable):
         batch_size: Number of items in a batch; the last of an epoch may have fewer.
         seed: Seed of the orders.
         part: Which part of the view.
-        snapshot: The rows of each source, by its folder, when the batches were opened.
+        snapshot: The rows of each source when the batches were opened, by its folder as the view
+            names it; "" if it names none.
         num_items: Number of items in an epoch.
     """
 
@@ -91,19 +93,17 @@ class Batches(Closeable):
         if not view.sources and data is None:
             raise ConfigError("View.sources names no data: add a folder with its share.")
         self.view, self.batch_size, self.seed, self.part = view, batch_size, seed, part
-        self._mode, self._names, self._reuse = mode, fields and list(fields), reuse
-        self._dtype = None if dtype is None else np.dtype(dtype)
+        self._mode = mode
         self._opened = contextlib.ExitStack()
         given = {None: 1.0} if data is not None else view.sources
         self._sources = [self._open(name, data, snapshot) for name in given]
-        self.snapshot = {str(s.dataset.directory): s.rows.snapshot for s in self._sources}
+        self.snapshot = {
+            name or "": source.rows.snapshot
+            for name, source in zip(given, self._sources, strict=True)
+        }
         self.num_items = self._count(np.array(list(given.values())))
         self._check()
-        self._names = self._names or self._default_names()
-        self.fields: dict[str, Field] = {}
-        for name in self._names:
-            self.fields |= self._described(name)
-        self._buffers = self._allocate(batch_size) if reuse else None
+        self._choose(fields, dtype, reuse=reuse)
         self._is_plain = len(self._sources) == 1 and not (view.windows or view.weights)
         self._epoch: tuple[int, Epoch] | None = None
         self._process = os.getpid()
@@ -120,10 +120,9 @@ class Batches(Closeable):
             dataset = self._opened.enter_context(Dataset.open(name or str(dataset)))
         known: Snapshot | None = None
         if snapshot is not None:
-            folder = str(dataset.directory)
-            if folder not in snapshot:
-                raise ConfigError(f"The snapshot does not have the source {folder}.")
-            known = Snapshot(*snapshot[folder])
+            if (name or "") not in snapshot:
+                raise ConfigError(f"The snapshot does not have the source {name}.")
+            known = Snapshot(*snapshot[name or ""])
         return Source(self.view, dataset, self._mode, self.part, known)
 
     def _count(self, shares: Array) -> int:
@@ -152,15 +151,28 @@ class Batches(Closeable):
             return int((counts * _SHARES // each).min())
         return int((-(-counts * _SHARES // each)).max())
 
+    def _choose(self, names: Sequence[str] | None, dtype: DTypeLike | None, *, reuse: bool) -> None:
+        """Choose what a batch contains."""
+        self._names = list(names or self.view.windows or self._sources[0].rows.fields)
+        self._dtype, self._reuse = None if dtype is None else np.dtype(dtype), reuse
+        self.fields: dict[str, Field] = {}
+        for name in self._names:
+            self.fields |= self._described(name)
+        self._buffers = self._allocate(self.batch_size) if reuse else None
+
+    def reading(self, fields: Sequence[str]) -> Batches:
+        """Return the same batches, of other fields; they share the open files."""
+        other = copy(self)
+        other._choose(fields, self._dtype, reuse=self._reuse)
+        other._epoch, other._opened = None, contextlib.ExitStack()
+        return other
+
     def _check(self) -> None:
         if not len(self):
             raise ConfigError(
                 f"An epoch has {self.num_items} items, fewer than a batch of {self.batch_size}, "
                 "and View.drop_last leaves out what is left."
             )
-
-    def _default_names(self) -> list[str]:
-        return list(self.view.windows or self._sources[0].rows.fields)
 
     def _described(self, name: str) -> dict[str, Field]:
         """Return the fields of a window or stored field in a batch."""
@@ -295,7 +307,7 @@ class Batches(Closeable):
         return found
 
     def _fill(self, batch: Batch, source: Source, slots: Index, items: Index) -> None:
-        for name in self._names or ():
+        for name in self._names:
             window = window_of(self.view, name)
             values = source.gather(window.field, items, window.at)
             batch[name][slots] = values[:, 0] if window.is_single else values
@@ -321,7 +333,7 @@ class Batches(Closeable):
     @property
     def digest(self) -> str:
         """Digest of all that the batches depend on, besides the values of the rows."""
-        known = {Path(name).name: tuple(each) for name, each in self.snapshot.items()}
+        known = {name: tuple(each) for name, each in self.snapshot.items()}
         bound = to_plain(self.view), known, self._mode, self.part, self.batch_size, self.seed
         return blake2b(repr(bound).encode(), digest_size=8).hexdigest()
 

@@ -6,9 +6,10 @@ from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
-from physx_core.config import DatasetConfig, to_plain
+from physx_core.config import to_plain
 from physx_core.errors import ConfigError
 from physx_core.plugins.references import is_recorded_as
+from physx_core.views.dataset_config import DatasetConfig
 
 _FREE = {
     "": {
@@ -26,6 +27,7 @@ _ENVIRONMENT = (
     *("simulations_per_step", "sampler", "sampler_kwargs"),
 )
 """Options of an environment that are compared even if it has nothing left to generate."""
+_TABLES = ("network", "dataset", "dataset.view", "environment")
 _REFERENCES = {
     *("network", "optimization", "transformation", "loss", "optimizer", "scheduler"),
     *("online", "environment", "sampler"),
@@ -91,8 +93,9 @@ def _differences(
 ) -> Iterator[str]:
     for name in dict.fromkeys([*former, *now]):
         before, after = former.get(name), now.get(name)
-        if not table and isinstance(before, Mapping) and isinstance(after, Mapping):
-            yield from _differences(before, after, f"{name}.")
+        is_table = f"{table}{name}" in _TABLES
+        if is_table and isinstance(before, Mapping) and isinstance(after, Mapping):
+            yield from _differences(before, after, f"{table}{name}.")
         elif not _is_same(name, before, after):
             yield f"{table}{name} was {before!r} and is now {after!r}"
 

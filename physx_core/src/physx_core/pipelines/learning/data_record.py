@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping
 from hashlib import blake2b
 from typing import Any
 
@@ -38,13 +38,16 @@ def describe_record(former: Mapping[str, Any]) -> str:
     return ", ".join(parts)
 
 
-def describe_changes(former: Mapping[str, Any], dataset: Dataset, mode: str) -> list[str]:
+def describe_changes(
+    former: Mapping[str, Any], dataset: Dataset, mode: str, fixed: Container[str] = ()
+) -> list[str]:
     """Return how the data differ from what a checkpoint recorded; empty if they do not.
 
     Args:
         former: What `record_data` returned then; empty if an older physx wrote the checkpoint.
         dataset: The dataset now.
         mode: Mode of the training samples.
+        fixed: Modes of which further rows are not read, and so are no difference.
     """
     if not former:
         return []
@@ -53,20 +56,22 @@ def describe_changes(former: Mapping[str, Any], dataset: Dataset, mode: str) -> 
         return [
             f"{name}: {text}"
             for name in dict.fromkeys([*former, *now])
-            for text in _changes(former.get(name, _NOTHING), now.get(name, _NOTHING))
+            for text in _changes(
+                former.get(name, _NOTHING), now.get(name, _NOTHING), grows=name not in fixed
+            )
         ]
     except (DatasetError, LookupError, TypeError, ValueError) as error:
         return [f"they cannot be compared: {error}"]
 
 
-def _changes(former: Mapping[str, Any], now: Mapping[str, Any]) -> Iterator[str]:
+def _changes(former: Mapping[str, Any], now: Mapping[str, Any], *, grows: bool) -> Iterator[str]:
     before = {(session, index): rest for session, index, *rest in former["partitions"]}
     after = {(session, index): rest for session, index, *rest in now["partitions"]}
     pairs = [(old, after.get(key)) for key, old in before.items()]
     kept = [(old, new) for old, new in pairs if new is not None and new[0] >= old[0]]
     if len(kept) < len(pairs):
         yield f"rows were removed ({former['rows']:,} then, {now['rows']:,} now)"
-    elif now["rows"] > former["rows"]:
+    elif grows and now["rows"] > former["rows"]:
         yield f"{now['rows'] - former['rows']:,} rows were appended to {former['rows']:,}"
     updated = [old for old, new in kept if old[0] == new[0] and old[1] and old[1] != new[1]]
     if updated:

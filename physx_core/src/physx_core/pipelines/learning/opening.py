@@ -130,8 +130,10 @@ class DataOpening:
             batch_size=size,
             validation_batch_size=(self.validation_batch_size or 0) * self.group.size or size,
             seed=self.progress.seed,
+            batch_fields=self.batch_fields,
             data_type=self.data_type,
             first=self.progress.batches_read,
+            snapshots=self.progress.snapshots,
         )
         made: GeneratedBatches | ReplayedBatches | None = None
         always = False
@@ -141,7 +143,7 @@ class DataOpening:
         elif environment is not None:
             made = self._open_generation(resources, environment, stored)
             always = environment.always_produce
-        return TrainingData(stored, made, batch_size=size, batch_nb=self.batch_nb, always=always)
+        return TrainingData(stored, made, batch_nb=self.batch_nb, always=always)
 
     def _open_replay(
         self, environment: EnvironmentConfig, stored: StoredBatches

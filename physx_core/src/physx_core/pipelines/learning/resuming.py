@@ -13,7 +13,7 @@ import numpy as np
 
 from physx_core import checkpoint
 from physx_core.checkpoint import Checkpoint
-from physx_core.config import SETS, WRONG, DatasetConfig, EnvironmentConfig
+from physx_core.config import SETS, WRONG, EnvironmentConfig
 from physx_core.dataset import Dataset
 from physx_core.dataset.store.manifest import to_plain_info
 from physx_core.errors import ConfigError, DatasetNotFoundError
@@ -24,6 +24,7 @@ from physx_core.pipelines.storage import (
     restore_parameters,
 )
 from physx_core.session import Session
+from physx_core.views.dataset_config import DatasetConfig
 from physx_core.workers.instance import NOTHING, Skip
 
 _SAME = (

@@ -49,7 +49,6 @@ class TrainingData:
         stored: StoredBatches,
         made: GeneratedBatches | ReplayedBatches | None,
         *,
-        batch_size: int,
         batch_nb: int | None,
         always: bool,
     ) -> None:
@@ -58,12 +57,11 @@ class TrainingData:
         Args:
             stored: The stored samples.
             made: Batches from environments; None: there are none.
-            batch_size: Samples in a batch.
             batch_nb: Batches in an epoch; None: one pass over the stored samples.
             always: Whether environments provide the samples of all epochs, not only of the first.
         """
         self.stored, self._made, self._always = stored, made, always
-        self._batch_size, self._batch_nb = batch_size, batch_nb
+        self._batch_nb = batch_nb
         self._generated = made if isinstance(made, GeneratedBatches) else None
         self._choose(made or stored)
 
@@ -94,7 +92,7 @@ class TrainingData:
     @property
     def batches_per_epoch(self) -> int:
         """Number of batches in an epoch."""
-        return self._batch_nb or -(-self.stored.num_samples // self._batch_size)
+        return self._batch_nb or self.stored.num_batches
 
     @property
     def dataset(self) -> Dataset:

@@ -40,9 +40,8 @@ class ReplayedBatches:
         """
         self.source = source
         self._stored, self._batch_size = stored, batch_size
-        part = stored.parts.get("training")
         random = None if seed is None else np.random.default_rng([seed, 1])
-        self._rows = StoredRows(stored.dataset, stored.mode, part.rows if part else None, random)
+        self._rows = StoredRows(stored.dataset, stored.mode, stored.rows, random)
         known, given = (
             {name: field for name, field in fields.items() if name not in RESERVED}
             for fields in (stored.fields, {field.name: field for field in source.fields})

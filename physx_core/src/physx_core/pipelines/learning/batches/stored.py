@@ -3,20 +3,28 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from functools import partial
+from dataclasses import replace
+from functools import cached_property
 
 import numpy as np
 
-from physx_core.config import DatasetConfig, EnvironmentConfig
-from physx_core.dataset import Dataset, Subset
+from physx_core.config import EnvironmentConfig
+from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, DatasetError, UsageError, listed
 from physx_core.fields import Field
 from physx_core.pipelines.storage import other_samples
 from physx_core.statistics import Normalization
 from physx_core.typing import Batch, Index
+from physx_core.views.batches import Batches
+from physx_core.views.dataset_config import DatasetConfig
+from physx_core.views.view import View
 
 _SHOWN = 64
 """Largest number of validation samples whose predictions are shown."""
+_PLAIN = View()
+
+Snapshots = dict[str, dict[str, Sequence[int]]]
+"""Mode to `Batches.snapshot`."""
 
 
 class StoredBatches:
@@ -25,10 +33,9 @@ class StoredBatches:
     Attributes:
         dataset: The dataset.
         mode: Mode of the samples to train on.
-        parts: The samples to train on and those held back, ``training`` and ``validation``; empty
-            if none are held back.
         count: Number of batches read, also before the training was resumed.
         has_changed: Whether samples were replaced since the last call of `normalization`.
+        snapshots: The samples that there were when the first of them was read, by mode.
     """
 
     def __init__(
@@ -40,8 +47,10 @@ class StoredBatches:
         batch_size: int,
         validation_batch_size: int,
         seed: int,
+        batch_fields: Sequence[str],
         data_type: str,
         first: int,
+        snapshots: Mapping[str, Mapping[str, Sequence[int]]],
     ) -> None:
         """Check that the samples are available, and hold some back if configured.
 
@@ -52,36 +61,73 @@ class StoredBatches:
             batch_size: Samples in a training batch.
             validation_batch_size: Samples in a validation batch.
             seed: Seed of the order of samples.
+            batch_fields: Names of the fields that the network needs.
             data_type: Floating-point type of the batches.
             first: Number of batches that the training read before it was resumed.
+            snapshots: The `snapshots` before the training was resumed; those of other modes are
+                taken when the first of their samples is read.
 
         Raises:
-            ConfigError: If samples should be held back, but environments generate them.
+            ConfigError: If the view is not one of what environments generate.
             DatasetError: If there are no samples to read.
         """
         self.dataset, self.mode = dataset, config.mode
-        self.count = first
-        self.has_changed = False
+        self.count, self.has_changed = first, False
+        self.snapshots: Snapshots = {mode: dict(each) for mode, each in snapshots.items()}
         self._config, self._batch_size = config, batch_size
         self._validation_batch_size = validation_batch_size
-        self._seed, self._data_type = seed, data_type
-        self._reader: Iterator[Batch] | None = None
-        if environment is None and not self.has_samples:
+        self._seed, self._names, self._data_type = seed, list(batch_fields), data_type
+        self._batches: Batches | None = None
+        if environment is None and not self.has_samples and not config.view.sources:
             raise DatasetError(
                 f'The dataset in {dataset.directory} has no samples of mode "{self.mode}" to '
                 f"train on. It has: {listed(dataset.modes)}."
                 f"{other_samples(dataset.directory, self.mode)}"
             )
-        if config.validation_split and environment is not None and not environment.load_samples:
+        replays = environment is not None and environment.load_samples
+        if environment is not None and config.view != _PLAIN and not replays:
             raise ConfigError(
-                "DatasetConfig.validation_split holds back stored samples, but environments "
-                'generate these. Generate the samples first, or others in the mode "validation".'
+                "DatasetConfig.view chooses among stored samples, but environments generate "
+                'these. Generate the samples first, or others in the mode "validation".'
             )
-        self.parts: dict[str, Subset] = {}
-        if config.validation_split and not dataset.num_samples("validation"):
-            share = config.validation_split
-            shares = {"training": 1 - share, "validation": share}
-            self.parts = dataset.split(self.mode, shares, by=config.split_by)
+        if replays and (config.view.windows or config.view.sources or config.view.weights):
+            raise ConfigError(
+                "Environments replay single rows of one dataset, each once: leave out window, "
+                "sources and weights of DatasetConfig.view."
+            )
+        self._has_mode = dataset.num_samples("validation") > 0  # goes before what is held back
+        order = config.view.order if config.shuffle else "stored"
+        fold = None if self._has_mode else config.view.fold
+        self._view = replace(config.view, order=order, fold=fold)
+
+    def _open(self, mode: str, view: View, size: int, part: str = "training") -> Batches:
+        """Open the samples of a mode as they were at its snapshot, or are now."""
+        found = Batches(
+            view,
+            size,
+            self._seed,
+            data=None if view.sources else self.dataset,
+            mode=mode,
+            part="validation" if part == "validation" else "training",
+            snapshot=self.snapshots.get(mode),
+            fields=self._names,
+            dtype=self._data_type,
+            reuse=True,
+        )
+        self.snapshots[mode] = {name: list(each) for name, each in found.snapshot.items()}
+        return found
+
+    @cached_property
+    def _training(self) -> Batches:
+        return self._open(self.mode, self._view, self._batch_size)
+
+    @cached_property
+    def _validation(self) -> Batches:
+        view = replace(self._view, order="stored", weights=None, drop_last=False)
+        size = self._validation_batch_size
+        if self._has_mode:
+            return self._open("validation", replace(view, sources={}, fold=None), size)
+        return self._open(self.mode, view, size, "validation")
 
     def begin_epoch(self, names: Sequence[str], batches: int) -> None:
         """Prepare an epoch.
@@ -90,26 +136,15 @@ class StoredBatches:
             names: Fields of the batches.
             batches: Number of batches that will be taken; ignored, because nothing is read ahead.
         """
-        if self._reader is None:
-            part = self.parts.get("training")
-            read = part.batches if part else partial(self.dataset.batches, self.mode)
-            self._reader = read(
-                self._batch_size,
-                shuffle=self._config.shuffle,
-                seed=self._seed,
-                epochs=None,
-                fields=names,
-                dtype=self._data_type,
-                reuse=True,
-                first=self.count,
-            )
+        if self._batches is None:
+            self._batches = self._training.reading(names)
 
     def next(self) -> Batch:
         """Return the next batch, in physical units; valid until the next call."""
-        if self._reader is None:
+        if self._batches is None:
             raise UsageError("Call begin_epoch() before next_batch().")
         self.count += 1
-        return next(self._reader)
+        return self._batches[self.count - 1]
 
     def update(self, index: Index, rows: Batch) -> None:
         """Replace samples.
@@ -123,22 +158,18 @@ class StoredBatches:
 
     def validation_batches(self, names: Sequence[str]) -> Iterator[Batch]:
         """Return the validation batches, in the order of writing."""
-        part = self.parts.get("validation")
-        batches = part.batches if part else partial(self.dataset.batches, "validation")
-        return batches(self._validation_batch_size, fields=names, dtype=self._data_type, reuse=True)
+        return iter(self._validation.reading(names))
 
     def validation_samples(self, names: Sequence[str]) -> Batch:
         """Return some of the validation samples, always the same ones, from all parts of them."""
-        part = self.parts.get("validation")
-        count = part.num_samples if part else self.dataset.num_samples("validation")
+        count = self._validation.num_items
         chosen = np.linspace(0, count - 1, min(count, _SHOWN)).astype(np.intp)
-        view = part or self.dataset["validation"]
-        return {name: view[name][chosen] for name in names}
+        return self._validation.reading(names).take(chosen)
 
     @property
     def has_validation(self) -> bool:
         """Whether there are validation samples."""
-        return bool(self.parts) or self.dataset.num_samples("validation") > 0
+        return self._has_mode or self._view.fold is not None
 
     @property
     def has_samples(self) -> bool:
@@ -148,13 +179,23 @@ class StoredBatches:
     @property
     def num_samples(self) -> int:
         """Number of samples to train on."""
-        part = self.parts.get("training")
-        return part.num_samples if part else self.dataset.num_samples(self.mode)
+        return self._training.num_items
+
+    @property
+    def num_batches(self) -> int:
+        """Number of batches of one pass over them."""
+        return len(self._training)
+
+    @property
+    def rows(self) -> Index | None:
+        """The rows to train on, ascending; None: all of the mode."""
+        return None if self._view.fold is None else self._training.all_rows()
 
     @property
     def fields(self) -> Mapping[str, Field]:
-        """The stored fields by name."""
-        return self.dataset.fields(self.mode)
+        """The stored fields by name, and windows of them."""
+        stored = self.dataset.fields(self.mode) if self.mode in self.dataset else {}
+        return stored | self._training.fields if self._view.windows else stored
 
     def normalization(self, *, recompute: bool = True) -> dict[str, Normalization]:
         """Return the normalization by field; empty if nothing is to be normalized.
@@ -163,10 +204,10 @@ class StoredBatches:
             recompute: Whether it may be recomputed from all samples, if so configured.
         """
         self.has_changed = False
-        if not self._config.normalize or not self.has_samples:
+        if not self._config.normalize or not (self.has_samples or self._view.sources):
             return {}
-        if self.parts:
-            return self.parts["training"].normalization()
+        if replace(self._view, order=None) != _PLAIN:
+            return self._training.normalization()
         if self._config.recompute_normalization and recompute:
             return self.dataset.recompute_normalization(self.mode)
         return self.dataset.normalization_of(self.mode)

@@ -1,0 +1,36 @@
+"""DatasetConfig: where samples are stored, and how and which of them are read."""
+
+from __future__ import annotations
+
+from dataclasses import field
+from pathlib import Path
+
+from physx_core.config import MODES, WRONG, at_least, configuration
+from physx_core.views.view import View
+
+
+@configuration
+class DatasetConfig:
+    """Where samples are stored, and how and which of them are read."""
+
+    existing_dir: str | Path | None = None
+    """Folder of an existing session or dataset to read; it is never modified."""
+    mode: str = field(default="training", metadata={"choices": (*MODES, WRONG)})
+    """Mode to write or read: "training", "validation" or "prediction"; "wrong", with the samples
+    that `check_sample` rejected, can only be read."""
+    max_file_size: float = at_least(1e-6, 0.25)
+    """Size of a partition in GB."""
+    writers: str = field(default="server", metadata={"choices": ("server", "clients")})
+    """Who writes the rows in data generation: "server", the run's own process, or "clients", each
+    client its own rows to its own partitions. The clients must then share the dataset's folder. Use
+    this for data rates that the run's connection cannot carry."""
+    shuffle: bool = True
+    """Read each epoch in a new random order; otherwise in the order of writing."""
+    view: View = field(default_factory=View)
+    """Which of the samples to learn from, in which form and order, and which of them to hold back
+    for validation if the dataset has no mode "validation"; the others define the normalization."""
+    normalize: bool = False
+    """Normalize each component to mean 0 and standard deviation 1 for networks."""
+    recompute_normalization: bool = False
+    """Recompute mean and standard deviation from the stored rows instead of using the stored
+    values."""
