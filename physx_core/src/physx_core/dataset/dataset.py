@@ -62,7 +62,7 @@ class Dataset(Closeable):
         self.directory = directory
         self.session = writer.session if writer else ""
         self._manifest = manifest
-        self._reader = Reader(directory, manifest)
+        self._reader = writer.reader if writer else Reader(directory, manifest)
         self._columns = ColumnCache(self._reader)
         self._appender = Appender(writer) if writer else None
         self._closed = False

@@ -272,7 +272,7 @@ class Stripes:
             for partition in empty:
                 del mode.partitions[mode.place(partition)]
             count_sealed(self.directory, manifest, mode)
-            write_index(self.directory, self.session, manifest)
+            write_index(self._writer.reader, self.session)
         keys = {partition.key for partition in sealed}
         self._groups = {
             number: group
