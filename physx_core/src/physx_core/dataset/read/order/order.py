@@ -144,7 +144,9 @@ class Orders:
         return self._records[mode].places
 
     def records(self, mode: str) -> Records:
-        """Return the records of a mode that has an order, as `Found.record` counts."""
+        """Return the records of a mode, as `Found.record` counts; there must be a table."""
+        with self._lock:
+            self._read_new()
         return self._records[mode].records if mode in self._records else NO_RECORDS
 
     def all(self, mode: str) -> Found:
