@@ -341,7 +341,7 @@ class DataGeneration(NewSessionPipeline):
         if self.episodes is None:
             queue = RowQueue(self._amount()[0], ended, self.retries)
         else:
-            queue = EpisodeQueue(self.episodes, ended.numbers, self.retries)
+            queue = EpisodeQueue(self.episodes, ended.all_numbers, self.retries)
         keeps_rejected = self.environment_config.record_wrong_samples
         return CampaignWriter(
             self.dataset, campaign, queue, self.max_failed, keeps_rejected=keeps_rejected

@@ -24,18 +24,18 @@ class Ended(NamedTuple):
 
     Attributes:
         first: The (first) number of each entry.
-        count: For how many numbers it stands; if they are several, each has one row.
+        numbers: For how many numbers it stands; if they are several, each has one row.
         rows: How many rows it has.
     """
 
     first: Index
-    count: Index
+    numbers: Index
     rows: Index
 
     @property
-    def numbers(self) -> Index:
-        """All numbers, shape (episodes,)."""
-        begins = np.repeat(self.first - np.cumsum(self.count) + self.count, self.count)
+    def all_numbers(self) -> Index:
+        """Each number, shape (episodes,)."""
+        begins = np.repeat(self.first - np.cumsum(self.numbers) + self.numbers, self.numbers)
         found: Index = begins + np.arange(len(begins))
         return found
 
@@ -65,18 +65,18 @@ class RowQueue(EpisodeQueue):
             recorded: Episodes that an earlier run has recorded.
             retries: How often a number is given out again after it was lost.
         """
-        super().__init__(_NO_END, recorded.numbers, retries)
-        first, count, rows = recorded
-        ends = np.cumsum(count)
-        before = int((first == ends - count).sum())  # entries before the first missing number
+        super().__init__(_NO_END, recorded.all_numbers, retries)
+        first, numbers, rows = recorded
+        ends = np.cumsum(numbers)
+        before = int((first == ends - numbers).sum())  # entries before the first missing number
         later = zip(*(column[before:].tolist() for column in recorded), strict=True)
         self.goal, self._taken, self._all_rows = goal, 0, int(rows.sum())
         self._parts: Counter[int] = Counter()  # number to its rows so far
         self._ended = {first: (count, rows) for first, count, rows in later}  # after the missing
-        self._last = int((first + count).max(initial=0)) - 1  # the last one that has ended
+        self._last = int((first + numbers).max(initial=0)) - 1  # the last one that has ended
         # Numbers up to the first missing one, and the rows before them:
-        self._firsts = [0, *ends[:before].tolist()]
-        self._sums = [0, *np.cumsum(rows[:before]).tolist()]
+        self._firsts: list[int] = [0, *ends[:before].tolist()]
+        self._sums: list[int] = [0, *np.cumsum(rows[:before]).tolist()]
         self._filled = int(ends[:before][rows[:before] > 0].max(initial=0))
         self._has_warned = False
 
