@@ -50,6 +50,11 @@ class Order:
         return self.found.places
 
     @cached_property
+    def last_records(self) -> Index:
+        """Number of the last record of each episode."""
+        return self.found.last
+
+    @cached_property
     def rows(self) -> int:
         """Number of rows."""
         return int(self.found.rows.sum())
