@@ -143,11 +143,21 @@ def reference(module: str) -> str:
             continue
         lines += [f".. auto{each.kind}:: {module}.{each.name}"]
         if each.kind != "function":
-            lines += ["   :members:", "   :show-inheritance:"]
+            lines += ["   :members:", *inherited(each.value), "   :show-inheritance:"]
         lines += [""]
     if others:
         lines += ["Described above: " + ", ".join(f"``{name}``" for name in others) + ".", ""]
     return "\n".join(lines)
+
+
+def inherited(kind: type) -> list[str]:
+    """Return the option that also describes what a class has from bases that no face offers."""
+    public = {each.value for each in described() if inspect.isclass(each.value)}
+    own = [base for base in kind.__mro__[1:] if base.__module__.startswith("physx")]
+    if public.issuperset(own):
+        return []
+    others = [base.__name__ for base in kind.__mro__[1:] if base in public or base not in own]
+    return [f"   :inherited-members: {', '.join(others)}"]
 
 
 def escaped(line: str) -> str:

@@ -237,6 +237,10 @@ class RejectedSamples:
             copies = {name: np.array(value) for name, value in sample.items()}
             self.waiting.append((copies, episode, step))
 
+    def has(self, episode: int, count: int) -> bool:
+        """Return whether the last `count` samples are of an episode."""
+        return len(self.waiting) >= count and self.waiting[-count][1] == episode
+
     def __len__(self) -> int:
         """Return how many samples there are."""
         return len(self.waiting)

@@ -106,6 +106,21 @@ def test_samples_of_an_episode_that_is_simulated_again_replace_the_former():
     assert rows("run", "wrong") == before
 
 
+@pytest.mark.parametrize("clients", [0, 2])
+def test_first_thousand_rejected_samples_of_an_episode_are_kept(clients, tmp_path):
+    late = PROGRAM.replace("self.x > (5 if self.episode_index == 3 else 0)",
+                           "self.step_index % 700 == 699")  # fmt: skip
+    (tmp_path / "case.py").write_text(late)
+    config = EnvironmentConfig("case.py:Case", seed=1, episode_steps=2, record_wrong_samples=True,
+                               max_wrong_samples_per_step=699, num_clients=max(1, clients),
+                               as_tcp_ip_client=clients > 0)  # fmt: skip
+    DataGeneration(config, session_name="run", episodes=5, quiet=True).execute()
+    steps = [step for step in range(1400) if step % 700 != 699][:1000]
+    found = [(number, step) for number, step, _ in rows("run", "wrong")]
+    assert found == [(number, step) for number in range(5) for step in steps]
+    assert len(rows("run", "training")) == 10
+
+
 def test_compacted_dataset_has_the_same_rejected_samples():
     generate("run", num_clients=3)
     before = rows("run", "wrong")

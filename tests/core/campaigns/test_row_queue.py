@@ -2,13 +2,20 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.errors import UsageError
-from physx_core.workers.row_queue import RowQueue
+from physx_core.workers.row_queue import Ended, RowQueue
+
+
+def ended_episodes(rows):
+    """Return episodes with these rows by number as a restarted run finds them."""
+    numbers = np.array(sorted(rows), np.int64)
+    return Ended(numbers, np.ones_like(numbers), np.array([rows[n] for n in numbers.tolist()]))
 
 
 def rows_without_gap(ended):
@@ -23,7 +30,7 @@ def rows_without_gap(ended):
 @given(st.data(), st.integers(1, 30), st.sets(st.integers(0, 8), max_size=4))
 def test_numbers_are_given_out_until_those_without_a_gap_have_enough_rows(data, goal, recorded):
     ended = {number: data.draw(st.integers(0, 5)) for number in recorded}
-    queue = RowQueue(goal, [EpisodeRecord(episode=n, rows=r) for n, r in ended.items()])
+    queue = RowQueue(goal, ended_episodes(ended))
     held, lost = [], set()
     for _ in range(300):
         assert queue.rows == rows_without_gap(ended)
@@ -80,6 +87,20 @@ def test_range_of_episodes_of_one_row_counts_as_its_episodes():
 
 def test_episodes_that_never_have_a_row_are_an_error():
     queue = RowQueue(5)
-    with pytest.raises(UsageError, match="1000 episodes have no row"):
+    with pytest.raises(UsageError, match="episodes 0 to 999 have no row"):
         for _ in range(1001):
             queue.note(EpisodeRecord(episode=queue.take(), rows=0))
+
+
+@pytest.mark.parametrize("restarted", [False, True])
+def test_episodes_without_rows_after_others_are_told_and_then_an_error(restarted):
+    ended = {0: 2, 1: 0, 2: 1} if restarted else {}
+    queue = RowQueue(5, ended_episodes(ended))
+    for number in range(len(ended), 3):
+        queue.note(EpisodeRecord(episode=queue.take(), rows=[2, 0, 1][number]))
+    with pytest.warns(UserWarning, match="episodes 3 to 1002 have no row") as warned:
+        for _ in range(9_999):
+            queue.note(EpisodeRecord(episode=queue.take(), rows=0))
+    assert len(warned) == 1
+    with pytest.raises(UsageError, match="episodes 3 to 10002 have no row"):
+        queue.note(EpisodeRecord(episode=queue.take(), rows=0))

@@ -11,7 +11,7 @@ from physx_core import Parameter
 from physx_core.components import LearningSampler
 from physx_core.dataset import EpisodeRecord
 from physx_core.workers.learned_sets import LearnedSets
-from physx_core.workers.row_queue import RowQueue
+from physx_core.workers.row_queue import Ended, RowQueue
 
 PARAMETERS = [Parameter("a", 0.0, 1.0, shape=(2,)), Parameter("n", 0, 9, distribution="integer")]
 
@@ -107,7 +107,9 @@ def test_each_set_is_chosen_after_exactly_the_batches_of_earlier_episodes(
             restored = told = told - back
             sets = begun(size, batch_nb, run_ahead)
             sets.restore(told, state)
-            queue = RowQueue(10**6, [EpisodeRecord(episode=n, rows=lengths[n]) for n in ended])
+            numbers = np.array(sorted(ended), np.int64)
+            rows = np.array(lengths)[numbers]
+            queue = RowQueue(10**6, Ended(numbers, np.ones_like(numbers), rows))
             queue.choose, held = sets.choose, []
     wanted = expected(lengths, size, batch_nb, run_ahead)
     assert chosen == {number: wanted[number] for number in chosen}

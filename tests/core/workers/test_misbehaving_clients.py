@@ -270,13 +270,29 @@ ENDED = {
 }
 
 
-@pytest.mark.parametrize("case", ["good", "failed with fields", *ENDED])
-def test_malformed_fields_of_episodes_are_refused(case):
+def leases_of_one(**options):
+    """Return leases, and a client that has the first number."""
     pace = SimpleNamespace(go_on=lambda: None)
-    peer = SimpleNamespace(instance_id=1, parameters=[], row_fields=[], episode_fields=MESH,
-                           send=lambda message: None, pace=pace, received=0)  # fmt: skip
+    peer = SimpleNamespace(instance_id=1, parameters=[], send=lambda message: None, pace=pace,
+                           received=0, **options)  # fmt: skip
     leases = Leases(EpisodeQueue(3), lambda numbers: {})
     leases.grant(peer, 1)
+    return leases, peer
+
+
+def test_more_rejected_rows_than_are_kept_are_refused():
+    leases, peer = leases_of_one(row_fields=[*DEFINED, *ROW_FIELDS], episode_fields=[])
+    payload = rows(*range(500), env_id=0)[HEADER.size :]
+    frame = Frame(Kind.WRONG, 500, bytearray(payload))
+    for _ in range(3):
+        leases.dispatch[Kind.WRONG](peer, frame)
+    with pytest.raises(ConnectionRefusedByPeerError, match="more rejected rows than are kept"):
+        leases.dispatch[Kind.WRONG](peer, frame)
+
+
+@pytest.mark.parametrize("case", ["good", "failed with fields", *ENDED])
+def test_malformed_fields_of_episodes_are_refused(case):
+    leases, peer = leases_of_one(row_fields=[], episode_fields=MESH)
     values, text = ENDED.get(case, (VALUES, "the fields"))
     status = EpisodeStatus.FAILED if case.startswith("failed") else EpisodeStatus.FINISHED
     payload = encode([(0, 1, 0, 0, int(status), 0.5, "", values)])

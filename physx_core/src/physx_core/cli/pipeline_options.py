@@ -114,9 +114,8 @@ def _opened(config: Any) -> Any:
     """Return a copy of a table, or the options of a configuration, nested ones too, as a table."""
     if not dataclasses.is_dataclass(config):
         return copy.deepcopy(config)
-    return {
-        option.name: _opened(getattr(config, option.name)) for option in _dataclass_fields(config)
-    }
+    names = [option.name for option in dataclasses.fields(config) if option.init]
+    return {name: _opened(getattr(config, name)) for name in names}
 
 
 def _closed(config: Any, tables: Any) -> Any:

@@ -11,14 +11,10 @@ import numpy as np
 from physx_core import files
 from physx_core.closeable import Closeable
 from physx_core.dataset.read.access.columns import ColumnCache
-from physx_core.dataset.read.episodes import Episode, find_episodes
+from physx_core.dataset.read.episode_reading import EpisodeReading
 from physx_core.dataset.read.mode_rows import ModeRows, Snapshot
 from physx_core.dataset.read.mode_statistics import compute_statistics
-from physx_core.dataset.read.order.addresses import Addresses
-from physx_core.dataset.read.order.records import RecordedEpisodes
-from physx_core.dataset.read.order.rewriting import records_at
 from physx_core.dataset.read.ordered_statistics import compute_in_order, store_in_order
-from physx_core.dataset.read.progress import Progress, find_progress
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.sampling import BatchOptions, BatchReader
 from physx_core.dataset.read.shuffling import OrderName, choose_order
@@ -26,11 +22,10 @@ from physx_core.dataset.read.splits import Subset, split
 from physx_core.dataset.read.views import ModeView, row_numbers
 from physx_core.dataset.repair import recovery, repair
 from physx_core.dataset.repair.report import find_problems, summarize
-from physx_core.dataset.store import failure_file, locks
-from physx_core.dataset.store.episode_record import EpisodeRecord, EpisodeStatus
-from physx_core.dataset.store.episode_table import EPISODES, LOST, TABLE_FIELDS, has_table
-from physx_core.dataset.store.failure_file import FailedEpisode
-from physx_core.dataset.store.manifest import Manifest, Mode, Partition, to_plain_info
+from physx_core.dataset.store import locks
+from physx_core.dataset.store.episode_record import EpisodeRecord
+from physx_core.dataset.store.episode_table import EPISODES, LOST, has_table
+from physx_core.dataset.store.manifest import Manifest, to_plain_info
 from physx_core.dataset.write.appender import Appender
 from physx_core.dataset.write.compacting import compact
 from physx_core.dataset.write.merging import add_partitions, drop_partition
@@ -41,12 +36,12 @@ from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError, UsageError
 from physx_core.fields import Field
 from physx_core.statistics import Normalization
-from physx_core.typing import Array, Batch, Index
+from physx_core.typing import Batch
 
 MAX_FILE_SIZE = 0.25
 
 
-class Dataset(Closeable):
+class Dataset(EpisodeReading, Closeable):
     """A folder of partition files and their manifest; use `create` or `open` to get one.
 
     A context manager. Unless the dataset is shared, one process at a time may write; any number
@@ -61,7 +56,7 @@ class Dataset(Closeable):
         self.directory = directory
         self.session = writer.session if writer else ""
         self._manifest = manifest
-        self._reader = Reader(directory, manifest)
+        self._reader = writer.reader if writer else Reader(directory, manifest)
         self._columns = ColumnCache(self._reader)
         self._appender = Appender(writer) if writer else None
         self._closed = False
@@ -276,18 +271,6 @@ class Dataset(Closeable):
         self._prepare_reading()
         return choose_order(self._reader.rows(mode), self._reader.row_nbytes(mode))
 
-    def episodes(self, mode: str) -> list[Episode]:
-        """Return the trajectories of a mode, each with the numbers of its rows in temporal order.
-
-        A trajectory ends when an environment calls `Environment.new_episode`, when `check_sample`
-        rejects a sample, and when another run begins.
-
-        Raises:
-            DatasetError: If there is no such mode, or its rows do not record where trajectories
-                begin.
-        """
-        return find_episodes(self.rows(mode))
-
     def rows(self, mode: str, snapshot: Snapshot | None = None) -> ModeRows:
         """Return the rows of a mode as they are now, or were at a snapshot: see `ModeRows`.
 
@@ -296,128 +279,6 @@ class Dataset(Closeable):
         """
         self._prepare_reading()
         return ModeRows(self._columns, mode, snapshot)
-
-    def recorded_episodes(self, mode: str) -> RecordedEpisodes | None:
-        """Return the recorded episodes of a mode, in order; None if its rows have no records.
-
-        Raises:
-            DatasetError: If there is no such mode, or the table of episodes is damaged.
-        """
-        self._prepare_reading()
-        order = self._reader.order(mode)
-        if order is None:
-            self._reader.mode(mode)  # there must be one
-            return None
-        return order.episodes
-
-    def failed_episodes(self, mode: str) -> list[FailedEpisode]:
-        """Return the episodes of a mode that are recorded as failed, in order, and why they did.
-
-        Raises:
-            DatasetError: If there is no such mode, or the table of episodes is damaged.
-        """
-        found = self.recorded_episodes(mode)
-        if found is None:
-            return []
-        known = {f[:3]: f for f in failure_file.read(self.directory)}
-        failed = found.status == EpisodeStatus.FAILED
-        keys = zip(found.campaign[failed].tolist(), found.episode[failed].tolist(), strict=True)
-        return [known.get((mode, *key), FailedEpisode(mode, *key, "")) for key in keys]
-
-    def episode_table(self, modes: Sequence[str]) -> Batch:
-        """Return the records of the episodes of some modes that count, by field.
-
-        They are those of `physx_core.dataset.store.episode_table`, with the parameters, but one for
-        each entry of `recorded_episodes`; ``first_row`` is the number of its first row.
-
-        Args:
-            modes: Names of the modes; those without records are left out.
-
-        Raises:
-            DatasetError: If there is no such mode, or no table of episodes, or it is damaged.
-        """
-        self._prepare_reading()
-        total = self._reader.stored_rows(EPISODES)
-        fields = self._reader.mode(EPISODES).fields
-        table = {name: self._reader.read(EPISODES, name, 0, total) for name in fields}
-        parts = [{name: column[:0] for name, column in table.items()}]
-        for mode in modes:
-            order = self._reader.order(mode)
-            if order is not None and len(order.found.last):
-                whole = Addresses(Mode({}, [Partition(mode, "", 0, 0, order.rows)]))
-                places = self._reader.orders.places(mode)
-                parts.append(records_at(order, places, whole, table, is_open=False))
-        return {name: np.concatenate([part[name] for part in parts]) for name in table}
-
-    def recorded_values(self, mode: str, entries: Index) -> Batch:
-        """Return the parameters and fields of some recorded episodes, by name; empty without any.
-
-        Args:
-            mode: Name of a mode with records.
-            entries: Which entries of `recorded_episodes`, shape (n,).
-
-        Returns:
-            Arrays of shape (n, *shape of the parameter or field).
-
-        Raises:
-            DatasetError: If there is no such mode, or the table of episodes is damaged.
-        """
-        self._prepare_reading()
-        order = self._reader.order(mode)
-        if order is None or not len(entries):
-            return {}
-        places = self._reader.orders.places(mode)[order.found.last[entries]]
-        names = self._reader.mode(EPISODES).fields.keys() - {field.name for field in TABLE_FIELDS}
-        return {name: self[EPISODES][name][places] for name in names}
-
-    @property
-    def episode_fields(self) -> dict[str, Field]:
-        """The fields that each independent episode has once, by name."""
-        mode = self._manifest.modes.get(EPISODES)
-        fields = mode.fields if mode is not None and self.has_episodes else {}
-        return {name: field for name, field in fields.items() if field.role == "episode"}
-
-    def episode_values(self, mode: str, name: str, rows: Any) -> Array:
-        """Return what the episode of each row has once: a parameter, or a field of its own.
-
-        Args:
-            mode: Name of a mode of independent episodes.
-            name: Name of a field of the mode ``episodes``.
-            rows: A row's number, numbers of shape (n,), or a slice.
-
-        Returns:
-            Shape (n, *field shape); 0 for rows of streams.
-
-        Raises:
-            DatasetError: If there is no such mode or field, the mode has no episodes, or the table
-                of episodes is damaged.
-            IndexError: If there is no such row.
-        """
-        self._prepare_reading()
-        known = self.rows(mode)
-        return known.episode_values(name, row_numbers(rows, known.count))
-
-    def progress(self, mode: str) -> list[Progress]:
-        """Return how many episodes of each campaign of a mode have ended; none without records.
-
-        Unlike `recorded_episodes`, all count that another process has recorded so far.
-
-        Raises:
-            DatasetError: If there is no such mode, or the table of episodes is damaged.
-        """
-        if self.recorded_episodes(mode) is None:
-            return []
-        orders = self._reader.orders
-        found, records = orders.all(mode), orders.records(mode)
-        if not len(records.rows):
-            return []
-        seconds = self._reader.read(EPISODES, "seconds", 0, self._reader.stored_rows(EPISODES))
-        return find_progress(found, records, seconds[orders.places(mode)])
-
-    @property
-    def has_episodes(self) -> bool:
-        """Whether the mode ``episodes`` is the table of episodes."""
-        return has_table(self._manifest)
 
     @property
     def is_written(self) -> bool:

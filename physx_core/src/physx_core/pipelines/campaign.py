@@ -16,7 +16,8 @@ from physx_core.dataset.read.order.records import Flags, RecordedEpisodes
 from physx_core.errors import ConfigError, DatasetError, listed
 from physx_core.fields import Field
 from physx_core.pipelines.storage import describe_environment
-from physx_core.typing import Batch, Index
+from physx_core.typing import Batch
+from physx_core.workers.row_queue import NONE_ENDED, Ended
 
 CAMPAIGNS = "campaigns"
 """Entry in a dataset's info: what its campaigns simulated, in order."""
@@ -151,30 +152,19 @@ class Campaign:
             "definitions, or leave resume out for other episodes."
         )
 
-    def simulated(self, dataset: Dataset, *, failed: bool = True) -> Index:
-        """Return the numbers that have ended, shape (n,), without those that were cut.
+    def ended(self, dataset: Dataset, *, failed: bool = True) -> Ended:
+        """Return the episodes that have ended, without those that were cut.
 
         Args:
             dataset: The dataset.
             failed: Whether those that failed are among them.
         """
-        first, count, _ = self._ended(dataset, failed)
-        begins = np.repeat(first - np.cumsum(count) + count, count)
-        return begins + np.arange(count.sum())
-
-    def records(self, dataset: Dataset, *, failed: bool = True) -> list[EpisodeRecord]:
-        """Return what is recorded of those numbers: see `simulated`."""
-        columns = (each.tolist() for each in self._ended(dataset, failed))
-        return [EpisodeRecord(episode=e, count=n, rows=r) for e, n, r in zip(*columns, strict=True)]
-
-    def _ended(self, dataset: Dataset, failed: bool) -> tuple[Index, Index, Index]:
-        """Return the first number, the number of episodes and that of rows of each entry."""
         known = self._recorded_episodes(dataset)
         if known is None:
-            return (np.zeros(0, np.int64),) * 3
+            return NONE_ENDED
         status = [EpisodeStatus.FINISHED, *([EpisodeStatus.FAILED] if failed else [])]
         chosen = np.isin(known.status, status) & self._are_own(known)
-        return known.episode[chosen], known.numbers[chosen], known.rows[chosen]
+        return Ended(known.episode[chosen], known.numbers[chosen], known.rows[chosen])
 
     def rows(self, dataset: Dataset) -> int:
         """Return how many rows it has."""

@@ -329,14 +329,12 @@ class DataGeneration(NewSessionPipeline):
         return max(self.dataset.num_samples(self._mode), Campaign.count(self.dataset, self._mode))
 
     def _make_writer(self, campaign: Campaign) -> CampaignWriter:
-        failed = not self.retry_failed
+        ended = campaign.ended(self.dataset, failed=not self.retry_failed)
         queue: EpisodeQueue
         if self.episodes is None:
-            known = campaign.records(self.dataset, failed=failed)
-            queue = RowQueue(self._amount()[0], known, self.retries)
+            queue = RowQueue(self._amount()[0], ended, self.retries)
         else:
-            numbers = campaign.simulated(self.dataset, failed=failed)
-            queue = EpisodeQueue(self.episodes, numbers, self.retries)
+            queue = EpisodeQueue(self.episodes, ended.all_numbers, self.retries)
         keeps_rejected = self.environment_config.record_wrong_samples
         return CampaignWriter(
             self.dataset, campaign, queue, self.max_failed, keeps_rejected=keeps_rejected

@@ -24,7 +24,7 @@ from physx_core.errors import (
 from physx_core.fields import Field
 from physx_core.rows import ROW_FIELDS, RowBuffer, infer_shapes
 from physx_core.typing import Batch
-from physx_core.workers.instance import Instance
+from physx_core.workers.instance import MOST_REJECTED, Instance
 from physx_core.workers.lease import AIM, Lease
 
 OF_EPISODES = (EnvironmentFailedError, ProgramError, NotFiniteError, WrongSamplesError)
@@ -150,8 +150,11 @@ class EpisodeRunner:
     @property
     def _is_full(self) -> bool:
         """Whether the block can take no further rows, or no further episodes."""
-        is_full = self._buffer is not None and self._buffer.full
-        return is_full or (self._number is None and len(self._parts) >= self._most_parts)
+        if self._buffer is not None and self._buffer.full:
+            return True
+        rejected = len(self._instance.rejected or ())
+        has_many = len(self._parts) >= self._most_parts or rejected >= MOST_REJECTED
+        return self._number is None and has_many
 
     def _begin(self) -> bool:
         """Begin the next number; return whether there is one."""

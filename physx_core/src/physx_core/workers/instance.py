@@ -47,6 +47,8 @@ NO_VALUES: Mapping[str, Any] = {}
 """For an episode without parameters; never changed. A dict is unpacked faster than a view."""
 _MOST_EMPTY = 1000
 """Number of episodes in a row that may end without a row."""
+MOST_REJECTED = 1000
+"""How many of the rejected samples of an independent episode are kept: the first ones."""
 _COUNTERS = (
     *("last_step", "last_episode", "has_ended"),
     *("_next_episode", "_rows", "_counts", "_is_numbered"),
@@ -582,8 +584,10 @@ class Instance(Closeable):
 
     def _reject(self, sample: dict[str, Any], wrong: int) -> None:
         """Record a rejected sample, the `wrong`-th in a row; raise if there are too many."""
-        if self.rejected is not None:
-            steps = self._alive()._earlier_steps if self._is_numbered else 0
+        if self.rejected is not None and not self._is_numbered:
+            self.rejected.add(sample, self.last_episode, self.last_step)
+        elif self.rejected is not None and not self.rejected.has(self.last_episode, MOST_REJECTED):
+            steps = self._alive()._earlier_steps
             self.rejected.add(sample, self.last_episode, self.last_step - steps)
         if wrong > self._max_wrong_samples:
             raise WrongSamplesError(

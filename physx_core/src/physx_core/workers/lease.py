@@ -37,9 +37,11 @@ class Lease(NamedTuple):
         """Return each number with the values of its parameters, for `Instance.begin`."""
         if not self.values:
             return zip(self.numbers, itertools.repeat(NO_VALUES))
-        names, columns = self.values.keys(), self.values.values()
-        lists = [each.copy() if each.ndim > 1 else each.tolist() for each in columns]
-        return zip(self.numbers, (dict(zip(names, each)) for each in zip(*lists)))  # noqa: B905
+        pairs = (  # no step of Python's own for each number
+            zip(itertools.repeat(name), values.copy() if values.ndim > 1 else values.tolist())
+            for name, values in self.values.items()
+        )
+        return zip(self.numbers, map(dict, zip(*pairs, strict=True)), strict=True)
 
     def parameters(self, first: int, count: int) -> dict[str, Any]:
         """Return the parameters of some of the numbers as `EpisodeRecord` has them."""

@@ -2,19 +2,45 @@
 
 from __future__ import annotations
 
+import warnings
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable, Collection
-from itertools import chain
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 
 from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.errors import UsageError
+from physx_core.typing import Index
 from physx_core.workers.episode_queue import EpisodeQueue
 
 _NO_END = 2**47
-_MOST_EMPTY = 1000
+_SOME_EMPTY, _MOST_EMPTY = 1000, 10_000
+
+
+class Ended(NamedTuple):
+    """Episodes that have ended, in order of their numbers; arrays of shape (entries,).
+
+    Attributes:
+        first: The (first) number of each entry.
+        numbers: For how many numbers it stands; if they are several, each has one row.
+        rows: How many rows it has.
+    """
+
+    first: Index
+    numbers: Index
+    rows: Index
+
+    @property
+    def all_numbers(self) -> Index:
+        """Each number, shape (episodes,)."""
+        begins = np.repeat(self.first - np.cumsum(self.numbers) + self.numbers, self.numbers)
+        found: Index = begins + np.arange(len(begins))
+        return found
+
+
+NONE_ENDED = Ended(*(np.zeros(0, np.int64) for _ in Ended._fields))
 
 
 class RowQueue(EpisodeQueue):
@@ -25,36 +51,44 @@ class RowQueue(EpisodeQueue):
 
     Attributes:
         goal: How many rows are wanted.
-        rows: How many the episodes before the first missing number have.
-        missing: The first missing number.
         choose: Chooses parameters of numbers below another one; returns the first number without.
             None: all can be chosen at any time.
     """
 
     choose: Callable[[RowQueue, int], int] | None = None
 
-    def __init__(
-        self, goal: int, recorded: Collection[EpisodeRecord] = (), retries: int = 1
-    ) -> None:
+    def __init__(self, goal: int, recorded: Ended = NONE_ENDED, retries: int = 1) -> None:
         """Start with the numbers that are not recorded.
 
         Args:
             goal: How many rows are wanted.
-            recorded: Numbers that an earlier run has recorded.
+            recorded: Episodes that an earlier run has recorded.
             retries: How often a number is given out again after it was lost.
         """
-        ranges = (range(each.episode, each.episode + each.count) for each in recorded)
-        numbers = np.array([*chain.from_iterable(ranges)], np.int64)
-        super().__init__(_NO_END, numbers, retries)
-        self.goal, self.rows = goal, 0
-        self._taken = self._all_rows = 0
+        super().__init__(_NO_END, recorded.all_numbers, retries)
+        first, numbers, rows = recorded
+        ends = np.cumsum(numbers)
+        before = int((first == ends - numbers).sum())  # entries before the first missing number
+        later = zip(*(column[before:].tolist() for column in recorded), strict=True)
+        self.goal, self._taken, self._all_rows = goal, 0, int(rows.sum())
         self._parts: Counter[int] = Counter()  # number to its rows so far
-        self._ended: dict[int, tuple[int, int]] = {}  # first number to how many, and their rows
-        self.missing = 0
-        self._firsts, self._sums = [0], [0]  # numbers up to the first missing one, rows before them
-        self._last = -1  # the last one that has ended
-        for each in recorded:
-            self._end(each.episode, each.count, each.rows)
+        self._ended = {first: (count, rows) for first, count, rows in later}  # after the missing
+        self._last = int((first + numbers).max(initial=0)) - 1  # the last one that has ended
+        # Numbers up to the first missing one, and the rows before them:
+        self._firsts: list[int] = [0, *ends[:before].tolist()]
+        self._sums: list[int] = [0, *np.cumsum(rows[:before]).tolist()]
+        self._filled = int(ends[:before][rows[:before] > 0].max(initial=0))
+        self._has_warned = False
+
+    @property
+    def missing(self) -> int:
+        """The first missing number."""
+        return self._firsts[-1]
+
+    @property
+    def rows(self) -> int:
+        """How many rows the episodes before the first missing number have."""
+        return self._sums[-1]
 
     @property
     def is_done(self) -> bool:
@@ -82,7 +116,7 @@ class RowQueue(EpisodeQueue):
         """Note what became of a number, or of several.
 
         Raises:
-            UsageError: If no episode has a row.
+            UsageError: If no episode has a row, or too many in a row have none.
         """
         super().note(record)
         if record.part == 0:
@@ -93,11 +127,24 @@ class RowQueue(EpisodeQueue):
         self._taken -= record.count
         rows = self._parts.pop(record.episode, 0) + record.rows
         self._end(record.episode, record.count, rows)
-        if self.missing >= _MOST_EMPTY and not self.rows:
-            raise UsageError(
-                f"{_MOST_EMPTY} episodes have no row, so there would never be {self.goal} rows: "
-                "call set_training_data() in the step that calls end_episode()."
-            )
+        self._check_empty()
+
+    def _check_empty(self) -> None:
+        """Check how many of the numbers before the first missing one have no row, at the end."""
+        empty = self.missing - self._filled
+        if empty < _SOME_EMPTY or self.is_done:
+            return
+        most = _MOST_EMPTY if self.rows else _SOME_EMPTY
+        text = (
+            f"The episodes {self._filled} to {self._filled + min(empty, most) - 1} have no row, "
+            f"but {self.goal} rows are wanted and there are {self.rows}: call set_training_data() "
+            "in each step, also in that which calls end_episode()."
+        )
+        if empty >= most:
+            raise UsageError(text)
+        if not self._has_warned:
+            self._has_warned = True
+            warnings.warn(f"{text} The run ends after {_MOST_EMPTY} of them.", stacklevel=2)
 
     def needs(self, number: int) -> bool:
         """Return whether a number is known to be needed: those before it have too few rows."""
@@ -134,7 +181,7 @@ class RowQueue(EpisodeQueue):
         self._last = max(self._last, first + count - 1)
         while self.missing in self._ended:
             count, rows = self._ended.pop(self.missing)
-            self.missing += count
-            self.rows += rows
-            self._firsts.append(self.missing)
-            self._sums.append(self.rows)
+            self._firsts.append(self.missing + count)
+            self._sums.append(self.rows + rows)
+            if rows:
+                self._filled, self._has_warned = self.missing, False

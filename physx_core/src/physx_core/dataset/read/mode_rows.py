@@ -131,7 +131,7 @@ class ModeRows:
             raise DatasetError(f'The rows of mode "{self.mode}" have no recorded episodes.')
         self._reader.field(EPISODES, name)
         entries = np.searchsorted(self.order.episodes.first, rows, "right") - 1
-        records = self._reader.orders.places(self.mode)[self.order.found.last]
+        records = self._reader.orders.places(self.mode)[self.order.last_records]
         once, places = np.unique(entries, return_inverse=True)
         column = self._columns.map(EPISODES, name)
         out = np.empty((len(once), *column.shape[1:]), column.dtype)

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import io
 from collections.abc import Iterator
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -19,7 +18,7 @@ import numpy as np
 from physx_core import files
 from physx_core.dataset.read.order.order import Order
 from physx_core.dataset.read.reader import Reader
-from physx_core.dataset.store.manifest import Manifest, Mode, Partition
+from physx_core.dataset.store.manifest import Mode, Partition
 from physx_core.dataset.store.partition.spans import FlatIndex
 from physx_core.fields import Field
 
@@ -31,24 +30,23 @@ Piece = tuple[Partition, slice, slice]
 """A partition, some of its rows, and their places in the mode."""
 
 
-def write_index(directory: Path, session: str, manifest: Manifest, *, wait: bool = False) -> None:
+def write_index(reader: Reader, session: str, *, wait: bool = False) -> None:
     """Write the index of all sealed rows.
 
     Args:
-        directory: The dataset's folder.
+        reader: Knows the rows.
         session: Session that writes it; it gets an index even if it has no rows yet.
-        manifest: The dataset's manifest.
         wait: Whether to wait for the disk.
     """
     import h5py
 
-    image, reader = io.BytesIO(), Reader(directory, manifest)
+    image, manifest = io.BytesIO(), reader.manifest
     with h5py.File(image, "w") as file:
         file.attrs["format"], file.attrs["format_version"] = FORMAT, 1
         for name in manifest.modes:
             _add_mode(file.create_group(name), reader.mode(name), reader.order(name))
     for name in {session, *manifest.sessions}:
-        files.replace(directory / f"{name}.h5", image.getvalue(), wait=wait)
+        files.replace(reader.directory / f"{name}.h5", image.getvalue(), wait=wait)
 
 
 def _add_mode(group: Any, mode: Mode, order: Order | None) -> None:

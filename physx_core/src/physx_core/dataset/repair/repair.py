@@ -101,7 +101,7 @@ def _store(folder: Path, manifest: Manifest) -> None:
     reader = Reader(folder, manifest)
     for name in manifest.modes:
         compute_statistics(reader, name)
-    write_index(folder, next(reversed(manifest.sessions), "run"), manifest)
+    write_index(reader, next(reversed(manifest.sessions), "run"))
     manifest_file.save(folder, manifest)
     store_in_order(reader)
 

@@ -45,7 +45,7 @@ def compact(writer: Writer, modes: Sequence[str]) -> int:
         How many bytes of disk space were freed.
     """
     store = writer.store
-    reader = Reader(store.directory, store.manifest)
+    reader = writer.reader
     orders = {name: order for name in modes if (order := reader.order(name)) is not None}
     if not orders:
         return 0
@@ -60,8 +60,8 @@ def compact(writer: Writer, modes: Sequence[str]) -> int:
     _check(store.directory, store.manifest, old)
     before = _size(store.directory)
     _replace(writer, reader, orders, old)
-    write_index(store.directory, writer.session, store.manifest)
-    store_in_order(Reader(store.directory, store.manifest))
+    write_index(reader, writer.session)
+    store_in_order(reader)
     return before - _size(store.directory)
 
 

@@ -80,7 +80,7 @@ def extend(folder: Path, options: WriterOptions) -> Writer:
             writer = options.writer(folder, manifest, lock)
             if alone:
                 if recovery.recover(folder, manifest):
-                    write_index(folder, writer.session, manifest)
+                    write_index(writer.reader, writer.session)
                 manifest_file.save(folder, manifest)
                 statistics_file.clear(folder, manifest.statistics_checksum)
                 if options.shared:

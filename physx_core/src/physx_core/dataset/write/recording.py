@@ -10,6 +10,7 @@ import numpy as np
 
 from physx_core import files
 from physx_core.dataset.read.order.addresses import Addresses
+from physx_core.dataset.read.order.records import Records
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.store import failure_file
 from physx_core.dataset.store.episode_record import OPEN, EpisodeRecord, EpisodeStatus
@@ -73,15 +74,25 @@ class Recorder:
             return
         for known in (self.recorded, self._streams, self._campaigns, self._parts):
             known.clear()
-        total = self._reader.stored_rows(EPISODES)
-        columns = [self._reader.read(EPISODES, f.name, 0, total).tolist() for f in _OWN]
-        places = {mode: Addresses(self.manifest.modes.get(mode, Mode({}))) for mode in RECORDED}
-        for about, campaign, episode, first, rows, part, status in zip(*columns, strict=True):
-            if 0 <= about < len(RECORDED):
-                mode = RECORDED[about]
-                self._note(mode, campaign, episode, first, rows, part, status)
-                if status == EpisodeStatus.MORE and not places[mode].has_all(first, rows):
-                    self._parts.pop((mode, campaign, episode), None)
+        for mode in RECORDED:
+            records = self._reader.orders.records(mode)
+            if len(records.rows):
+                self._load(mode, records)
+
+    def _load(self, mode: str, records: Records) -> None:
+        """Look at the records about a mode; one by one at those of streams and of parts only."""
+        addresses = Addresses(self.manifest.modes.get(mode, Mode({})))
+        more = records.status == EpisodeStatus.MORE
+        single = ~np.isin(records.episode, records.episode[more])
+        single &= records.status != EpisodeStatus.STREAM
+        last = records.take(single)
+        if len(last.rows):
+            self._note_end(mode, int(last.campaign.max()), int((last.first_row + last.rows).max()))
+        columns = (column.tolist() for column in records.take(~single))
+        for campaign, episode, _, first, rows, part, status in zip(*columns, strict=True):
+            self._note(mode, campaign, episode, first, rows, part, status)
+            if status == EpisodeStatus.MORE and not addresses.has_all(first, rows):
+                self._parts.pop((mode, campaign, episode), None)
 
     def append(
         self, mode: str, rows: Batch, count: int, episodes: Sequence[EpisodeRecord], table: Batch
@@ -197,11 +208,8 @@ class Recorder:
         self, mode: str, campaign: int, episode: int, first: int, rows: int, part: int, status: int
     ) -> None:
         """Take note of a record."""
-        self._campaigns[mode] = max(campaign, self._campaigns.get(mode, 0))
-        known = self.manifest.modes.get(mode)
         is_open = status == EpisodeStatus.STREAM and rows == OPEN
-        if known is not None:
-            known.recorded = max(known.recorded, first + (0 if is_open else rows))
+        self._note_end(mode, campaign, first + (0 if is_open else rows))
         if status == EpisodeStatus.STREAM:
             self._streams.pop(mode, None)
             self.recorded.add(mode)
@@ -214,11 +222,12 @@ class Recorder:
         if status == EpisodeStatus.MORE and part in (0, before):
             self._parts[key] = part + 1
 
-
-_OWN = [
-    next(field for field in TABLE_FIELDS if field.name == name)
-    for name in ("mode_index", "campaign", "episode", "first_row", "rows", "part", "status")
-]
+    def _note_end(self, mode: str, campaign: int, end: int) -> None:
+        """Take note of a campaign, and of the address after recorded rows."""
+        self._campaigns[mode] = max(campaign, self._campaigns.get(mode, 0))
+        known = self.manifest.modes.get(mode)
+        if known is not None:
+            known.recorded = max(known.recorded, end)
 
 
 def table_rows(

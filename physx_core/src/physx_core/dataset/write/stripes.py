@@ -16,6 +16,7 @@ from typing import Protocol
 
 from physx_core import files
 from physx_core.dataset.read.mode_statistics import count_sealed
+from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.virtual_index import write_index
 from physx_core.dataset.repair import recovery
 from physx_core.dataset.store.definitions import compare_fields
@@ -59,10 +60,12 @@ class Beginning(Protocol):
     Attributes:
         store: The manifest.
         session: Session that writes.
+        reader: Reads what is written.
     """
 
     store: ManifestStore
     session: str
+    reader: Reader
 
     def capacity(self, mode: Mode) -> int:
         """Return the number of rows of a mode that fit into a partition."""
@@ -272,7 +275,7 @@ class Stripes:
             for partition in empty:
                 del mode.partitions[mode.place(partition)]
             count_sealed(self.directory, manifest, mode)
-            write_index(self.directory, self.session, manifest)
+            write_index(self._writer.reader, self.session)
         keys = {partition.key for partition in sealed}
         self._groups = {
             number: group

@@ -104,6 +104,7 @@ class Writer:
     Attributes:
         store: The manifest, kept up to date in memory and on disk.
         session: Name of the session that writes.
+        reader: Reads what is written.
         recorder: Writes the table of episodes.
     """
 
@@ -134,13 +135,13 @@ class Writer:
         self._max_nbytes = int(max_file_size * 1e9) - _HEADER
         self._syncer = None if durable else Syncer(helper("physx-sync"))
         self._digester: Helper[None] = helper("physx-digest")
-        self._reader = Reader(store.directory, store.manifest)
+        self.reader = Reader(store.directory, store.manifest)
         self._open: dict[str, OpenPartition] = {}
         self._filled: dict[str, Partition] = {}
         self._sealed: list[Partition] = []
         self._sealer: Helper[Partition] = helper("physx-seal")
         self._stripes: dict[str, Stripes] = {}
-        self.recorder = Recorder(self, self._reader)
+        self.recorder = Recorder(self, self.reader)
         self._recorded = self.recorder.recorded
 
     @property
@@ -324,7 +325,7 @@ class Writer:
                     count_sealed(self._directory, manifest, mode)
                 else:
                     del mode.partitions[mode.place(entry)]
-            write_index(self._directory, self.session, manifest)
+            write_index(self.reader, self.session)
         empty = [entry for entry in self._sealed if not entry.rows]
         self._sealed.clear()
         for entry in empty:
@@ -392,11 +393,11 @@ class Writer:
             if any(partition.sealed and not partition.counted for partition in mode.partitions):
                 changed = True
                 with contextlib.suppress(DatasetError):  # a partition is damaged: skip for now
-                    compute_statistics(self._reader, name)
+                    compute_statistics(self.reader, name)
         if changed or manifest.has_new_statistics:
             manifest_file.save(self._directory, manifest)
-        store_in_order(self._reader)
-        write_index(self._directory, self.session, manifest, wait=True)
+        store_in_order(self.reader)
+        write_index(self.reader, self.session, wait=True)
 
 
 def _seal(directory: Path, fields: Mapping[str, Field], partition: Partition) -> Partition:

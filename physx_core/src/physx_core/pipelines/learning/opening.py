@@ -228,7 +228,7 @@ class DataOpening:
         else:
             reject_episode_fields(source)
             return None
-        queue = RowQueue(self.buffer.total, campaign.records(dataset), self.retries)
+        queue = RowQueue(self.buffer.total, campaign.ended(dataset), self.retries)
         writer = CampaignWriter(
             dataset,
             campaign,

@@ -20,6 +20,7 @@ from physx_core.rows import concatenate
 from physx_core.typing import Batch, Index
 from physx_core.workers.episode_queue import EpisodeQueue
 from physx_core.workers.episode_runner import EpisodeBlock
+from physx_core.workers.instance import MOST_REJECTED
 from physx_core.workers.lease import AIM, Lease, most_numbers
 from physx_core.workers.row_codec import unpack_rows
 from physx_core.workers.server.peer import Peer
@@ -153,6 +154,8 @@ class Leases:
         held, count = self._held.get(peer.instance_id), frame.number
         if held is None or not peer.row_fields or count < 1:
             raise ConnectionRefusedByPeerError(f"It sent {count} rejected rows of no episode.")
+        if count + sum(len(rows["step"]) for rows in held.rejected) >= 2 * MOST_REJECTED:
+            raise ConnectionRefusedByPeerError("It sent more rejected rows than are kept.")
         rows = unpack_rows(frame.payload, peer.row_fields, count)
         check_values(rows, peer.row_fields, peer.instance_id)
         held.rejected.append(rows)

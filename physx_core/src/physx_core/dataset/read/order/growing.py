@@ -42,13 +42,16 @@ class GrowingRecords:
             records: The records.
             places: Their rows in the table.
         """
-        new = np.stack([places, *records])[:, records.is_valid]
-        total = self.count + new.shape[1]
+        valid = records.is_valid
+        if not valid.all():
+            records, places = records.take(valid), places[valid]
+        total = self.count + len(places)
         if total > self._columns.shape[1]:
-            grown = np.empty((len(new), max(_SOME, 2 * total)), np.int64)
+            grown = np.empty((len(self._columns), max(_SOME, total + self.count)), np.int64)
             grown[:, : self.count] = self._columns[:, : self.count]
             self._columns = grown
-        self._columns[:, self.count : total] = new
+        for known, new in zip(self._columns, (places, *records), strict=True):
+            known[self.count : total] = new
         self.count = total
 
     @property

@@ -50,6 +50,11 @@ class Order:
         return self.found.places
 
     @cached_property
+    def last_records(self) -> Index:
+        """Number of the last record of each episode."""
+        return self.found.last
+
+    @cached_property
     def rows(self) -> int:
         """Number of rows."""
         return int(self.found.rows.sum())
@@ -165,7 +170,9 @@ class Orders:
         return self._records[mode].places
 
     def records(self, mode: str) -> Records:
-        """Return the records of a mode that has an order, as `Found.record` counts."""
+        """Return the records of a mode, as `Found.record` counts; there must be a table."""
+        with self._lock:
+            self._read_new()
         return self._records[mode].records if mode in self._records else NO_RECORDS
 
     def all(self, mode: str) -> Found:

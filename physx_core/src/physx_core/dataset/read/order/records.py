@@ -203,8 +203,10 @@ def resolve(records: Records, addresses: Addresses, written: Index) -> Found:
         records._replace(first_row=first, rows=rows),
         stream | failed | (rows == records.rows),
     )
-    check_shared(_found(chosen, written), addresses)
-    return _found(_without_replaced(chosen, written), written)
+    found = _found(chosen, written)
+    check_shared(found, addresses)
+    kept = _without_replaced(chosen, written)
+    return found if kept is chosen else _found(kept, written)
 
 
 def check_shared(found: Found, addresses: Addresses) -> None:
