@@ -6,7 +6,9 @@ from pathlib import Path
 
 import pytest
 
+from physx_core import DataGeneration
 from physx_core.cli import main
+from physx_core.cli.pipeline_options import pipeline_from
 
 pytestmark = pytest.mark.processes
 
@@ -148,7 +150,7 @@ def test_help_shows_the_arguments_without_names_and_examples(verb, arguments, ca
     ("verb", "text"),
     [
         ("generate", "None: `num_clients`, which the launcher starts."),
-        ("train", "if the dataset has a validation mode or `View.fold` holds samples"),
+        ("train", "if the dataset has a validation mode or `View.fold` "),
     ],
 )
 def test_help_breaks_lines_only_where_they_are_full(verb, text, capsys, monkeypatch):
@@ -187,3 +189,20 @@ def test_module_is_the_command():
     words = [sys.executable, "-m", "physx_core", "--version"]
     out = subprocess.run(words, capture_output=True, text=True, check=True, env=os.environ)
     assert out.stdout.startswith("physx 0.")
+
+
+@pytest.mark.parametrize(
+    ("words", "expected"), [([], True), (["True"], True), (["False"], False), (["None"], None)]
+)
+def test_an_option_that_may_be_left_open_is_switched_on_by_its_name(words, expected):
+    made = pipeline_from(
+        DataGeneration, "generate", ["environment.environment"],
+        ["toy/spring", "--environment.independent-episodes", *words, "--episodes", "2"],
+        arguments="ENVIRONMENT", examples=[],
+    )  # fmt: skip
+    assert made.environment_config.independent_episodes is expected
+
+
+def test_a_switch_that_is_neither_on_nor_off_is_an_error(capsys):
+    assert main(["generate", "toy/spring", "--environment.independent-episodes", "maybe"]) != 0
+    assert "neither True nor False" in " ".join(capsys.readouterr().err.split())

@@ -54,7 +54,27 @@ def argument_registry() -> ConstructorRegistry:
             str_from_instance=lambda value: [str(value)],
         )
 
+    @registry.primitive_rule
+    def switch(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+        if info.type != bool | None:
+            return None
+        return PrimitiveConstructorSpec(
+            nargs="*",
+            metavar="[True|False]",
+            instance_from_str=_switched,
+            is_instance=lambda value: value is None or isinstance(value, bool),
+            str_from_instance=lambda value: [str(value)],
+        )
+
     return registry
+
+
+def _switched(words: Sequence[str]) -> bool | None:
+    """Return the value of an option that is on if it is named alone."""
+    known = {"True": True, "False": False, "None": None}
+    if len(words) > 1 or not known.keys() >= set(words):
+        raise ValueError(f"{' '.join(words)!r} is neither True nor False")
+    return known[words[0]] if words else True
 
 
 def take_changes(
