@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from physx_core import Dataset, Field, files
+from physx_core import Dataset, Field, View, files
 from physx_core.dataset import EPISODES, EpisodeRecord, EpisodeStatus
 from physx_core.errors import DatasetError, DatasetLockedError, UsageError
 
@@ -153,13 +153,16 @@ def test_who_may_not_compact(folder):
         shared.compact()
 
 
-def test_parts_of_a_mode_are_an_error_instead_of_other_rows(folder):
+def test_open_batches_are_an_error_instead_of_other_rows(folder):
     with Dataset.create(folder) as dataset:
         fill(dataset)
-        part = dataset.split("training", {"a": 0.5})["a"]
-        dataset.compact()
-        with pytest.raises(DatasetError, match="split it again"):
-            part["x"][:]
+        with View(fold=None).open(2, data=dataset) as batches:
+            batches[0]
+            dataset.compact()
+            with pytest.raises(DatasetError, match="open them again"):
+                batches[1]
+            with pytest.raises(DatasetError, match="compacted"):
+                View(fold=None).open(2, data=dataset, snapshot=batches.snapshot)
 
 
 def test_a_reader_sees_the_same_rows_after_refreshing(folder):

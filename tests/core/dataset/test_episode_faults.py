@@ -7,7 +7,7 @@ from collections import Counter
 import numpy as np
 import pytest
 
-from physx_core import Dataset
+from physx_core import Dataset, View
 from physx_core.dataset import EPISODES, EpisodeRecord, EpisodeStatus
 from physx_core.errors import ConfigError, DatasetError, UsageError
 
@@ -34,30 +34,20 @@ def test_refused_episodes_leave_stripes_as_they_are(dataset):
     assert stripes.begun == 0
 
 
-def test_parts_of_a_mode_keep_their_rows_when_earlier_episodes_come(dataset):
+def test_batches_keep_their_rows_when_earlier_episodes_come_or_replace_them(dataset):
     for number in range(10, 20):
         store(dataset, number, [number])
-    part = dataset.split("training", {"a": 0.5, "b": 0.5})["a"]
-    before = part["x"][:].tolist()
-    for number in range(5):
-        store(dataset, number, [number])
-    assert part["x"][:].tolist() == before
-    found = np.concatenate([batch["x"] for batch in part.batches(3, shuffle=False)])
-    assert found.tolist() == before
-    store(dataset, int(before[0]), [-1.0])
-    with pytest.raises(DatasetError, match="were replaced since the mode was split"):
-        part["x"][:]
-
-
-@pytest.mark.parametrize("order", ["exact", "blocks"])
-def test_parts_of_replaced_episodes_are_an_error_instead_of_an_endless_loop(dataset, order):
-    for number in range(10):
-        store(dataset, number, [number] * 3)
-    part = dataset.split("training", {"a": 0.5, "b": 0.5})["a"]
-    for number in range(10):
-        store(dataset, number, [number])
-    with pytest.raises(DatasetError):
-        list(part.batches(4, shuffle=True, order=order))
+    with View(fold=0).open(3, data=dataset) as batches:
+        before = [batch["x"].tolist() for batch in batches]
+        for number in range(5):
+            store(dataset, number, [number])
+        store(dataset, int(before[0][0]), [-1.0])
+        assert [batch["x"].tolist() for batch in batches] == before
+        with View(fold=0).open(3, data=dataset, snapshot=batches.snapshot) as again:
+            assert [batch["x"].tolist() for batch in again] == before
+        dataset.compact()
+        with pytest.raises(DatasetError, match="compacted"):
+            View(fold=0).open(3, data=dataset, snapshot=batches.snapshot)
 
 
 def test_iterating_gives_the_rows_that_were_there_at_first(dataset):

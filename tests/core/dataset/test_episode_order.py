@@ -19,12 +19,12 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from hypothesis.stateful import run_state_machine_as_test as run_machine
 from sizes import trials
 
-from physx_core import Dataset
+from physx_core import Dataset, View
 from physx_core.dataset import EPISODES, EpisodeRecord, EpisodeStatus
 from physx_core.dataset.read import shuffling
 from physx_core.dataset.read.access import disk, memory
 from physx_core.dataset.store import locks
-from physx_core.errors import UsageError
+from physx_core.errors import DatasetError, UsageError
 
 QUICK = settings(database=None, max_examples=2, stateful_step_count=30)
 FINISHED, FAILED, CUT, MORE = (
@@ -444,17 +444,22 @@ class Machine(RuleBasedStateMachine):
         for f in failed:
             assert f.reason in {f"of {f.campaign - shift}, {f.episode}" for shift in shifts}
 
-    @rule(by=st.sampled_from(["row", "episode"]), key=st.integers(0, 3))
-    def split(self, by, key):
+    @rule(fold=st.integers(0, 1), key=st.integers(0, 3))
+    def folds(self, fold, key):
         entries = [entry for entry in self.model.entries() if entry[3]]
-        whole = all(status is not None for _, _, status, _ in entries)
-        if len(entries) < 4 or (by == "episode" and not whole):
+        if len(entries) < 4 or any(status is None for _, _, status, _ in entries):
             return
-        parts = self.dataset.split(self.mode, {"a": 0.5, "b": 0.5}, by=by, seed=key)
-        found = {name: set(part["n"][:].tolist()) for name, part in parts.items()}
-        assert sorted(found["a"] | found["b"]) == sorted(self.model.rows())
-        for entry in entries if by == "episode" else ():
-            assert set(entry[3]) <= found["a"] or set(entry[3]) <= found["b"]
+        view, found = View(folds=2, fold=fold, fold_seed=key), {}
+        for part in ("training", "validation"):
+            try:
+                with view.open(3, data=self.dataset, mode=self.mode, part=part) as batches:
+                    found[part] = {n for batch in batches for n in batch["n"].tolist()}
+            except DatasetError:
+                found[part] = set()
+        both = found["training"] | found["validation"]
+        assert sorted(both) == sorted(self.model.rows())
+        for entry in entries:
+            assert set(entry[3]) <= found["training"] or set(entry[3]) <= found["validation"]
 
     @rule()
     def episodes(self):

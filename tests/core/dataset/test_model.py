@@ -26,9 +26,9 @@ from hypothesis.stateful import (
 )
 from sizes import trials
 
-from physx_core import Dataset, Field
+from physx_core import Dataset, Field, View
 from physx_core.dataset.read import reader as reading
-from physx_core.dataset.read import shuffling, splits
+from physx_core.dataset.read import shuffling
 from physx_core.dataset.read.access import disk, memory
 from physx_core.dataset.store.partition import segment
 from physx_core.errors import (
@@ -52,7 +52,7 @@ LONG = settings(QUICK, stateful_step_count=50)
 @pytest.fixture(autouse=True)
 def little_at_a_time(monkeypatch):
     """A few rows fill blocks and windows, and a few partitions all files that may be open."""
-    for module in (reading, segment, splits):
+    for module in (reading, segment):
         monkeypatch.setattr(module, "rows_per_block", lambda nbytes: max(1, 400 // max(1, nbytes)))
     monkeypatch.setattr(disk, "_OPEN_FILES", 2)
     monkeypatch.setattr(shuffling, "_CHUNK", 200)
@@ -270,7 +270,7 @@ class Machine(RuleBasedStateMachine):
         self.folder = self.root / "data"
         self.dataset = self.reader = None
         self.modes, self.views = {}, {}
-        self.iterations, self.subsets = [], []
+        self.iterations = []
         self.next_number, self.others, self.turn = 0, 0, 0
 
     def teardown(self):
@@ -482,7 +482,6 @@ class Machine(RuleBasedStateMachine):
         for name, numbers in model.numbers.items():
             model.numbers[name] = np.delete(numbers, slice(first, first + part.rows))
         self.iterations = [each for each in self.iterations if each.mode != mode]
-        self.subsets = [each for each in self.subsets if each.mode != mode]
         self.removed = True
 
     @SELDOM
@@ -509,7 +508,7 @@ class Machine(RuleBasedStateMachine):
         for model in self.modes.values():
             model.open = False
         self.views = dict.fromkeys(self.views)
-        self.iterations, self.subsets = [], []
+        self.iterations = []
 
     # Reading ------------------------------------------------------------------------------------
 
@@ -705,65 +704,43 @@ class Machine(RuleBasedStateMachine):
             one_of(found, model.fields[name], several, iteration.dtype if floating else None)
         iteration.done += len(rows)
 
-    @rule(mode=KNOWN, share=st.integers(1, 9), by=st.sampled_from(["row", "episode"]),
-          key=st.integers(0, 3))  # fmt: skip
-    def split(self, mode, share, by, key):
+    @rule(mode=KNOWN)
+    def trajectories(self, mode):
         mode = self.known(mode)
         self.committed()
         model = self.modes[mode]
-        shares = {"a": share / 10, "b": 1 - share / 10}
-        if by == "episode" and "step" not in model.fields:
+        if "step" not in model.fields:
             with pytest.raises(DatasetError, match="trajectories"):
-                self.dataset.split(mode, shares, by=by)
+                self.dataset.episodes(mode)
             return
-        try:
-            parts = self.dataset.split(mode, shares, by=by, seed=key)
-        except ConfigError:
-            episodes = len(episodes_of(model)) if by == "episode" else 0
-            assert episodes < 2 and (by == "episode" or round(share / 10 * model.rows) in (
-                0, model.rows
-            ))  # fmt: skip
-            return
-        if by == "episode":
-            found = self.dataset.episodes(mode)
-            expected = episodes_of(model)
-            assert [(e.env_id, e.episode, e.rows.tolist()) for e in found] == expected
-        again = self.dataset.split(mode, shares, by=by, seed=key)
-        together = np.concatenate([part.rows for part in parts.values()])
-        assert sorted(together.tolist()) == list(range(model.rows))
-        for name, part in parts.items():
-            assert part.rows.tolist() == again[name].rows.tolist() == sorted(part.rows.tolist())
-            if by == "episode":
-                mine = set(part.rows.tolist())
-                for _, _, rows in episodes_of(model):
-                    assert mine.issuperset(rows) or mine.isdisjoint(rows)
-        if by == "row":
-            assert parts["a"].num_samples == round(share / 10 * model.rows)
-        self.subsets = [*self.subsets[-3:], *parts.values()]
+        found = self.dataset.episodes(mode)
+        expected = episodes_of(model)
+        assert [(e.env_id, e.episode, e.rows.tolist()) for e in found] == expected
 
-    @precondition(lambda self: self.subsets)
-    @rule(which=st.integers(0, 5), count=st.integers(1, 20), how=HOW,
-          shuffle=st.booleans(), index=INDEXES, free=st.sampled_from([None, 0]))  # fmt: skip
-    def read_subset(self, which, count, how, shuffle, index, free):
-        subset = self.subsets[which % len(self.subsets)]
-        model = self.modes[subset.mode]
-        index = index_of(index, len(subset.rows))
-        for name in model.fields:
-            expected = model.values(name)[subset.rows]
-            assert subset[name].shape == expected.shape
-            np.testing.assert_array_equal(subset[name][index], expected[index])
-        with memory_of(free):
-            batches = subset.batches(count, shuffle=shuffle, seed=1, order=how)
-            found = [{n: block.copy() for n, block in batch.items()} for batch in batches]
-        rows = {name: np.concatenate([b[name] for b in found]) for name in model.fields}
-        place = {number: row for row, number in enumerate(model.numbers["n"].tolist())}
-        order = np.array([place[number] for number in rows["n"].tolist()])
-        assert sorted(order.tolist()) == subset.rows.tolist()
-        assert shuffle or order.tolist() == subset.rows.tolist()
-        self.check_rows(model, rows, order, None, False)
-        part = Mode(model.fields)
-        part.numbers = {name: n[subset.rows] for name, n in model.numbers.items()}
-        check_statistics(subset.normalization(), part)
+    @rule(mode=KNOWN, part=st.sampled_from(["training", "validation"]), count=st.integers(1, 20),
+          seed=st.integers(0, 3), free=st.sampled_from([None, 0]))  # fmt: skip
+    def folds(self, mode, part, count, seed, free):
+        """The rows of two folds are all rows, each in one of them."""
+        mode = self.known(mode)
+        self.committed()
+        model, found = self.modes[mode], []
+        for fold in (0, 1):
+            view = View(folds=2, fold=fold, fold_seed=seed, order="stored")
+            try:
+                with (
+                    memory_of(free),
+                    view.open(count, data=self.dataset, mode=mode, part=part) as batches,
+                ):
+                    found.append(np.concatenate([batch["n"].copy() for batch in batches]))
+                    place = [self.place(model, n) for n in found[-1].tolist()]
+                    assert sorted(place) == batches.all_rows().tolist()
+            except DatasetError as error:
+                assert "nothing to read" in str(error)
+                found.append(np.zeros(0))
+        assert sorted(np.concatenate(found).tolist()) == sorted(model.numbers["n"].tolist())
+
+    def place(self, model, number):
+        return model.numbers["n"].tolist().index(number)
 
     # A reader beside the writer -----------------------------------------------------------------
 
@@ -879,7 +856,6 @@ class Machine(RuleBasedStateMachine):
         yield IndexError, lambda: d[mode]["n"][np.array([total])]
         yield IndexError, lambda: d[mode]["n"][0, 0]
         yield ConfigError, lambda: d.batches(mode, 0)
-        yield ConfigError, lambda: d.split(mode, {"a": 1.5})
         yield ConfigError, lambda: d.update_info(wrong=object())
         yield ConfigError, lambda: d.append("no identifier", rows)
         yield NotFiniteError, lambda: d.append("unknown", {"x": [np.nan]})

@@ -413,8 +413,11 @@ def test_rows_that_come_between_change_nothing_with_a_snapshot(tmp_path):
         dataset.append_episodes("training", rows, [record(5)])
     with view.open(4, data=tmp_path, snapshot=snapshot) as again:
         assert all(equal(*pair) for pair in zip(again, whole, strict=True))
-    with pytest.raises(DatasetError, match="missing"):
-        view.open(4, data=tmp_path, snapshot={str(tmp_path): (900, 90)})
+    for lost in ((900, 90, 0), (6, 1, 0), (6, 0, 0)):
+        with pytest.raises(DatasetError, match="no longer there as they were"):
+            view.open(4, data=tmp_path, snapshot={"": lost})
+    with pytest.raises(ConfigError, match="no rows of the source"):
+        view.open(4, data=tmp_path, snapshot={"elsewhere": snapshot[""]})
 
 
 @pytest.mark.processes

@@ -12,7 +12,6 @@ from .read.mode_rows import ModeRows as ModeRows
 from .read.mode_rows import Snapshot as Snapshot
 from .read.order.records import RecordedEpisodes as RecordedEpisodes
 from .read.progress import Progress as Progress
-from .read.splits import Subset as Subset
 from .read.views import ModeView as ModeView
 from .repair.recovery import holds_dataset as holds_dataset
 from .store.episode_record import EpisodeRecord as EpisodeRecord

@@ -18,7 +18,6 @@ from physx_core.dataset.read.ordered_statistics import compute_in_order, store_i
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.sampling import BatchOptions, BatchReader
 from physx_core.dataset.read.shuffling import OrderName, choose_order
-from physx_core.dataset.read.splits import Subset, split
 from physx_core.dataset.read.views import ModeView, row_numbers
 from physx_core.dataset.repair import recovery, repair
 from physx_core.dataset.repair.report import find_problems, summarize
@@ -284,25 +283,6 @@ class Dataset(EpisodeReading, Closeable):
     def is_written(self) -> bool:
         """Whether another process is writing to it as its only writer."""
         return self._appender is None and locks.is_written(self.directory)
-
-    def split(
-        self, mode: str, shares: Mapping[str, float], *, by: str = "row", seed: int = 0
-    ) -> dict[str, Subset]:
-        """Split the current samples of a mode into parts without copying them.
-
-        Args:
-            mode: Name of the mode.
-            shares: Name of each part to its share. Shares add up to at most 1; remaining samples
-                belong to no part.
-            by: ``row``: draw rows at random; ``episode``: draw whole trajectories, so that none
-                has rows in two parts.
-            seed: Seed of the draw; the same rows and seed give the same parts.
-
-        Raises:
-            DatasetError: If there is no such mode, or its trajectories are unknown.
-            ConfigError: If the shares are invalid, or a part would be empty.
-        """
-        return split(self[mode], self.num_samples(mode), shares, by, seed)
 
     @property
     def normalization(self) -> dict[str, Normalization]:

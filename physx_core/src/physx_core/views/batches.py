@@ -121,7 +121,8 @@ class Batches(Closeable):
         known: Snapshot | None = None
         if snapshot is not None:
             if (name or "") not in snapshot:
-                raise ConfigError(f"The snapshot does not have the source {name}.")
+                folder = dataset.directory
+                raise ConfigError(f"The snapshot has no rows of the source {name or folder}.")
             known = Snapshot(*snapshot[name or ""])
         return Source(self.view, dataset, self._mode, self.part, known)
 
@@ -216,6 +217,8 @@ class Batches(Closeable):
         epoch, place = divmod(int(number), len(self))
         start = place * self.batch_size
         stop = min(start + self.batch_size, self.num_items)
+        for source in self._sources:
+            source.rows.check()
         batch = self._new_batch(stop - start)
         if self._is_plain:
             self._begin(epoch).fill(start, batch)
@@ -242,6 +245,7 @@ class Batches(Closeable):
 
     def take(self, items: Index) -> Batch:
         """Return some of the items of a single source as a batch, whatever their order."""
+        self._only.rows.check()
         batch = self._allocate(len(items))
         self._fill(batch, self._only, np.arange(len(items)), items)
         return batch

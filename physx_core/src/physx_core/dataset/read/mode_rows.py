@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Any, NamedTuple
 
 import numpy as np
+from xxhash import xxh32_intdigest
 
 from physx_core.dataset.read.access.columns import ColumnCache
 from physx_core.dataset.read.epochs import Epoch, Stored, begin_epoch
 from physx_core.dataset.read.shuffling import ItemOrder
 from physx_core.dataset.store.episode_table import EPISODES, TABLE_FIELDS
+from physx_core.dataset.store.manifest import Partition
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
 from physx_core.typing import Array, Index
@@ -21,10 +24,12 @@ class Snapshot(NamedTuple):
     Attributes:
         rows: Number of rows.
         records: Number of records in the table of episodes about it; 0 if its rows have none.
+        digest: Digest of what these rows are, in the records or by their partitions.
     """
 
     rows: int
-    records: int = 0
+    records: int
+    digest: int
 
 
 class ModeRows:
@@ -48,21 +53,54 @@ class ModeRows:
             DatasetError: If there is no such mode, or rows of the snapshot are missing.
         """
         self.mode, self._columns, self._reader = mode, columns, columns.reader
+        self._numbering = self._reader.manifest.numbering
         orders = self._reader.orders
         if snapshot is None:
             self.order = self._reader.order(mode)
             records = 0 if self.order is None else orders.count(mode)
-            snapshot = Snapshot(self._reader.rows(mode), records)
+            rows = self._reader.rows(mode)
+            snapshot = Snapshot(rows, records, self._digest(rows, records))
         else:
             self._reader.mode(mode)
             self.order = orders.at(mode, snapshot.records) if snapshot.records else None
             rows = self._reader.stored_rows(mode) if self.order is None else self.order.rows
-            if rows < snapshot.rows:
+            known = self._digest(snapshot.rows, snapshot.records)
+            is_lost = bool(snapshot.records) and self.order is None
+            if is_lost or rows < snapshot.rows or known != snapshot.digest:
                 raise DatasetError(
-                    f"Of the {snapshot.rows} samples of mode {mode!r} that there were in "
-                    f"{self._reader.directory}, only {rows} are left."
+                    f'The {snapshot.rows} samples of mode "{mode}" that there were in '
+                    f"{self._reader.directory} are no longer there as they were: some were "
+                    "removed, or they were compacted."
                 )
         self.snapshot = snapshot
+
+    def check(self) -> None:
+        """Check that the rows are still there.
+
+        Raises:
+            DatasetError: If some were removed in this process, or compacted.
+        """
+        if self._reader.manifest.numbering != self._numbering:
+            raise DatasetError(
+                f'Samples of mode "{self.mode}" in {self._reader.directory} were removed, or '
+                "compacted, since the batches were opened: open them again."
+            )
+
+    def _digest(self, rows: int, records: int) -> int:
+        """Return the digest of the first rows, or of the first records."""
+        if records:
+            known = self._reader.orders.records(self.mode)
+            content = b"".join(column[:records].tobytes() for column in known)
+        else:
+            before = itertools.accumulate((p.rows for p in self._parts), initial=0)
+            keys = [part.key for part, start in zip(self._parts, before, strict=False)
+                    if start < rows]  # fmt: skip
+            content = repr(keys).encode()
+        return int(xxh32_intdigest(content))
+
+    @property
+    def _parts(self) -> list[Partition]:
+        return self._reader.mode(self.mode).with_rows
 
     @property
     def count(self) -> int:

@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import secrets
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import TypedDict
 
 import numpy as np
 from numpy.typing import DTypeLike
 
 from physx_core.dataset.read.access.columns import ColumnCache
-from physx_core.dataset.read.epochs import Epoch, begin_epoch
+from physx_core.dataset.read.epochs import Epoch
+from physx_core.dataset.read.mode_rows import ModeRows
 from physx_core.dataset.read.shuffling import (
     OrderName,
     check_order,
@@ -20,11 +21,11 @@ from physx_core.dataset.read.shuffling import (
 )
 from physx_core.errors import ConfigError, DatasetError
 from physx_core.statistics import Normalization
-from physx_core.typing import Batch, Index
+from physx_core.typing import Batch
 
 
 class BatchOptions(TypedDict, total=False):
-    """Options of `Dataset.batches`, where they are described, and of `Subset.batches`."""
+    """Options of `Dataset.batches`, where they are described."""
 
     shuffle: bool
     order: OrderName | None
@@ -38,14 +39,13 @@ class BatchOptions(TypedDict, total=False):
 
 
 class BatchReader:
-    """Iterator over the batches of a mode or of a subset of its rows; usable once."""
+    """Iterator over the batches of a mode; usable once."""
 
     def __init__(
         self,
         columns: ColumnCache,
         mode: str,
         batch_size: int,
-        subset: Index | None = None,
         *,
         shuffle: bool = False,
         order: OrderName | None = None,
@@ -57,7 +57,7 @@ class BatchReader:
         reuse: bool = False,
         normalize: bool | Mapping[str, Normalization] = False,
     ) -> None:
-        """Check the options, which are those of `Dataset.batches`; `subset` must be ascending.
+        """Check the options, which are those of `Dataset.batches`.
 
         Here, `normalize` is the normalization to use, by field, or False.
         """
@@ -74,7 +74,7 @@ class BatchReader:
         known = [reader.field(mode, name) for name in self._names]
         if not reader.rows(mode):
             raise DatasetError(f'Mode "{mode}" has no samples yet, so there are no batches.')
-        self._columns, self._mode, self._subset = columns, mode, subset
+        self._columns, self._mode = columns, mode
         self._size, self._epochs, self._first = batch_size, epochs, first
         self._order: OrderName | None = "stored" if not shuffle else order and check_order(order)
         self._key = key_of(secrets.randbits(64) if seed is None else seed)
@@ -92,14 +92,14 @@ class BatchReader:
 
     def __iter__(self) -> Iterator[Batch]:
         """Yield the batches of all epochs."""
-        size = self._size
-        number, skipped = divmod(self._first, -(-self._count // size))
+        size, first = self._size, ModeRows(self._columns, self._mode)
+        number, skipped = divmod(self._first, -(-first.count // size))
         while self._epochs is None or number < self._epochs:
-            count = self._count
-            epoch = self._begin(number, count)
+            rows = ModeRows(self._columns, self._mode)
+            epoch = self._begin(number, rows)
             try:
-                for start in range(skipped * size, count, size):
-                    batch = self._new_batch(size if start + size <= count else count - start)
+                for start in range(skipped * size, rows.count, size):
+                    batch = self._new_batch(min(size, rows.count - start))
                     epoch.fill(start, batch)
                     for name, mean, std in self._scales:
                         values = batch[name]
@@ -110,29 +110,10 @@ class BatchReader:
                 epoch.close()
             number, skipped = number + 1, 0
 
-    @property
-    def _count(self) -> int:
-        """Number of rows of an epoch that begins now."""
-        reader, subset = self._columns.reader, self._subset
-        return reader.rows(self._mode) if subset is None else len(subset)
-
-    def _begin(self, number: int, count: int) -> Epoch:
-        row_nbytes = self._columns.reader.row_nbytes(self._mode)
-        name = self._order or choose_order(count, row_nbytes)
-        order = make_order(name, count, row_nbytes, key_of(self._key, number))
-        return begin_epoch(
-            self._columns, self._mode, self._names, self._dtype, order, self._stored_rows()
-        )
-
-    def _stored_rows(self) -> Callable[[Index], Index] | None:
-        """Return the function that gives the stored rows of some rows; None: they are the same."""
-        order, subset = self._columns.reader.order(self._mode), self._subset
-        index = None if order is None or order.index is None else order
-        if subset is None:
-            return None if index is None else index.stored
-        if index is None:
-            return subset.__getitem__
-        return lambda rows: index.stored(subset[rows])
+    def _begin(self, number: int, rows: ModeRows) -> Epoch:
+        name = self._order or choose_order(rows.count, rows.row_nbytes)
+        order = make_order(name, rows.count, rows.row_nbytes, key_of(self._key, number))
+        return rows.epoch(self._names, self._dtype, order)
 
     def _new_batch(self, size: int) -> Batch:
         if self._buffers is None:

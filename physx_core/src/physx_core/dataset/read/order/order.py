@@ -148,16 +148,16 @@ class Orders:
         """Return the number of valid records of a mode so far; 0 if it has none."""
         return self._records[mode].count if mode in self._records else 0
 
-    def at(self, mode: str, records: int) -> Order:
-        """Return the order of a mode that has one, by the first of its records.
+    def at(self, mode: str, records: int) -> Order | None:
+        """Return the order of a mode by the first of its records; None: there are not so many.
 
         Raises:
-            DatasetError: If there are not so many, or the table of episodes is invalid.
+            DatasetError: If the table of episodes is invalid.
         """
         with self._lock:
             now = self._newest(mode)
             if self.count(mode) < records:
-                raise DatasetError(f'Records of the episodes of mode "{mode}" are missing.')
+                return None
             if now is not None and self.count(mode) == records and not self.until_gap:
                 return now
             fresh, known = GrowingRecords(), self._records[mode]

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from physx_core.statistics import Normalization
 from physx_core.typing import Batch, Index
 from physx_core.views.batches import Batches
 from physx_core.views.dataset_config import DatasetConfig
+from physx_core.views.folds import Part
 from physx_core.views.view import View
 
 _SHOWN = 64
@@ -100,20 +101,24 @@ class StoredBatches:
         fold = None if self._has_mode else config.view.fold
         self._view = replace(config.view, order=order, fold=fold)
 
-    def _open(self, mode: str, view: View, size: int, part: str = "training") -> Batches:
-        """Open the samples of a mode as they were at its snapshot, or are now."""
-        found = Batches(
+    def _open(self, mode: str, view: View, size: int, part: Part = "training") -> Batches:
+        """Open the samples of a mode as they were at its snapshot, or else are now."""
+        open_now = partial(
+            Batches,
             view,
             size,
             self._seed,
             data=None if view.sources else self.dataset,
             mode=mode,
-            part="validation" if part == "validation" else "training",
-            snapshot=self.snapshots.get(mode),
+            part=part,
             fields=self._names,
             dtype=self._data_type,
             reuse=True,
         )
+        try:
+            found = open_now(snapshot=self.snapshots.get(mode))
+        except DatasetError:  # samples were removed, as the training has said
+            found = open_now()
         self.snapshots[mode] = {name: list(each) for name, each in found.snapshot.items()}
         return found
 
