@@ -107,7 +107,7 @@ class Batches(Closeable):
         self._is_plain = len(self._sources) == 1 and not (view.windows or view.weights)
         self._epoch: tuple[int, Epoch] | None = None
         self._process = os.getpid()
-        self._passes: dict[tuple[int, int], ItemOrder] = {}
+        self._passes: dict[tuple[int, int, int], tuple[ItemOrder, int]] = {}
 
     def _open(
         self,
@@ -155,10 +155,12 @@ class Batches(Closeable):
     def _choose(self, names: Sequence[str] | None, dtype: DTypeLike | None, *, reuse: bool) -> None:
         """Choose what a batch contains."""
         self._names = list(names or self.view.windows or self._sources[0].rows.fields)
+        self._windows = {name: window_of(self.view, name) for name in self._names}
         self._dtype, self._reuse = None if dtype is None else np.dtype(dtype), reuse
         self.fields: dict[str, Field] = {}
         for name in self._names:
             self.fields |= self._described(name)
+        self._kinds = {n: field.converted_dtype(self._dtype) for n, field in self.fields.items()}
         self._buffers = self._allocate(self.batch_size) if reuse else None
 
     def reading(self, fields: Sequence[str]) -> Batches:
@@ -177,7 +179,7 @@ class Batches(Closeable):
 
     def _described(self, name: str) -> dict[str, Field]:
         """Return the fields of a window or stored field in a batch."""
-        window = window_of(self.view, name)
+        window = self._windows[name]
         first = self._sources[0]
         if window.field not in first.rows.fields:
             raise DatasetError(
@@ -219,13 +221,18 @@ class Batches(Closeable):
         stop = min(start + self.batch_size, self.num_items)
         for source in self._sources:
             source.rows.check()
-        batch = self._new_batch(stop - start)
         if self._is_plain:
+            batch = self._new_batch(stop - start)
             self._begin(epoch).fill(start, batch)
             return batch
-        for k, (slots, items) in enumerate(self._drawn(epoch, start, stop)):
-            if len(slots):
-                self._fill(batch, self._sources[k], slots, items)
+        if len(self._sources) == 1:
+            return self._values(self._sources[0], self._items(0, epoch, 0, start, stop))
+        batch = self._new_batch(stop - start)
+        for source, (slots, items) in zip(
+            self._sources, self._drawn(epoch, start, stop), strict=True
+        ):
+            for name, values in self._values(source, items).items() if len(slots) else ():
+                batch[name][slots] = values
         return batch
 
     def __iter__(self) -> Iterator[Batch]:
@@ -246,9 +253,7 @@ class Batches(Closeable):
     def take(self, items: Index) -> Batch:
         """Return some of the items of a single source as a batch, whatever their order."""
         self._only.rows.check()
-        batch = self._allocate(len(items))
-        self._fill(batch, self._only, np.arange(len(items)), items)
-        return batch
+        return self._values(self._only, items)
 
     @property
     def _only(self) -> Source:
@@ -273,23 +278,26 @@ class Batches(Closeable):
             epoch = source.rows.epoch(
                 list(self.fields),
                 self._dtype,
-                self._pass(0, number, 0),
+                self._pass(0, number, 0)[0],
                 None if items.is_plain else lambda chosen: items.rows(chosen)[:, 0],
             )
             self._epoch = number, epoch
         return self._epoch[1]
 
-    def _pass(self, source: int, epoch: int, repeat: int) -> ItemOrder:
-        """Return the order of a pass over a source, one of several in an epoch."""
-        key = self._key(source, epoch, repeat)
-        if (source, key) not in self._passes:
-            kept = [each for each in self._passes if each[0] == source][-1:]
-            others = {k: v for k, v in self._passes.items() if k[0] != source or k in kept}
-            self._passes = {**others, (source, key): self._sources[source].pass_order(key)}
-        return self._passes[source, key]
+    def _pass(self, source: int, epoch: int, repeat: int) -> tuple[ItemOrder, int]:
+        """Return the order of a pass over a source, one of several in an epoch, and its key."""
+        which = source, epoch, repeat
+        if which not in self._passes:
+            key = key_of(self.seed, epoch, source, repeat)
+            last = [each for each in self._passes if each[0] == source][-1:]
+            others = {k: v for k, v in self._passes.items() if k[0] != source or k in last}
+            self._passes = {**others, which: (self._sources[source].pass_order(key), key)}
+        return self._passes[which]
 
-    def _key(self, source: int, epoch: int, repeat: int) -> int:
-        return key_of(self.seed, epoch, source, repeat)
+    def _items(self, source: int, epoch: int, repeat: int, start: int, stop: int) -> Index:
+        """Return the items at some positions of a pass."""
+        order, key = self._pass(source, epoch, repeat)
+        return self._sources[source].drawn(order.items(start, stop), key)
 
     def _drawn(self, epoch: int, start: int, stop: int) -> list[tuple[Index, Index]]:
         """Return for each source which places of a batch it fills, and with which items."""
@@ -303,21 +311,23 @@ class Batches(Closeable):
             for repeat in np.unique(positions // source.count).tolist():
                 here = positions // source.count == repeat
                 inside = positions[here] - repeat * source.count
-                order, key = self._pass(k, epoch, repeat), self._key(k, epoch, repeat)
                 first = int(inside[0])
-                drawn = order.items(first, int(inside[-1]) + 1)[inside - first]
-                items[here] = source.drawn(drawn, key)
+                drawn = self._items(k, epoch, repeat, first, int(inside[-1]) + 1)
+                items[here] = drawn[inside - first]
             found.append((mine, items))
         return found
 
-    def _fill(self, batch: Batch, source: Source, slots: Index, items: Index) -> None:
-        for name in self._names:
-            window = window_of(self.view, name)
+    def _values(self, source: Source, items: Index) -> Batch:
+        """Return what a batch contains of some items of a source."""
+        found: Batch = {}
+        for name, window in self._windows.items():
             values = source.gather(window.field, items, window.at)
-            batch[name][slots] = values[:, 0] if window.is_single else values
-            if name + _PAD in batch:
+            values = values[:, 0] if window.is_single else values
+            found[name] = values.astype(self._kinds[name], copy=False)
+            if name + _PAD in self.fields:
                 padded = source.items.are_padded(items, window.at)
-                batch[name + _PAD][slots] = padded[:, 0] if window.is_single else padded
+                found[name + _PAD] = padded[:, 0] if window.is_single else padded
+        return found
 
     def _new_batch(self, size: int) -> Batch:
         if self._buffers is None:
@@ -328,7 +338,7 @@ class Batches(Closeable):
 
     def _allocate(self, size: int) -> Batch:
         return {
-            name: np.empty((size, *(field.shape or ())), field.converted_dtype(self._dtype))
+            name: np.empty((size, *(field.shape or ())), self._kinds[name])
             for name, field in self.fields.items()
         }
 
@@ -349,7 +359,7 @@ class Batches(Closeable):
         found = {}
         for name, field in self.fields.items():
             if has_statistics(field) and not name.endswith(_PAD):
-                window = window_of(self.view, name)
+                window = self._windows[name]
                 found[name] = _repeated(self._statistics(window.field), field.shape or ())
         return found
 

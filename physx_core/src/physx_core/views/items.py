@@ -59,6 +59,14 @@ class Items:
         found = self._found.places
         return places if found is None else found[places]
 
+    def first_rows(self, items: Index, offsets: Sequence[int]) -> Index | None:
+        """Return the first row of each window; None if its rows do not follow one another."""
+        is_run = list(offsets) == list(range(offsets[0], offsets[0] + len(offsets)))
+        if self._pads or self._found.places is not None or not is_run:
+            return None
+        start, _, place = self._locate(items)
+        return start + place + offsets[0]
+
     def are_padded(self, items: Index, offsets: Sequence[int]) -> Flags:
         """Return whether the values of items at some offsets are repeated, as `rows`."""
         _, size, place = self._locate(items)

@@ -163,6 +163,9 @@ class Source:
 
     def gather(self, name: str, items: Index, offsets: Sequence[int]) -> Array:
         """Return a stored field of items at some offsets, shape (items, offsets, *field shape)."""
+        first = self.items.first_rows(items, offsets)
+        if first is not None:
+            return self.rows.windows(name, first, len(offsets))
         rows = self.items.rows(items, offsets)
         found = self.rows.gather(name, rows.ravel())
         return found.reshape(*rows.shape, *found.shape[1:])

@@ -74,7 +74,8 @@ def find_trajectories(known: ModeRows) -> Trajectories:
         streams = stream[first]
         number = np.where(streams, np.cumsum(streams) - 1, columns["episode"][first])
         campaign = np.where(streams, -1, columns["campaign"][first])
-        return Trajectories(campaign, number, begins, rows, places)
+        is_plain = bool((np.diff(places) == 1).all())  # of one instance
+        return Trajectories(campaign, number, begins, rows, None if is_plain else places)
     found = order.episodes
     has_rows = (found.rows > 0) & (found.first < total)
     each = np.where(found.numbers > 1, found.rows, 1)[has_rows]

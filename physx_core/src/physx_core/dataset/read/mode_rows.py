@@ -149,6 +149,20 @@ class ModeRows:
         column.gather(rows if stored is None else stored(rows), out)
         return out
 
+    def windows(self, name: str, first: Index, count: int) -> Array:
+        """Return consecutive rows of a field from some rows on, shape (n, count, *field shape)."""
+        stored, begin = self.stored, first
+        if stored is not None:
+            begin = stored(first)
+            if (
+                stored(first + (count - 1)) - begin != count - 1
+            ).any():  # episodes in several parts
+                found = self.gather(name, (first[:, None] + np.arange(count)).ravel())
+                return found.reshape(len(first), count, *found.shape[1:])
+        column = self._columns.map(self.mode, name)
+        column.check()
+        return column.windows(begin, count)
+
     def read(self, name: str) -> Array:
         """Return all rows of a field."""
         if self.stored is None:

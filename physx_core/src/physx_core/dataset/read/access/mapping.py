@@ -70,6 +70,26 @@ class MappedColumn:
             index = self._slots[numbers] + places
         self._array.take(index, 0, out, "clip")
 
+    def windows(self, first: Index, count: int) -> Array:
+        """Return consecutive rows from each of some rows on, shape (n, count, *field shape)."""
+        numbers, places = self._index.locate(first)
+        ends, _ = self._index.locate(first + (count - 1))
+        begins = self._slots[numbers] + places
+        array, size = self._array, self._row_nbytes
+        if not size or len(array) < count:
+            return np.empty((len(first), count, *array.shape[1:]), array.dtype)
+        run = np.dtype((np.void, count * size))  # gathered in one piece, at any row
+        runs = np.ndarray((len(array) - count + 1,), run, array.data, 0, (size,))
+        found: Array = runs[np.minimum(begins, len(runs) - 1)].view(array.dtype)
+        found = found.reshape(len(first), count, *array.shape[1:])
+        apart = np.flatnonzero(numbers != ends)
+        if len(apart):
+            rows = first[apart, None] + np.arange(count)
+            several = np.empty((rows.size, *array.shape[1:]), array.dtype)
+            self.gather(rows.ravel(), several)
+            found[apart] = several.reshape(len(apart), *found.shape[1:])
+        return found
+
     def check(self) -> None:
         """Check that no file was truncated: the system kills a process that reads past the end."""
         for part in self._mapped:
