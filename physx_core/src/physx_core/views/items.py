@@ -34,7 +34,7 @@ class Items:
         if self._pads:
             low = high = 0
         is_single = low == high == 0 and not view.windows
-        if is_single and view.stride == 1 and found.places is None:
+        if is_single and view.stride == 1 and found.places is None and not view.weights:
             found = _joined(found)
         self._stride, self._low, self._found = view.stride, low, found
         room = np.maximum(0, found.rows - (high - low))
