@@ -84,7 +84,13 @@ class Recorder:
                     self._parts.pop((mode, campaign, episode), None)
 
     def append(
-        self, mode: str, rows: Batch, count: int, episodes: Sequence[EpisodeRecord], table: Batch
+        self,
+        mode: str,
+        rows: Batch,
+        count: int,
+        episodes: Sequence[EpisodeRecord],
+        table: Batch,
+        first: int | None = None,
     ) -> None:
         """Store rows and then the records that commit them.
 
@@ -94,16 +100,17 @@ class Recorder:
             count: Number of rows.
             episodes: The records.
             table: Their rows in the table, checked, but for the first rows.
+            first: Address of the rows if another process has written them.
         """
-        self._end_stream(mode)
-        first = 0
-        if count:
+        self.end_stream(mode)
+        if count and first is None:
             self.recorded.discard(mode)
             try:
                 self._writer.append(mode, rows, count)
             finally:
                 self.recorded.add(mode)
             first = _first_of_last(self.manifest.modes[mode], count)
+        if count:
             table["first_row"] = first + np.cumsum(table["rows"]) - table["rows"]
         self.store_reasons(
             FailedEpisode(mode, each.campaign, each.episode, each.reason)
@@ -111,6 +118,7 @@ class Recorder:
             if each.status is EpisodeStatus.FAILED
         )
         self._writer.append(EPISODES, table, len(table["rows"]))
+        first = first or 0
         for each in episodes:
             self._note(mode, each.campaign, each.episode, first, each.rows, each.part, each.status)
             first += each.rows
@@ -151,7 +159,7 @@ class Recorder:
                 "rows: open it without shared=True."
             )
         known = self.manifest.modes[mode]
-        first = max(Addresses(known).end, known.recorded)
+        first = max(Addresses(known).end, known.taken)
         self._store_stream(mode, self._campaigns[mode] + 1, first, OPEN)
 
     @property
@@ -181,7 +189,7 @@ class Recorder:
         end = 0 if known is None else Addresses(known).end
         return campaign, first, max(0, end - first)
 
-    def _end_stream(self, mode: str) -> None:
+    def end_stream(self, mode: str) -> None:
         """Let the next rows of a mode count only with a record."""
         if (stream := self.ended_stream(mode)) is not None:
             self._store_stream(mode, *stream)
@@ -201,7 +209,7 @@ class Recorder:
         known = self.manifest.modes.get(mode)
         is_open = status == EpisodeStatus.STREAM and rows == OPEN
         if known is not None:
-            known.recorded = max(known.recorded, first + (0 if is_open else rows))
+            known.taken = max(known.taken, first + (0 if is_open else rows))
         if status == EpisodeStatus.STREAM:
             self._streams.pop(mode, None)
             self.recorded.add(mode)

@@ -74,11 +74,7 @@ class DiskColumn:
         """Copy consecutive rows into a contiguous array, shape (rows, *field shape)."""
         rows = self._target(out)
         for number, first, _, where in self._parts(start, len(rows)):
-            target = rows[where]
-            part = target if where.step == 1 else np.empty(target.shape, target.dtype)
-            self._read(number, first, files.as_bytes(part))
-            if part is not target:
-                target[...] = part
+            self._read(number, first, files.as_bytes(rows[where]))
         if rows is not out:
             out[...] = rows
 
@@ -112,9 +108,9 @@ class DiskColumn:
             return
         number, place, follow = self._index.find(start)
         if count <= follow:
-            yield number, place, count, builtins.slice(0, count, 1)
+            yield number, place, count, builtins.slice(0, count)
             return
-        number, stop = number - self._segments[number].span.place, start + count
+        stop = start + count
         while number < len(self._segments) and self._segments[number].span.start < stop:
             span = self._segments[number].span
             first, part = span.inside(start, stop)
