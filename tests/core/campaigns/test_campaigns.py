@@ -419,11 +419,6 @@ def test_modes_have_campaigns_of_their_own():
     assert numbers("run", "validation")[0] == list(range(6))
 
 
-def test_clients_cannot_write_episodes_themselves():
-    with pytest.raises(PhysxError):
-        generate("run", 3, clients=2, dataset_config=DatasetConfig(writers="clients"))
-
-
 def test_environment_that_cannot_be_created_ends_the_run():
     config = EnvironmentConfig(TROUBLED, env_kwargs={"unknown": 1}, seed=1, num_clients=2)
     with pytest.raises(PhysxError, match="unknown") as caught:

@@ -274,9 +274,6 @@ def test_streams_have_none():
     made = dataclasses.replace(config(), independent_episodes=False)
     with pytest.raises(ConfigError, match="Leave out independent_episodes=False"):
         generate(made, batch_nb=1, batch_size=2)
-    with pytest.raises(ConfigError, match="writers='clients'"):
-        generate(config(clients=1), batch_nb=1, batch_size=2,
-                 dataset_config=DatasetConfig(writers="clients"))  # fmt: skip
 
 
 def test_names_of_the_record_are_taken():
