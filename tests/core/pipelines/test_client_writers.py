@@ -23,7 +23,7 @@ from physx_core import (
     NetworkConfig,
     Training,
 )
-from physx_core.dataset import EPISODES
+from physx_core.dataset import EPISODES, EpisodeStatus
 from physx_core.errors import (
     ConfigError,
     DatasetError,
@@ -62,11 +62,12 @@ def contents(folder):
         assert dataset.verify() == []
         for mode in (mode for mode in COUNTED if mode in dataset):
             known = dataset.recorded_episodes(mode)
-            ended = np.arange(len(known.episode))
+            is_cut = known.status == EpisodeStatus.CUT  # how many are, beyond the rows, is chance
+            ended = np.flatnonzero((known.rows > 0) | ~is_cut)
             values = dataset.recorded_values(mode, ended)
             found[mode] = (
                 {name: view[:].tobytes() for name, view in dataset[mode].items()},
-                [column.tolist() for column in known],
+                [column[ended].tolist() for column in known],
                 {name: np.asarray(each).tobytes() for name, each in values.items()},
                 {
                     name: [array.tobytes() for array in (each.mean, each.std)]
@@ -85,7 +86,9 @@ def contents(folder):
     [
         FEW,
         {"batch_nb": 3, "batch_size": 41},
-        pytest.param({"batch_nb": 1, "batch_size": 1, "mode": "validation"}, marks=pytest.mark.slow),
+        pytest.param(
+            {"batch_nb": 1, "batch_size": 1, "mode": "validation"}, marks=pytest.mark.slow
+        ),
     ],
 )
 @pytest.mark.parametrize("clients", [pytest.param(1, marks=pytest.mark.slow), 3])
@@ -141,7 +144,7 @@ def test_client_writers_killed_at_random_moments(process_ids):
     chance, ended = random.Random(seed()), threading.Event()
 
     def kill():
-        while not ended.wait(0.2 + 0.3 * chance.random()):
+        while not ended.wait(0.5 + 0.5 * chance.random()):
             alive = list(process_ids().values())
             if alive:
                 os.kill(chance.choice(alive), signal.SIGKILL)
@@ -150,7 +153,9 @@ def test_client_writers_killed_at_random_moments(process_ids):
     killer.start()
     threading.Timer(6.0, ended.set).start()
     try:
-        folder = generate("clients", env_kwargs={"delay": 0.02}, num_clients=3, options=options)
+        folder = generate(
+            "clients", env_kwargs={"delay": 0.02}, num_clients=3, min_clients=1, options=options
+        )
     finally:
         ended.set()
         killer.join()
@@ -192,7 +197,7 @@ def test_full_disk_of_client_writers_keeps_committed_rows(small_disk):
         pytest.raises(DatasetError, match="the disk is full"),
         DataGeneration(
             EnvironmentConfig(f"{PROGRAM}:Large", num_clients=2, seed=3),
-            DatasetConfig(writers="clients", max_file_size=1e-3),
+            DatasetConfig(writers="clients", max_file_size=2e-4),
             episodes=1000,
             session_dir=str(small_disk),
             session_name="full",
@@ -203,7 +208,8 @@ def test_full_disk_of_client_writers_keeps_committed_rows(small_disk):
     with Dataset.open(small_disk / "full") as dataset:
         known = dataset.recorded_episodes("training")
         assert known.rows.sum() == dataset.num_samples("training") > 50
-        wanted = np.repeat(known.episode, known.rows) + np.tile(np.arange(10) / 100, len(known.rows))
+        first = np.repeat(known.episode, known.rows)
+        wanted = first + np.arange(len(first)) % 10 / 100
         np.testing.assert_array_equal(dataset["training"]["x"][:][:, -1], wanted)
         assert dataset.verify() == []
 
@@ -280,9 +286,9 @@ def test_dataset_is_locked_while_clients_write():
             with pytest.raises(UsageError, match="Other processes write"):
                 self.dataset.append("training", rows)
             with pytest.raises(UsageError, match="Other processes write"):
-                self.dataset.update("training", 0, rows)
+                self.dataset.update("training", 0, {"n": 1})
             with pytest.raises(UsageError, match="Other processes write"):
-                self.dataset.merge(generate("other", options={"episodes": 3}))
+                self.dataset.remove_partition("training", 0)
             with Dataset.open(self.session.path) as reader:
                 count = reader.num_samples("training")
                 seen = reader["training"]["episode"][:].tolist()

@@ -68,6 +68,9 @@ class Walks(Environment):
 class Stream(Environment):
     """A stream."""
 
+    def create(self):
+        pass
+
     def init_database(self):
         self.define_training_fields(("n", int))
 
@@ -80,6 +83,9 @@ class Large(Environment):
 
     episode_steps = 10
 
+    def create(self):
+        pass
+
     def init_database(self):
         self.define_training_fields(Field("x", shape=(5000,)))
 
@@ -87,6 +93,7 @@ class Large(Environment):
         pass
 
     def step(self):
+        time.sleep(2e-3)  # else a block of rows fills the disk
         self.set_training_data(x=np.full(5000, self.episode_index + self.step_index / 100))
 
 

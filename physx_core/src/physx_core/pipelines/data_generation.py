@@ -168,7 +168,7 @@ class DataGeneration(NewSessionPipeline):
 
     def _cut(self, kind: type[BaseException] | None, *_: object) -> None:
         """Leave out what the last episodes have more than the batches, when the run is closed."""
-        if kind is None and self._writer is not None:
+        if kind is None and self._writer is not None and self.episodes is None:
             rows = self._first_row + self.batch_id * (self.batch_size or 0)
             self._writer.cut(max(rows, self._former_rows))
 
@@ -289,6 +289,7 @@ class DataGeneration(NewSessionPipeline):
             self._writer = self._make_writer(campaign)
             if self._writer.queue.is_done and self.episodes is not None:
                 return
+        resources.push(self._cut)  # once the environments are closed
         by_clients = dataset_config.writers == "clients"
         delegation = self.dataset.delegate(self._mode) if by_clients else None
         total = None if self.episodes is not None else self._amount()[0]
@@ -303,8 +304,6 @@ class DataGeneration(NewSessionPipeline):
         if self._writer is not None:
             self._describe()
             self._writer.open(self.source, delegation)
-            if self.episodes is None:
-                resources.push(self._cut)
         else:
             if delegation is not None:
                 reject_streams_of_writers(describe_environment_config(config))
