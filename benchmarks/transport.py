@@ -29,7 +29,7 @@ from cores import on_core, two_cores
 from measure import claim, finish, rates, report
 from raw_tcp import raw_answers, raw_blocks, raw_client, raw_stream
 from transport_costs import print_costs
-from transport_environments import Asking, Rows, Sleeping, Working, compute
+from transport_environments import Asking, Episodes, Rows, Sleeping, Working, compute
 
 from physx_core import (
     DataGeneration,
@@ -321,7 +321,7 @@ def generation_by_clients(root: Path) -> bool:
 
     def of(writers: str) -> Work:
         dataset = DatasetConfig(writers=writers, max_file_size=0.05)
-        return lambda: generation(root, Rows, {"values": values}, rows, 48, 2, dataset)
+        return lambda: generation(root, Episodes, {"values": values}, rows, 48, 2, dataset)
 
     candidates = {"through the server": of("server"), "written by clients": of("clients")}
     print("Generation of 480 kB samples with 2 clients, to one disk")
