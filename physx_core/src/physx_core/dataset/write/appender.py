@@ -97,7 +97,7 @@ class Appender:
         total = sum(each.rows for each in episodes)
         if first_row is not None:
             self._check_written(mode, first_row, total)
-        elif rows:
+        elif total:
             self.writer.check_alone([mode])
         recorder.check(mode, episodes)
         table = self._check_table(mode, episodes, episode_fields) if episodes else {}
