@@ -84,7 +84,7 @@ class WrittenRows:
             "first_row": entry.first_row,
             "capacity": share.capacity,
         }
-        peer.send(pack(Kind.PARTITION, encode(plain)))
+        peer.send_once(pack(Kind.PARTITION, encode(plain)))
 
     def _take_sealed(self, peer: Peer, frame: Frame) -> None:
         checksums, share = decode(frame.payload), self._shares.get(peer)
