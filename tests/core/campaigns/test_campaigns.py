@@ -17,7 +17,7 @@ import pytest
 import sizes
 from campaigns import TROUBLED, rows_of
 
-from physx_core import DataGeneration, Dataset, DatasetConfig, EnvironmentConfig
+from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.cli import main
 from physx_core.dataset import EpisodeStatus
 from physx_core.errors import (

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from campaigns import stream
 
-from physx_core import DataGeneration, Dataset, DatasetConfig, EnvironmentConfig
+from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.cli import main
 from physx_core.dataset import EPISODES, EpisodeStatus
 from physx_core.errors import ConfigError, DependentEpisodeError, FieldsMismatchError, UsageError

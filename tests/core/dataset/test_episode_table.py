@@ -2,7 +2,6 @@
 
 import os
 import shutil
-from dataclasses import replace
 
 import h5py
 import numpy as np

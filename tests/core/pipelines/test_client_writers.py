@@ -1,4 +1,4 @@
-"""DataGeneration whose clients write their rows: the dataset of ``writers="server"``, bit for bit."""
+"""DataGeneration whose clients write their rows: the dataset of the server, bit for bit."""
 
 from __future__ import annotations
 
@@ -119,9 +119,9 @@ def test_rows_of_client_writers_can_be_compacted_merged_and_extended(tmp_path):
 
 def test_commands_take_them():
     command = [sys.executable, "-m", "physx_core"]
-    words = ["generate", WALKS, "--environment.num-clients", "2", "--environment.seed", "3"]
-    words += ["--episodes", "30", "--dataset.writers", "clients", "--session-name", "a"]
-    for words in (words, ["info", "sessions/a"], ["verify", "sessions/a"]):
+    made = ["generate", WALKS, "--environment.num-clients", "2", "--environment.seed", "3"]
+    made += ["--episodes", "30", "--dataset.writers", "clients", "--session-name", "a"]
+    for words in (made, ["info", "sessions/a"], ["verify", "sessions/a"]):
         done = subprocess.run([*command, *words], capture_output=True, text=True)
         assert not done.returncode, done.stderr
     wanted = contents(generate("b", "server", record_wrong_samples=False))

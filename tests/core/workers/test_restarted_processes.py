@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from physx_core import DataGeneration, Dataset, DatasetConfig, EnvironmentConfig
+from physx_core import DataGeneration, Dataset, EnvironmentConfig
 
 pytestmark = pytest.mark.processes
 
