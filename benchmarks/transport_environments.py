@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from physx_core import Environment, Field
+from physx_core import Environment, Field, Parameter
 
 
 class Rows(Environment):
@@ -29,6 +29,20 @@ class Rows(Environment):
     def step(self) -> None:
         """Set the arrays."""
         self.set_training_data(x=self.x, y=self.y)
+
+
+class Episodes(Rows):
+    """The same in independent episodes with a parameter."""
+
+    episode_steps = 10
+
+    def create(self) -> None:
+        """Define the parameter."""
+        self.define_parameters(Parameter("mass", 1, 2))
+
+    def reset_parameters(self, mass: float) -> None:
+        """Set the parameter."""
+        self.x[0] = mass
 
 
 class Asking(Rows):

@@ -17,7 +17,7 @@ import pytest
 import sizes
 from campaigns import TROUBLED, rows_of
 
-from physx_core import DataGeneration, Dataset, DatasetConfig, EnvironmentConfig
+from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.cli import main
 from physx_core.dataset import EpisodeStatus
 from physx_core.errors import (
@@ -417,11 +417,6 @@ def test_modes_have_campaigns_of_their_own():
     generate("run", 6, mode="validation", resume=True)
     assert numbers("run")[0] == list(range(5))
     assert numbers("run", "validation")[0] == list(range(6))
-
-
-def test_clients_cannot_write_episodes_themselves():
-    with pytest.raises(PhysxError):
-        generate("run", 3, clients=2, dataset_config=DatasetConfig(writers="clients"))
 
 
 def test_environment_that_cannot_be_created_ends_the_run():

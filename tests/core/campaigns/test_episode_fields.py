@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from campaigns import stream
 
-from physx_core import DataGeneration, Dataset, DatasetConfig, EnvironmentConfig
+from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.cli import main
 from physx_core.dataset import EPISODES, EpisodeStatus
 from physx_core.errors import ConfigError, DependentEpisodeError, FieldsMismatchError, UsageError
@@ -274,9 +274,6 @@ def test_streams_have_none():
     made = dataclasses.replace(config(), independent_episodes=False)
     with pytest.raises(ConfigError, match="Leave out independent_episodes=False"):
         generate(made, batch_nb=1, batch_size=2)
-    with pytest.raises(ConfigError, match="writers='clients'"):
-        generate(config(clients=1), batch_nb=1, batch_size=2,
-                 dataset_config=DatasetConfig(writers="clients"))  # fmt: skip
 
 
 def test_names_of_the_record_are_taken():

@@ -2,19 +2,23 @@
 
 import itertools
 import random
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from powercut.checker import NEXT_BOOT
 from powercut.disk import Disk, Folder, Recorder
-from powercut.stage import Stage
+from powercut.stage import LaterHelper, Stage
 from sizes import trials
 
-from physx_core import Dataset
+from physx_core import Dataset, Field
 from physx_core.dataset import EpisodeRecord, EpisodeStatus
+from physx_core.dataset.write.partition_writer import PartitionWriter
 
 STEPS = 14
 WHAT = ["part", "part", "part", "range", "stream", "tick", "seal", "compact"]
+BY_CLIENTS = ["part", "part", "part", "part", "range", "tick", "seal", "lose"]
+X = [Field("x", ())]
 
 
 def rows(campaign, episode, count, attempt):
@@ -24,16 +28,46 @@ def rows(campaign, episode, count, attempt):
 
 
 class History:
-    """Episodes of three rows in two parts each, ranges, failed ones, and streams in between."""
+    """Episodes of four rows in two parts each, ranges, failed ones, and streams in between."""
 
     def __init__(self, seed):
+        self.clients = None  # pairs of a share and a writer, if clients write the rows
         self.chance, self.attempts, self.open = random.Random(seed), {}, {}
         self.streamed, self.finished, self.failed = 0, set(), set()
         self.kept = [(0, set())]  # from which operation on which episodes are on the disk
 
+    def delegate(self, dataset):
+        """Let three clients write the rows from now on."""
+        dataset.define_episodes()
+        self.delegation = dataset.delegate("training")
+        self.clients = [self.new_client(dataset) for _ in range(3)]
+
+    def new_client(self, dataset):
+        share = self.delegation.share(X)
+        writer = PartitionWriter(dataset.directory, X, share.capacity, LaterHelper)
+        return share, writer
+
+    def store(self, dataset, block, record):
+        if self.clients is None or not len(block):
+            dataset.append_episodes("training", {"x": block}, [record])
+            return
+        share, writer = self.chance.choice(self.clients)
+        while writer.room < len(block):
+            writer.add(replace(share.begin()))
+        first = writer.append({"x": block}, len(block))
+        share.take(first, len(block))
+        dataset.append_episodes("training", {}, [record], first_row=first)
+        for sealed in writer.take_sealed():
+            assert share.accept(sealed.index, sealed.checksums)
+
     def step(self, dataset, stage, journal):
-        what = self.chance.choice(WHAT)
-        if what == "compact":
+        what = self.chance.choice(WHAT if self.clients is None else BY_CLIENTS)
+        if what == "lose":
+            which = self.chance.randrange(3)
+            share, _ = self.clients[which]
+            self.delegation.end(share)
+            self.clients[which] = self.new_client(dataset)
+        elif what == "compact":
             dataset.compact()
             self.open.clear()
             self.kept.append((len(journal), set(self.finished)))
@@ -50,7 +84,7 @@ class History:
         elif what == "range":
             block = rows(2, 0, 4, len(self.attempts))
             record = EpisodeRecord(campaign=2, episode=0, rows=4, count=4)
-            dataset.append_episodes("training", {"x": block}, [record])
+            self.store(dataset, block, record)
         else:
             self.part(dataset)
 
@@ -69,7 +103,7 @@ class History:
             reason="of no matter",
         )  # fmt: skip
         block = block[:0] if failed else block
-        dataset.append_episodes("training", {"x": block}, [record])
+        self.store(dataset, block, record)
         if part:
             (self.failed if failed else self.finished).add(episode)
 
@@ -100,13 +134,16 @@ def check(folder, kept, failed):
 
 
 @pytest.mark.slow
+@pytest.mark.parametrize("by_clients", [False, True])
 @pytest.mark.parametrize("seed", range(trials(3, 1)))
-def test_after_a_power_cut_only_whole_recorded_episodes_count(tmp_path, seed):
+def test_after_a_power_cut_only_whole_recorded_episodes_count(tmp_path, seed, by_clients):
     (tmp_path / "work").mkdir()
     stage, recorder = Stage(), Recorder(tmp_path / "work")
     folder, history = tmp_path / "work" / "data", History(seed)
     with stage.entered(), stage.recorded(recorder):
         dataset = Dataset.create(folder, max_file_size=(2**14 + 8 * 7) * 1e-9)
+        if by_clients:
+            history.delegate(dataset)
         for _ in range(STEPS):
             history.step(dataset, stage, recorder.journal)
     stage.boot = NEXT_BOOT

@@ -23,17 +23,6 @@ def store(dataset, episode, values, **options):
     dataset.append_episodes("training", {"x": np.array(values, float)}, [record])
 
 
-def test_refused_episodes_leave_stripes_as_they_are(dataset):
-    dataset.append("training", {"x": [0.0]})
-    stripes = dataset.stripes("training", 1)
-    failed = EpisodeRecord(episode=0, rows=0, status=EpisodeStatus.FAILED)
-    for rows, record in (({"x": [5.0]}, EpisodeRecord(episode=0, rows=1)), ({}, failed)):
-        with pytest.raises(UsageError, match="Other processes write"):
-            dataset.append_episodes("training", rows, [record])
-    assert EPISODES not in dataset.modes
-    assert stripes.begun == 0
-
-
 def test_batches_keep_their_rows_when_earlier_episodes_come_or_replace_them(dataset):
     for number in range(10, 20):
         store(dataset, number, [number])
@@ -80,7 +69,7 @@ def test_only_episodes_change_their_table(dataset):
         lambda: dataset.append(EPISODES, {name: [value] for name, value in row.items()}),
         lambda: dataset.append_sample(EPISODES, row),
         lambda: dataset.update(EPISODES, 0, {"first_row": 0}),
-        lambda: dataset.stripes(EPISODES, 1),
+        lambda: dataset.delegate(EPISODES),
         lambda: dataset.remove_partition(EPISODES, 0),
     )
     for change in changes:

@@ -7,7 +7,7 @@ import contextlib
 import os
 import shutil
 import tempfile
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from unittest import mock
 
@@ -19,13 +19,15 @@ from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, ru
 from hypothesis.stateful import run_state_machine_as_test as run_machine
 from sizes import trials
 
-from physx_core import Dataset, View
+from physx_core import Dataset, Field, View
 from physx_core.dataset import EPISODES, EpisodeRecord, EpisodeStatus
 from physx_core.dataset.read import shuffling
 from physx_core.dataset.read.access import disk, memory
 from physx_core.dataset.store import locks
+from physx_core.dataset.write.partition_writer import PartitionWriter
 from physx_core.errors import DatasetError, UsageError
 
+FIELDS = [Field("n", (), "int64"), Field("x", (2,))]
 QUICK = settings(database=None, max_examples=2, stateful_step_count=30)
 FINISHED, FAILED, CUT, MORE = (
     EpisodeStatus.FINISHED,
@@ -55,6 +57,7 @@ class Model:
             status, the rows, and all rows that were recorded together.
         parts: The rows of unfinished ones.
         stored: All rows as they are stored.
+        shares: Rows that each of several other processes has written, and how many it has reported.
         stream: Campaign of the stream that takes rows; None: rows need a record.
     """
 
@@ -62,13 +65,20 @@ class Model:
     episodes: dict = field(default_factory=dict)
     parts: dict = field(default_factory=dict)
     stored: list = field(default_factory=list)
+    shares: list = field(default_factory=list)
     stream: int | None = 0
+
+    @property
+    def there(self):
+        """All rows that are known to be stored."""
+        return set(self.stored).union(*(rows[:known] for rows, known in self.shares))
 
     def entries(self):
         """Campaign, first number, status and rows of all that counts, in order."""
         found = [(c, -1, None, rows) for c, rows in self.streams.items()]
+        there = self.there
         for (campaign, episode), computed in self.episodes.items():
-            left = [(s, rows) for s, rows, needed in computed if needed <= set(self.stored)]
+            left = [(s, rows) for s, rows, needed in computed if needed <= there]
             found += [(campaign, episode, *left[-1])] if left else []
         return sorted(found, key=lambda entry: entry[:2])
 
@@ -86,7 +96,6 @@ class Model:
         return [row for entry in found for row in entry[3]]
 
     def add(self, record, rows):
-        self.stored += rows
         for number in range(record.episode, record.episode + record.count):
             key = record.campaign, number
             mine = rows if record.count == 1 else [rows[number - record.episode]]
@@ -136,8 +145,37 @@ def look(dataset, mode):
     )
 
 
+@dataclass(eq=False)
+class Client:
+    """Another process that writes rows, here in this one."""
+
+    share: object
+    writer: PartitionWriter
+    place: int
+
+    def write(self, block, count):
+        """Write rows; return their address."""
+        while self.writer.room < count:
+            self.writer.add(replace(self.share.begin()))
+        return self.writer.append(block, count)
+
+    def take_sealed(self):
+        for sealed in self.writer.take_sealed(wait=True):
+            assert self.share.accept(sealed.index, sealed.checksums)
+
+    def die(self):
+        """End as if the process were killed: files are closed, and nothing else."""
+        writer = self.writer
+        writer._sealer.close()
+        opened, writer._opened = writer._opened, None
+        for file in opened.files.values() if opened else ():
+            file.close()
+        writer._digester.close()
+        writer._syncer._helper.close()
+
+
 class Machine(RuleBasedStateMachine):
-    """A dataset with one writer, and a reader beside it."""
+    """A dataset with one writer, which may let others write, and a reader beside it."""
 
     mode = "training"
 
@@ -146,9 +184,12 @@ class Machine(RuleBasedStateMachine):
         self.root = Path(tempfile.mkdtemp(dir=Path.cwd()))
         self.folder, self.copies = self.root / "data", 0
         self.model, self.next_row, self.turn = Model(), 0, 0
-        self.dataset = None
+        self.dataset = self.delegation = None
+        self.clients = []
 
     def teardown(self):
+        for client in self.clients:
+            client.die()
         if self.dataset is not None:
             with contextlib.suppress(Exception):  # it would hide what failed before
                 self.dataset.close()
@@ -174,6 +215,8 @@ class Machine(RuleBasedStateMachine):
 
     @rule(count=st.integers(0, 7))
     def append(self, count):
+        if self.goes_on():
+            return
         rows, model = self.draw(count), self.model
         self.dataset.append(self.mode, self.block(rows))
         if count and model.stream is None:
@@ -182,8 +225,8 @@ class Machine(RuleBasedStateMachine):
             model.streams.setdefault(model.stream, []).extend(rows)
             model.stored += rows
 
-    @rule(drawn=st.lists(EPISODE, min_size=1, max_size=5))
-    def append_episodes(self, drawn):
+    def records(self, drawn):
+        """Records of what was drawn, the rows of each, and the next part of unfinished episodes."""
         records, rows = [], []
         unfinished = dict.fromkeys(self.model.parts, 1)
         parts = dict(self.counts) if hasattr(self, "counts") else {}
@@ -205,9 +248,10 @@ class Machine(RuleBasedStateMachine):
                 unfinished[key], parts[key] = 1, part + 1
             records.append(record)
             rows.append(self.draw(record.rows))
-        self.dataset.append_episodes(
-            self.mode, self.block([row for mine in rows for row in mine]), records
-        )
+        return records, rows, parts
+
+    def note(self, records, rows, parts):
+        """Add records that have been stored to the model."""
         self.counts = parts
         if self.model.stream is not None:
             self.model.streams.setdefault(self.model.stream, [])
@@ -215,8 +259,115 @@ class Machine(RuleBasedStateMachine):
         for record, mine in zip(records, rows, strict=True):
             self.model.add(record, mine)
 
+    @rule(drawn=st.lists(EPISODE, min_size=1, max_size=5))
+    def append_episodes(self, drawn):
+        if self.goes_on():
+            return
+        records, rows, parts = self.records(drawn)
+        block = [row for mine in rows for row in mine]
+        self.dataset.append_episodes(self.mode, self.block(block), records)
+        self.model.stored += block
+        self.note(records, rows, parts)
+
+    # Other processes that write -----------------------------------------------------------------
+
+    @rule(writes=st.lists(st.tuples(
+        st.integers(0, 2), st.lists(EPISODE, min_size=1, max_size=2), st.booleans()
+    ), min_size=1, max_size=6))  # fmt: skip
+    def write_in_clients(self, writes):
+        for write in writes:
+            self.write_in_a_client(*write)
+            self.compare(self.dataset)
+
+    def write_in_a_client(self, which, drawn, seals):
+        client = self.client(which)
+        records, rows, parts = self.records(drawn)
+        block = [row for mine in rows for row in mine]
+        first = None
+        if block:
+            first = client.write(self.block(block), len(block))
+            client.share.take(first, len(block))
+            known, count = self.model.shares[client.place]
+            assert count == len(known)
+            self.model.shares[client.place] = [*known, *block], count + len(block)
+        self.dataset.append_episodes(self.mode, {}, records, first_row=first)
+        self.note(records, rows, parts)
+        if seals:
+            client.take_sealed()
+
+    @rule(which=st.integers(0, 3), count=st.integers(0, 9), is_known=st.booleans())
+    def lose_a_client(self, which, count, is_known):
+        """It may have written rows that it has not reported; another one does not go on there."""
+        client = self.client(which)
+        rows = self.draw(count)
+        if rows:
+            client.write(self.block(rows), count)
+        known, told = self.model.shares[client.place]
+        self.model.shares[client.place] = known + rows, told
+        client.die()
+        self.clients.remove(client)
+        if is_known:
+            self.delegation.end(client.share)
+
+    @rule(which=st.integers(0, 3))
+    def only_clients_write(self, which):
+        client = self.client(which)
+        with pytest.raises(UsageError, match="Other processes write"):
+            self.dataset.append(self.mode, self.block([0]))
+        with pytest.raises(UsageError, match="Other processes write"):
+            record = EpisodeRecord(episode=0, rows=1)
+            self.dataset.append_episodes(self.mode, self.block([0]), [record])
+        with pytest.raises(UsageError, match="has written 1 rows"):
+            self.dataset.append_episodes(self.mode, {}, [record], first_row=client.share.end)
+        with pytest.raises(ValueError, match="rows at the address"):
+            client.share.take(client.share.end + 1, 1)
+
+    def client(self, which):
+        """One of the clients, or a new one."""
+        if self.delegation is None:
+            self.dataset.define_episodes()
+            self.delegation = self.dataset.delegate(self.mode)
+        if which < len(self.clients):
+            return self.clients[which]
+        share = self.delegation.share(FIELDS)
+        writer = PartitionWriter(self.folder, share.fields, share.capacity)
+        self.clients.append(Client(share, writer, len(self.model.shares)))
+        self.model.shares.append(([], 0))
+        if self.model.stream is not None:
+            self.model.streams.setdefault(self.model.stream, [])
+            self.model.stream = None
+        return self.clients[-1]
+
+    def goes_on(self):
+        """Whether clients go on writing; a few of the calls that need them to end let them end."""
+        if self.delegation is not None and self.turn % 6 == 0:
+            self.end_delegation()
+        return self.delegation is not None
+
+    def end_delegation(self):
+        """Let all clients end, so that this process can write again."""
+        if self.delegation is not None:
+            for client in self.clients:
+                client.writer.close()
+            self.delegation.close()
+            self.take_shares()
+
+    def take_shares(self):
+        """Take what other processes have stored, of which unreported rows may be left."""
+        mode = self.dataset._manifest.modes.get(self.mode)
+        stored = self.dataset._reader.read(self.mode, "n", 0, mode.rows).tolist() if mode else []
+        shares, self.model.shares = self.model.shares, []
+        unsure = {row for rows, told in shares for row in rows[told:]}
+        self.model.stored += [row for rows, told in shares for row in rows[:told]]
+        assert [row for row in stored if row not in unsure] == self.model.stored
+        self.model.stored, self.delegation, self.clients = stored, None, []
+
+    # Changing -----------------------------------------------------------------------------------
+
     @rule(index=st.lists(st.integers(0, 300), max_size=5))
     def update(self, index):
+        if self.goes_on():
+            return
         before = self.model.rows()
         if not before:
             return
@@ -239,7 +390,7 @@ class Machine(RuleBasedStateMachine):
 
     @rule(which=st.integers(0, 50))
     def remove_partition(self, which):
-        if self.turn % 4 or self.mode not in self.dataset:
+        if self.turn % 4 or self.mode not in self.dataset or self.goes_on():
             return
         parts = [p for p in self.dataset._manifest.modes[self.mode].partitions if p.rows]
         if not parts:
@@ -262,6 +413,8 @@ class Machine(RuleBasedStateMachine):
     @rule(again=st.booleans())
     def compact(self, again):
         if self.turn % 3 or EPISODES not in self.dataset.modes:
+            return
+        if self.goes_on():
             return
         before = look(self.dataset, self.mode)
         self.dataset.compact()
@@ -297,6 +450,8 @@ class Machine(RuleBasedStateMachine):
           drawn=st.lists(EPISODE, max_size=4))  # fmt: skip
     def merge(self, before, after, capacity, drawn):
         """Merge a dataset with a stream, episodes, and a stream."""
+        if self.goes_on():
+            return
         self.copies += 1
         folder, other = self.root / f"other_{self.copies}", Model()
         size = (2**14 + 16 * capacity + 0.5) * 1e-9
@@ -312,6 +467,7 @@ class Machine(RuleBasedStateMachine):
                 )  # fmt: skip
                 mine = self.draw(record.rows)
                 given.append_episodes(self.mode, self.block(mine), [record])
+                other.stored += mine
                 other.add(record, mine)
             rows = self.draw(after)
             given.append(self.mode, self.block(rows))
@@ -346,18 +502,23 @@ class Machine(RuleBasedStateMachine):
             self.copies += 1
             copy = self.root / f"copy_{self.copies}"
             shutil.copytree(self.folder, copy)
+            for client in self.clients:
+                client.die()
             self.dataset.close()
             shutil.rmtree(self.folder)
             copy.rename(self.folder)
         else:
+            self.end_delegation()
             self.dataset.close()
         with Dataset.open(self.folder) as reader:
             self.compare(reader)
         self.dataset = Dataset.open(self.folder, writable=True, session=session, **self.options)
+        if self.delegation is not None:
+            self.take_shares()
 
     @rule(again=st.booleans())
     def repair(self, again):
-        if self.turn % 5:
+        if self.turn % 5 or self.goes_on():
             return
         self.dataset.close()
         if again:
@@ -494,6 +655,8 @@ class Machine(RuleBasedStateMachine):
     def virtual_index(self):
         import h5py
 
+        if self.goes_on():
+            return
         self.dataset.close()
         with h5py.File(self.folder / f"{self.dataset.session}.h5") as file:
             if self.mode in file:
@@ -501,13 +664,25 @@ class Machine(RuleBasedStateMachine):
         self.dataset = Dataset.open(self.folder, writable=True, **self.options)
 
 
+class Writers(Machine):
+    """One that other processes write most of the time."""
+
+    update = merge = remove_partition = split = episodes = batches = virtual_index = None
+    read_by_index = look_at_files = look_at_records = normalization = append_episodes = None
+
+
+MACHINES = pytest.mark.parametrize("machine", [Machine, Writers])
+
+
 @pytest.mark.slow
-@pytest.mark.parametrize("number", range(trials(12, 6)))
-def test_episodes_behave_like_lists(number):
-    run_machine(seed(number)(Machine), settings=QUICK)
+@MACHINES
+@pytest.mark.parametrize("number", range(trials(8, 4)))
+def test_episodes_behave_like_lists(number, machine):
+    run_machine(seed(number)(machine), settings=QUICK)
 
 
 @pytest.mark.faults
-@pytest.mark.parametrize("number", range(100, 140))
-def test_longer_histories_of_episodes(number):
-    run_machine(seed(number)(Machine), settings=settings(QUICK, stateful_step_count=50))
+@MACHINES
+@pytest.mark.parametrize("number", range(100, 120))
+def test_longer_histories_of_episodes(number, machine):
+    run_machine(seed(number)(machine), settings=settings(QUICK, stateful_step_count=50))

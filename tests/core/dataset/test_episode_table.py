@@ -2,7 +2,6 @@
 
 import os
 import shutil
-from dataclasses import replace
 
 import h5py
 import numpy as np
@@ -14,7 +13,6 @@ from physx_core.dataset import EPISODES, EpisodeRecord, EpisodeStatus, FailedEpi
 from physx_core.dataset.read import virtual_index
 from physx_core.dataset.store import locks
 from physx_core.dataset.store.episode_record import OPEN
-from physx_core.dataset.write.stripe_writer import StripeWriter
 from physx_core.errors import (
     ConfigError,
     DatasetError,
@@ -154,34 +152,6 @@ def test_several_writers_cannot_store_episodes(folder):
         with pytest.raises(UsageError):
             dataset.append("training", x(1))
         assert read(dataset) == [1]
-
-
-def test_rows_of_stripes_are_those_of_a_stream(folder):
-    with Dataset.create(folder) as dataset:
-        store(dataset, 1, 1, 2)
-        store(dataset, 0, 3, status=MORE)
-        stripes = dataset.stripes("training", 2)
-        stripes.define(dataset.fields("training").values())
-        stripes.begin()
-        for place in range(2):
-            with StripeWriter(folder, stripes.fields, stripes.capacity) as writer:
-                for number, entry in stripes.entries(place).items():
-                    writer.add(number, replace(entry))
-                writer.append(x(10 + place, 20 + place), 2)
-            stripes.note(place, 2)
-        stripes.commit(stripes.whole)
-        assert read(dataset) == [1, 2, 10, 11, 20, 21]
-        with pytest.raises(UsageError):
-            store(dataset, 0, 4, part=1)
-        assert read(dataset) == [1, 2, 10, 11, 20, 21]
-    with Dataset.open(folder, writable=True) as dataset:
-        assert read(dataset) == [1, 2, 10, 11, 20, 21]
-        store(dataset, 0, 4, part=1)
-        assert read(dataset) == [3, 4, 1, 2, 10, 11, 20, 21]
-        dataset.append("training", x(5))
-        assert read(dataset) == [3, 4, 1, 2, 10, 11, 20, 21, 5]
-    with h5py.File(folder / "run.h5") as file:
-        assert_array_equal(file["training/x"][:], [3, 4, 1, 2, 10, 11, 20, 21, 5])
 
 
 def test_rows_around_damaged_ones_stay_those_of_their_episodes(folder):

@@ -4,6 +4,7 @@ import contextlib
 import random
 import shutil
 import warnings
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -13,10 +14,12 @@ from numpy.testing import assert_array_equal
 from xxhash import xxh3_64_intdigest
 
 from physx_core import Dataset, Field, files
+from physx_core.dataset import EpisodeRecord
 from physx_core.dataset.store.partition import commits
 from physx_core.dataset.store.partition import format as partition_format
 from physx_core.dataset.store.partition.commits import BlockDigests, block_ends
 from physx_core.dataset.store.partition.format import inspect
+from physx_core.dataset.write.partition_writer import PartitionWriter
 from physx_core.errors import DatasetError
 
 N, SIZE = 200, 5e-5
@@ -221,30 +224,63 @@ def test_rows_that_were_updated_have_no_digest_and_others_still_have(folder):
     check(folder, block_of("x", 150), rows)
 
 
-# Stripes ----------------------------------------------------------------------------------------
+# Several open partitions of a mode --------------------------------------------------------------
 
 
-def test_stripes_lose_the_same_rows(folder):
-    from physx_core.dataset.write.stripe_writer import StripeWriter
-
-    work = folder.with_name("striped")
+def left_open_by_clients(folder):
+    """Let two clients write every other episode of ten rows, and kill everything."""
+    work = folder.with_name("work")
     dataset = Dataset.create(work, max_file_size=SIZE)
-    stripes = dataset.stripes("training", 2)
-    stripes.define(FIELDS)
-    stripes.begin()
-    for place in range(2):
-        writer = StripeWriter(work, FIELDS, stripes.capacity)
-        writer.add(0, stripes.entries(place)[0])
-        writer.append({name: np.ascontiguousarray(a[place::2]) for name, a in ROWS.items()}, 100)
+    dataset.define_episodes()
+    delegation = dataset.delegate("training")
+    shares = [delegation.share(FIELDS) for _ in range(2)]
+    writers = [PartitionWriter(work, FIELDS, share.capacity) for share in shares]
+    for share, writer in zip(shares, writers, strict=True):
+        writer.add(replace(share.begin()))
+    for episode in range(N // 10):
+        share, writer = shares[episode % 2], writers[episode % 2]
+        first = writer.append({n: a[10 * episode :][:10] for n, a in ROWS.items()}, 10)
+        share.take(first, 10)
+        record = EpisodeRecord(episode=episode, rows=10)
+        dataset.append_episodes("training", {}, [record], first_row=first)
+    for writer in writers:
         writer.close()
     shutil.copytree(work, folder)
+    dataset.close()
+
+
+@pytest.mark.parametrize("how", ["writer", "repair", "rebuild"])
+def test_damage_in_the_partition_of_a_client_costs_its_own_episodes(folder, how):
+    left_open_by_clients(folder)
     path = folder / "run_training_x_1.h5"
     content = bytearray(path.read_bytes())
     content[inspect(path).data_offset + 48 * 33] ^= 4
     path.write_bytes(content)
-    said = close(folder, "writer")
-    assert "Rows 30 to 39 are damaged" in said
-    check(folder, range(60, 80))
+    assert "Rows 30 to 39 are damaged" in close(folder, how)
+    check(folder, range(70, 80))
+
+
+def test_rows_that_a_client_has_reported_and_lost_are_an_error(folder):
+    with Dataset.create(folder, max_file_size=SIZE) as dataset:
+        dataset.define_episodes()
+        delegation = dataset.delegate("training")
+        share = delegation.share(FIELDS)
+        with PartitionWriter(folder, FIELDS, share.capacity) as writer:
+            writer.add(replace(share.begin()))
+            for episode in range(2):
+                rows = {name: a[10 * episode :][:10] for name, a in ROWS.items()}
+                first = writer.append(rows, 10)
+                share.take(first, 10)
+                record = EpisodeRecord(episode=episode, rows=10)
+                dataset.append_episodes("training", {}, [record], first_row=first)
+        path = folder / FILES["x"]
+        content = bytearray(path.read_bytes())
+        content[inspect(path).data_offset + 48 * 15] ^= 4
+        path.write_bytes(content)
+        with pytest.raises(DatasetError, match="10 rows that clients wrote .* are missing"):
+            delegation.close()
+        assert dataset["training"]["n"][:].tolist() == list(range(10))
+    check(folder, range(10, N))
 
 
 # Ends in the middle -----------------------------------------------------------------------------

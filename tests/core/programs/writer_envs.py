@@ -1,6 +1,6 @@
-"""An environment whose clients write their rows, a launcher that spoils their folder, and a run.
+"""Environments whose clients write their rows, a launcher that spoils their folder, and a run.
 
-``python writer_envs.py WRITERS CLIENTS BATCHES SIZE`` adds to the session "run" in this folder.
+``python writer_envs.py WRITERS CLIENTS EPISODES`` goes on with the session "run" in this folder.
 """
 
 from __future__ import annotations
@@ -27,28 +27,37 @@ from physx_core.net.values import encode
 from physx_core.workers.launchers import SubprocessLauncher
 
 
-class Steps(Environment):
-    """Numbers that follow from the seed, at any pace; an instance may kill itself, once."""
+class Walks(Environment):
+    """Walks of random length at any pace; a client may kill itself, once."""
 
-    def __init__(self, *, delay: float = 0.0, dies: tuple[int, int] = (0, 0), **kwargs):
+    independent_episodes = True
+
+    def __init__(self, *, delay: float = 0.0, dies: tuple[int, int] = (-1, 0), **kwargs):
         super().__init__(**kwargs)
         self.delay, self.dies = delay, dies
 
     def create(self):
-        pass
+        self.define_parameters(Parameter("mass", 0.5, 1.5))
 
     def init_database(self):
         self.define_training_fields([Field("x", unit="m"), ("n", int)])
         self.define_additional_fields([Field("f", shape=(), dtype="float32")])
+        self.define_episode_fields(Field("shape", shape=(3,)))
+
+    def reset_parameters(self, mass):
+        self.mass, self.left = mass, int(self.rng.integers(0, 12))
+        self.set_episode_data(shape=np.full(3, mass))
 
     def step(self):
+        if not self.left:
+            self.end_episode()
+            return
+        self.left -= 1
         time.sleep(self.delay * int.from_bytes(os.urandom(2), "little") / 65536)
-        if (self.instance_id, self.step_index) == tuple(self.dies) and not Path("died").exists():
+        if (self.episode_index, self.step_index) == tuple(self.dies) and not Path("died").exists():
             Path("died").touch()
             os.kill(os.getpid(), signal.SIGKILL)
-        if self.rng.random() < 0.1:
-            self.new_episode()
-        x = self.rng.normal(size=30)
+        x = self.mass * self.rng.normal(size=30)
         self.set_training_data(x=x, n=self.step_index)
         self.set_additional_data(f=np.float32(x.sum()))
 
@@ -56,50 +65,53 @@ class Steps(Environment):
         return self.rng.random() < 0.8
 
 
-class Large(Steps):
+class Stream(Environment):
+    """A stream."""
+
+    def create(self):
+        pass
+
+    def init_database(self):
+        self.define_training_fields(("n", int))
+
+    def step(self):
+        self.set_training_data(n=self.step_index)
+
+
+class Large(Environment):
     """Fills a small disk."""
+
+    episode_steps = 10
+
+    def create(self):
+        pass
 
     def init_database(self):
         self.define_training_fields(Field("x", shape=(5000,)))
 
+    def reset_parameters(self):
+        pass
+
     def step(self):
-        self.set_training_data(x=np.full(5000, self.step_index + self.instance_id / 10))
-
-    def check_sample(self):
-        return True
+        time.sleep(2e-3)  # else a block of rows fills the disk
+        self.set_training_data(x=np.full(5000, self.episode_index + self.step_index / 100))
 
 
-class Rogue(Steps):
+class Rogue(Walks):
     """Sends a message of its own, which a client would not send."""
 
     def __init__(self, *, kind: str, number: int, value=None, **kwargs):
         super().__init__(**kwargs)
         if value == "plausible":
-            names = ("mean", "squares", "minimum", "maximum")
-            value = {
-                "rows": 3,
-                "checksums": dict.fromkeys(("x", "n", "f", "env_id", "episode", "step"), 0),
-                "statistics": {
-                    name: {"count": np.array(3), **{each: np.zeros(shape) for each in names}}
-                    for name, shape in (("x", 30), ("f", ()))
-                },
-            }
+            names = ("x", "n", "f", "env_id", "episode", "step")
+            value = dict.fromkeys(names, 0)
         self.message = pack(Kind[kind], encode(value), number)
 
     def step(self):
         super().step()
-        if self.instance_id == 2 and self.step_index == 5:
-            wait_for_partitions()
+        if self.episode_index >= 20 and not Path("sent").exists():
+            Path("sent").touch()
             connection().sendall(self.message)
-
-
-def wait_for_partitions():
-    """Wait until the server has begun partitions: it needs a row of instance 1 for that."""
-    until = time.monotonic() + 30
-    while not list(Path("sessions").glob("*/dataset/*_training_*.h5")):
-        if time.monotonic() > until:
-            raise TimeoutError("the server has begun no partition")
-        time.sleep(0.01)
 
 
 def connection():
@@ -112,22 +124,6 @@ def connection():
             continue
         return found
     raise LookupError("no connection")
-
-
-class Gaps(Steps):
-    """Comes upon NaN."""
-
-    def step(self):
-        super().step()
-        if self.instance_id == 2 and self.step_index >= 30:
-            self.set_training_data(x=np.full(30, np.nan), n=0)
-
-
-class Drawn(Steps):
-    """Has a parameter."""
-
-    def create(self):
-        self.define_parameters([Parameter("mass", 0.5, 1.5)])
 
 
 class Elsewhere(SubprocessLauncher):
@@ -146,15 +142,20 @@ class Elsewhere(SubprocessLauncher):
         return super().launch(instances, address, token)
 
 
-def main(writers, clients, batches, size):
-    """Add rows to the session."""
+def main(writers, clients, episodes):
+    """Simulate what is missing in the session."""
     environment = EnvironmentConfig(
-        Steps, num_clients=int(clients), env_kwargs={"delay": 0.003}, seed=3
-    )
-    dataset = DatasetConfig(writers=writers, max_file_size=3e-5)
-    options = {"session_name": "run", "new_session": False, "quiet": True}
+        Walks, num_clients=int(clients), env_kwargs={"delay": 0.003}, seed=3,
+        record_wrong_samples=True,
+    )  # fmt: skip
     with DataGeneration(
-        environment, dataset, batch_nb=int(batches), batch_size=int(size), **options
+        environment,
+        DatasetConfig(writers=writers, max_file_size=3e-5),
+        episodes=int(episodes),
+        session_name="run",
+        resume=Path("sessions/run/dataset/dataset.json").exists(),
+        retries=1000,
+        quiet=True,
     ) as run:
         run.execute()
 

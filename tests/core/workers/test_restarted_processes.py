@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from physx_core import DataGeneration, Dataset, DatasetConfig, EnvironmentConfig
+from physx_core import DataGeneration, Dataset, EnvironmentConfig
 
 pytestmark = pytest.mark.processes
 
@@ -64,8 +64,7 @@ def test_a_pipeline_stores_the_same_rows_whatever_happens(nothing_stays_behind):
     assert len(sums) == 1
 
 
-@pytest.mark.parametrize("writers", ["server", "clients"])
-def test_a_stream_ends_though_each_of_its_processes_makes_few_rows(nothing_stays_behind, writers):
+def test_a_stream_ends_though_each_of_its_processes_makes_few_rows(nothing_stays_behind):
     found = []
     for life in (0, 12):
         config = EnvironmentConfig(
@@ -76,8 +75,7 @@ def test_a_stream_ends_though_each_of_its_processes_makes_few_rows(nothing_stays
             state_every=5,
             seed=3,
         )
-        dataset_config = DatasetConfig(writers=writers)
-        generation = DataGeneration(config, dataset_config, batch_nb=8, batch_size=10)
+        generation = DataGeneration(config, batch_nb=8, batch_size=10)
         generation.execute()
         with Dataset.open(generation.session.path) as dataset:
             assert dataset.num_samples("training") == 80

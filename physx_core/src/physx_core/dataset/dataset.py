@@ -27,9 +27,9 @@ from physx_core.dataset.store.episode_table import EPISODES, LOST, has_table
 from physx_core.dataset.store.manifest import Manifest, to_plain_info
 from physx_core.dataset.write.appender import Appender
 from physx_core.dataset.write.compacting import compact
+from physx_core.dataset.write.delegation import Delegation
 from physx_core.dataset.write.merging import add_partitions, drop_partition
 from physx_core.dataset.write.opening import WriterOptions, create, extend
-from physx_core.dataset.write.stripes import Stripes
 from physx_core.dataset.write.updating import check_update
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError, UsageError
@@ -406,6 +406,7 @@ class Dataset(EpisodeReading, Closeable):
         *,
         episode_fields: Iterable[Field] = (),
         checked: bool = False,
+        first_row: int | None = None,
     ) -> None:
         """Store rows of independent episodes, and what is recorded of these.
 
@@ -426,6 +427,8 @@ class Dataset(EpisodeReading, Closeable):
             episode_fields: Those of role ``episode`` that records may have, all or none; the first
                 call for a dataset determines them. Of a record without them, 0 is stored.
             checked: Whether the rows are known to be finite, as in `append`.
+            first_row: Address of the rows, if a process to which the mode is delegated has written
+                them, so that none are given: see `delegate`.
 
         Raises:
             SampleError: If a field or a parameter is missing, unknown, of the wrong shape, type or
@@ -433,29 +436,50 @@ class Dataset(EpisodeReading, Closeable):
             ConfigError: If the mode cannot hold episodes.
             DatasetError: If the disk is full or fails; rows stored before stay.
             UsageError: If the episodes have another number of rows, if a part does not follow the
-                one before, or if the dataset is closed, open for reading only, or shared.
+                one before, if there are no such rows at `first_row`, or if the dataset is closed,
+                open for reading only, or shared.
         """
         self._as_only_writer("store episodes")
         self._for_writing().append_episodes(
-            mode, rows, episodes, episode_fields=episode_fields, checked=checked
+            mode,
+            rows,
+            episodes,
+            episode_fields=episode_fields,
+            checked=checked,
+            first_row=first_row,
         )
 
-    def stripes(self, mode: str, count: int) -> Stripes:
-        """Let `count` other processes write the rows of a mode from now on, in turn.
-
-        Of the rows they write, row r, counted from 0, comes from process ``r % count``. They share
-        the dataset's folder, each with a `StripeWriter`; this process maintains the manifest.
+    def define_episodes(
+        self, parameters: Iterable[Field] = (), episode_fields: Iterable[Field] = ()
+    ) -> None:
+        """Define what is recorded of each episode, unless the dataset has episodes already.
 
         Args:
-            mode: Name of the mode; nothing else may change its rows until the dataset is closed.
-            count: Number of processes that write it.
+            parameters: The parameters that all episodes have.
+            episode_fields: The fields of role ``episode`` that they may have.
+
+        Raises:
+            UsageError: If the dataset is closed, open for reading only, or shared.
+        """
+        self._as_only_writer("store episodes")
+        self._for_writing().define_episodes(parameters, episode_fields)
+
+    def delegate(self, mode: str) -> Delegation:
+        """Let other processes write the rows of episodes of a mode, until the dataset is closed.
+
+        They share the dataset's folder, each with a `PartitionWriter`; this process keeps the
+        manifest, and stores the records with `append_episodes`. `define_episodes` comes before
+        the first rows.
+
+        Args:
+            mode: Name of the mode; nothing else may change its rows.
 
         Raises:
             UsageError: If the dataset is closed, open for reading only, or shared.
             DatasetError: If the folder cannot be written.
         """
         self._check_ordinary(mode)
-        return self._as_only_writer("let others write stripes").stripes(mode, count)
+        return self._as_only_writer("let others write rows").delegate(mode)
 
     def append_sample(self, mode: str, sample: Mapping[str, Any]) -> None:
         """Store one sample; it is committed together with others or by `flush`.

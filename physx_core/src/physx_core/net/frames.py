@@ -84,13 +84,11 @@ class Kind(enum.IntEnum):
     FOLDER = 29
     """Client that writes partitions: what it read in the dataset's folder."""
     PARTITION = 30
-    """Server: a partition that the client writes its rows to [its number among the client's]."""
+    """Client: request for a partition to write rows to. Server: the partition."""
     WRITTEN = 31
-    """Client: rows have been written to its partitions [their total number since the start]."""
-    SEAL = 32
-    """Server: order to stop generating and seal the last partition [total rows to keep]."""
+    """Client, instead of ROWS: rows are in its partitions [address of the first one]."""
     SEALED = 33
-    """Client: a partition is sealed; its checksums and statistics [its number]."""
+    """Client: a full partition is sealed; its checksums [its number]."""
     LEASE = 34
     """Server: numbers of episodes to simulate, with their parameters [how many]."""
     EPISODES = 35

@@ -8,6 +8,7 @@ from dataclasses import replace
 from physx_core.config import WRONG
 from physx_core.dataset import TABLE_FIELDS, Dataset, EpisodeRecord, EpisodeStatus
 from physx_core.dataset.store.definitions import compare_fields
+from physx_core.dataset.write.delegation import Delegation
 from physx_core.errors import ConfigError, FailedEpisodesError
 from physx_core.pipelines.campaign import Campaign
 from physx_core.pipelines.independence import IndependenceProof
@@ -48,13 +49,18 @@ class CampaignWriter:
         self.campaign, self.queue, self.failed = campaign, queue, 0
         self._dataset, self._max_failed = dataset, max_failed
         self._keeps_rejected = keeps_rejected
+        self._delegation: Delegation | None = None
         self._unsure: list[EpisodeRecord] = []  # failed, but perhaps not needed
         self._source: Source | None = None
         self._episodes: EpisodeSource | None = None
         self._proof = IndependenceProof()
 
-    def open(self, source: Source) -> None:
+    def open(self, source: Source, delegation: Delegation | None = None) -> None:
         """Simulate with open environments, whose episodes are independent.
+
+        Args:
+            source: The environments.
+            delegation: Lets their clients write the rows; None: this process writes them.
 
         Raises:
             ConfigError: If they define other parameters than when the campaign began, or two names
@@ -63,6 +69,10 @@ class CampaignWriter:
         """
         self.campaign.check_parameters(source.sets.parameters)
         self._check_episode_fields(source)
+        self._delegation = delegation
+        if delegation is not None:
+            parameters = (replace(each.field, unit="") for each in source.sets.parameters)
+            self._dataset.define_episodes(parameters, source.episode_fields)
         self._source, self._episodes = source, source.lease(self.queue)
 
     def _check_episode_fields(self, source: Source) -> None:
@@ -101,7 +111,12 @@ class CampaignWriter:
             )
         fields = self._source.episode_fields
         self._dataset.append_episodes(
-            mode, block.rows, records, episode_fields=fields, checked=True
+            mode,
+            block.rows,
+            records,
+            episode_fields=fields,
+            checked=True,
+            first_row=block.first_row,
         )
         self._count_failed(record for record in records if record.status is EpisodeStatus.FAILED)
         return self.queue.finished - before
@@ -132,6 +147,8 @@ class CampaignWriter:
 
         When this returns, a kill of the process loses nothing of it.
         """
+        if self._delegation is not None:
+            self._delegation.close()
         if self._episodes is not None:
             self.campaign.cut(self._dataset, rows)
         self._dataset.flush()

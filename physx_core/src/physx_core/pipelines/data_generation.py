@@ -28,8 +28,8 @@ from physx_core.pipelines.storage import (
     end_generation,
     open_own,
     record_beside_rows,
-    reject_client_writers,
     reject_episode_fields,
+    reject_streams_of_writers,
     store_sets,
 )
 from physx_core.session import Session
@@ -53,8 +53,7 @@ class DataGeneration(NewSessionPipeline):
     Attributes:
         dataset: The session's dataset, open for writing.
         source: The environments.
-        batch: The last batch of a stream; empty if episodes are stored as they end, or the clients
-            write their own rows.
+        batch: The last batch of a stream; empty if episodes are stored as they end.
         batch_id: Number of stored batches.
     """
 
@@ -162,7 +161,7 @@ class DataGeneration(NewSessionPipeline):
 
     def _cut(self, kind: type[BaseException] | None, *_: object) -> None:
         """Leave out what the last episodes have more than the batches, when the run is closed."""
-        if kind is None and self._writer is not None:
+        if kind is None and self._writer is not None and self.episodes is None:
             rows = self._first_row + self.batch_id * (self.batch_size or 0)
             self._writer.cut(max(rows, self._former_rows))
 
@@ -248,8 +247,6 @@ class DataGeneration(NewSessionPipeline):
                 "DataGeneration generates new samples, so load_samples cannot be set: it works in "
                 "Training, Prediction and Replay."
             )
-        if self.episodes is not None or self.resume:
-            reject_client_writers(dataset_config, "a generation of independent episodes")
         if dataset_config.writers == "clients":
             check_client_writers(config)
         if self._mode == WRONG:
@@ -285,12 +282,12 @@ class DataGeneration(NewSessionPipeline):
             self._writer = self._make_writer(campaign)
             if self._writer.queue.is_done and self.episodes is not None:
                 return
-        stripes = None
-        if dataset_config.writers == "clients":
-            stripes = self.dataset.stripes(self._mode, config.num_clients)
+        resources.push(self._cut)  # once the environments are closed
+        by_clients = dataset_config.writers == "clients"
+        delegation = self.dataset.delegate(self._mode) if by_clients else None
         total = None if self.episodes is not None else self._amount()[0]
-        self.source = self._open_source(resources, config, seed, total=total, stripes=stripes)
-        if campaign is None and self._simulates_episodes(dataset_config):
+        self.source = self._open_source(resources, config, seed, total=total, delegation=delegation)
+        if campaign is None and self._simulates_episodes():
             self.source.check_independent()
             parameters = self.source.sets.parameters
             campaign = Campaign.begin(
@@ -299,10 +296,10 @@ class DataGeneration(NewSessionPipeline):
             self._writer = self._make_writer(campaign)
         if self._writer is not None:
             self._describe()
-            self._writer.open(self.source)
-            if self.episodes is None:
-                resources.push(self._cut)
+            self._writer.open(self.source, delegation)
         else:
+            if delegation is not None:
+                reject_streams_of_writers(describe_environment_config(config))
             reject_episode_fields(self.source)
             if self.max_failed:
                 raise ConfigError(
@@ -340,12 +337,10 @@ class DataGeneration(NewSessionPipeline):
             self.dataset, campaign, queue, self.max_failed, keeps_rejected=keeps_rejected
         )
 
-    def _simulates_episodes(self, dataset_config: DatasetConfig) -> bool:
+    def _simulates_episodes(self) -> bool:
         """Return whether episodes are simulated by number, instead of streams."""
         return self.episodes is not None or (
-            self.source.is_independent
-            and self._is_own(DataGeneration.batch_produce)
-            and dataset_config.writers == "server"
+            self.source.is_independent and self._is_own(DataGeneration.batch_produce)
         )
 
     def _plan(self) -> Iterable[str]:

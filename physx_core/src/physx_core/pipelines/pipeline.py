@@ -17,7 +17,7 @@ import numpy as np
 
 from physx_core.components.visualizer import Observer
 from physx_core.config import EnvironmentConfig, to_plain
-from physx_core.dataset.write.stripes import Stripes
+from physx_core.dataset.write.delegation import Delegation
 from physx_core.errors import UsageError
 from physx_core.observers import Observers, ProgressBar, ScalarsFile
 from physx_core.pipelines.services import Predict, RunServices, Show
@@ -289,7 +289,7 @@ class Pipeline(ABC):
         replayed: Path | None = None,
         accept_all: bool = False,
         skip: Skip = NOTHING,
-        stripes: Stripes | None = None,
+        delegation: Delegation | None = None,
     ) -> Source:
         """Open the environments, in this process or in clients.
 
@@ -308,7 +308,7 @@ class Pipeline(ABC):
             accept_all: Whether to accept samples that `check_sample` rejects.
             skip: The rows that an earlier run already had: they are generated again, but not
                 returned.
-            stripes: Where clients write their own rows; None: the source returns them.
+            delegation: Lets clients write their own rows; None: the source returns them.
         """
         services = RunServices(
             self.session.dataset_dir, show or self.observers.events, predict, replayed
@@ -329,7 +329,7 @@ class Pipeline(ABC):
                 total=total,
                 accept_all=accept_all,
                 skip=skip,
-                stripes=stripes,
+                delegation=delegation,
             )
         return resources.enter_context(source)
 

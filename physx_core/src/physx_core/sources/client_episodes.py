@@ -15,6 +15,7 @@ from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.server.client_group import ClientGroup
 from physx_core.workers.server.leases import Leases
 from physx_core.workers.server.peer import Peer
+from physx_core.workers.server.written_rows import WrittenRows
 
 _TICK = 0.005
 """How long the losses that the next parameters depend on may go unnoticed, in s."""
@@ -31,6 +32,7 @@ class ClientEpisodes(EpisodeSource):
         check: Callable[[Peer], None],
         check_canceled: Callable[[], None],
         clock: Clock,
+        written: WrittenRows | None,
     ) -> None:
         """Prepare the clients.
 
@@ -41,11 +43,13 @@ class ClientEpisodes(EpisodeSource):
             check: Raises an error if a client's environment differs from the others'.
             check_canceled: Raises an error if the run is over.
             clock: Tells how long episodes take.
+            written: Takes note of the rows that clients write themselves; None: they send them.
         """
         super().__init__(sets, queue)
         self._group, self._check, self._check_canceled = group, check, check_canceled
         self._checked: set[Peer] = set()
-        self._leases = Leases(queue, sets.values_of, clock)
+        self._written = written
+        self._leases = Leases(queue, sets.values_of, clock, written)
         group.lease(self._leases)
 
     @property
@@ -83,7 +87,11 @@ class ClientEpisodes(EpisodeSource):
 
         if not self._leases.blocks:
             self._group.wait(missing)
-        return self._leases.blocks.popleft()
+        block = self._leases.blocks.popleft()
+        if self._written is None or block.first_row is None:
+            return block
+        count = sum(record.rows for record in block.records)
+        return block._replace(rows=self._written.read(block.first_row, count))
 
     def _busy(self) -> list[int]:
         """Give free clients numbers; return those to wait for, none if something has ended."""

@@ -10,9 +10,8 @@ import numpy as np
 
 from physx_core.components.environment import Services
 from physx_core.config import EnvironmentConfig
-from physx_core.dataset.write.stripes import Stripes
+from physx_core.dataset.write.delegation import Delegation
 from physx_core.errors import (
-    ConfigError,
     FieldShapeError,
     FieldsMismatchError,
     UsageError,
@@ -62,7 +61,7 @@ class ClientSource(Source):
         total: int | None = None,
         accept_all: bool = False,
         skip: Skip = NOTHING,
-        stripes: Stripes | None = None,
+        delegation: Delegation | None = None,
         transport: Transport = SOCKETS,
     ) -> None:
         """Prepare the clients.
@@ -78,10 +77,11 @@ class ClientSource(Source):
                 generate none beyond it. None: unknown.
             accept_all: Whether samples that `check_sample` rejects count like the others.
             skip: The rows that an earlier run already got: generated again, but not returned.
-            stripes: Where the clients write the rows themselves; None: `batch` returns them.
+            delegation: Lets the clients write the rows of independent episodes themselves; None:
+                they send them.
             transport: What connects the clients, and the clock that the run follows.
         """
-        self._written = None if stripes is None else WrittenRows(stripes)
+        self._written = None if delegation is None else WrittenRows(delegation)
         self._name = getattr(config.environment, "__name__", str(config.environment))
         self._clock = transport.clock
         self._episodes: ClientEpisodes | None = None
@@ -123,7 +123,6 @@ class ClientSource(Source):
         """Start the clients: see `Source.open`.
 
         Raises:
-            ConfigError: If the clients write the rows, but the environment has parameters.
             PhysxError: If an environment or client fails.
         """
         try:
@@ -134,11 +133,6 @@ class ClientSource(Source):
                 self._agree(peer.instance_id, first.fields, peer.fields)
                 self._agree(peer.instance_id, first.episode_fields, peer.episode_fields)
             parameters = [peer.parameters for peer in (first, *others)]
-            if self._written is not None and any(parameters):
-                raise ConfigError(
-                    "The environment has parameters, and the run records which ones each row was "
-                    "generated with, so it needs the rows. Use DatasetConfig.writers='server'."
-                )
             self.sets.begin(parameters)
             self.is_plain = not (self.sets.parameters or self._rejections)
             self.is_independent = first.is_independent
@@ -154,7 +148,13 @@ class ClientSource(Source):
         from physx_core.sources.client_episodes import ClientEpisodes  # streams need no records
 
         self._episodes = ClientEpisodes(
-            self._group, self.sets, queue, self._check_guest, self._check_canceled, self._clock
+            self._group,
+            self.sets,
+            queue,
+            self._check_guest,
+            self._check_canceled,
+            self._clock,
+            self._written,
         )
         return self._episodes
 
@@ -166,8 +166,6 @@ class ClientSource(Source):
 
     def batch(self, size: int, stored: Batch | None = None) -> Batch:
         """Return the next rows: see `Source.batch`.
-
-        If the clients write them, the batch is empty, and they are in the dataset.
 
         Raises:
             UsageError: If stored rows are given, but the clients run ahead.
@@ -189,16 +187,13 @@ class ClientSource(Source):
             if not self._table:
                 self._group.wait(self._without_table)
                 self._grant()
-            if self._written is None and self._capacity < size:
+            if self._capacity < size:
                 self._capacity = size
                 self._out = {
                     field.name: np.empty((size, *(field.shape or ())), field.dtype)
                     for field in self._table
                 }
             self._group.wait(self._without_rows)
-            if self._written is not None:
-                self._written.commit(self._asked)
-                return {}
         except BaseException:
             self._failed = True
             raise
@@ -308,8 +303,6 @@ class ClientSource(Source):
                 allowances[peer] = allowed
             else:
                 allowances[peer] = peer.granted
-        if self._written is not None and self._table:
-            self._written.extend(allowances)
         for peer, allowed in allowances.items():
             if allowed > peer.granted:
                 peer.granted = allowed
@@ -323,8 +316,6 @@ class ClientSource(Source):
         peer = self._group.peer(1)
         if peer.row_fields:
             self._table = peer.row_fields
-            if self._written is not None:
-                self._written.define(self._table)
             return []
         if peer.failure is not None:
             raise peer.failure
@@ -342,11 +333,7 @@ class ClientSource(Source):
             if peer.row_fields and number not in self._agreeing:
                 self._agree(number, self._table, peer.row_fields)
                 self._agreeing.add(number)
-            if self._written is not None:
-                moved = min(missing, peer.received - taken)
-                self._taken[number - 1] += moved
-                missing -= moved
-            elif peer.rows.count:
+            if peer.rows.count:
                 start = taken * self.instance_nb + number - 1 - self._first
                 moved = peer.rows.take(missing, self._out, start, self.instance_nb)
                 self._taken[number - 1] += moved

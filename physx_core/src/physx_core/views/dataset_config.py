@@ -22,8 +22,9 @@ class DatasetConfig:
     """Size of a partition in GB."""
     writers: str = field(default="server", metadata={"choices": ("server", "clients")})
     """Who writes the rows in data generation: "server", the run's own process, or "clients", each
-    client its own rows to its own partitions. The clients must then share the dataset's folder. Use
-    this for data rates that the run's connection cannot carry."""
+    client the rows of its episodes, which must be independent. The clients must then share the
+    dataset's folder. The dataset is the same; use this for data rates that the run's connection
+    cannot carry."""
     shuffle: bool = True
     """Read each epoch in a new random order; otherwise in the order of writing."""
     view: View = field(default_factory=View)

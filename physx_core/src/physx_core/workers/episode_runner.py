@@ -44,12 +44,14 @@ class EpisodeBlock(NamedTuple):
         instance_id: The instance that has simulated them.
         rejected: The samples that `check_sample` rejected in the episodes that have ended, if they
             are recorded; ``step`` counts all of an episode's.
+        first_row: Address of the rows if a client has written them itself, so that there are none.
     """
 
     rows: Batch
     records: list[EpisodeRecord]
     instance_id: int = 1
     rejected: Batch = {}  # noqa: RUF012 - never changed
+    first_row: int | None = None
 
 
 @dataclass(slots=True)

@@ -11,6 +11,7 @@ from typing import Any
 from unittest import mock
 
 import physx_core.checkpoint
+import physx_core.dataset.write.partition_writer as partition_writer_module
 import physx_core.dataset.write.writer as writer_module
 from physx_core import files
 from physx_core.dataset.store import syncing
@@ -114,7 +115,8 @@ class Stage:
             patch = mock.patch.object
             writer = functools.partial(Writer, helper=LaterHelper)
             stack.enter_context(patch(opening, "Writer", writer))
-            stack.enter_context(patch(writer_module, "Syncer", Syncer))
+            for module in (writer_module, partition_writer_module):
+                stack.enter_context(patch(module, "Syncer", Syncer))
             stack.enter_context(patch(partition_format, "boot_id", lambda: Stage.now.boot))
             stack.enter_context(patch(partition_file, "make_header", _make_header))
             stack.enter_context(warnings.catch_warnings())

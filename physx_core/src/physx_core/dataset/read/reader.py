@@ -146,10 +146,7 @@ class Reader:
             first, count = segment.span.inside(start, start + len(out))
             if count:
                 rows = out[segment.span.among(first, count, start)]
-                part = rows if segment.span.stride == 1 else np.empty(rows.shape, rows.dtype)
-                self._read_part(part, mode, segment, first, {} if checks is None else checks)
-                if part is not rows:
-                    rows[...] = part
+                self._read_part(rows, mode, segment, first, {} if checks is None else checks)
 
     def partition_blocks(self, partition: Partition, name: str, start: int) -> Iterator[Array]:
         """Yield a partition's rows from its row `start` on, as `blocks` does for a mode."""

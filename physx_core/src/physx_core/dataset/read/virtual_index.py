@@ -72,7 +72,6 @@ def _pieces(mode: Mode, order: Order) -> Iterator[Piece]:
     index = FlatIndex(spans)
     for first, rows in order.pieces(0, order.rows):
         found, number, piece = 0, index.find(first)[0], (first, first + rows)
-        number -= spans[number].place
         while number < len(spans) and spans[number].start < first + rows:
             partition, (begin, count) = mode.partitions[number], spans[number].inside(*piece)
             if count and not partition.sealed:
@@ -112,6 +111,5 @@ def _add(group: Any, field: Field, pieces: list[Piece]) -> None:
 def _select(space: Any, rows: slice) -> None:
     """Select some rows of a space; h5py's own layouts take eight times as long for each piece."""
     others = space.shape[1:]
-    count = len(range(rows.start, rows.stop, rows.step or 1))
-    start, stride = (rows.start, *(0 for _ in others)), (rows.step or 1, *(1 for _ in others))
-    space.select_hyperslab(start, (count, *others), stride)
+    start = rows.start, *(0 for _ in others)
+    space.select_hyperslab(start, (rows.stop - rows.start, *others))

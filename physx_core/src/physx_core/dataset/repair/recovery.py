@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
+from collections.abc import Iterator, Mapping
 from itertools import chain
 from pathlib import Path
-from typing import Any
 
 from physx_core import files
 from physx_core.dataset.repair.quarantine import FOLDER, keep, set_aside
 from physx_core.dataset.repair.salvage import seal_without_damage
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.definitions import compare_fields
-from physx_core.dataset.store.manifest import Manifest, Mode, Partition, trim_stripes
+from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition.commits import (
     SECTOR,
     Range,
@@ -27,7 +25,6 @@ from physx_core.dataset.store.partition.format import (
     FORMAT,
     MAGIC,
     SIGNATURE,
-    Identity,
     Inspection,
     inspect,
     open_partition,
@@ -138,8 +135,8 @@ def recover(directory: Path, manifest: Manifest) -> list[str]:
     for draft in chain(directory.glob("*.h5.tmp"), directory.glob(manifest_file.FILE + ".tmp")):
         files.remove(draft)
     for mode in manifest.modes.values():
-        for group in [group for group in mode.groups if not group[0].sealed]:
-            done += _close(directory, manifest, mode, group)
+        for partition in [each for each in mode.partitions if not each.sealed]:
+            done.append(_close(directory, manifest, mode, partition))
     if complete_checksums(directory, manifest):
         done.append("Rows were being updated in place: their checksums have been recomputed.")
     if any(mode.dropped for mode in manifest.modes.values()):
@@ -161,32 +158,24 @@ def _label(partition: Partition) -> str:
     )
 
 
-def _close(
-    directory: Path, manifest: Manifest, mode: Mode, group: Sequence[Partition]
-) -> list[str]:
-    """Seal open partitions whose writer is gone, or remove them; return what was done."""
-    done = []
-    for partition in group:
-        without = " without its damaged ones" if partition.damaged else ""
-        what = f"of {partition.rows} rows was left open and has been sealed{without}."
-        if not partition.rows:
-            what = "had no committed rows and has been removed."
-        if partition.problem:  # the original files are kept
-            keep(directory, [partition.path(directory, name) for name in mode.fields])
-            what += f" {partition.problem} The original files are in {directory / FOLDER}."
-        done.append(f"{_label(partition)} {what}")
-    with_rows = [partition for partition in group if partition.rows]
-    for partition in group:
-        if not partition.rows:
-            mode.partitions.remove(partition)
-            mode.dropped.append(partition)
-    if any(partition.damaged for partition in with_rows):
-        seal_without_damage(directory, manifest, mode, with_rows)
-        return done
-    for partition in with_rows:
+def _close(directory: Path, manifest: Manifest, mode: Mode, partition: Partition) -> str:
+    """Seal an open partition whose writer is gone, or remove it; return what was done."""
+    without = " without its damaged ones" if partition.damaged else ""
+    what = f"of {partition.rows} rows was left open and has been sealed{without}."
+    if not partition.rows:
+        what = "had no committed rows and has been removed."
+    if partition.problem:  # the original files are kept
+        keep(directory, [partition.path(directory, name) for name in mode.fields])
+        what += f" {partition.problem} The original files are in {directory / FOLDER}."
+    if not partition.rows:
+        mode.partitions.remove(partition)
+        mode.dropped.append(partition)
+    elif partition.damaged:
+        seal_without_damage(directory, manifest, mode, partition)
+    else:
         listed = bool(partition.offsets)  # other files may be sealed, as an older manifest says
         mode.swap(seal(directory, mode.fields, partition, rewrite=listed))
-    return done
+    return f"{_label(partition)} {what}"
 
 
 def clear_dropped(directory: Path, manifest: Manifest) -> None:
@@ -311,18 +300,12 @@ def _discard_behind_gaps(mode: Mode) -> None:
     """Discard rows of open partitions that would come after a gap.
 
     These are the rows of partitions whose writer had filled an earlier one, if that one has lost
-    rows or never got them; and rows of stripes whose turn had not come, as other stripes lack
-    theirs.
+    rows or never got them.
     """
-    for group in mode.groups:
-        if group[0].sealed:
-            continue
-        if any(_follows_gap(mode, partition) for partition in group):
-            for partition in group:
-                if partition.rows and not partition.stripe:
-                    partition.problem = "It comes after rows that did not reach the disk."
-                partition.rows = 0
-        trim_stripes(group)
+    for partition in mode.partitions:
+        if not partition.sealed and partition.rows and _follows_gap(mode, partition):
+            partition.problem = "It comes after rows that did not reach the disk."
+            partition.rows = 0
 
 
 def _follows_gap(mode: Mode, partition: Partition) -> bool:
@@ -366,52 +349,21 @@ def _adopt(directory: Path, manifest: Manifest, strict: bool) -> None:
         if path.name == identity.file_name:
             key = identity.mode, identity.session, identity.index
             groups.setdefault(key, {})[identity.field.name] = found
-    before = _stripes_before(groups)
     for (mode_name, session, index), group in sorted(groups.items(), key=_order):
         identity = next(iter(group.values())).identity
-        if not identity.stripe and not all(found.rows for found in group.values()):
+        if not all(found.rows for found in group.values()):
             continue  # the writer was killed before the partition's first commit
         fields = {name: found.identity.field for name, found in sorted(group.items(), key=_role)}
         mode = manifest.modes.get(mode_name)
         if mode is not None and not strict and not _fits(mode, fields):
             continue  # part of a partition that was being removed, or of another dataset
         mode = manifest.modes.setdefault(mode_name, Mode(fields))
-        mode.partitions.append(
-            Partition(
-                mode_name,
-                session,
-                index,
-                identity.first_row,
-                stripe=identity.stripe,
-                follows=before.get(_place(identity)) if identity.stripe else None,
-            )
-        )
+        mode.add(Partition(mode_name, session, index, identity.first_row))
         mode.fields |= {
             name: field
             for name, field in fields.items()
             if name not in mode.fields or mode.fields[name].shape is None
         }
-
-
-def _stripes_before(
-    groups: Mapping[tuple[str, str, int], Group],
-) -> dict[tuple[Any, ...], tuple[int, int]]:
-    """Map the place after each partition of a stripe to its index and its capacity in rows.
-
-    Only the files of a partition that was not filled have space for more rows than it has.
-    """
-    found = {}
-    for group in groups.values():
-        capacity = max(inspection.capacity for inspection in group.values())
-        identity = next(iter(group.values())).identity
-        if identity.stripe is not None:
-            last = identity.first_row + capacity * identity.stripe.of
-            found[_place(replace(identity, first_row=last))] = identity.index, capacity
-    return found
-
-
-def _place(identity: Identity) -> tuple[Any, ...]:
-    return identity.mode, identity.session, identity.stripe, identity.first_row
 
 
 def _fits(mode: Mode, fields: Mapping[str, Field]) -> bool:

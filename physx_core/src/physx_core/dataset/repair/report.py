@@ -143,8 +143,6 @@ def _difference(found: Inspection, partition: Partition, field: Field) -> str | 
     have = found.identity
     if (have.mode, have.session, have.index) != (partition.mode, *partition.key):
         return f"belongs to another partition: {have.file_name}."
-    if have.stripe != partition.stripe:
-        return "has a different stripe of the rows than the manifest says."
     if have.field != field:
         return f"holds {have.field}, but the manifest says {field}."
     if not partition.sealed:

@@ -10,11 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from physx_core import files
-from physx_core.errors import DatasetError, DatasetLockedError
+from physx_core.errors import DatasetLockedError
 
 LOCK = "dataset.lock"
 MANIFEST_LOCK = "dataset.json.lock"
-_PATIENCE = 20.0
 _MOMENT = 2.0  # for a process that a killed writer was about to start
 _PAUSE = 0.02
 
@@ -95,39 +94,6 @@ def share(directory: Path, lock: files.FileLock) -> None:
     """
     if not lock.acquire(shared=True):
         raise _locked(directory, lock)
-
-
-def take_over(path: Path, place: int) -> int:
-    """Lock one byte of a file for the process that writes a stripe; closing it releases the lock.
-
-    The previous process of this place may need a moment to exit. As the system releases its lock on
-    exit, the two never write at the same time.
-
-    Returns:
-        The descriptor.
-
-    Raises:
-        DatasetError: If another process keeps the lock.
-    """
-    descriptor = files.open_regular(path, os.O_RDWR)
-    until = time.monotonic() + _PATIENCE
-    try:
-        while True:
-            try:
-                fcntl.lockf(descriptor, fcntl.LOCK_EX | fcntl.LOCK_NB, 1, place)
-            except (BlockingIOError, PermissionError):
-                if time.monotonic() > until:
-                    raise DatasetError(
-                        f"An earlier client is still writing the rows of instance {place + 1} to "
-                        f"{path.parent}, {_PATIENCE:g} s after another one took its place. "
-                        "Terminate it; its machine may have lost its connection to the run."
-                    ) from None
-                time.sleep(_PAUSE)
-            else:
-                return descriptor
-    except BaseException:
-        files.close(descriptor)
-        raise
 
 
 @contextlib.contextmanager

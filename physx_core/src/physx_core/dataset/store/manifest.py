@@ -6,11 +6,11 @@
 
 from __future__ import annotations
 
+import bisect
 import functools
-import itertools
 import json
 import platform
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
@@ -23,7 +23,6 @@ from physx_core.dataset.store.partition.commits import Kept, Range
 from physx_core.dataset.store.partition.format import (
     Identity,
     Inspection,
-    Stripe,
     find_rows,
     inspect,
     partition_file,
@@ -37,24 +36,20 @@ from physx_core.statistics import RunningStatistics
 
 @dataclass
 class Partition:
-    """Rows of one mode: one file for each field.
-
-    The rows are consecutive, or every n-th: n partitions that were begun together may have stripes
-    of the same rows.
+    """Consecutive rows of one mode: one file for each field.
 
     Attributes:
         mode: Name of the mode.
         session: Session that wrote it.
         index: Its number in the session and mode, counted from 0.
-        first_row: Number of its first row in the mode when it was begun; orders the partitions.
-        stripe: Which of the rows from there on it has; None: all up to the next partition.
+        first_row: Address of its first row; orders the partitions.
         rows: Number of committed rows, the same in all fields.
         sealed: Whether it is complete: every file has exactly these rows.
         offsets: Byte of the file at which the rows begin, by field.
         checksums: CRC-32 of the rows, by field; empty until it is sealed, and while rows are
             updated in place.
         counted: Whether the mode's statistics include its rows.
-        writing: Whether this process writes it, so that `offsets` are valid before it is sealed.
+        writing: Whether this process has begun it, so that `offsets` are valid before it is sealed.
         follows: While it is not sealed, number of the partition that its writer filled before it,
             and that one's number of rows: if any of them is missing, its own rows do not count.
         kept: While it is not sealed, what counts in its files as found in them, by field; not
@@ -70,7 +65,6 @@ class Partition:
     first_row: int
     rows: int = 0
     sealed: bool = False
-    stripe: Stripe | None = None
     offsets: dict[str, int] = field(default_factory=dict)
     checksums: dict[str, int] = field(default_factory=dict)
     counted: bool = False
@@ -86,13 +80,6 @@ class Partition:
         """Key that is unique among the partitions of its mode."""
         return self.session, self.index
 
-    @property
-    def group(self) -> tuple[str, int, int]:
-        """Key that it shares only with the partitions that have stripes of the same rows."""
-        if self.stripe is None:
-            return self.session, self.first_row, self.index
-        return self.session, self.first_row - self.stripe.place, -1
-
     def file_name(self, name: str) -> str:
         """Return the name of a field's file."""
         return partition_file(self.session, self.mode, name, self.index)
@@ -103,7 +90,7 @@ class Partition:
 
     def identity(self, of: Field) -> Identity:
         """Return the identity of a field's file."""
-        return Identity(self.session, self.mode, of, self.index, self.first_row, self.stripe)
+        return Identity(self.session, self.mode, of, self.index, self.first_row)
 
     def inspect(self, directory: Path, of: Field) -> Inspection:
         """Return the contents of the header of a field's file."""
@@ -148,41 +135,12 @@ class Partition:
             "sealed": self.sealed,
             "offsets": self.offsets,
         }
-        if self.stripe is not None:
-            plain["stripe"] = list(self.stripe)
         if self.sealed:
             crc32 = {name: f"{value:08x}" for name, value in self.checksums.items()}
             plain |= {"rows": self.rows, "crc32": crc32, "counted": self.counted}
         elif self.follows is not None:
             plain["follows"] = list(self.follows)
         return plain
-
-
-def whole_stripes(rows: Sequence[int]) -> int:
-    """Return the number of rows before the first one missing in any stripe.
-
-    Args:
-        rows: Number of rows of each stripe.
-    """
-    return min(have * len(rows) + place for place, have in enumerate(rows))
-
-
-def trim_stripes(group: Sequence[Partition], total: int | None = None) -> None:
-    """Limit the partitions of a group to the rows before the first missing one.
-
-    Args:
-        group: Partitions that have stripes of the same rows, in order.
-        total: Maximum number of rows they have together.
-    """
-    whole = whole_stripes([partition.rows for partition in group])
-    total = whole if total is None else min(whole, total)
-    for place, partition in enumerate(group):
-        partition.rows = rows_of_stripe(total, place, len(group))
-
-
-def rows_of_stripe(total: int, place: int, count: int) -> int:
-    """Return the number of rows of a stripe among the first `total` rows."""
-    return (total - place + count - 1) // count
 
 
 @dataclass
@@ -198,8 +156,8 @@ class Mode:
             being removed, or copied from another dataset.
         removed: Largest number of a removed partition, by session. It is never reused, so that a
             reader that still lists the removed partition cannot mistake new rows for its rows.
-        recorded: End of the rows that the table of episodes speaks of, even if some are lost; their
-            places are never used again: see `physx_core.dataset.store.episode_table`. Not stored.
+        taken: End of the addresses that are never used again although there may be no rows: the
+            table of episodes speaks of them, or other processes may yet write them. Not stored.
     """
 
     fields: dict[str, Field]
@@ -207,7 +165,7 @@ class Mode:
     statistics: dict[str, RunningStatistics] | None = field(default_factory=dict)
     dropped: list[Partition] = field(default_factory=list)
     removed: dict[str, int] = field(default_factory=dict)
-    recorded: int = 0
+    taken: int = 0
 
     @property
     def rows(self) -> int:
@@ -218,7 +176,7 @@ class Mode:
     def next_row(self) -> int:
         """First row of the next partition, larger than that of any earlier one."""
         before = (p.first_row + max(1, p.rows) for p in (*self.partitions, *self.dropped))
-        return max(self.rows, *before, self.recorded)
+        return max(self.rows, *before, self.taken)
 
     @property
     def counted_fields(self) -> dict[str, Field]:
@@ -230,22 +188,17 @@ class Mode:
         return [p.key for p in self.partitions].index(partition.key)
 
     @property
-    def groups(self) -> list[list[Partition]]:
-        """The partitions in order; those with stripes of the same rows form one group."""
-        grouped = itertools.groupby(self.partitions, lambda partition: partition.group)
-        return [list(partitions) for _, partitions in grouped]
-
-    @property
     def spans(self) -> list[Span]:
         """Rows of the mode that each partition currently has."""
         found, start = [], 0
-        for group in self.groups:
-            found += [
-                Span(start + place, partition.rows, len(group), place)
-                for place, partition in enumerate(group)
-            ]
-            start += sum(partition.rows for partition in group)
+        for partition in self.partitions:
+            found.append(Span(start, partition.rows))
+            start += partition.rows
         return found
+
+    def add(self, partition: Partition) -> None:
+        """Add a partition at its place."""
+        bisect.insort(self.partitions, partition, key=lambda each: each.first_row)
 
     def swap(self, partition: Partition) -> None:
         """Replace the earlier state of a partition."""
@@ -262,10 +215,10 @@ class Mode:
     def continues(self, earlier: Mode) -> bool:
         """Return whether all rows of an earlier state still exist under the same numbers."""
         before, now = earlier.with_rows, self.with_rows
-        last = before[-1].group if before else None
+        last = before[-1].key if before else None
         grown = all(
             old.key == new.key
-            and (old.rows == new.rows or (old.group == last and old.rows < new.rows))
+            and (old.rows == new.rows or (old.key == last and old.rows < new.rows))
             for old, new in zip(before, now, strict=False)
         )
         return grown and len(now) >= len(before) and self.rows >= earlier.rows
@@ -288,7 +241,7 @@ class Mode:
             None if self.statistics is None else dict(self.statistics),
             list(self.dropped),
             dict(self.removed),
-            self.recorded,
+            self.taken,
         )
 
     def to_dict(self) -> dict[str, Any]:
@@ -356,12 +309,6 @@ class Manifest:
         return self.statistics_checksum is None and any(
             mode.statistics for mode in self.modes.values()
         )
-
-    @property
-    def is_striped(self) -> bool:
-        """Whether partitions have stripes of the same rows."""
-        modes = self.modes.values()
-        return any(p.stripe for mode in modes for p in (*mode.partitions, *mode.dropped))
 
     @property
     def file_names(self) -> set[str]:

@@ -27,8 +27,6 @@ from physx_core.parsing import parse_json
 FILE = "dataset.json"
 FORMAT = "physx dataset"
 VERSION = 1
-STRIPED_VERSION = 2
-"""Version of a dataset with stripes; a physx that does not support them rejects it."""
 
 _LARGEST = 2**27
 _END = re.compile(rb',\n "crc32": "([0-9a-f]{8})"\n\}\s*$')
@@ -47,7 +45,7 @@ def save(directory: Path, manifest: Manifest) -> None:
         after = statistics_file.write(directory, manifest)
     plain = {
         "format": FORMAT,
-        "format_version": STRIPED_VERSION if manifest.is_striped else VERSION,
+        "format_version": VERSION,
         "versions": manifest.versions,
         "info": manifest.info,
         "modes": {name: mode.to_dict() for name, mode in manifest.modes.items()},
@@ -87,11 +85,10 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
         if not isinstance(plain, dict) or plain.get("format") != FORMAT:
             raise ValueError(f'its format is not "{FORMAT}"')
         version = whole(plain["format_version"], "the format's version")
-        if version not in (VERSION, STRIPED_VERSION):
+        if version != VERSION:
             raise DatasetError(
                 f"{path} has version {version} of the dataset's format, but this physx reads "
-                f"versions {VERSION} and {STRIPED_VERSION}. "
-                f"{install_hint('physx-core', update=True)}"
+                f"version {VERSION}. {install_hint('physx-core', update=True)}"
             )
         if not edited and not _is_whole(content):
             raise ValueError("it was truncated or edited by hand: its checksum does not match")

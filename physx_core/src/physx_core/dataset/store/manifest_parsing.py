@@ -6,7 +6,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
-from physx_core.dataset.store.partition.format import Stripe, parse_stripe
 from physx_core.dataset.store.statistics_file import file_name
 from physx_core.dataset.store.validation import (
     SESSION,
@@ -62,8 +61,6 @@ def _mode(mode_name: str, plain: Any) -> Mode:
     keys = [partition.key for partition in (*mode.partitions, *mode.dropped)]
     if len(set(keys)) != len(keys):
         raise ValueError("a partition is listed twice")
-    for group in mode.groups:
-        _check_stripes(group)
     whole(mode.rows, "the number of rows")
     return mode
 
@@ -96,21 +93,8 @@ def _partition(mode_name: str, plain: Any, fields: Mapping[str, Field]) -> Parti
         first_row=whole(plain["first_row"], "a first row"),
         rows=rows,
         sealed=sealed,
-        stripe=parse_stripe(plain["stripe"]) if "stripe" in plain else None,
         offsets=offsets,
         checksums={n: int(checked(str, crc, "a checksum"), 16) for n, crc in crc32.items()},
         counted=sealed and bool(crc32) and plain.get("counted") is True,
         follows=follows,
     )
-
-
-def _check_stripes(group: list[Partition]) -> None:
-    """Check that stripes of the same rows are in order and have consistent numbers of rows."""
-    places = [partition.stripe or Stripe(0, 1) for partition in group]
-    if len({stripe.of for stripe in places}) > 1 or places != sorted(set(places)):
-        raise ValueError("stripes of the same rows are inconsistent")
-    if len({partition.sealed for partition in group}) > 1:
-        raise ValueError("some stripes of the same rows are sealed and others are not")
-    rows = [partition.rows for partition in group]
-    if rows != sorted(rows, reverse=True) or rows[0] > rows[-1] + 1:
-        raise ValueError("stripes of the same rows have inconsistent numbers of rows")

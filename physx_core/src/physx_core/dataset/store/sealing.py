@@ -18,7 +18,12 @@ from physx_core.statistics import RunningStatistics
 
 
 def seal(
-    directory: Path, fields: Mapping[str, Field], partition: Partition, *, rewrite: bool = False
+    directory: Path,
+    fields: Mapping[str, Field],
+    partition: Partition,
+    *,
+    rewrite: bool = False,
+    statistics: bool = True,
 ) -> Partition:
     """Rewrite a partition's files at their exact size, unless they are full, and checksum them.
 
@@ -30,6 +35,7 @@ def seal(
         fields: The fields of the mode.
         partition: The partition; nothing may write to it any more.
         rewrite: Whether to rewrite full files too.
+        statistics: Whether to compute those of the rows, which modes with episodes do not use.
 
     Returns:
         The sealed partition, for the manifest.
@@ -46,18 +52,22 @@ def seal(
             files.sync_file(path)
     files.sync_folder(directory)
     sealed = replace(partition, offsets=offsets, sealed=True, writing=False, follows=None)
-    return scan(directory, fields, sealed)
+    return scan(directory, fields, sealed, statistics=statistics)
 
 
-def scan(directory: Path, fields: Mapping[str, Field], partition: Partition) -> Partition:
+def scan(
+    directory: Path, fields: Mapping[str, Field], partition: Partition, *, statistics: bool = True
+) -> Partition:
     """Return a sealed partition with checksums and statistics, computed in one pass."""
     crc, running = dict.fromkeys(fields, 0), {}
     for name, field in fields.items():
-        statistics = running[name] = RunningStatistics()
+        counts = statistics and has_statistics(field)
+        if counts:
+            running[name] = RunningStatistics()
         for block in partition.segment(directory, field).blocks():
             crc[name] = crc32(files.as_bytes(block), crc[name])
-            if has_statistics(field):
-                statistics.update(block)
+            if counts:
+                running[name].update(block)
     return replace(partition, checksums=crc, running=running, counted=False)
 
 

@@ -89,35 +89,59 @@ class Appender:
         *,
         episode_fields: Iterable[Field] = (),
         checked: bool = False,
+        first_row: int | None = None,
     ) -> None:
         """Store rows with the records that commit them: see `Dataset.append_episodes`."""
         recorder = self.writer.recorder
         mode_index(mode)  # it must be one that can hold episodes
-        self.writer.check_alone([mode, EPISODES])
+        total = sum(each.rows for each in episodes)
+        if first_row is not None:
+            self._check_written(mode, first_row, total)
+        elif total:
+            self.writer.check_alone([mode])
         recorder.check(mode, episodes)
         table = self._check_table(mode, episodes, episode_fields) if episodes else {}
         block, count = self._check_rows(mode, rows, checked=checked) if rows else ({}, 0)
-        total = sum(each.rows for each in episodes)
-        if total != count:
+        if total != count and first_row is None:
             raise UsageError(f"{count} rows are given, but the episodes have {total}.")
         self._flush(mode)
         if episodes:
-            recorder.append(mode, block, count, episodes, table)
+            recorder.append(mode, block, total, episodes, table, first_row)
+
+    def _check_written(self, mode: str, first_row: int, count: int) -> None:
+        """Check that another process has written rows with these addresses."""
+        delegation = self.writer.delegation(mode)
+        if delegation is None or not delegation.has(first_row, count):
+            raise UsageError(
+                f"No process to which mode {mode!r} is delegated has written {count} rows with "
+                f"the address {first_row}."
+            )
+
+    def define_episodes(self, parameters: Iterable[Field], episode_fields: Iterable[Field]) -> None:
+        """Define the table of episodes unless there is one: see `Dataset.define_episodes`."""
+        if not self._is_settled(EPISODES):
+            self.define_fields(EPISODES, self._table_fields(parameters, episode_fields).values())
+
+    def _table_fields(
+        self, parameters: Iterable[Field], episode_fields: Iterable[Field]
+    ) -> dict[str, Field]:
+        """Return the fields of the table of episodes, or what they are to be."""
+        own = {field.name: field for field in TABLE_FIELDS}
+        known = self._manifest.modes.get(EPISODES)
+        if known is None:
+            return {f.name: f for f in (*parameters, *episode_fields)} | own
+        if not has_table(self._manifest):
+            compare_fields(f'Mode "{EPISODES}" of the dataset', known.fields, own)
+        return known.fields
 
     def _check_table(
         self, mode: str, episodes: Sequence[EpisodeRecord], episode_fields: Iterable[Field]
     ) -> Batch:
         """Return the records of a mode for the table of episodes, which is defined if needed."""
-        own = {field.name: field for field in TABLE_FIELDS}
-        known = self._manifest.modes.get(EPISODES)
-        if known is not None and not has_table(self._manifest):
-            compare_fields(f'Mode "{EPISODES}" of the dataset', known.fields, own)
-        if known is not None:
-            fields = known.fields
-        else:
-            axes = int(episodes[0].count > 1)
-            parameters = infer_fields(episodes[0].parameters, axes)
-            fields = {f.name: f for f in (*parameters, *episode_fields)} | own
+        is_known = EPISODES in self._manifest.modes
+        axes = int(episodes[0].count > 1)
+        parameters = [] if is_known else infer_fields(episodes[0].parameters, axes)
+        fields = self._table_fields(parameters, episode_fields)
         table, _ = check_rows(fields, table_rows(mode, fields, episodes))
         if not self._is_settled(EPISODES):
             self.define_fields(EPISODES, infer_shapes(fields.values(), table, axes=1))

@@ -75,11 +75,11 @@ def _kept(mode: Mode, order: Order) -> int:
     first, rows = order.places
     in_place = int(rows[0]) if len(rows) and first[0] == 0 else 0
     count, kept = 0, 0
-    for group in mode.groups:
-        kept += sum(partition.rows for partition in group)
+    for partition in mode.partitions:
+        kept += partition.rows
         if kept > in_place:
             break
-        count += len(group)
+        count += 1
     return count
 
 

@@ -102,7 +102,7 @@ def _reserve(writer: Writer, given: Manifest) -> dict[str, Pairs]:
             first = mode.next_row
             for old in (partition for partition in other.partitions if partition.rows):
                 new = writer.new_partition(name, mode)
-                new.rows, new.stripe = old.rows, old.stripe
+                new.rows = old.rows
                 new.first_row = first + old.first_row
                 mode.dropped.append(new)
                 found.append((old, new))

@@ -95,7 +95,13 @@ class Recorder:
                 self._parts.pop((mode, campaign, episode), None)
 
     def append(
-        self, mode: str, rows: Batch, count: int, episodes: Sequence[EpisodeRecord], table: Batch
+        self,
+        mode: str,
+        rows: Batch,
+        count: int,
+        episodes: Sequence[EpisodeRecord],
+        table: Batch,
+        first: int | None = None,
     ) -> None:
         """Store rows and then the records that commit them.
 
@@ -105,16 +111,17 @@ class Recorder:
             count: Number of rows.
             episodes: The records.
             table: Their rows in the table, checked, but for the first rows.
+            first: Address of the rows if another process has written them.
         """
-        self._end_stream(mode)
-        first = 0
-        if count:
+        self.end_stream(mode)
+        if count and first is None:
             self.recorded.discard(mode)
             try:
                 self._writer.append(mode, rows, count)
             finally:
                 self.recorded.add(mode)
             first = _first_of_last(self.manifest.modes[mode], count)
+        if count:
             table["first_row"] = first + np.cumsum(table["rows"]) - table["rows"]
         self.store_reasons(
             FailedEpisode(mode, each.campaign, each.episode, each.reason)
@@ -122,6 +129,7 @@ class Recorder:
             if each.status is EpisodeStatus.FAILED
         )
         self._writer.append(EPISODES, table, len(table["rows"]))
+        first = first or 0
         for each in episodes:
             self._note(mode, each.campaign, each.episode, first, each.rows, each.part, each.status)
             first += each.rows
@@ -162,7 +170,7 @@ class Recorder:
                 "rows: open it without shared=True."
             )
         known = self.manifest.modes[mode]
-        first = max(Addresses(known).end, known.recorded)
+        first = max(Addresses(known).end, known.taken)
         self._store_stream(mode, self._campaigns[mode] + 1, first, OPEN)
 
     @property
@@ -192,7 +200,7 @@ class Recorder:
         end = 0 if known is None else Addresses(known).end
         return campaign, first, max(0, end - first)
 
-    def _end_stream(self, mode: str) -> None:
+    def end_stream(self, mode: str) -> None:
         """Let the next rows of a mode count only with a record."""
         if (stream := self.ended_stream(mode)) is not None:
             self._store_stream(mode, *stream)
@@ -227,7 +235,7 @@ class Recorder:
         self._campaigns[mode] = max(campaign, self._campaigns.get(mode, 0))
         known = self.manifest.modes.get(mode)
         if known is not None:
-            known.recorded = max(known.recorded, end)
+            known.taken = max(known.taken, end)
 
 
 def table_rows(

@@ -22,8 +22,8 @@ from physx_core.dataset.store.manifest_store import ManifestStore
 from physx_core.dataset.store.partition.file import PartitionFile
 from physx_core.dataset.store.sealing import remove_files, seal
 from physx_core.dataset.store.syncing import Syncer, sync_marked
+from physx_core.dataset.write.delegation import Delegation
 from physx_core.dataset.write.recording import Recorder
-from physx_core.dataset.write.stripes import Stripes
 from physx_core.dataset.write.updating import update_rows
 from physx_core.errors import DatasetError, UsageError
 from physx_core.fields import Field
@@ -140,7 +140,7 @@ class Writer:
         self._filled: dict[str, Partition] = {}
         self._sealed: list[Partition] = []
         self._sealer: Helper[Partition] = helper("physx-seal")
-        self._stripes: dict[str, Stripes] = {}
+        self._delegations: dict[str, Delegation] = {}
         self.recorder = Recorder(self, self.reader)
         self._recorded = self.recorder.recorded
 
@@ -149,21 +149,24 @@ class Writer:
         """Whether this process opened it, rather than having been forked from one that did."""
         return self._lock.is_own
 
-    def stripes(self, mode_name: str, count: int) -> Stripes:
-        """Let other processes write a mode's rows from now on: see `Dataset.stripes`."""
+    def delegate(self, mode_name: str) -> Delegation:
+        """Let other processes write a mode's rows from now on: see `Dataset.delegate`."""
         self.finish(mode_name)
-        if mode_name in self._recorded:
-            self.recorder.begin_stream(mode_name)
-        found = self._stripes[mode_name] = Stripes(self, mode_name, count)
+        found = self._delegations[mode_name] = Delegation(self, mode_name)
         return found
+
+    def delegation(self, mode_name: str) -> Delegation | None:
+        """Return through what other processes write the rows of a mode; None if none do."""
+        found = self._delegations.get(mode_name)
+        return None if found is None or found.is_closed else found
 
     def check_alone(self, mode_names: Iterable[str]) -> None:
         """Refuse to change rows of modes that other processes write."""
         for name in mode_names:
-            if name in self._stripes:
+            if self.delegation(name) is not None:
                 raise UsageError(
                     f"Other processes write the rows of mode {name!r}: nothing else may change "
-                    "them until the dataset has been closed and reopened."
+                    "them until its delegation is closed."
                 )
 
     def append(self, mode_name: str, rows: Batch, count: int) -> None:
@@ -175,14 +178,14 @@ class Writer:
             count: Number of rows.
         """
         done, syncer = 0, self._syncer
-        if self._stripes:
+        if self._delegations:
             self.check_alone([mode_name])
         if self._recorded and count and mode_name in self._recorded:
             self.recorder.begin_stream(mode_name)
         try:
             if self.store.failure is not None or (syncer is not None and syncer.error is not None):
                 self._check()
-            if self._sealer.pending:
+            if self._sealer.pending or self._sealed:
                 self._collect(wait=False)
             while done < count:
                 partition = self._open.get(mode_name)
@@ -261,17 +264,17 @@ class Writer:
                 self._check()
                 for mode_name in list(self._open):
                     self._retire(mode_name)
+                for delegation in self._delegations.values():
+                    delegation.close()
                 self._collect(wait=True)
-                for stripes in self._stripes.values():
-                    stripes.close()
                 self._complete()
         except DatasetError as error:
             cause = error.__cause__
             if not (isinstance(cause, OSError) and cause.errno in files.FULL):
                 raise
         finally:
-            for stripes in self._stripes.values():
-                stripes.remove_proof()
+            for delegation in self._delegations.values():
+                delegation.remove_proof()
             self._sealer.close()
             self._digester.close()
             for opened in self._open.values():
@@ -320,6 +323,8 @@ class Writer:
         with self.store.change() as manifest:
             for entry in self._sealed:
                 mode = manifest.modes[entry.mode]
+                if entry.rows < mode.partitions[mode.place(entry)].rows:
+                    manifest.renumber()  # some are lost
                 if entry.rows:
                     mode.swap(entry)
                     count_sealed(self._directory, manifest, mode)
@@ -331,7 +336,21 @@ class Writer:
         for entry in empty:
             remove_files(self._directory, self.store.manifest.modes[entry.mode].fields, entry)
 
-    def _begin(self, mode_name: str) -> OpenPartition:
+    def seal(self, entry: Partition, how: Callable[[Partition], Partition]) -> None:
+        """Seal a partition that another process has written, in the background."""
+        self._sealer.give(partial(how, replace(entry)))
+
+    def list_sealed(self, entry: Partition) -> None:
+        """List a partition as sealed that another process has sealed, before long."""
+        self._sealed.append(entry)
+
+    def begin(self, mode_name: str, first_row: int) -> Partition:
+        """Begin a partition that another process writes, and return its entry."""
+        opened = self._begin(mode_name, first_row)
+        opened.close()
+        return opened.partition
+
+    def _begin(self, mode_name: str, first_row: int | None = None) -> OpenPartition:
         """Create the files of a partition, then list it; rows may be committed only after that."""
         parts: dict[str, PartitionFile] = {}
         try:
@@ -340,13 +359,16 @@ class Writer:
                 capacity = self.capacity(mode)
                 entry = self.new_partition(mode_name, mode)
                 entry.writing = True
-                entry.follows = self._find_unsealed_before(mode_name, mode)
+                if first_row is None:
+                    entry.follows = self._find_unsealed_before(mode_name, mode)
+                else:
+                    entry.first_row = first_row
                 for name, field in mode.fields.items():
                     parts[name] = self.create_file(entry, field, capacity)
                 for part in parts.values():
                     part.publish()
                 files.sync_folder(self._directory)
-                mode.partitions.append(entry)
+                mode.add(entry)
         except BaseException:
             for part in parts.values():
                 part.discard()

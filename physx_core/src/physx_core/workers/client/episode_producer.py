@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from physx_core.dataset import EpisodeRecord
 from physx_core.errors import ConnectionRefusedByPeerError
@@ -15,15 +15,24 @@ from physx_core.workers.instance import Instance
 from physx_core.workers.lease import Lease
 from physx_core.workers.row_codec import pack_rows
 
+if TYPE_CHECKING:
+    from physx_core.workers.client.row_files import RowFiles
+
 _MOST_REJECTED = 256
 
 
 class EpisodeProducer:
     """Runs an instance for a campaign."""
 
-    def __init__(self, link: WorkerLink, instance: Instance) -> None:
-        """Store what simulates the episodes and sends their rows."""
-        self._link, self._instance = link, instance
+    def __init__(self, link: WorkerLink, instance: Instance, row_files: RowFiles | None) -> None:
+        """Store what simulates the episodes.
+
+        Args:
+            link: The connection to the server.
+            instance: Simulates; open.
+            row_files: Where the rows are written; None: they are sent.
+        """
+        self._link, self._instance, self._row_files = link, instance, row_files
         self._leased: deque[Lease] = deque()
         self._announced = False
 
@@ -47,18 +56,24 @@ class EpisodeProducer:
             self._announced = True
             table = [field.to_dict() for field in runner.fields]
             self._link.send(pack(Kind.FIELDS, encode(table)))
-        if count:
+        if count and self._row_files is not None:
+            self._row_files.put(block.rows, count, runner.fields)
+        elif count:
             self._link.send_parts(pack_rows(block.rows, count))
         for start in range(0, rejected, _MOST_REJECTED):
             part = {n: each[start : start + _MOST_REJECTED] for n, each in block.rejected.items()}
             self._link.send_parts(pack_rows(part, len(part["step"]), Kind.WRONG))
         records = [_plain(record) for record in block.records]
         self._link.send(pack(Kind.EPISODES, encode(records), count))
+        if self._row_files is not None:
+            self._row_files.tell_sealed()
 
     def _obey(self, frame: Frame) -> None:
         if frame.kind is Kind.LEASE:
             first, values = decode(frame.payload)
             self._leased.append(Lease(range(first, first + frame.number), values))
+        elif frame.kind is Kind.PARTITION and self._row_files is not None:
+            self._row_files.take(frame)
         elif frame.kind is Kind.CLOSE:
             raise RunEnded
         elif frame.kind not in (Kind.ANSWER, Kind.REFUSAL):  # to an abandoned request

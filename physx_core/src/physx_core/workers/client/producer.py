@@ -8,7 +8,6 @@ from typing import Any
 
 from physx_core.errors import (
     ConnectionRefusedByPeerError,
-    DatasetError,
     NotFiniteError,
     PhysxError,
     StateError,
@@ -19,7 +18,6 @@ from physx_core.net.values import decode, encode
 from physx_core.rows import ROW_FIELDS, RowBuffer, copy_row, infer_shapes
 from physx_core.typing import Sample
 from physx_core.workers.client.link import RunEnded, WorkerLink
-from physx_core.workers.client.row_sinks import RowSink
 from physx_core.workers.instance import Instance
 from physx_core.workers.row_codec import pack_rows
 
@@ -39,7 +37,6 @@ class Producer:
         self,
         link: WorkerLink,
         instance: Instance,
-        sink: RowSink,
         *,
         rows: int = 0,
         rejected: int = 0,
@@ -50,7 +47,6 @@ class Producer:
         Args:
             link: The connection to the server.
             instance: Generates the rows; open.
-            sink: Takes the rows.
             rows: How many rows the server has from earlier clients. They are generated again, but
                 not sent.
             rejected: How many rejected rows the server has from earlier clients.
@@ -58,7 +54,7 @@ class Producer:
         """
         self.made = self.shown = 0
         self.failure: PhysxError | None = None
-        self._link, self._instance, self._sink = link, instance, sink
+        self._link, self._instance = link, instance
         self._clock = link.clock
         self._skip, self._skip_rejected = rows, rejected
         self._state_every, self._last_state, self._has_refused = state_every, 0, False
@@ -69,10 +65,6 @@ class Producer:
         self._credit = 0
         self._sent_at = 0.0
 
-    def open(self) -> None:
-        """Open the sink; rows that it already has are generated again, but not put."""
-        self._skip = self._sink.open(self._skip)
-
     def resume(self, state: Mapping[str, Any]) -> None:
         """Go on from the state that an earlier client sent.
 
@@ -80,14 +72,8 @@ class Producer:
             state: Its counters, and what `_send_state` has sent.
 
         Raises:
-            DatasetError: If rows before it have been lost.
             StateError: If the environment was created differently.
         """
-        if self._skip < state["rows"]:
-            raise DatasetError(
-                f"Of the {state['rows']} rows before the state of instance "
-                f"{self._instance.instance_id}, the dataset's folder has only {self._skip}."
-            )
         kept = decode(state["state"])
         self._instance.set_state(kept["instance"])
         self._stored.extend(kept["stored"])
@@ -131,10 +117,8 @@ class Producer:
                 self.failure, rows = error, buffer.take()
             count = len(rows["step"])
             if count:
-                self._sink.put(rows, count, buffer.fields)
+                self._link.send_parts(pack_rows(rows, count))
             self.made += count
-        if self._announced:
-            self._sink.tell()
         self._sent_at = self._clock.monotonic()
         if self.failure is not None:
             raise RunEnded
@@ -235,8 +219,6 @@ class Producer:
         self._orders += frame.kind in (Kind.APPLY, Kind.STORED)
         if frame.kind is Kind.CREDIT:
             self._credit = frame.number
-        elif self._sink.take(frame):
-            self._credit = self.made if self._sink.ended else self._credit
         elif frame.kind is Kind.APPLY:
             prediction = decode(frame.payload)
             for row in range(frame.number):

@@ -21,11 +21,11 @@ from physx_core.typing import Sample
 from physx_core.workers.client.joining import PATIENCE, join
 from physx_core.workers.client.link import RunEnded, ServerGone, WorkerLink
 from physx_core.workers.client.producer import Producer
-from physx_core.workers.client.row_sinks import RowSink, SentRows
 from physx_core.workers.instance import Instance
 
 if TYPE_CHECKING:
     from physx_core.workers.client.episode_producer import EpisodeProducer
+    from physx_core.workers.client.row_files import RowFiles
 
 _PACKAGES = re.compile(r"/(site-packages|dist-packages|lib-dynload|lib\d*/python3[^/]*)(/|$)")
 """What belongs to an interpreter, in the module path."""
@@ -86,21 +86,15 @@ def run_instance(
     Raises:
         ServerGone: If the server is gone without having ended the run.
     """
-    draw, skip, stripes = setup.pop("draw"), setup.pop("skip"), setup.pop("stripes", None)
+    draw, skip, folder = setup.pop("draw"), setup.pop("skip"), setup.pop("folder", None)
     every, state = setup.pop("state_every"), setup.pop("state")
-    sink: RowSink = SentRows(link)
-    if stripes is not None:
-        # Importing datasets takes a quarter of a client's start time, and most clients need none.
-        from physx_core.workers.client.striped_rows import StripedRows
-
-        sink = StripedRows(link, stripes)
     say(
         f"running {setup['environment']}, instance {setup['instance_id']} of {setup['instance_nb']}"
         + _describe_past(skip["rows"], 0 if state is None else state["rows"])
     )
     link.spins = has_core_for_each(setup["instance_nb"])
     shown, skip["state_every"] = skip.pop("shown"), every
-    client = _Client(link, Instance(**setup), sink, shown, skip)
+    client = _Client(link, Instance(**setup), folder, shown, skip)
     try:
         client.live(draw, state)
     finally:
@@ -148,17 +142,18 @@ class _Client:
         self,
         link: WorkerLink,
         instance: Instance,
-        sink: RowSink,
+        folder: dict[str, Any] | None,
         shown: int,
         skip: dict[str, int],
     ) -> None:
         self.failure: PhysxError | None = None
         self.is_forsaken = False
-        self._link, self._instance, self._sink = link, instance, sink
-        self._producer = Producer(link, instance, sink, **skip)
+        self._link, self._instance, self._folder = link, instance, folder
+        self._producer = Producer(link, instance, **skip)
         self._services = RemoteServices(link, self._producer, shown)
         self._has_states = skip["state_every"] > 0
         self._leased: EpisodeProducer | None = None
+        self._row_files: RowFiles | None = None
 
     def live(self, draw: bool, state: Mapping[str, Any] | None) -> None:
         """Open the environment and generate rows until the run ends or the environment fails.
@@ -169,7 +164,10 @@ class _Client:
         """
         services, with_states = self._services, self._has_states
         try:
-            self._producer.open()
+            if self._folder is not None:
+                from physx_core.workers.client.row_files import RowFiles
+
+                self._row_files = RowFiles(self._link, self._folder)
             self._instance.open(services, draw, services.choose, with_states=with_states)
             parameters = [parameter.to_dict() for parameter in self._instance.parameters]
             if parameters:
@@ -199,14 +197,15 @@ class _Client:
             # Importing datasets takes a quarter of a client's start time; streams need none.
             from physx_core.workers.client.episode_producer import EpisodeProducer
 
-            self._leased = EpisodeProducer(self._link, self._instance)
+            self._leased = EpisodeProducer(self._link, self._instance, self._row_files)
         (self._leased or self._producer).run()
 
     def close(self) -> None:
         """Close the environment, and the files that it writes."""
-        for close in (self._instance.close, self._sink.close):
+        for opened in (self._instance, self._row_files):
             try:
-                close()
+                if opened is not None:
+                    opened.close()
             except PhysxError as error:
                 if self.failure is None:
                     self._report(error, 0)

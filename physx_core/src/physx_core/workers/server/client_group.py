@@ -78,7 +78,7 @@ class ClientGroup:
             sets: Chooses the instances' parameters.
             accept_all: Whether samples that `check_sample` rejects count like the others.
             skip: What an earlier run already got: clients generate it again, but do not send it.
-            written: Counts the rows that the clients write themselves; None: they send them.
+            written: Takes note of the rows that the clients write themselves; None: they send them.
             transport: What connects the clients, and the clock that the run follows.
         """
         self._clock = transport.clock
@@ -201,8 +201,6 @@ class ClientGroup:
         patience = 0.0
         self._closing = True
         try:
-            if orderly and self._written is not None:
-                self._written.end(self.server.peers.values())
             absent = [number for number in self._handles if self._find_peer(number) is None]
             stop([self._handles.pop(number) for number in absent], 0.0)
             self.server.end()
@@ -402,6 +400,8 @@ class ClientGroup:
             self._launch([number])
 
     def _vacate(self, number: int, former: ClientHandle | None, patience: float = 0.0) -> None:
+        if self._written is not None and number in self.server.peers:
+            self._written.lose(self.server.peers[number])
         self.server.vacate(number)
         stop([] if former is None else [former], patience)
         self._exits.pop(number, None)
@@ -496,7 +496,7 @@ class ClientGroup:
         skip = {"rows": peer.received, "rejected": peer.rejected.count, "shown": peer.shown}
         first: dict[str, Any] = {"heartbeat": min(_SAY_EVERY, self.config.timeout / 4)}
         if self._written is not None:
-            first["stripes"] = self._written.describe(peer)
+            first["folder"] = self._written.describe()
         if self._pool is not None:
             skip = dict.fromkeys(skip, 0)
         state = None if peer.journal is None else peer.journal.state

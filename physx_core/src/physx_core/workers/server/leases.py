@@ -25,6 +25,7 @@ from physx_core.workers.lease import AIM, Lease, most_numbers
 from physx_core.workers.row_codec import unpack_rows
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.validation import check_values
+from physx_core.workers.server.written_rows import WrittenRows
 
 _STATUS = (EpisodeStatus.FINISHED, EpisodeStatus.FAILED, EpisodeStatus.MORE)
 
@@ -45,6 +46,7 @@ class Leases:
         queue: EpisodeQueue,
         choose: Callable[[range], Batch],
         clock: Clock = SYSTEM_CLOCK,
+        written: WrittenRows | None = None,
     ) -> None:
         """Store what is simulated.
 
@@ -52,11 +54,13 @@ class Leases:
             queue: The numbers.
             choose: Returns the parameters of numbers: see `ParameterSets.values_of`.
             clock: Tells how long episodes take.
+            written: Takes note of the rows that clients write themselves; None: they send them.
         """
-        self._clock = clock
+        self._clock, self._written = clock, written
         self.blocks: deque[EpisodeBlock] = deque()
+        rows = {Kind.ROWS: self._take_rows} if written is None else {Kind.WRITTEN: self._take_place}
         self.dispatch: dict[Kind, Callable[[Peer, Frame], None]] = {
-            Kind.ROWS: self._take_rows,
+            **rows,
             Kind.WRONG: self._take_rejected,
             Kind.EPISODES: self._take_episodes,
         }
@@ -150,6 +154,12 @@ class Leases:
             raise ConnectionRefusedByPeerError(f"It sent {count} rows that belong to no episode.")
         held.rows = unpack_rows(frame.payload, peer.row_fields, count)
 
+    def _take_place(self, peer: Peer, frame: Frame) -> None:
+        held = self._held.get(peer.instance_id)
+        if held is None or held.first_row is not None:
+            raise ConnectionRefusedByPeerError("It wrote rows that belong to no episode.")
+        held.first_row = frame.number
+
     def _take_rejected(self, peer: Peer, frame: Frame) -> None:
         held, count = self._held.get(peer.instance_id), frame.number
         if held is None or not peer.row_fields or count < 1:
@@ -163,6 +173,7 @@ class Leases:
     def _take_episodes(self, peer: Peer, frame: Frame) -> None:
         held = self._held.get(peer.instance_id, _Held())
         rows, held.rows = held.rows, {}
+        first_row, held.first_row = held.first_row, None
         rejected, held.rejected = concatenate(held.rejected), []
         try:
             records = [_parse(plain, peer.episode_fields) for plain in decode(frame.payload)]
@@ -172,14 +183,18 @@ class Leases:
         records = [held.settled(record) for record in records]
         if held.count < before:
             held.since = self._clock.monotonic()
-        _check_rows(rows, records)
+        count = sum(record.rows for record in records)
+        if first_row is None:
+            _check_rows(rows, records, count)
         if rows:
             check_values(rows, peer.row_fields, peer.instance_id)
         _check_fields(records, peer)
         _check_rejected(rejected, records)
-        peer.received += len(rows.get("step", ()))
+        if self._written is not None and first_row is not None:
+            self._written.take(peer, first_row, count)
+        peer.received += count
         held.note_pace(records)
-        self.blocks.append(EpisodeBlock(rows, records, peer.instance_id, rejected))
+        self.blocks.append(EpisodeBlock(rows, records, peer.instance_id, rejected, first_row))
 
 
 class _Held:
@@ -187,12 +202,14 @@ class _Held:
 
     Attributes:
         rows: Rows whose record has not arrived.
+        first_row: Address of rows that it has written and whose record has not arrived.
         rejected: Rejected ones.
         since: When it began its present episode, in monotonic s.
     """
 
     def __init__(self) -> None:
         self.rows: Batch = {}
+        self.first_row: int | None = None
         self.rejected: list[Batch] = []
         self.since = 0.0
         self._leases: list[tuple[Lease, range]] = []  # with numbers that have not ended
@@ -264,10 +281,9 @@ class _Held:
         return replace(record, parameters=lease.parameters(first, record.count))
 
 
-def _check_rows(rows: Batch, records: list[EpisodeRecord]) -> None:
+def _check_rows(rows: Batch, records: list[EpisodeRecord], count: int) -> None:
     """Check that rows are those that the records count."""
-    count = len(rows.get("step", ()))
-    if count != sum(record.rows for record in records):
+    if count != len(rows.get("step", ())):
         raise ConnectionRefusedByPeerError("It sent another number of rows than episodes have.")
     if not count:
         return

@@ -76,11 +76,7 @@ class DiskColumn:
         for start, stop in _runs(index):
             target = rows[start:stop]
             for number, first, _, where in self._parts(int(index[start]), stop - start):
-                part = target[where]
-                whole = part if where.step == 1 else np.empty(part.shape, part.dtype)
-                self._read(number, first, files.as_bytes(whole))
-                if whole is not part:
-                    part[...] = whole
+                self._read(number, first, files.as_bytes(target[where]))
         if rows is not out:
             out[...] = rows
 
@@ -114,9 +110,9 @@ class DiskColumn:
             return
         number, place, follow = self._index.find(start)
         if count <= follow:
-            yield number, place, count, slice(0, count, 1)
+            yield number, place, count, slice(0, count)
             return
-        number, stop = number - self._segments[number].span.place, start + count
+        stop = start + count
         while number < len(self._segments) and self._segments[number].span.start < stop:
             span = self._segments[number].span
             first, part = span.inside(start, stop)

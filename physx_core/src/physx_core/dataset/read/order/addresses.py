@@ -18,10 +18,11 @@ class Addresses:
 
     def __init__(self, mode: Mode) -> None:
         """Look at the mode's partitions as they are now."""
-        groups = [group for group in mode.groups if any(part.rows for part in group)]
-        rows = [sum(part.rows for part in group) for group in groups]
-        first = [g[0].first_row - (g[0].stripe.place if g[0].stripe else 0) for g in groups]
-        self._first, self._rows = np.array(first, np.int64), np.array(rows, np.int64)
+        self._first, self._rows = (
+            np.array([(part.first_row, part.rows) for part in mode.with_rows], np.int64)
+            .reshape(-1, 2)
+            .T
+        )
         self._starts = np.cumsum(self._rows) - self._rows
         self.end = int((self._first + self._rows).max(initial=0))
         self.rows = int(self._rows.sum())
@@ -34,6 +35,10 @@ class Addresses:
         inside = np.clip(addresses - self._first[group], 0, self._rows[group])
         found: Index = self._starts[group] + inside
         return found
+
+    def stored(self, address: int) -> int:
+        """Return the number of stored rows before an address."""
+        return int(self.stored_before(np.array([address]))[0])
 
     @property
     def runs(self) -> tuple[Index, Index]:

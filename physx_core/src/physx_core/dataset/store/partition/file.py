@@ -95,39 +95,31 @@ class PartitionFile:
         return file
 
     @classmethod
-    def reopen(
-        cls, directory: Path, identity: Identity, rows: int, digester: Helper[None]
-    ) -> PartitionFile:
-        """Open an existing partition file to write rows after its first ones.
+    def reopen(cls, directory: Path, identity: Identity, digester: Helper[None]) -> PartitionFile:
+        """Open a partition file that another process has created, to write its first rows.
 
         Args:
             directory: The dataset's folder.
             identity: Expected identity of the file.
-            rows: Number of its committed rows to keep.
             digester: Computes the digests of large blocks.
 
         Raises:
-            DatasetError: If the file has a different identity or fewer rows.
+            DatasetError: If the file has a different identity or has rows.
         """
         path = directory / identity.file_name
         descriptor = files.open_regular(path, os.O_RDWR)
         try:
             found = inspect(path)
-            if found.identity != identity or found.rows < rows:
-                raise DatasetError(f"{path} is not the partition to be continued.")
+            if found.identity != identity or found.rows:
+                raise DatasetError(f"{path} is not the empty partition to be written.")
         except BaseException:
             files.close(descriptor)
             raise
-        nbytes = identity.field.nbytes
-        size = found.data_offset + found.capacity * nbytes
+        size = found.data_offset + found.capacity * identity.field.nbytes
         header = Header(
             b"", found.rows_offset, found.table_offset, found.data_offset, found.capacity, size
         )
-        file = cls(path, identity, header, descriptor, digester)
-        file._reserved = file.data_offset + rows * nbytes
-        if found.rows:
-            file.withdraw((rows, 0, 0))
-        return file
+        return cls(path, identity, header, descriptor, digester)
 
     def publish(self) -> None:
         """Rename the file to its final name."""

@@ -17,7 +17,6 @@ import os
 import struct
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
 
 import numpy as np
 from xxhash import xxh3_64_intdigest
@@ -44,10 +43,6 @@ from physx_core.fields import Field
 
 FORMAT = "physx partition"
 VERSION = 4
-STRIPED_VERSION = 5
-READABLE = (VERSION, STRIPED_VERSION)
-"""Versions of the header; files of stripes have their own."""
-MOST_STRIPES = 2**24
 MAGIC = b"\x89physx\r\n"
 """Start of the dataset ``header``, which physx reads without HDF5."""
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
@@ -64,18 +59,6 @@ _INVALID = (
 _END_OF_FILE = 40  # offset of the file's size in an HDF5 superblock of version 0
 
 
-class Stripe(NamedTuple):
-    """A partition's share of consecutive rows of a mode that several partitions hold in turn.
-
-    Attributes:
-        place: Place of its first row among those of all partitions, counted from 0.
-        of: Number of partitions that share the rows: it has every `of`-th.
-    """
-
-    place: int
-    of: int
-
-
 @dataclass(frozen=True)
 class Identity:
     """The partition and field that a partition file belongs to.
@@ -85,8 +68,7 @@ class Identity:
         mode: Mode of its rows.
         field: Its field, with a known shape.
         index: Number of the partition in its session and mode, counted from 0.
-        first_row: Number of the partition's first row in the mode.
-        stripe: Which rows from there on it has; None: all up to the next partition.
+        first_row: Address of the partition's first row in the mode.
     """
 
     session: str
@@ -94,12 +76,6 @@ class Identity:
     field: Field
     index: int
     first_row: int
-    stripe: Stripe | None = None
-
-    @property
-    def version(self) -> int:
-        """Version of the file's header."""
-        return VERSION if self.stripe is None else STRIPED_VERSION
 
     @property
     def file_name(self) -> str:
@@ -107,11 +83,11 @@ class Identity:
         return partition_file(self.session, self.mode, self.field.name, self.index)
 
     @property
-    def attributes(self) -> dict[str, str | int | Stripe]:
+    def attributes(self) -> dict[str, str | int]:
         """The file's attributes."""
         return {
             "format": FORMAT,
-            "format_version": self.version,
+            "format_version": VERSION,
             "session": self.session,
             "mode": self.mode,
             "field": self.field.name,
@@ -119,7 +95,6 @@ class Identity:
             "unit": self.field.unit,
             "role": self.field.role,
             "first_row": self.first_row,
-            **({} if self.stripe is None else {"stripe": self.stripe}),
         }
 
 
@@ -189,15 +164,6 @@ class Inspection:
 def partition_file(session: str, mode: str, field: str, index: int) -> str:
     """Return the name of a partition file."""
     return f"{session}_{mode}_{field}_{index}.h5"
-
-
-def parse_stripe(plain: Any) -> Stripe:
-    """Return the stripe described by plain data."""
-    place, count = checked(list, plain, "a stripe")
-    count = whole(count, "the number of stripes", MOST_STRIPES)
-    if count < 2:
-        raise ValueError(f"the number of stripes cannot be {count}")
-    return Stripe(whole(place, "the place of a stripe", count - 1), count)
 
 
 def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
@@ -369,14 +335,13 @@ def _check_superblock(file: io.FileIO, path: Path, offset: int | None, row_nbyte
 def _describe(identity: Identity) -> bytes:
     plain = {
         "format": FORMAT,
-        "format_version": identity.version,
+        "format_version": VERSION,
         "session": identity.session,
         "mode": identity.mode,
         "field": identity.field.to_dict(),
         "partition": identity.index,
         "first_row": identity.first_row,
         "boot": boot_id(),
-        **({} if identity.stripe is None else {"stripe": list(identity.stripe)}),
     }
     text = json.dumps(plain).encode()
     return text + b" " * (-(len(MAGIC) + _NUMBERS.size + len(text)) % _ALIGNMENT)
@@ -409,8 +374,8 @@ def _parse_header(head: bytes) -> Inspection:
         raise ValueError("its header is incomplete")
     plain = json.loads(head[begin : begin + length])
     version = whole(plain["format_version"], "the format's version")
-    if version not in READABLE:
-        raise ValueError(f"its format has version {version}; this physx reads {list(READABLE)}")
+    if version != VERSION:
+        raise ValueError(f"its format has version {version}; this physx reads {VERSION}")
     field = parse_field(plain["field"])
     if field.shape is None:
         raise ValueError("the shape of its field is missing")
@@ -429,7 +394,6 @@ def _parse_header(head: bytes) -> Inspection:
         field,
         whole(plain["partition"], "the number of a partition", 2**31),
         whole(plain["first_row"], "a first row"),
-        parse_stripe(plain["stripe"]) if version == STRIPED_VERSION else None,
     )
     rows, commits = decode(head[rows_offset : rows_offset + NBYTES])
     boot = checked(str, plain["boot"], "'boot'")
