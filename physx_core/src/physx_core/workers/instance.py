@@ -33,10 +33,11 @@ from physx_core.plugins import resolve
 from physx_core.plugins.references import adapters_hint
 from physx_core.processes.endings import describe_ending, is_ending
 from physx_core.rows import RejectedSamples
-from physx_core.typing import Array, Batch, Sample
+from physx_core.typing import Array, Sample
 
 if TYPE_CHECKING:
     from physx_core.states import Baseline
+    from physx_core.workers.pasts import Past
 
 PARAMETER = "parameters/"
 """Name prefix of a stored row's entries that hold the parameters it was generated with; no field
@@ -61,14 +62,14 @@ class Skip(NamedTuple):
     Attributes:
         rows: Number of rows from all instances together.
         rejected: Number of rejected samples of each instance; empty: none.
-        sets: Number of recorded sets of parameters.
-        begun: Fields ``env_id`` and ``episode`` of the rows; empty: there are no sets.
+        sets: Numbers of the recorded sets of parameters.
+        pasts: From where instances go on, by their number; the others repeat all of their rows.
     """
 
     rows: int = 0
     rejected: tuple[int, ...] = ()
-    sets: int = 0
-    begun: Batch = {}  # noqa: RUF012 - never changed
+    sets: frozenset[int] = frozenset()
+    pasts: Mapping[int, Past] = {}
 
     def rows_of(self, number: int, instance_nb: int) -> int:
         """Return how many of the rows an instance generated; instances are numbered from 1."""
@@ -77,6 +78,20 @@ class Skip(NamedTuple):
     def rejected_of(self, number: int) -> int:
         """Return how many samples of an instance were rejected."""
         return self.rejected[number - 1] if self.rejected else 0
+
+    def covers(self, number: int, past: Past, instance_nb: int) -> bool:
+        """Return whether it has all that came before the past of an instance."""
+        return (
+            1 <= number <= instance_nb
+            and past.rows <= self.rows_of(number, instance_nb)
+            and past.rejected <= self.rejected_of(number)
+            and (past.recorded < 0 or past.recorded in self.sets)
+        )
+
+    def repeated(self, instance_nb: int) -> int:
+        """Return how many rows instances simulate again, all together."""
+        known = sum(past.rows for past in self.pasts.values())
+        return self.rows - known
 
 
 NOTHING = Skip()
