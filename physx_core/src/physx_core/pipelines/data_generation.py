@@ -295,10 +295,11 @@ class DataGeneration(NewSessionPipeline):
         resources.callback(self._close_streams)
         self.dataset = resources.enter_context(open_own(self.session, dataset_config))
         campaign = former = None
+        campaigns = Campaign.count(self.dataset, self._mode)
         if self.resume and self._stores_rows(dataset_config):
-            campaigns = Campaign.count(self.dataset, self._mode)
             former = StoredStreams.find(self.dataset, self._mode, others=campaigns > 0)
-        if self.resume and former is None:
+        is_begun = campaigns > 0 or self.dataset.num_samples(self._mode) > 0
+        if self.resume and former is None and is_begun:
             campaign = Campaign.last(self.dataset, self._mode, config)
         self._open_environments(resources, config, dataset_config, campaign, former)
 
