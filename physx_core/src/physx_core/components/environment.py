@@ -5,7 +5,7 @@ from __future__ import annotations
 import functools
 import inspect
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeAlias
 
 import numpy as np
 
@@ -58,7 +58,7 @@ _COUNTERS = (
 """What changes about the place of an environment in its run; instances keep it."""
 _OF_THE_RUN = (
     *("factory", "step_time", "compute_training_data", "_sample", "_training", "_additional"),
-    *("_services", "_choose_parameters", "_baseline"),
+    *("_services", "_choose_parameters", "_baseline", "_made_with", "_loaded", "_has_kept"),
 )
 """What an environment has from its run, for viewers, or only within a step."""
 
@@ -149,6 +149,13 @@ class Environment(Closeable):
     independent_episodes: bool = False
     episode_steps: int | None = None
     _has_seed: bool | None = None  # until the constructor has run
+    _made_with: tuple[tuple[Any, ...], dict[str, Any]]
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Note the arguments, for `fork`."""
+        made = super().__new__(cls)
+        made._made_with = args, kwargs
+        return made
 
     def __init__(
         self,
@@ -190,6 +197,8 @@ class Environment(Closeable):
         self._training: dict[str, Any] | None = None
         self._additional: dict[str, Any] | None = None
         self._services: Services | None = None
+        self._loaded: list[dict[str, Any]] = []  # parameters, while it was created
+        self._has_kept = False  # parameters in the run
         self._defined_parameters: list[Parameter] = []
         self._choose_parameters: Choose | None = None
         self._has_begun_episodes = False
@@ -277,6 +286,24 @@ class Environment(Closeable):
             StateError: If this environment was created differently.
         """
         self._tracked().restore(state)
+
+    def fork(self) -> Self:
+        """Return an independent copy that goes on from here, in this process; close it.
+
+        It is a new object of the same class and arguments, for which `create`, `init` and
+        `init_database` were called, with the state of this one. Its steps have the same bits as
+        those of this one, and influence nothing here: what it saves stays in it, and it draws
+        nothing; predictions come from the same network. To look ahead, call its `step`, then
+        `take_sample` for what that has set; count in its `step_index` if `step` uses that.
+        `Instance.fork` does so.
+
+        Raises:
+            StateError: If an attribute cannot be captured; it is named.
+            UsageError: If `track_state` was not called right after creation.
+        """
+        from physx_core.components.forking import fork  # few environments are forked
+
+        return fork(self)
 
     def close(self) -> None:
         """Free the resources that `create` acquired."""
@@ -501,11 +528,15 @@ class Environment(Closeable):
                 "it in create() or init(), and set what belongs to an episode with "
                 "set_episode_data()."
             )
+        self._has_kept = True
         self._run().save_parameters(self._saves_as, values)
 
     def load_parameters(self) -> dict[str, Any]:
         """Return the values that this instance saved with `save_parameters`, if any."""
-        return self._run().load_parameters(self._saves_as)
+        loaded, self._has_kept = self._run().load_parameters(self._saves_as), True
+        if not self._has_begun_episodes:
+            self._loaded.append(loaded)
+        return loaded
 
     @property
     def _saves_as(self) -> int:
@@ -529,7 +560,10 @@ class Environment(Closeable):
         return self._earlier_steps + self.step_index
 
     def track_state(self) -> None:
-        """Prepare the default `get_state`, right after creation; physx calls it.
+        """Prepare the default `get_state`, right after creation.
+
+        physx calls it if the run takes states. An environment that forks itself calls it at the end
+        of `init_database`.
 
         Raises:
             StateError: If an attribute cannot be captured; it is named.
@@ -554,7 +588,8 @@ class Environment(Closeable):
         if self._baseline is None:
             raise UsageError(
                 f"There is no state of {type(self).__name__} by default, because it has methods of "
-                "its own for it, or track_state() was not called right after creation."
+                "its own for it, or track_state() was not called right after creation: call it at "
+                "the end of init_database()."
             )
         return self._baseline
 
@@ -563,12 +598,18 @@ class Environment(Closeable):
         place = {name: getattr(self, name) for name in _COUNTERS}
         from physx_core.states import as_lists
 
+        chosen = getattr(self._choose_parameters, "chosen", {})  # by forks that are ahead
+        place["chosen"] = {n: dict(each) for n, each in chosen.items() if n > self.episode_index}
         return {**place, "rng": as_lists(self.rng.bit_generator.state)}
 
     def set_place(self, place: Mapping[str, Any]) -> None:
         """Set what `get_place` returned."""
         for name in _COUNTERS:
             setattr(self, name, place[name])
+        if place["chosen"] and self._choose_parameters is not None:
+            from physx_core.components.forking import SharedChoice
+
+            self._choose_parameters = SharedChoice(self._choose_parameters, place["chosen"])
         self.rng.bit_generator.state = place["rng"]
 
     def begin_episode(self, episode: int | None = None) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import traceback
 import warnings
@@ -497,6 +498,25 @@ class Instance(Closeable):
             self.rejected.waiting = list(state["rejected"] or [])
         if self._drawing is not None and state["drawing"] is not None:
             self._drawing.restore(state["drawing"])
+
+    def fork(self) -> Instance:
+        """Return an independent copy that goes on from here: see `Environment.fork`.
+
+        It records no rejected samples, and draws nothing. Close it.
+
+        Raises:
+            StateError: If something cannot be captured; it is named.
+            EnvironmentFailedError: If the environment raises.
+        """
+        if self._refusal is not None:
+            raise self._refusal
+        self._check_tasks()
+        fork = copy.copy(self)
+        fork.environment = environment = self._call("fork", self._alive().fork)
+        fork._simulate = fork._simulate_sub_steps if self._sub_steps else environment.step
+        fork.rejected = None if self.rejected is None else RejectedSamples()
+        fork._draws, fork._drawing, fork._runner = False, None, None
+        return fork
 
     def _check_tasks(self) -> None:
         """Check that no task waits in the event loop."""
