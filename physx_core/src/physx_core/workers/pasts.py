@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import logging
 import math
-from collections import deque
+from collections import Counter, deque
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -26,8 +26,10 @@ from physx_core.net.values import decode, encode
 
 LARGEST = 2**32
 """Maximum size of a file with pasts, in bytes."""
-_PERIOD = 2.0
-"""Time in s between two files; by then the rows before the first are on the disk."""
+_PERIOD = 0.1
+"""Time in s between two files of an instance."""
+_SETTLED = 2.0
+"""Time in s after which stored rows are on the disk: they are synced every second."""
 _CHECKSUM = 4
 _LOG = logging.getLogger("physx")
 
@@ -233,11 +235,11 @@ def unpack(content: bytes) -> tuple[int, dict[int, Past]]:
 
 
 class PastFiles(Closeable):
-    """Keeps the pasts of a generation in a session's folder: the last two of each instance.
+    """Keeps the pasts of a generation in a session's folder: the last ones of each instance.
 
-    They are written when the rows before them are stored, at most every two seconds: after a power
-    failure, the older one is on the disk, with the rows before it. Each counts only if all that
-    came before it is in the dataset.
+    The newest is replaced as soon as the rows before it are stored, which may not have reached the
+    disk when the power fails. So two that were taken at least two seconds before they were written
+    are kept beside it, replaced in turn. Each counts only if all that came before it is stored.
     """
 
     def __init__(self, folder: Path, run: str, clock: Clock = SYSTEM_CLOCK) -> None:
@@ -251,6 +253,8 @@ class PastFiles(Closeable):
         self._folder, self._run, self._clock = folder, run, clock
         self._written: dict[int, tuple[int, float]] = {}  # rows, and when
         self._waiting: dict[int, Past] = {}
+        self._aging: dict[int, tuple[bytes, float]] = {}  # content, and when it was taken
+        self._turns: Counter[int] = Counter()
 
     def keep(self, pasts: Mapping[int, Past]) -> None:
         """Take pasts, and write those that are new and due.
@@ -279,16 +283,19 @@ class PastFiles(Closeable):
             self._write(number, math.inf)
 
     def _write(self, number: int, now: float) -> None:
-        past, path = self._waiting.pop(number), self._folder / f"{number}.bin"
+        past = self._waiting.pop(number)
         content = encode([self._run, replace(past, count=0).pack()], "the state")
-        checksum = crc32(content).to_bytes(_CHECKSUM, "little")
+        content = crc32(content).to_bytes(_CHECKSUM, "little") + content
+        aging, taken = self._aging.setdefault(number, (content, now))
         with files.storing(f"The state of instance {number}"):
             if not self._folder.is_dir():
                 files.make_folder(self._folder)
-            if path.exists():
-                files.rename(path, self._folder / f"{number}.former.bin")
-            files.replace(path, checksum + content, wait=False)
-            files.start_sync(path)
+            files.replace(self._folder / f"{number}.bin", content, wait=now == math.inf)
+            if now - taken >= _SETTLED:
+                self._turns[number] += 1
+                name = f"{number}.{self._turns[number] % 2}.bin"
+                files.replace(self._folder / name, aging, wait=False)
+                self._aging[number] = content, now
         self._written[number] = past.rows, now
 
     def read(self, is_valid: Callable[[int, Past], bool]) -> dict[int, Past]:
