@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, Self, TypeAlias
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
 from physx_core.closeable import Closeable
 from physx_core.components.parameter import Parameter, as_parameters, draw, random_of
 from physx_core.components.sampler import checked
-from physx_core.components.scene.event import Event
 from physx_core.components.scene.factory import Factory, NullFactory
+from physx_core.components.services import Aside, Choose, Services, SharedChoice
 from physx_core.errors import (
     ConfigError,
     MissingFieldError,
@@ -86,30 +86,6 @@ def not_finite_prediction(name: str) -> NotFiniteError:
         "finite. Train the network again, with normalized data or a smaller learning rate.",
         field=name,
     )
-
-
-class Services(Protocol):
-    """Requests that an environment can make to its run."""
-
-    def predict(self, fields: Sample) -> Sample:
-        """Return the network's prediction for one sample, in physical units."""
-        ...
-
-    def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
-        """Save values of one instance, or of all (0), for later runs on the same dataset."""
-        ...
-
-    def load_parameters(self, instance_id: int) -> dict[str, Any]:
-        """Return the values that one instance, or 0, saved; empty if it saved none."""
-        ...
-
-    def show(self, instance_id: int, step: int, events: list[Event]) -> None:
-        """Pass drawing events to the viewers."""
-        ...
-
-
-Choose: TypeAlias = Callable[[int], Mapping[str, Any]]
-"""Returns the values of the parameters for an episode, by name."""
 
 
 class Environment(Closeable):
@@ -301,9 +277,27 @@ class Environment(Closeable):
             StateError: If an attribute cannot be captured; it is named.
             UsageError: If `track_state` was not called right after creation.
         """
-        from physx_core.components.forking import fork  # few environments are forked
-
-        return fork(self)
+        state, (args, kwargs) = self.get_state(), self._made_with
+        copy = type(self)(*args, **kwargs)
+        copy.independent_episodes = self.independent_episodes
+        if self._choose_parameters is not None:
+            self._choose_parameters = SharedChoice.of(self._choose_parameters)
+        aside = Aside(self._services, self._loaded)
+        copy._services, copy._choose_parameters = aside, self._choose_parameters
+        try:
+            copy.create()
+            copy.init()
+            copy.init_database()
+            copy.track_state()
+            if self._has_kept and self._services is not None:
+                aside.saved[self._saves_as] = self._services.load_parameters(self._saves_as)
+            copy.set_state(state)
+            copy.set_place(self.get_place() | {"chosen": {}})
+        except BaseException:
+            copy.close()
+            raise
+        copy.compute_training_data, copy._sample = self.compute_training_data, self._sample
+        return copy
 
     def close(self) -> None:
         """Free the resources that `create` acquired."""
@@ -607,8 +601,6 @@ class Environment(Closeable):
         for name in _COUNTERS:
             setattr(self, name, place[name])
         if place["chosen"] and self._choose_parameters is not None:
-            from physx_core.components.forking import SharedChoice
-
             self._choose_parameters = SharedChoice(self._choose_parameters, place["chosen"])
         self.rng.bit_generator.state = place["rng"]
 

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from physx_core.components.environment import Services
+from physx_core.components.services import Services
 from physx_core.config import EnvironmentConfig
 from physx_core.dataset.write.stripes import Stripes
 from physx_core.errors import (

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from physx_core.components.environment import Services
+from physx_core.components.services import Services
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import ConfigError, PhysxError, StateError, UsageError
 from physx_core.fields import Field

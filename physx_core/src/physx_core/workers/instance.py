@@ -11,15 +11,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from physx_core.closeable import Closeable
 from physx_core.components.environment import (
-    Choose,
     Environment,
     PredictedFields,
-    Services,
     explain_missing_attribute,
     options_of,
 )
 from physx_core.components.parameter import Parameter
 from physx_core.components.scene.factory import Factory
+from physx_core.components.services import Choose, Services
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import (
     EnvironmentFailedError,

@@ -20,7 +20,7 @@ from zlib_ng.zlib_ng import crc32
 from physx_core import files
 from physx_core.clock import SYSTEM_CLOCK, Clock
 from physx_core.closeable import Closeable
-from physx_core.components.environment import Services
+from physx_core.components.services import Services
 from physx_core.errors import ConnectionRefusedByPeerError
 from physx_core.net.values import decode, encode
 

@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from physx_core.components.environment import Services
 from physx_core.components.launcher import ClientHandle, Launcher
+from physx_core.components.services import Services
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import (
     ClientError,

@@ -7,7 +7,7 @@ import selectors
 from collections.abc import Callable, Collection, Iterable, Mapping
 from types import MappingProxyType
 
-from physx_core.components.environment import Services
+from physx_core.components.services import Services
 from physx_core.errors import (
     ConfigError,
     ConnectionRefusedByPeerError,

@@ -7,7 +7,7 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from physx_core.components.environment import Services
+from physx_core.components.services import Services
 from physx_core.errors import ConnectionRefusedByPeerError, PhysxError, UsageError
 from physx_core.net.frames import HEADER, Frame, Kind, pack
 from physx_core.net.remote_errors import encode_error

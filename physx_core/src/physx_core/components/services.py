@@ -1,49 +1,40 @@
-"""Forking: copies of an environment that go on from where it is, in the same process."""
+"""Services: what environments may request from their run, and forks of them share."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any, TypeVar
+from collections.abc import Callable, Mapping
+from typing import Any, Protocol, Self, TypeAlias
 
-from physx_core.components.environment import Choose, Environment, Services
 from physx_core.components.scene.event import Event
 from physx_core.errors import UsageError
 from physx_core.typing import Sample
 
-E = TypeVar("E", bound=Environment)
 _REMEMBERED = 1024
 """How many episodes a fork may lag behind."""
 
 
-def fork(environment: E) -> E:
-    """Return a copy: see `Environment.fork`."""
-    state = environment.get_state()
-    args, kwargs = environment._made_with
-    copy: E = type(environment)(*args, **kwargs)
-    copy.independent_episodes = environment.independent_episodes
-    services, choose = environment._services, environment._choose_parameters
-    if choose is not None and not isinstance(choose, SharedChoice):
-        environment._choose_parameters = choose = SharedChoice(choose)
-    aside = _Aside(services, environment._loaded)
-    copy._services, copy._choose_parameters = aside, choose
-    try:
-        copy.create()
-        copy.init()
-        copy.init_database()
-        copy.track_state()
-        number = environment._saves_as
-        if environment._has_kept and services is not None:
-            aside.saved[number] = services.load_parameters(number)
-        copy.set_state(state)
-        copy.set_place(environment.get_place() | {"chosen": {}})
-    except BaseException:
-        copy.close()
-        raise
-    copy.compute_training_data, copy._sample = (
-        environment.compute_training_data,
-        environment._sample,
-    )
-    return copy
+class Services(Protocol):
+    """Requests that an environment can make to its run."""
+
+    def predict(self, fields: Sample) -> Sample:
+        """Return the network's prediction for one sample, in physical units."""
+        ...
+
+    def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
+        """Save values of one instance, or of all (0), for later runs on the same dataset."""
+        ...
+
+    def load_parameters(self, instance_id: int) -> dict[str, Any]:
+        """Return the values that one instance, or 0, saved; empty if it saved none."""
+        ...
+
+    def show(self, instance_id: int, step: int, events: list[Event]) -> None:
+        """Pass drawing events to the viewers."""
+        ...
+
+
+Choose: TypeAlias = Callable[[int], Mapping[str, Any]]
+"""Returns the values of the parameters for an episode, by name."""
 
 
 class SharedChoice:
@@ -60,6 +51,11 @@ class SharedChoice:
         self._choose = choose
         self.chosen = dict(chosen or {})
 
+    @classmethod
+    def of(cls, choose: Choose) -> Self:
+        """Return a function that is shared from now on, if it is not yet."""
+        return choose if isinstance(choose, cls) else cls(choose)
+
     def __call__(self, episode: int) -> Mapping[str, Any]:
         """Return the values of the parameters for an episode."""
         if episode not in self.chosen:
@@ -68,7 +64,7 @@ class SharedChoice:
         return self.chosen[episode]
 
 
-class _Aside:
+class Aside:
     """The services of a fork: it asks the same network, and keeps what it saves.
 
     Attributes:
