@@ -6,6 +6,7 @@
 killed: a stream of 10 s whose process is killed every 3 s ends within 1.5 times as long. Without
 states it never ends.
 age: after a kill, a stream that is ten times older goes on after at most 1.2 times as long.
+resumed: the same after ``kill -9`` of the whole run and ``--resume``.
 journal: for 3 000 rows that each ask for 5 predictions of 32 kB, 480 MB in all, the journal holds
 those since the last state.
 states: taking a state, sending and keeping it costs at most 1 % if there is one each 0.1 s.
@@ -19,6 +20,8 @@ import logging
 import os
 import signal
 import statistics
+import subprocess
+import sys
 import tempfile
 import threading
 import time
@@ -29,7 +32,7 @@ from typing import Any
 import numpy as np
 from measure import claim, finish
 
-from physx_core import Environment, EnvironmentConfig, Field
+from physx_core import DataGeneration, Environment, EnvironmentConfig, Field
 from physx_core.net import decode, encode
 from physx_core.sources import ClientSource
 from physx_core.workers import Instance
@@ -150,6 +153,49 @@ def check_age() -> bool:
     return claim("ten times older, times as long", old / young, at_most=1.2)
 
 
+def generation(name: str, rows: int, **options: Any) -> DataGeneration:
+    """Return a generation of one stream in batches of 100 rows."""
+    config = EnvironmentConfig(
+        f"{Path(__file__).resolve()}:Walk", env_kwargs={"pause": 1e-3}, state_every=EVERY, seed=7
+    )
+    return DataGeneration(
+        config, session_name=name, batch_nb=rows // 100, batch_size=100, quiet=True, **options
+    )
+
+
+def run_and_die(name: str, rows: int) -> None:
+    """Generate rows, and kill this process, in which that is all that happens."""
+
+    class Mortal(DataGeneration):
+        def data_generation_end(self) -> None:
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    made = generation(name, rows)
+    made.__class__ = Mortal
+    made.execute()
+
+
+def seconds_to_resume(name: str, age: int) -> float:
+    """Return the time that a resumed run takes for 100 rows after as many as its age."""
+    command = [sys.executable, __file__, "--die", name, str(age)]
+    assert subprocess.run(command, check=False).returncode == -signal.SIGKILL
+    began = time.monotonic()
+    generation(name, age + 100, resume=True).execute()
+    return time.monotonic() - began
+
+
+def check_resumed() -> bool:
+    """Compare young runs with old ones."""
+    ages = (500, 5000)
+    found: dict[int, list[float]] = {age: [] for age in ages}
+    for number in range(2 * ROUNDS - 1):  # starting processes varies most
+        for age in ages:
+            found[age].append(seconds_to_resume(f"run{age}_{number}", age))
+    young, old = (statistics.median(found[age]) for age in ages)
+    print(f"Resumed after {ages[0]} rows {young:.3f} s, after {ages[1]} rows {old:.3f} s")
+    return claim("run ten times older, times as long", old / young, at_most=1.2)
+
+
 def check_journal() -> bool:
     """Follow the size of a journal."""
     largest = 0
@@ -183,6 +229,7 @@ def check_states() -> bool:
 CHECKS: dict[str, Callable[[], bool]] = {
     "killed": check_killed,
     "age": check_age,
+    "resumed": check_resumed,
     "journal": check_journal,
     "states": check_states,
 }
@@ -194,7 +241,11 @@ def main() -> None:
     parser = argparse.ArgumentParser()
     parser.add_argument("--check", action="store_true")
     parser.add_argument("--only", nargs="+", choices=CHECKS, default=[*CHECKS])
-    names = parser.parse_args().only
+    parser.add_argument("--die", nargs=2, help=argparse.SUPPRESS)
+    given = parser.parse_args()
+    if given.die:
+        run_and_die(given.die[0], int(given.die[1]))
+    names = given.only
     with tempfile.TemporaryDirectory() as folder, contextlib.chdir(folder):
         met = [CHECKS[name]() for name in names]
     finish(met)

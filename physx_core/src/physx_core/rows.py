@@ -245,10 +245,6 @@ class RejectedSamples:
         """Return how many samples there are."""
         return len(self.waiting)
 
-    def discard(self, count: int) -> None:
-        """Discard the first samples."""
-        del self.waiting[:count]
-
     def infer_shapes(self, fields: Sequence[Field]) -> list[Field]:
         """Fill in open shapes of fields from the first sample that has all the fields."""
         for sample, _, _ in self.waiting:

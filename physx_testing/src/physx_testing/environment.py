@@ -212,6 +212,20 @@ def _is_not_disturbed(subject: Subject) -> None:
                 raise NotApplicableError(_DISTURBED)
 
 
+def _forks(subject: Subject) -> None:
+    with one_instance(subject) as instance:
+        try:
+            instance.track_states()
+            rows_between(instance, _ROWS, None)
+            with instance.fork() as fork:
+                ahead = rows_between(fork, _ROWS, None)
+        except StateError as error:
+            raise NotApplicableError(str(error)) from error
+        here = rows_between(instance, _ROWS, None)
+    for row, (found, wanted) in enumerate(zip(ahead, here, strict=True)):
+        expect_equal(found, wanted, f"row {row} after fork() differs in the fork")
+
+
 def _closes(subject: Subject) -> None:
     made = subject.make(instance_id=1, instance_nb=1, seed=list(SEED))
     _close(made, "before create(), as after a failure there")
@@ -260,6 +274,7 @@ CHECKS: dict[str, Check] = {
     "replays stored rows": _replays,
     "continues from its state in another process": _continues,
     "gives the same rows when states are taken": _is_not_disturbed,
+    "goes on alike in a fork": _forks,
     "closes at any time, even twice": _closes,
     "leaves its process as it was": _quiet,
 }

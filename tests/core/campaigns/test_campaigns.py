@@ -381,14 +381,6 @@ def test_option_of_episodes_is_not_for_streams():
         DataGeneration(config, batch_nb=1, batch_size=1, max_failed=1).execute()
 
 
-def test_stream_cannot_be_resumed():
-    config = EnvironmentConfig("toy/spring", as_tcp_ip_client=False)
-    options = {"session_name": "run", "batch_nb": 1, "batch_size": 1}
-    DataGeneration(config, **options).execute()
-    with pytest.raises(ConfigError, match="no episodes .* to go on with"):
-        DataGeneration(config, resume=True, **options).execute()
-
-
 @pytest.mark.parametrize("option", [{"episodes": 0}, {"episodes": 2, "max_failed": -1}])
 def test_numbers_out_of_range(option):
     with pytest.raises(ConfigError, match="at least"):

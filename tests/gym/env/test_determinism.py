@@ -7,6 +7,7 @@ import subprocess
 import sys
 from collections import deque
 from pathlib import Path
+from types import SimpleNamespace
 
 import gymnasium
 import numpy as np
@@ -15,6 +16,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sizes import size
 
+from physx_core.net import decode, encode
+from physx_core.states import Baseline
 from physx_gym import Layer, RobotEnv
 from physx_gym.spaces import copy_tree
 from physx_sim import Encoder, Imu, Motor
@@ -273,6 +276,36 @@ def test_copies_of_a_running_environment(backend, way):
     assert not np.shares_memory(other.robot_state.q, env.robot_state.q)
     other.action_space.sample()
     assert onward(other, actions) == onward(env, actions)
+
+
+def captured(env, other):
+    """Return another environment with the state of one, as a process would get it."""
+    source, target = (Baseline(SimpleNamespace(env=each)) for each in (env, other))
+    target.restore(decode(encode(source.capture(), "the state")))
+    return other
+
+
+def restored(env, other):
+    """Return another environment with the snapshot of one."""
+    other.restore(env.snapshot())
+    return other
+
+
+def test_all_ways_to_copy_have_the_same_future_in_the_middle_of_contacts(backend):
+    def made():
+        env = Counting(make(backend))
+        env.reset(seed=3)
+        return env
+
+    env, other = made(), made()
+    actions = [env.action_space.sample() for _ in range(3)]
+    while not len(env.simulator.simulation.contacts()):
+        env.step(actions[0])
+        assert env.num_steps < 200
+    env.restore(env.snapshot())  # an engine may forget what its solver starts from
+    copies = [copy.deepcopy(env), unpickled(env), restored(env, made()), captured(env, other)]
+    futures = [onward(each, actions) for each in (env, *copies)]
+    assert futures == [futures[0]] * 5
 
 
 def test_copies_of_an_environment_that_never_ran(backend):

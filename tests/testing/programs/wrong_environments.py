@@ -79,7 +79,7 @@ class Meddles(Right):
     def create(self):
         super().create()
         os.chdir("/")
-        os.umask(0o022 if os.umask(0) != 0o022 else 0o077)
+        os.umask(0o027)
         tempfile.tempdir = f"/tmp/{time.monotonic()}"
         os.environ.update(MEDDLED=str(time.monotonic()))
         signal.signal(signal.SIGUSR1, lambda *_: None)

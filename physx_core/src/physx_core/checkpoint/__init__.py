@@ -21,18 +21,21 @@ from physx_core.checkpoint.description import (
     FORMAT_VERSION,
     NAME,
     SAMPLER,
+    STREAMS,
     Checkpoint,
     Progress,
 )
 from physx_core.checkpoint.reading import (
     check_unchanged,
     find,
+    has_streams,
     list_all,
     list_numbers,
     list_within_epochs,
     read,
     read_buffer,
     read_sampler,
+    read_streams,
 )
 from physx_core.checkpoint.writing import check_session, dry_run_save, remove, save
 
@@ -43,18 +46,21 @@ __all__ = [
     "FORMAT_VERSION",
     "NAME",
     "SAMPLER",
+    "STREAMS",
     "Checkpoint",
     "Progress",
     "check_session",
     "check_unchanged",
     "dry_run_save",
     "find",
+    "has_streams",
     "list_all",
     "list_numbers",
     "list_within_epochs",
     "read",
     "read_buffer",
     "read_sampler",
+    "read_streams",
     "remove",
     "save",
 ]

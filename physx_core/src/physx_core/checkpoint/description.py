@@ -27,6 +27,9 @@ NORMALIZATION = "normalization.safetensors"
 SAMPLER = "sampler.bin"
 """File with the state of the sampler that learns from the training: 8-byte floats."""
 REAL = np.dtype("<f8")
+STREAMS = "streams.bin"
+"""File with what streams of environments need to go on from states."""
+LARGEST_STREAMS = 2**32
 KEPT = (
     "network",
     "network_kwargs",

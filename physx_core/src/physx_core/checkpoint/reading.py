@@ -24,11 +24,13 @@ from physx_core.checkpoint.description import (
     FORMAT_VERSION,
     KEPT,
     LARGEST,
+    LARGEST_STREAMS,
     NAME,
     NORMALIZATION,
     NUMBER,
     REAL,
     SAMPLER,
+    STREAMS,
     WHOLE,
     Checkpoint,
     Progress,
@@ -190,16 +192,35 @@ def read_sampler(found: Checkpoint) -> Array:
     return np.frombuffer(_read_numbers(found, SAMPLER), REAL).astype(np.float64)
 
 
+def has_streams(found: Checkpoint) -> bool:
+    """Return whether a checkpoint has what streams of environments need to go on from states."""
+    return (found.path / STREAMS).is_file()
+
+
+def read_streams(found: Checkpoint) -> bytes:
+    """Return what streams of environments need to go on from states, from a checkpoint.
+
+    Raises:
+        CheckpointError: If the checkpoint has none, or was replaced in the meantime.
+    """
+    return _read_state(found, STREAMS, LARGEST_STREAMS)
+
+
 def _read_numbers(found: Checkpoint, name: str) -> bytes:
+    content = _read_state(found, name, LARGEST)
+    return content[: len(content) // 8 * 8]
+
+
+def _read_state(found: Checkpoint, name: str, largest: int) -> bytes:
     try:
-        content = files.read_content(found.path / name, LARGEST)
+        content = files.read_content(found.path / name, largest)
     except OSError as error:
         raise CheckpointError(
             f"{found.path / name} cannot be read: {error.strerror or error}. The training cannot "
             "be resumed there. Use another checkpoint."
         ) from error
     check_unchanged(found)
-    return content[: len(content) // 8 * 8]
+    return content
 
 
 def check_unchanged(found: Checkpoint) -> None:

@@ -28,6 +28,7 @@ from physx_core.checkpoint.description import (
     NUMBER,
     REAL,
     SAMPLER,
+    STREAMS,
     WHOLE,
     Progress,
     former_path,
@@ -56,6 +57,7 @@ def save(
     progress: Progress,
     buffer: Index | None = None,
     sampler: Array | None = None,
+    streams: bytes | None = None,
     *,
     best: bool = False,
 ) -> Path:
@@ -73,6 +75,7 @@ def save(
         progress: Progress of the training.
         buffer: State of the buffer that draws the batches, if any.
         sampler: State of the sampler that learns from the training, if any.
+        streams: What streams of environments need to go on from states, if any.
         best: Replace ``<network_name>_best``, for prediction or as a starting point, without the
             state that a resumed training needs.
 
@@ -96,7 +99,12 @@ def save(
         if best:
             _write(partial, description, network, coefficients)
         else:
-            _write(partial, description, network, coefficients, optimization, buffer, sampler)
+            states = {
+                BUFFER: None if buffer is None else np.asarray(buffer, WHOLE).tobytes(),
+                SAMPLER: None if sampler is None else np.asarray(sampler, REAL).tobytes(),
+                STREAMS: streams,
+            }
+            _write(partial, description, network, coefficients, optimization, states)
         _publish(partial, path)
     except BaseException as error:
         cause = error if isinstance(error, OSError) else error.__cause__
@@ -149,8 +157,7 @@ def _write(
     network: Network,
     normalization: bytes | None,
     optimization: Optimization | None = None,
-    buffer: Index | None = None,
-    sampler: Array | None = None,
+    states: Mapping[str, bytes | None] | None = None,
 ) -> None:
     """Write a checkpoint's files to a new folder, and wait until they are on the disk."""
     files.create_folder(partial, sync=False)
@@ -161,12 +168,10 @@ def _write(
     if optimization is not None and optimization.state_file:
         optimization.save_state(partial / optimization.state_file)
         described |= _describe_files(partial, described)
-    if buffer is not None:
-        _write_new(partial / BUFFER, np.asarray(buffer, WHOLE).tobytes())
-        described |= _describe_files(partial, described)
-    if sampler is not None:
-        _write_new(partial / SAMPLER, np.asarray(sampler, REAL).tobytes())
-        described |= _describe_files(partial, described)
+    for name, content in (states or {}).items():
+        if content is not None:
+            _write_new(partial / name, content)
+            described |= _describe_files(partial, described)
     _write_description(partial / DESCRIPTION, {**description, "files": described})
     for file in (*described, DESCRIPTION):
         files.sync_file(partial / file)

@@ -3,7 +3,6 @@
 from .buffer import BatchSelection as BatchSelection
 from .buffer import Buffer as Buffer
 from .environment import Environment as Environment
-from .environment import Services as Services
 from .environment import options_of as options_of
 from .group import Group as Group
 from .launcher import ClientHandle as ClientHandle
@@ -21,6 +20,7 @@ from .scene.event import Event as Event
 from .scene.factory import Factory as Factory
 from .scene.geometry import vertex_normals as vertex_normals
 from .scene.kinds import KINDS as KINDS
+from .services import Services as Services
 from .transformation import Transformation as Transformation
 from .visualizer import Observer as Observer
 from .visualizer import Visualizer as Visualizer

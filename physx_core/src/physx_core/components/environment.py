@@ -4,16 +4,16 @@ from __future__ import annotations
 
 import functools
 import inspect
-from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeAlias
+from collections.abc import Iterable, Mapping, Sequence
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
 from physx_core.closeable import Closeable
 from physx_core.components.parameter import Parameter, as_parameters, draw, random_of
 from physx_core.components.sampler import checked
-from physx_core.components.scene.event import Event
 from physx_core.components.scene.factory import Factory, NullFactory
+from physx_core.components.services import Aside, Choose, Services, SharedChoice
 from physx_core.errors import (
     ConfigError,
     MissingFieldError,
@@ -58,7 +58,7 @@ _COUNTERS = (
 """What changes about the place of an environment in its run; instances keep it."""
 _OF_THE_RUN = (
     *("factory", "step_time", "compute_training_data", "_sample", "_training", "_additional"),
-    *("_services", "_choose_parameters", "_baseline"),
+    *("_services", "_choose_parameters", "_baseline", "_made_with", "_loaded", "_has_kept"),
 )
 """What an environment has from its run, for viewers, or only within a step."""
 
@@ -86,30 +86,6 @@ def not_finite_prediction(name: str) -> NotFiniteError:
         "finite. Train the network again, with normalized data or a smaller learning rate.",
         field=name,
     )
-
-
-class Services(Protocol):
-    """Requests that an environment can make to its run."""
-
-    def predict(self, fields: Sample) -> Sample:
-        """Return the network's prediction for one sample, in physical units."""
-        ...
-
-    def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
-        """Save values of one instance, or of all (0), for later runs on the same dataset."""
-        ...
-
-    def load_parameters(self, instance_id: int) -> dict[str, Any]:
-        """Return the values that one instance, or 0, saved; empty if it saved none."""
-        ...
-
-    def show(self, instance_id: int, step: int, events: list[Event]) -> None:
-        """Pass drawing events to the viewers."""
-        ...
-
-
-Choose: TypeAlias = Callable[[int], Mapping[str, Any]]
-"""Returns the values of the parameters for an episode, by name."""
 
 
 class Environment(Closeable):
@@ -149,6 +125,13 @@ class Environment(Closeable):
     independent_episodes: bool = False
     episode_steps: int | None = None
     _has_seed: bool | None = None  # until the constructor has run
+    _made_with: tuple[tuple[Any, ...], dict[str, Any]]
+
+    def __new__(cls, *args: Any, **kwargs: Any) -> Self:
+        """Note the arguments, for `fork`."""
+        made = super().__new__(cls)
+        made._made_with = args, kwargs
+        return made
 
     def __init__(
         self,
@@ -190,6 +173,8 @@ class Environment(Closeable):
         self._training: dict[str, Any] | None = None
         self._additional: dict[str, Any] | None = None
         self._services: Services | None = None
+        self._loaded: list[dict[str, Any]] = []  # parameters, while it was created
+        self._has_kept = False  # parameters in the run
         self._defined_parameters: list[Parameter] = []
         self._choose_parameters: Choose | None = None
         self._has_begun_episodes = False
@@ -277,6 +262,42 @@ class Environment(Closeable):
             StateError: If this environment was created differently.
         """
         self._tracked().restore(state)
+
+    def fork(self) -> Self:
+        """Return an independent copy that goes on from here, in this process; close it.
+
+        It is a new object of the same class and arguments, for which `create`, `init` and
+        `init_database` were called, with the state of this one. Its steps have the same bits as
+        those of this one, and influence nothing here: what it saves stays in it, and it draws
+        nothing; predictions come from the same network. To look ahead, call its `step`, then
+        `take_sample` for what that has set; count in its `step_index` if `step` uses that.
+        `Instance.fork` does so.
+
+        Raises:
+            StateError: If an attribute cannot be captured; it is named.
+            UsageError: If `track_state` was not called right after creation.
+        """
+        state, (args, kwargs) = self.get_state(), self._made_with
+        copy = type(self)(*args, **kwargs)
+        copy.independent_episodes = self.independent_episodes
+        if self._choose_parameters is not None:
+            self._choose_parameters = SharedChoice.of(self._choose_parameters)
+        aside = Aside(self._services, self._loaded)
+        copy._services, copy._choose_parameters = aside, self._choose_parameters
+        try:
+            copy.create()
+            copy.init()
+            copy.init_database()
+            copy.track_state()
+            if self._has_kept and self._services is not None:
+                aside.saved[self._saves_as] = self._services.load_parameters(self._saves_as)
+            copy.set_state(state)
+            copy.set_place(self.get_place() | {"chosen": {}})
+        except BaseException:
+            copy.close()
+            raise
+        copy.compute_training_data, copy._sample = self.compute_training_data, self._sample
+        return copy
 
     def close(self) -> None:
         """Free the resources that `create` acquired."""
@@ -501,11 +522,15 @@ class Environment(Closeable):
                 "it in create() or init(), and set what belongs to an episode with "
                 "set_episode_data()."
             )
+        self._has_kept = True
         self._run().save_parameters(self._saves_as, values)
 
     def load_parameters(self) -> dict[str, Any]:
         """Return the values that this instance saved with `save_parameters`, if any."""
-        return self._run().load_parameters(self._saves_as)
+        loaded, self._has_kept = self._run().load_parameters(self._saves_as), True
+        if not self._has_begun_episodes:
+            self._loaded.append(loaded)
+        return loaded
 
     @property
     def _saves_as(self) -> int:
@@ -529,7 +554,10 @@ class Environment(Closeable):
         return self._earlier_steps + self.step_index
 
     def track_state(self) -> None:
-        """Prepare the default `get_state`, right after creation; physx calls it.
+        """Prepare the default `get_state`, right after creation.
+
+        physx calls it if the run takes states. An environment that forks itself calls it at the end
+        of `init_database`.
 
         Raises:
             StateError: If an attribute cannot be captured; it is named.
@@ -554,7 +582,8 @@ class Environment(Closeable):
         if self._baseline is None:
             raise UsageError(
                 f"There is no state of {type(self).__name__} by default, because it has methods of "
-                "its own for it, or track_state() was not called right after creation."
+                "its own for it, or track_state() was not called right after creation: call it at "
+                "the end of init_database()."
             )
         return self._baseline
 
@@ -563,12 +592,16 @@ class Environment(Closeable):
         place = {name: getattr(self, name) for name in _COUNTERS}
         from physx_core.states import as_lists
 
+        chosen = getattr(self._choose_parameters, "chosen", {})  # by forks that are ahead
+        place["chosen"] = {n: dict(each) for n, each in chosen.items() if n > self.episode_index}
         return {**place, "rng": as_lists(self.rng.bit_generator.state)}
 
     def set_place(self, place: Mapping[str, Any]) -> None:
         """Set what `get_place` returned."""
         for name in _COUNTERS:
             setattr(self, name, place[name])
+        if place["chosen"] and self._choose_parameters is not None:
+            self._choose_parameters = SharedChoice(self._choose_parameters, place["chosen"])
         self.rng.bit_generator.state = place["rng"]
 
     def begin_episode(self, episode: int | None = None) -> None:

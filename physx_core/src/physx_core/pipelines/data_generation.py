@@ -16,6 +16,7 @@ from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, listed
 from physx_core.pipelines.campaign import Campaign
 from physx_core.pipelines.campaign_writer import CampaignWriter
+from physx_core.pipelines.generation import Generation
 from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed, derive_seed
 from physx_core.pipelines.run_description import (
     describe_dataset,
@@ -23,6 +24,8 @@ from physx_core.pipelines.run_description import (
     describe_samples,
 )
 from physx_core.pipelines.storage import (
+    GENERATION,
+    STREAMS,
     check_client_writers,
     describe_environment,
     end_generation,
@@ -32,11 +35,13 @@ from physx_core.pipelines.storage import (
     reject_streams_of_writers,
     store_sets,
 )
+from physx_core.pipelines.stored_streams import StoredStreams
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 from physx_core.views.dataset_config import DatasetConfig
 from physx_core.workers.episode_queue import EpisodeQueue
+from physx_core.workers.instance import NOTHING
 from physx_core.workers.row_queue import RowQueue
 
 
@@ -79,8 +84,9 @@ class DataGeneration(NewSessionPipeline):
     """Simulate one of the independent episodes again at the end, if that costs less than 1 % of the
     run, and fail if its samples differ in any bit."""
     resume: bool = field(default=False, metadata={"recorded": False})
-    """Go on with the independent episodes of an existing session: simulate those that it does not
-    have."""
+    """Go on with the samples of an existing session: simulate the independent episodes that it does
+    not have; or let streams go on from their last states (`EnvironmentConfig.state_every`), else
+    from their beginning, and store what is missing."""
     retry_failed: bool = field(default=False, metadata={"recorded": False})
     """With `resume`: also simulate the episodes again that failed, for example because of a mistake
     that has been mended."""
@@ -97,6 +103,8 @@ class DataGeneration(NewSessionPipeline):
     _writer: CampaignWriter | None = field(init=False, repr=False, default=None)
     _first_row: int = field(init=False, repr=False, default=0)
     _former_rows: int = field(init=False, repr=False, default=0)
+    _streams: StoredStreams | None = field(init=False, repr=False, default=None)
+    _is_described: bool = field(init=False, repr=False, default=False)
 
     def __post_init__(self) -> None:
         """Check that the options ask for batches or for episodes.
@@ -183,20 +191,31 @@ class DataGeneration(NewSessionPipeline):
         With ``record_wrong_samples``, the samples that `check_sample` rejected are stored too, in
         the mode "wrong".
         """
+        wanted = self._first_row + (self.batch_id + 1) * (self.batch_size or 0)
         if self._writer is not None:
             self.batch = {}
-            self._writer.store_rows(self._first_row + (self.batch_id + 1) * (self.batch_size or 0))
+            self._writer.store_rows(wanted)
+            return
+        streams, missing = self._streams, self.batch_size or 0
+        earlier: dict[int, int] = {}
+        if streams is not None:
+            missing = streams.missing(wanted, missing)
+            earlier, streams.earlier = streams.earlier, earlier
+        if not missing:  # an earlier run has stored it
+            self.batch = {}
             return
         source, dataset, mode = self.source, self.dataset, self._mode
-        with record_beside_rows(source, dataset, mode):
-            self.batch = source.batch(self.batch_size or 0)
+        with record_beside_rows(source, dataset, mode, earlier):
+            self.batch = source.batch(missing)
             if not source.is_plain:
                 store_sets(source, dataset, mode)
-            if self.batch_id == 0:
+            if not self._is_described:
                 dataset.define_fields(mode, source.fields)
                 self._describe()
             if self.batch:
                 dataset.append(mode, self.batch, checked=True)
+        if streams is not None:
+            streams.keep(source)
 
     def _check_batch_produce(self) -> None:
         """Call a replacement of `batch_produce`, which must store samples."""
@@ -205,13 +224,14 @@ class DataGeneration(NewSessionPipeline):
         if self.dataset.num_samples(self._mode) == before:
             store = f"store them with self.dataset.append({self._mode!r}, ...)"
             raise self._lacks("batch_produce", "stored no samples", store)
-        if self.batch_id == 0:
+        if not self._is_described:
             self._describe()
 
     def _describe(self) -> None:
         """Store with the samples which environment generated them."""
         described = describe_environment(self.environment_config, self._seed)
         self.dataset.update_info(**described)
+        self._is_described = True
 
     def batch_count(self) -> None:
         """Count the batch."""
@@ -231,7 +251,7 @@ class DataGeneration(NewSessionPipeline):
             self._writer.failed = 0
             if isinstance(self._writer.queue, RowQueue):
                 self._writer.queue.goal = self._first_row + self._amount()[0]
-        end_generation(self.dataset)
+        end_generation(self.dataset, GENERATION)
 
     def _open(self, resources: contextlib.ExitStack) -> None:
         dataset_config = self.dataset_config or DatasetConfig()
@@ -258,10 +278,19 @@ class DataGeneration(NewSessionPipeline):
             self.session = Session.existing(self.session_dir, self.session_name)
         else:
             self.session = self._create_session()
+        self._writer = self._streams = None
+        self._first_row = self.batch_id = self._former_rows = 0
+        self._is_described = False
+        resources.callback(self._close_streams)
         self.dataset = resources.enter_context(open_own(self.session, dataset_config))
-        self._writer, self._first_row, self.batch_id, self._former_rows = None, 0, 0, 0
-        campaign = Campaign.last(self.dataset, self._mode, config) if self.resume else None
-        self._open_environments(resources, config, dataset_config, campaign)
+        campaign = former = None
+        campaigns = Campaign.count(self.dataset, self._mode)
+        if self.resume and self._stores_rows(dataset_config):
+            former = StoredStreams.find(self.dataset, self._mode, others=campaigns > 0)
+        is_begun = campaigns > 0 or self.dataset.num_samples(self._mode) > 0
+        if self.resume and former is None and is_begun:
+            campaign = Campaign.last(self.dataset, self._mode, config)
+        self._open_environments(resources, config, dataset_config, campaign, former)
 
     def _open_environments(
         self,
@@ -269,13 +298,23 @@ class DataGeneration(NewSessionPipeline):
         config: EnvironmentConfig,
         dataset_config: DatasetConfig,
         campaign: Campaign | None,
+        former: Generation | None,
     ) -> None:
-        """Open the environments, unless there is nothing left to simulate."""
-        if campaign is None:
-            self._seed = choose_seed(config.seed)
-            seed = derive_seed(self._seed, self._mode, self._offset())
-        else:
+        """Open the environments, unless there is nothing left to simulate.
+
+        Args:
+            resources: Closes them.
+            config: The environment.
+            dataset_config: Who writes the samples.
+            campaign: The episodes to go on with, if any.
+            former: The streams to go on with, if any.
+        """
+        offset = self._offset() if former is None else former.offset
+        if campaign is not None:
             self._seed, seed = campaign.environment["seed"], campaign.seed
+        else:
+            self._seed = choose_seed(config.seed) if former is None else former.seed
+            seed = derive_seed(self._seed, self._mode, offset)
         self._record_config(self._seed, **self._larger_number())
         self._observe(resources, config)
         if campaign is not None:
@@ -286,26 +325,51 @@ class DataGeneration(NewSessionPipeline):
         by_clients = dataset_config.writers == "clients"
         delegation = self.dataset.delegate(self._mode) if by_clients else None
         total = None if self.episodes is not None else self._amount()[0]
-        self.source = self._open_source(resources, config, seed, total=total, delegation=delegation)
+        skip = NOTHING
+        if campaign is None and self._stores_rows(dataset_config):
+            place = (self.session, self.dataset, self._mode)
+            self._streams = StoredStreams(*place, config, self._seed, offset, former, total or 0)
+            skip = self._streams.skip
+            if former is not None and skip.rows >= (total or 0):
+                return
+        self.source = self._open_source(
+            *(resources, config, seed),
+            total=total,
+            skip=skip,
+            delegation=delegation,
+            keeps_pasts=self._streams is not None,
+        )
         if campaign is None and self._simulates_episodes():
-            self.source.check_independent()
-            parameters = self.source.sets.parameters
-            campaign = Campaign.begin(
-                self.dataset, self._mode, config, self._seed, seed, parameters
-            )
-            self._writer = self._make_writer(campaign)
+            self._begin_campaign(config, seed)
         if self._writer is not None:
             self._describe()
             self._writer.open(self.source, delegation)
         else:
             if delegation is not None:
                 reject_streams_of_writers(describe_environment_config(config))
-            reject_episode_fields(self.source)
-            if self.max_failed:
-                raise ConfigError(
-                    "DataGeneration.max_failed is for independent episodes, but "
-                    f"{describe_environment_config(config)} is a stream: leave it out."
-                )
+            self._check_streams()
+
+    def _check_streams(self) -> None:
+        """Check that nothing is asked for that only independent episodes have."""
+        reject_episode_fields(self.source)
+        if self.max_failed:
+            name = describe_environment_config(self.environment_config)
+            raise ConfigError(
+                f"DataGeneration.max_failed is for independent episodes, but {name} is a stream: "
+                "leave it out."
+            )
+
+    def _begin_campaign(self, config: EnvironmentConfig, seed: list[int]) -> None:
+        """Simulate episodes by number, instead of streams."""
+        self.source.check_independent()
+        parameters, self._streams = self.source.sets.parameters, None
+        self.dataset.update_info(**{STREAMS: None})
+        campaign = Campaign.begin(self.dataset, self._mode, config, self._seed, seed, parameters)
+        self._writer = self._make_writer(campaign)
+
+    def _close_streams(self) -> None:
+        if self._streams is not None:
+            self._streams.close()
 
     def _larger_number(self) -> dict[str, int]:
         """Return how much to record if the campaign was to have more than this run asks for."""
@@ -343,6 +407,11 @@ class DataGeneration(NewSessionPipeline):
             self.source.is_independent and self._is_own(DataGeneration.batch_produce)
         )
 
+    def _stores_rows(self, dataset_config: DatasetConfig) -> bool:
+        """Return whether the pipeline itself stores the rows of batches."""
+        is_own = self._is_own(DataGeneration.batch_produce)
+        return self.episodes is None and is_own and dataset_config.writers == "server"
+
     def _plan(self) -> Iterable[str]:
         former = Path(self.session_dir) / self.session_name
         if self._writer is not None and self.session.is_new and former != self.session.path:
@@ -366,7 +435,7 @@ class DataGeneration(NewSessionPipeline):
 
     def _next(self, error: BaseException | None) -> Iterable[str]:
         path = shlex.quote(str(self.session.path))
-        if error is not None and self._writer is not None:
+        if error is not None and (self._writer is not None or self._streams is not None):
             yield f"physx generate {path} --resume"
         yield f"physx info {path}"
         if error is None and self._mode == "training":

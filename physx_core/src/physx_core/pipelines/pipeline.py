@@ -290,6 +290,7 @@ class Pipeline(ABC):
         accept_all: bool = False,
         skip: Skip = NOTHING,
         delegation: Delegation | None = None,
+        keeps_pasts: bool = False,
     ) -> Source:
         """Open the environments, in this process or in clients.
 
@@ -309,7 +310,9 @@ class Pipeline(ABC):
             skip: The rows that an earlier run already had: they are generated again, but not
                 returned.
             delegation: Lets clients write their own rows; None: the source returns them.
+            keeps_pasts: Whether the run keeps what a later one needs to go on from states.
         """
+        self._tell_repeated(config, skip)
         services = RunServices(
             self.session.dataset_dir, show or self.observers.events, predict, replayed
         )
@@ -317,7 +320,9 @@ class Pipeline(ABC):
         if in_process or not config.as_tcp_ip_client:
             from physx_core.sources.local_source import LocalSource
 
-            source = LocalSource(config, services, seed, accept_all=accept_all, skip=skip)
+            source = LocalSource(
+                config, services, seed, accept_all=accept_all, skip=skip, keeps_pasts=keeps_pasts
+            )
         else:
             from physx_core.sources.client_source import ClientSource
 
@@ -330,8 +335,16 @@ class Pipeline(ABC):
                 accept_all=accept_all,
                 skip=skip,
                 delegation=delegation,
+                keeps_pasts=keeps_pasts,
             )
         return resources.enter_context(source)
+
+    def _tell_repeated(self, config: EnvironmentConfig, skip: Skip) -> None:
+        """Say that a run repeats rows of an earlier one, if it does not go on from states."""
+        repeated = skip.repeated(config.num_clients)
+        if repeated and not skip.pasts:
+            hint = "" if config.state_every else "; with state_every it would go on from states"
+            self._say(f"{repeated:,} samples are stored, and simulated again first{hint}")
 
     def _record_config(self, seed: int, **others: object) -> None:
         """Write the options, some of them changed, and the actual seed to the session."""

@@ -21,6 +21,7 @@ from physx_core.pipelines.run_description import (
     describe_samples,
 )
 from physx_core.pipelines.storage import (
+    GENERATIONS,
     describe_environment,
     end_generation,
     open_existing,
@@ -210,7 +211,7 @@ class Prediction(Pipeline):
         if self.record:
             self.dataset = resources.enter_context(open_own(self.session, config))
             self.dataset.update_info(prediction=describe_environment(environment, seed))
-            end_generation(self.dataset)
+            end_generation(self.dataset, *GENERATIONS)
         self._record_config(seed)
         self._observe(resources, environment)
         self.source = self._open_source(

@@ -30,11 +30,14 @@ from physx_core.views.dataset_config import DatasetConfig
 PARAMETERS = "parameters_{}.bin"
 """Name of the file in a dataset's folder that contains an instance's saved parameters."""
 _FORMER = ".former"
-_IF_SET = ("independent_episodes", "episode_steps", "sampler", "sampler_kwargs")
+_IF_SET = ("independent_episodes", "episode_steps", "sampler", "sampler_kwargs", "state_every")
 LARGEST_PARAMETERS = 2**32
 """Maximum size of such a file in bytes."""
 GENERATION = "generation"
 """Entry in a dataset's info that describes the last training whose environments generated rows."""
+STREAMS = "streams"
+"""Entry that describes the last data generation by streams."""
+GENERATIONS = (GENERATION, STREAMS)
 
 
 def open_own(session: Session, config: DatasetConfig) -> Dataset:
@@ -229,8 +232,8 @@ def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:
         )
     dataset.merge(config.existing_dir)
     with Dataset.open(config.existing_dir) as existing:
-        info = {**existing.info, GENERATION: None, "copied_from": str(existing.directory)}
-        dataset.update_info(**info)
+        copied = {"copied_from": str(existing.directory)}
+        dataset.update_info(**existing.info | dict.fromkeys(GENERATIONS) | copied)
         for path in existing.directory.glob(PARAMETERS.format("*")):
             with files.storing(f"{path}, copied into the session,"):
                 content = files.read_content(path, LARGEST_PARAMETERS)
@@ -301,6 +304,23 @@ def _recording_beside_rows(
     store_sets(source, dataset, mode)
 
 
+def last_steps(dataset: Dataset, mode: str, first: int, stop: int, count: int) -> dict[int, int]:
+    """Return the step of each instance's last row among stored rows of streams.
+
+    Args:
+        dataset: Contains the rows.
+        mode: Their mode.
+        first: Index of the first row of the streams.
+        stop: Index behind their last row.
+        count: Number of streams.
+    """
+    if stop <= first:
+        return {}
+    last = slice(max(first, stop - count), stop)
+    numbers, steps = (dataset[mode][name][last].tolist() for name in ("env_id", "step"))
+    return dict(zip(numbers, steps, strict=True))
+
+
 def _store_rejected(
     source: Source, dataset: Dataset | None, earlier: Mapping[int, int] | None
 ) -> None:
@@ -327,20 +347,22 @@ def store_sets(source: Source, dataset: Dataset | None, mode: str) -> None:
         dataset.append(SETS, sets)
 
 
-def end_generation(dataset: Dataset) -> None:
-    """Record where the rows end that the environments of the last training generated.
+def end_generation(dataset: Dataset, *entries: str) -> None:
+    """Record where the rows end that the streams of earlier runs generated.
 
-    Called before another run adds rows, so that the training can still be resumed if it needs no
-    more rows.
+    Called before another run adds rows, so that they can still be resumed if they need no more
+    rows.
 
     Args:
         dataset: The dataset, open for writing.
+        entries: Which runs: `GENERATION`, `STREAMS`.
     """
-    last = dataset.info.get(GENERATION)
-    if isinstance(last, dict) and last.get("ended") is None:
-        counted = (str(last.get("mode")), WRONG, SETS)
-        ended = [dataset.num_samples(name) for name in counted]
-        dataset.update_info(**{GENERATION: {**last, "ended": ended}})
+    for entry in entries:
+        last = dataset.info.get(entry)
+        if isinstance(last, dict) and last.get("ended") is None:
+            counted = (str(last.get("mode")), WRONG, SETS)
+            ended = [dataset.num_samples(name) for name in counted]
+            dataset.update_info(**{entry: {**last, "ended": ended}})
 
 
 def describe_environment(config: EnvironmentConfig, seed: int) -> dict[str, Any]:

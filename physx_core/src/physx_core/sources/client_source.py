@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from physx_core.components.environment import Services
+from physx_core.components.services import Services
 from physx_core.config import EnvironmentConfig
 from physx_core.dataset.write.delegation import Delegation
 from physx_core.errors import (
@@ -26,6 +26,7 @@ from physx_core.sources.source import Canceled, Source, check_stored
 from physx_core.typing import Batch
 from physx_core.workers.instance import NOTHING, Skip
 from physx_core.workers.parameter_sets import ParameterSets
+from physx_core.workers.pasts import Pasts
 from physx_core.workers.row_codec import row_bytes
 from physx_core.workers.server.client_group import ClientGroup
 from physx_core.workers.server.peer import Peer
@@ -63,6 +64,7 @@ class ClientSource(Source):
         skip: Skip = NOTHING,
         delegation: Delegation | None = None,
         transport: Transport = SOCKETS,
+        keeps_pasts: bool = False,
     ) -> None:
         """Prepare the clients.
 
@@ -80,6 +82,7 @@ class ClientSource(Source):
             delegation: Lets the clients write the rows of independent episodes themselves; None:
                 they send them.
             transport: What connects the clients, and the clock that the run follows.
+            keeps_pasts: Whether somebody calls `take_pasts` after each batch.
         """
         self._written = None if delegation is None else WrittenRows(delegation)
         self._name = getattr(config.environment, "__name__", str(config.environment))
@@ -87,6 +90,8 @@ class ClientSource(Source):
         self._episodes: ClientEpisodes | None = None
         self.instance_nb = config.num_clients
         self.sets = ParameterSets(config, seed, skip)
+        if keeps_pasts and config.state_every:
+            self.pasts = Pasts(1e9 * config.journal_size, skip.pasts)
         self._group = ClientGroup(
             config,
             services,
@@ -96,13 +101,14 @@ class ClientSource(Source):
             skip=skip,
             written=self._written,
             transport=transport,
+            pasts=self.pasts,
         )
         self._rejections = 0
         if config.record_wrong_samples:
             self._rejections = config.max_wrong_samples_per_step + 1
         self._failed_row: int | None = None
         self._run_ahead, self._total = run_ahead, total
-        self._asked = self._first = skip.rows
+        self._asked = self._first = self.rows = skip.rows
         self._taken = [skip.rows_of(n + 1, self.instance_nb) for n in range(self.instance_nb)]
         self._agreeing = {1}
         self._opened: list[Field] = []
@@ -194,6 +200,7 @@ class ClientSource(Source):
                     for field in self._table
                 }
             self._group.wait(self._without_rows)
+            self.rows = self._asked
         except BaseException:
             self._failed = True
             raise

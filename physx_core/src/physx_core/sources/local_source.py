@@ -3,23 +3,30 @@
 from __future__ import annotations
 
 import contextlib
+import logging
 from collections.abc import Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
-from physx_core.components.environment import Services
+from physx_core.components.services import Services
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import ConfigError, PhysxError, StateError, UsageError
 from physx_core.fields import Field
+from physx_core.net.remote_errors import decode_error, encode_error
+from physx_core.net.values import decode, encode
 from physx_core.rows import ROW_FIELDS, RowBuffer, concatenate, copy_row, infer_shapes
 from physx_core.sources.source import Source, check_stored
-from physx_core.typing import Batch
+from physx_core.typing import Batch, Sample
 from physx_core.workers.instance import NOTHING, Instance, Skip, instance_arguments
 from physx_core.workers.parameter_sets import ParameterSets
+from physx_core.workers.pasts import Past, Pasts
 
 if TYPE_CHECKING:
     from physx_core.sources.episode_source import LocalEpisodes
     from physx_core.workers.episode_queue import EpisodeQueue
+
+
+_LOG = logging.getLogger("physx")
 
 
 class LocalSource(Source):
@@ -33,6 +40,7 @@ class LocalSource(Source):
         *,
         accept_all: bool = False,
         skip: Skip = NOTHING,
+        keeps_pasts: bool = False,
     ) -> None:
         """Prepare the instances.
 
@@ -42,6 +50,7 @@ class LocalSource(Source):
             seed: Seed of all instances.
             accept_all: Whether samples that `check_sample` rejects count like the others.
             skip: The rows that an earlier run already got: generated again, but not returned.
+            keeps_pasts: Whether somebody calls `take_pasts` after each batch.
 
         Raises:
             ConfigError: If the configuration is for an elastic run, which needs clients.
@@ -63,8 +72,15 @@ class LocalSource(Source):
         ]
         self._buffer: RowBuffer | None = None
         self._next = 0
-        self._skip = skip
+        self.rows, self._skip = skip.rows, skip
         self._last = range(0)
+        self._rejected: list[list[Batch]] = [[] for _ in self._instances]
+        pasts = [skip.pasts.get(each.instance_id, Past()) for each in self._instances]
+        self._restored = [past.rows for past in pasts]
+        self._rejections = [past.rejected for past in pasts]
+        self._says_refusal = config.state_every > 0
+        if keeps_pasts and config.state_every:
+            self.pasts = Pasts(1e9 * config.journal_size, skip.pasts)
 
     @property
     def fields(self) -> list[Field]:
@@ -96,9 +112,10 @@ class LocalSource(Source):
         if not self.is_plain:
             self.pop_rejected()
         if self._next < self._skip.rows:
-            self._generate_again(size)
+            self._generate_again()
         self._last = range(self._next, self._next + size)
         rows = self._fill(size, stored).take()
+        self.rows = self._next
         if not self.is_plain:
             self.sets.note(rows)
         return rows
@@ -112,7 +129,15 @@ class LocalSource(Source):
     def _open(self, instance: Instance) -> None:
         draw, with_states = self._config.visualizer is not None, self._config.state_every > 0
         choose = partial(self._choose, instance.instance_id)
-        instance.open(self._services, draw, choose, with_states=with_states)
+        number, services = instance.instance_id, self._services
+        if self.pasts is not None:
+            services = _Remembering(services, self.pasts, number)
+        instance.open(services, draw, choose, with_states=with_states)
+        if self.pasts is not None:
+            self.pasts.created(number, self._services)
+        past = self._skip.pasts.get(number)
+        if past is not None and past.state:
+            instance.set_state(decode(past.state)["instance"])
 
     def _choose(self, instance_id: int, episode: int) -> dict[str, Any]:
         return self.sets.choose(instance_id, episode)
@@ -124,20 +149,12 @@ class LocalSource(Source):
             buffer = self._buffer = RowBuffer(buffer.fields[: -len(ROW_FIELDS)], size)
         elif buffer is not None and buffer.count:  # an error ended the last batch
             buffer.clear()
-        instances, every = self._instances, self._config.state_every
+        instances = self._instances
         while self._next < first + size:
             place = self._next % count
             instance = instances[place]
             given = None if stored is None else copy_row(stored, self._next - first)
-            try:
-                if every and (row := self._next // count) and row % every == 0:
-                    with contextlib.suppress(StateError):  # after the same rows as in a client
-                        instance.get_state()
-                sample = instance.step(given)
-            except PhysxError as error:
-                if instance.environment is not None:
-                    self.sets.explain(place + 1, instance.environment.episode_index, error)
-                raise
+            sample = self._step(self._next, given)
             if buffer is None:
                 buffer = self._buffer = RowBuffer(infer_shapes(instance.fields, sample), size)
             buffer.put(sample, place + 1, instance.last_episode, instance.last_step)
@@ -146,25 +163,71 @@ class LocalSource(Source):
             raise UsageError(f"A batch must have at least one row, not {size}.")
         return buffer
 
-    def _generate_again(self, size: int) -> None:
+    def _step(self, row: int, stored: Sample | None = None) -> dict[str, Any]:
+        """Return a row of the instance whose turn it is; take its state before, if it is due."""
+        number, place = divmod(row, self.instance_nb)
+        instance, every = self._instances[place], self._config.state_every
+        try:
+            if every and number and number % every == 0 and number != self._restored[place]:
+                self._take_state(instance, number)
+            return instance.step(stored)
+        except PhysxError as error:
+            if instance.environment is not None:
+                self.sets.explain(place + 1, instance.environment.episode_index, error)
+            raise
+
+    def _take_state(self, instance: Instance, rows: int) -> None:
+        """Take a state, after the same rows as in a client."""
+        number = instance.instance_id
+        self._take_rejected(instance)
+        try:
+            state = instance.get_state()
+        except StateError as error:
+            if self._says_refusal:
+                self._says_refusal = False
+                _LOG.warning(
+                    "A run that is resumed will repeat all rows since the last state, as instance "
+                    "%d gives none. %s",
+                    number,
+                    error,
+                )
+            return
+        if self.pasts is not None:
+            encoded = encode({"instance": state, "stored": []}, "the state")
+            recorded, sets = self.sets.waiting(number)
+            saved = self._services.load_parameters(number)
+            past = Past(rows, encoded, self._rejections[number - 1], recorded, sets, saved)
+            self.pasts.note(number, past)
+
+    def _generate_again(self) -> None:
         """Generate the rows that an earlier run already got, and discard them."""
-        while left := self._skip.rows - self._next:
-            self._fill(min(left, size)).clear()
-        for instance in self._instances:
-            if instance.rejected is not None:
-                instance.rejected.discard(self._skip.rejected_of(instance.instance_id))
+        for row in range(self._next, self._skip.rows):
+            if row // self.instance_nb >= self._restored[row % self.instance_nb]:
+                self._step(row)
+            self._next = row + 1
 
     def pop_rejected(self) -> Batch:
         """Return the rejected samples: see `Source.pop_rejected`."""
         blocks = []
-        for instance in self._instances:
-            if instance.rejected is not None:
-                if self._buffer is None:
-                    fields = instance.rejected.infer_shapes(instance.fields)
-                else:
-                    fields = self._buffer.fields[: -len(ROW_FIELDS)]
-                blocks.append(instance.rejected.take(fields, instance.instance_id))
+        for instance, taken in zip(self._instances, self._rejected, strict=True):
+            self._take_rejected(instance)
+            blocks += taken
+            taken.clear()
         return concatenate(blocks)
+
+    def _take_rejected(self, instance: Instance) -> None:
+        """Take the samples that an instance has rejected, but for those that a run already got."""
+        place, rejected = instance.instance_id - 1, instance.rejected
+        if rejected is None:
+            return
+        fields = rejected.infer_shapes(instance.fields)
+        if self._buffer is not None:
+            fields = self._buffer.fields[: -len(ROW_FIELDS)]
+        rows = rejected.take(fields, instance.instance_id)
+        count = len(rows["step"])
+        left = max(0, self._skip.rejected_of(instance.instance_id) - self._rejections[place])
+        self._rejections[place] += count
+        self._rejected[place].append({name: values[left:] for name, values in rows.items()})
 
     def apply(self, prediction: Batch) -> None:
         """Pass predictions to the instances: see `Source.apply`."""
@@ -177,3 +240,29 @@ class LocalSource(Source):
         with contextlib.ExitStack() as stack:
             for instance in self._instances:
                 stack.callback(instance.close)
+
+
+class _Remembering:
+    """The run's services for one instance; what they predict is noted, and told again."""
+
+    def __init__(self, services: Services, pasts: Pasts, number: int) -> None:
+        self._services, self._pasts, self._number = services, pasts, number
+        self.save_parameters = services.save_parameters
+        self.load_parameters = services.load_parameters
+        self.show = services.show
+
+    def predict(self, fields: Sample) -> Sample:
+        """Return the prediction for one sample: see `Services.predict`."""
+        answer = self._pasts.tell(self._number)
+        if answer is None:
+            try:
+                found = self._services.predict(fields)
+            except PhysxError as error:
+                self._pasts.answered(self._number, (False, encode_error(error)))
+                raise
+            self._pasts.answered(self._number, (True, encode(found, "the prediction")))
+            return found
+        if not answer[0]:
+            raise decode_error(answer[1])
+        told: Sample = decode(answer[1])
+        return told

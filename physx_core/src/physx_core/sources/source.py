@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from types import TracebackType
 from typing import TYPE_CHECKING, Self
 
@@ -13,6 +13,7 @@ from physx_core.errors import PhysxError, UsageError
 from physx_core.fields import Field
 from physx_core.typing import Batch
 from physx_core.workers.parameter_sets import ParameterSets
+from physx_core.workers.pasts import Past, Pasts
 
 if TYPE_CHECKING:
     from physx_core.sources.episode_source import EpisodeSource
@@ -72,6 +73,8 @@ class Source(Opened):
         episode_fields: The fields that each independent episode has once; known once it is open.
         is_plain: Whether all that an open source produces are rows: there are no parameters, and
             rejected samples are not recorded.
+        rows: Number of rows that have been returned, with those of an earlier run.
+        pasts: Keeps what a later run needs to go on from states; None: it repeats the rows.
     """
 
     instance_nb: int
@@ -80,6 +83,8 @@ class Source(Opened):
     is_independent = False
     episode_fields: Sequence[Field] = ()
     is_plain = False
+    rows = 0
+    pasts: Pasts | None = None
     _is_canceled = False
     _name = ""
 
@@ -130,6 +135,17 @@ class Source(Opened):
         Args:
             queue: The numbers to simulate.
         """
+
+    def take_pasts(self) -> Mapping[int, Past] | None:
+        """Return what the instances need to go on after the last batch, and forget what was before.
+
+        Returns:
+            The past of each instance by number; None: a later run has to repeat the rows.
+        """
+        if self.pasts is None:
+            return None
+        nb = self.instance_nb
+        return self.pasts.at(lambda number: (self.rows - number + nb) // nb, nb)
 
     def check_independent(self) -> None:
         """Check that the environment's episodes are independent.

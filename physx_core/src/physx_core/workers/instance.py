@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import inspect
 import traceback
 import warnings
@@ -10,15 +11,14 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 from physx_core.closeable import Closeable
 from physx_core.components.environment import (
-    Choose,
     Environment,
     PredictedFields,
-    Services,
     explain_missing_attribute,
     options_of,
 )
 from physx_core.components.parameter import Parameter
 from physx_core.components.scene.factory import Factory
+from physx_core.components.services import Choose, Services
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import (
     EnvironmentFailedError,
@@ -33,10 +33,11 @@ from physx_core.plugins import resolve
 from physx_core.plugins.references import adapters_hint
 from physx_core.processes.endings import describe_ending, is_ending
 from physx_core.rows import RejectedSamples
-from physx_core.typing import Array, Batch, Sample
+from physx_core.typing import Array, Sample
 
 if TYPE_CHECKING:
     from physx_core.states import Baseline
+    from physx_core.workers.pasts import Past
 
 PARAMETER = "parameters/"
 """Name prefix of a stored row's entries that hold the parameters it was generated with; no field
@@ -63,14 +64,14 @@ class Skip(NamedTuple):
     Attributes:
         rows: Number of rows from all instances together.
         rejected: Number of rejected samples of each instance; empty: none.
-        sets: Number of recorded sets of parameters.
-        begun: Fields ``env_id`` and ``episode`` of the rows; empty: there are no sets.
+        sets: Numbers of the recorded sets of parameters.
+        pasts: From where instances go on, by their number; the others repeat all of their rows.
     """
 
     rows: int = 0
     rejected: tuple[int, ...] = ()
-    sets: int = 0
-    begun: Batch = {}  # noqa: RUF012 - never changed
+    sets: frozenset[int] = frozenset()
+    pasts: Mapping[int, Past] = {}
 
     def rows_of(self, number: int, instance_nb: int) -> int:
         """Return how many of the rows an instance generated; instances are numbered from 1."""
@@ -79,6 +80,20 @@ class Skip(NamedTuple):
     def rejected_of(self, number: int) -> int:
         """Return how many samples of an instance were rejected."""
         return self.rejected[number - 1] if self.rejected else 0
+
+    def covers(self, number: int, past: Past, instance_nb: int) -> bool:
+        """Return whether it has all that came before the past of an instance."""
+        return (
+            1 <= number <= instance_nb
+            and past.rows <= self.rows_of(number, instance_nb)
+            and past.rejected <= self.rejected_of(number)
+            and (past.recorded < 0 or past.recorded in self.sets)
+        )
+
+    def repeated(self, instance_nb: int) -> int:
+        """Return how many rows instances simulate again, all together."""
+        known = sum(past.rows for past in self.pasts.values())
+        return self.rows - known
 
 
 NOTHING = Skip()
@@ -484,6 +499,25 @@ class Instance(Closeable):
             self.rejected.waiting = list(state["rejected"] or [])
         if self._drawing is not None and state["drawing"] is not None:
             self._drawing.restore(state["drawing"])
+
+    def fork(self) -> Instance:
+        """Return an independent copy that goes on from here: see `Environment.fork`.
+
+        It records no rejected samples, and draws nothing. Close it.
+
+        Raises:
+            StateError: If something cannot be captured; it is named.
+            EnvironmentFailedError: If the environment raises.
+        """
+        if self._refusal is not None:
+            raise self._refusal
+        self._check_tasks()
+        fork = copy.copy(self)
+        fork.environment = environment = self._call("fork", self._alive().fork)
+        fork._simulate = fork._simulate_sub_steps if self._sub_steps else environment.step
+        fork.rejected = None if self.rejected is None else RejectedSamples()
+        fork._draws, fork._drawing, fork._runner = False, None, None
+        return fork
 
     def _check_tasks(self) -> None:
         """Check that no task waits in the event loop."""

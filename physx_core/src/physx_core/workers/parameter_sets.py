@@ -58,11 +58,20 @@ class ParameterSets:
         self.learned: LearnedSets | None = None
         self._config, self._seed = config, list(seed)
         self.instance_nb = config.num_clients
-        self._skip, self._recorded = skip, skip.sets
+        self._recorded = skip.sets
         self._sampler = None if config.sampler is None else _make_sampler(config, config.sampler)
         self._waiting: list[dict[int, Mapping[str, Any]]] = [{} for _ in range(self.instance_nb)]
         self._newest: dict[int, Mapping[str, Any]] = {}  # of each instance
         self._begun: list[dict[str, Any]] = []
+        self._last_recorded = [-1] * self.instance_nb
+        for number, past in skip.pasts.items():
+            self._waiting[number - 1].update(past.sets)
+            self._newest.update(past.sets)
+            self._last_recorded[number - 1] = past.recorded
+
+    def waiting(self, instance_id: int) -> tuple[int, dict[int, Mapping[str, Any]]]:
+        """Return what a state of an instance needs: see `Past.recorded` and `Past.sets`."""
+        return self._last_recorded[instance_id - 1], dict(self._waiting[instance_id - 1])
 
     def begin(self, definitions: Sequence[Sequence[Parameter]]) -> None:
         """Take the parameters that the instances define.
@@ -211,20 +220,17 @@ class ParameterSets:
         self._begun = []
         if not self.parameters:
             return
-        skip = self._skip
-        rows = {name: batch[name] for name in ("episode", "env_id")}
-        if skip.begun:
-            self._skip = skip._replace(begun={})
-            rows = {name: np.concatenate([skip.begun[name], rows[name]]) for name in rows}
-        numbers = np.asarray(rows["episode"], np.int64) * self.instance_nb + rows["env_id"] - 1
-        found, first = np.unique(numbers, return_index=True)
+        episodes = np.asarray(batch["episode"], np.int64)
+        found, first = np.unique(
+            episodes * self.instance_nb + batch["env_id"] - 1, return_index=True
+        )
         for number in found[np.argsort(first)].tolist():
-            waiting = self._waiting[number % self.instance_nb]
+            place = number % self.instance_nb
+            waiting = self._waiting[place]
             for begun in sorted(known for known in waiting if known <= number):
-                self._begun.append(self._record(begun, waiting.pop(begun)))
-        recorded = min(self._recorded, len(self._begun))
-        self._recorded -= recorded
-        del self._begun[:recorded]
+                values, self._last_recorded[place] = waiting.pop(begun), begun
+                if begun not in self._recorded:  # by an earlier run
+                    self._begun.append(self._record(begun, values))
 
     def pop(self, mode: str) -> Batch:
         """Return and clear the record of the sets that were found last, field name to array.

@@ -369,6 +369,7 @@ class Learner:
         progress: checkpoint.Progress | None = None,
         buffer: Index | None = None,
         sampler: Array | None = None,
+        streams: bytes | None = None,
         *,
         best: bool = False,
     ) -> Path:
@@ -379,6 +380,7 @@ class Learner:
             progress: Progress of the training; None: the network was not trained here.
             buffer: State of the buffer that draws the batches, if any.
             sampler: State of the sampler that learns from the training, if any.
+            streams: What streams need to go on from states, if any.
             best: Whether the network is the best so far, which replaces the previous best one.
 
         Raises:
@@ -394,6 +396,7 @@ class Learner:
             progress or checkpoint.Progress(0, 0, 0, 0),
             buffer,
             sampler,
+            streams,
             best=best,
         )
 

@@ -8,15 +8,17 @@ from collections.abc import Callable, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from typing import Any
 
+from physx_core import checkpoint
 from physx_core.checkpoint import Progress
 from physx_core.components.buffer import Buffer
 from physx_core.components.group import Group
 from physx_core.components.network import Network
 from physx_core.config import EnvironmentConfig, NetworkConfig
 from physx_core.dataset import Dataset
-from physx_core.errors import ConfigError, UsageError
+from physx_core.errors import CheckpointError, ConfigError, UsageError
 from physx_core.pipelines.campaign import Campaign
 from physx_core.pipelines.campaign_writer import CampaignWriter
+from physx_core.pipelines.generation import Generation
 from physx_core.pipelines.learning.batches.blocks import Block, Blocks
 from physx_core.pipelines.learning.batches.drawn_rows import DrawnRows
 from physx_core.pipelines.learning.batches.feeder import Feeder
@@ -25,22 +27,25 @@ from physx_core.pipelines.learning.batches.online import OnlineBatches
 from physx_core.pipelines.learning.batches.replayed import ReplayedBatches
 from physx_core.pipelines.learning.batches.row_statistics import RowStatistics
 from physx_core.pipelines.learning.batches.stored import StoredBatches
-from physx_core.pipelines.learning.resuming import Generation, Start
+from physx_core.pipelines.learning.resuming import Start, advise
 from physx_core.pipelines.learning.training_data import TrainingData
 from physx_core.pipelines.pipeline import derive_seed
 from physx_core.pipelines.services import Predict, Show
 from physx_core.pipelines.storage import (
+    GENERATION,
     copy_existing,
     describe_environment,
     open_existing,
     open_own,
     reject_episode_fields,
+    restore_parameters,
 )
 from physx_core.plugins.networks import resolve_network
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 from physx_core.workers.instance import NOTHING, Skip
+from physx_core.workers.pasts import unpack
 from physx_core.workers.row_queue import RowQueue
 
 
@@ -185,7 +190,13 @@ class DataOpening:
         feeder = Feeder[Block]() if environment.as_tcp_ip_client else None
         generation, skip = self._begin_generation(dataset, environment)
         source = self._open_environments(
-            environment, dataset, generation.offset, feeder, total=buffer.total, skip=skip
+            environment,
+            dataset,
+            generation.offset,
+            feeder,
+            total=buffer.total,
+            skip=skip,
+            keeps_pasts=True,
         )
         drawn = None
         if buffer.capacity:
@@ -198,6 +209,7 @@ class DataOpening:
             stored.mode,
             normalize=self.start.config.normalize,
             first=generation.first,
+            known=skip,
             statistics=RowStatistics(self.progress.seed, buffer.total),
             writer=writer,
             feeder=feeder,
@@ -284,19 +296,48 @@ class DataOpening:
         """Record what the environments' rows depend on; return the rows that an earlier run had."""
         described = describe_environment(environment, self._seed_of(environment))
         now = Generation.begin(
+            GENERATION,
             dataset,
             self.start.config.mode,
             self.progress.seed,
+            described,
             self.buffer.batch_size,
             self.batch_nb,
-            described,
         )
         former = self.start.generation
         self._generation = former or now
-        if former is not None:
-            return former, former.resume(dataset, environment, now, self.buffer.total)
-        now.start(dataset)
-        return now, NOTHING
+        if former is None:
+            now.start(dataset)
+            return now, NOTHING
+        advice = advise(self.session.path)
+        skip = former.resume(dataset, environment, now, self.buffer.total, advice)
+        restore_parameters(dataset.directory)
+        return former, self._find_place(former, skip, environment.num_clients)
+
+    def _find_place(self, former: Generation, skip: Skip, count: int) -> Skip:
+        """Return what streams do not have to return: all that is stored, or what is before states.
+
+        Args:
+            former: Describes them.
+            skip: What is stored.
+            count: How many they are.
+        """
+        found = self.start.checkpoint
+        if found is None or not checkpoint.has_streams(found):  # they repeat all rows
+            return skip._replace(rows=0) if former.depends else skip
+        try:
+            rows, pasts = unpack(checkpoint.read_streams(found))
+        except ValueError as error:
+            raise CheckpointError(
+                f"The states of environments in {found.path} cannot be used: {error}. Use another "
+                "checkpoint."
+            ) from error
+        if rows > skip.rows or not all(skip.covers(n, past, count) for n, past in pasts.items()):
+            raise CheckpointError(
+                f"The states of environments in {found.path} are after rows that did not reach the "
+                "disk. Rename or remove its folder to resume from the checkpoint before it."
+            )
+        return skip._replace(rows=rows, pasts=pasts)
 
     def _seed_of(self, environment: EnvironmentConfig) -> int:
         return self.progress.seed if environment.seed is None else environment.seed
@@ -309,4 +350,6 @@ class DataOpening:
 
     def _repeats(self) -> bool:
         """Return whether environments would generate the same samples again."""
-        return self._generation is not None and not self._generation.depends
+        environment, generation = self.start.environment, self._generation
+        has_states = environment is not None and environment.state_every > 0
+        return generation is not None and (has_states or not generation.depends)

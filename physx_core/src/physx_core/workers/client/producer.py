@@ -69,7 +69,8 @@ class Producer:
         """Go on from the state that an earlier client sent.
 
         Args:
-            state: Its counters, and what `_send_state` has sent.
+            state: Its counters, and what `_send_state` has sent. The counters ``shown`` and
+                ``requests`` are None if that was in an earlier run.
 
         Raises:
             StateError: If the environment was created differently.
@@ -79,7 +80,8 @@ class Producer:
         self._stored.extend(kept["stored"])
         self.made = self._last_state = state["rows"]
         self._orders, self._rejected = state["orders"], state["rejected"]
-        self.shown, self._link.requests = state["shown"], state["requests"]
+        if state["requests"] is not None:  # the server counts on, as it has not been replaced
+            self.shown, self._link.requests = state["shown"], state["requests"]
 
     def run(self) -> None:
         """Generate rows until the server ends the run."""

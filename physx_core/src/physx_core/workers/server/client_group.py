@@ -10,8 +10,8 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from physx_core.components.environment import Services
 from physx_core.components.launcher import ClientHandle, Launcher
+from physx_core.components.services import Services
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import (
     ClientError,
@@ -30,6 +30,7 @@ from physx_core.plugins.references import locate
 from physx_core.workers.instance import NOTHING, Skip, instance_arguments
 from physx_core.workers.launchers import describe_states, stop
 from physx_core.workers.parameter_sets import ParameterSets
+from physx_core.workers.pasts import Pasts
 from physx_core.workers.server.client_errors import exit_error, overdue_error, timeout_error
 from physx_core.workers.server.episode_pool import EpisodePool
 from physx_core.workers.server.leases import Leases
@@ -68,6 +69,7 @@ class ClientGroup:
         skip: Skip = NOTHING,
         written: WrittenRows | None = None,
         transport: Transport = SOCKETS,
+        pasts: Pasts | None = None,
     ) -> None:
         """Store the arguments; `open` starts the clients.
 
@@ -80,9 +82,11 @@ class ClientGroup:
             skip: What an earlier run already got: clients generate it again, but do not send it.
             written: Takes note of the rows that the clients write themselves; None: they send them.
             transport: What connects the clients, and the clock that the run follows.
+            pasts: Keeps what a later run needs, and what an earlier one has left; None: nobody
+                needs it.
         """
         self._clock = transport.clock
-        self._written = written
+        self._written, self._pasts = written, pasts
         self.config = config
         self._seed, self._sets = list(seed), sets
         self._accepts_all = accept_all
@@ -113,6 +117,7 @@ class ClientGroup:
             self._reserved,
             {} if written is None else written.dispatch,
             transport,
+            pasts,
         )
 
     def open(self) -> None:
@@ -499,9 +504,22 @@ class ClientGroup:
             first["folder"] = self._written.describe()
         if self._pool is not None:
             skip = dict.fromkeys(skip, 0)
-        state = None if peer.journal is None else peer.journal.state
-        first["state"] = None if state is None else decode(state)
+        first["state"] = self._find_state(peer)
         return self._encode(peer.instance_id, skip=skip, **first)
+
+    def _find_state(self, peer: Peer) -> dict[str, Any] | None:
+        """Return the state with which a client begins: of its predecessor, or of an earlier run.
+
+        What a client of an earlier run has counted is not continued, as this run has not seen it.
+        """
+        if peer.journal is not None and peer.journal.state is not None:
+            state: dict[str, Any] = decode(peer.journal.state)
+            return state
+        past = None if self._pasts is None else self._pasts.former(peer.instance_id)
+        if past is None or not past.state:
+            return None
+        counts = {"rows": past.rows, "rejected": past.rejected, "orders": 0}
+        return {**counts, "shown": None, "requests": None, "state": past.state}
 
     def _encode(self, instance_id: int, **progress: Any) -> bytes:
         config = self.config

@@ -7,7 +7,7 @@ import selectors
 from collections.abc import Callable, Collection, Iterable, Mapping
 from types import MappingProxyType
 
-from physx_core.components.environment import Services
+from physx_core.components.services import Services
 from physx_core.errors import (
     ConfigError,
     ConnectionRefusedByPeerError,
@@ -24,6 +24,7 @@ from physx_core.net.remote_errors import decode_error, encode_error
 from physx_core.net.spin_wait import has_core_for_each
 from physx_core.workers.instance import NOTHING, Skip
 from physx_core.workers.parameter_sets import ParameterSets
+from physx_core.workers.pasts import Pasts
 from physx_core.workers.row_codec import unpack_rows
 from physx_core.workers.server.journal import Journal
 from physx_core.workers.server.peer import Peer
@@ -70,6 +71,7 @@ class Server:
         reserved: Callable[[], Collection[int]] = tuple,
         dispatch: Mapping[Kind, Callable[[Peer, Frame], None]] = MappingProxyType({}),
         transport: Transport = SOCKETS,
+        pasts: Pasts | None = None,
     ) -> None:
         """Store the arguments; `open` starts listening.
 
@@ -89,13 +91,15 @@ class Server:
             dispatch: Handles the messages about rows, by their kind, if clients do not just send
                 rows of streams.
             transport: What connects the clients, and the clock that the server follows.
+            pasts: Keeps what a later run needs; None: nobody needs it.
         """
         self.peers: dict[int, Peer] = {}
         self.token = token
         self._transport, self._clock = transport, transport.clock
         self._ip_address, self._port, self._instance_nb = ip_address, port, instance_nb
         self._spin_time = _SPIN_TIME if has_core_for_each(instance_nb) else 0.0
-        self._requests = ServiceRequests(services, sets)
+        self._requests = ServiceRequests(services, sets, pasts)
+        self._services, self._pasts = services, pasts
         self._setup, self._replaces, self._skip = setup, replaces, skip
         self._journal_size = journal_size
         self._reserved = reserved
@@ -108,7 +112,7 @@ class Server:
         )
         self.dispatch: dict[Kind, Callable[[Peer, Frame], None]] = {
             Kind.PARAMETERS: _take_parameters,
-            Kind.READY: _take_ready,
+            Kind.READY: self._take_ready,
             Kind.FIELDS: _take_fields,
             Kind.WRONG: _take_wrong,
             Kind.ERROR: _take_error,
@@ -336,14 +340,21 @@ class Server:
         peer.finished = self._ending and peer.failure is None
         self._drop(peer)  # it waits for this
 
+    def _take_ready(self, peer: Peer, frame: Frame) -> None:
+        _take_ready(peer, frame)
+        if self._pasts is not None:
+            self._pasts.created(peer.instance_id, self._services)
+
     def _take_state(self, peer: Peer, frame: Frame) -> None:
         if frame.number:
-            peer.keep_state(frame.number, parse_state(frame.payload))
+            state = parse_state(frame.payload)
+            peer.keep_state(frame.number, state)
+            self._requests.keep_state(peer, frame.number, state)
         elif not self._has_no_states:
             self._has_no_states = True
             _LOG.warning(
-                "A client that takes the place of another one will repeat all rows since the last "
-                "state, as instance %d gives none. %s",
+                "A client that takes the place of another one, also in a run that is resumed, will "
+                "repeat all rows since the last state, as instance %d gives none. %s",
                 peer.instance_id,
                 decode_error(frame.payload),
             )

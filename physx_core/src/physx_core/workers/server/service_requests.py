@@ -7,15 +7,17 @@ from typing import Any, TypeAlias
 
 import numpy as np
 
-from physx_core.components.environment import Services
+from physx_core.components.services import Services
 from physx_core.errors import ConnectionRefusedByPeerError, PhysxError, UsageError
-from physx_core.net.frames import Frame, Kind, pack
+from physx_core.net.frames import HEADER, Frame, Kind, pack
 from physx_core.net.remote_errors import encode_error
 from physx_core.net.values import decode, pack_value
 from physx_core.typing import Batch, Sample
 from physx_core.workers.parameter_sets import ParameterSets
+from physx_core.workers.pasts import Past, Pasts
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.validation import (
+    ClientState,
     parse_choice,
     parse_events,
     parse_saved,
@@ -24,6 +26,7 @@ from physx_core.workers.server.validation import (
 
 _MOST_UNREAD = 1 << 26
 _KEPT = "the saved parameters"
+_PREDICTION = "the prediction"
 
 Signature: TypeAlias = tuple[tuple[str, tuple[int, ...], str], ...]
 Request: TypeAlias = tuple[Peer, int, Sample]
@@ -44,15 +47,17 @@ class ServiceRequests:
         batches: Whether requests for predictions are answered as one batch.
     """
 
-    def __init__(self, services: Services, sets: ParameterSets) -> None:
+    def __init__(self, services: Services, sets: ParameterSets, pasts: Pasts | None) -> None:
         """Store the services.
 
         Args:
             services: The services of the run.
             sets: Chooses the instances' parameters.
+            pasts: Keeps the answers to requests for predictions, and those of an earlier run; None:
+                nobody needs them.
         """
         self._services = services
-        self._sets = sets
+        self._sets, self._pasts = sets, pasts
         self._predict_batch: Callable[[Batch], Batch] | None = getattr(
             services, "predict_batch", None
         )
@@ -88,6 +93,11 @@ class ServiceRequests:
                 peer.pace.go_on()
                 return
         if frame.kind is Kind.PREDICT:
+            told = None if self._pasts is None else self._pasts.tell(peer.instance_id)
+            if told is not None:
+                peer.send(pack(Kind.ANSWER if told[0] else Kind.REFUSAL, told[1], frame.number))
+                peer.pace.go_on()
+                return
             self._keep(peer, frame)
         elif frame.kind is Kind.SAVE:
             of_all, values = parse_saved(frame.payload)
@@ -103,6 +113,15 @@ class ServiceRequests:
             events = parse_events(frame.payload)
             peer.shown += 1
             self._services.show(peer.instance_id, frame.number, events)
+
+    def keep_state(self, peer: Peer, rows: int, state: ClientState) -> None:
+        """Keep a state for a later run, with what the run knows about the instance by now."""
+        if self._pasts is not None:
+            number = peer.instance_id
+            saved = self._services.load_parameters(number)
+            recorded, sets = self._sets.waiting(number)
+            past = Past(rows, state["state"], state["rejected"], recorded, sets, saved)
+            self._pasts.note(number, past)
 
     def _choose(self, peer: Peer, frame: Frame) -> None:
         if not peer.parameters:
@@ -120,7 +139,7 @@ class ServiceRequests:
                     np.asarray(value)
             except ValueError:
                 refusal = UsageError(f'get_prediction() got "{name}", which is not an array.')
-                peer.send(pack(Kind.REFUSAL, encode_error(refusal), frame.number))
+                self._tell(peer, pack(Kind.REFUSAL, encode_error(refusal), frame.number))
                 return
         if self._waiting:
             self.forget(peer)
@@ -136,7 +155,7 @@ class ServiceRequests:
         self._waiting = [request for request in self._waiting if request[0].is_ahead]
         if len(waiting) == 1:
             ((peer, number, sample),) = waiting
-            self._answer(peer, number, "the prediction", self._services.predict, sample)
+            self._answer(peer, number, _PREDICTION, self._services.predict, sample)
             return not peer.outgoing
         groups: dict[Signature | int, list[Request]] = {}
         for place, request in enumerate(sorted(waiting, key=lambda one: one[0].instance_id)):
@@ -149,14 +168,14 @@ class ServiceRequests:
     def _predict_group(self, requests: list[Request]) -> None:
         try:
             messages = [
-                pack_value(Kind.ANSWER, prediction, "the prediction", number)
+                pack_value(Kind.ANSWER, prediction, _PREDICTION, number)
                 for (_, number, _), prediction in zip(
                     requests, self._predictions(requests), strict=True
                 )
             ]
         except PhysxError as error:
             for peer, number, _ in requests:
-                peer.send(pack(Kind.REFUSAL, encode_error(error), number))
+                self._tell(peer, pack(Kind.REFUSAL, encode_error(error), number))
                 peer.pace.go_on()
             return
         except Exception as error:
@@ -164,8 +183,16 @@ class ServiceRequests:
             error.add_note(f"while handling the prediction for instance {numbers}")
             raise
         for (peer, _, _), message in zip(requests, messages, strict=True):
-            peer.send(message)
+            self._tell(peer, message)
             peer.pace.go_on()
+
+    def _tell(self, peer: Peer, message: bytes) -> None:
+        """Send the answer to a request for a prediction."""
+        if self._pasts is not None:
+            _, kind, _, _ = HEADER.unpack_from(message)
+            answer = kind == Kind.ANSWER, bytes(message[HEADER.size :])
+            self._pasts.answered(peer.instance_id, answer)
+        peer.send(message)
 
     def _predictions(self, requests: list[Request]) -> list[Sample]:
         if self._predict_batch is None or len(requests) == 1:
@@ -195,7 +222,10 @@ class ServiceRequests:
         except Exception as error:
             error.add_note(f"while handling {what} for instance {peer.instance_id}")
             raise
-        peer.send(message)
+        if what is _PREDICTION:
+            self._tell(peer, message)
+        else:
+            peer.send(message)
         peer.pace.go_on()
 
 

@@ -11,11 +11,13 @@ from physx_core.fields import Field
 from physx_core.pipelines.campaign_writer import CampaignWriter
 from physx_core.pipelines.learning.batches.feeder import Feeder
 from physx_core.pipelines.learning.batches.row_statistics import RowStatistics
-from physx_core.pipelines.storage import record_beside_rows, store_sets
+from physx_core.pipelines.storage import last_steps, record_beside_rows, store_sets
 from physx_core.rows import concatenate
 from physx_core.sources.source import Source
 from physx_core.statistics import Normalization, RunningStatistics
 from physx_core.typing import Batch
+from physx_core.workers.instance import Skip
+from physx_core.workers.pasts import Past
 
 _CHUNK = 4096
 
@@ -32,12 +34,15 @@ class Block:
             empty if nothing is to be normalized.
         statistics: Mean, deviation, and quantiles of the rows up to the last one of this block, if
             they are due: see `RowStatistics`.
+        pasts: Number of rows up to its last one, and what streams need to go on after it; None:
+            they would have to repeat these rows.
     """
 
     rows: Batch = field(default_factory=dict)
     fields: Mapping[str, Field] = field(default_factory=dict)
     normalization: dict[str, Normalization] = field(default_factory=dict)
     statistics: Mapping[str, float] = field(default_factory=dict)
+    pasts: tuple[int, Mapping[int, Past]] | None = None
 
     @property
     def nbytes(self) -> int:
@@ -50,7 +55,8 @@ class Blocks:
 
     Independent episodes are stored as they end, and their rows read in the order of the episodes.
     A run that continues another run first gets the rows that the other run stored, in the same
-    blocks and with bit-identical normalization.
+    blocks and with bit-identical normalization. If its environments go on from states before some
+    of these rows, they generate those again.
 
     With a feeder, expected blocks are generated and stored in its thread while the network learns:
     the calls of source and dataset and their order are the same, and so are the blocks.
@@ -64,6 +70,7 @@ class Blocks:
         *,
         normalize: bool,
         first: int,
+        known: Skip,
         statistics: RowStatistics,
         writer: CampaignWriter | None = None,
         feeder: Feeder[Block] | None = None,
@@ -76,6 +83,7 @@ class Blocks:
             mode: Mode to store them in.
             normalize: Whether the blocks have a normalization.
             first: Number of rows that the mode had before the first block.
+            known: The rows that the environments do not return.
             statistics: Summarizes the rows; still without any.
             writer: Stores independent episodes; None: the environments are streams.
             feeder: Generates rows in its thread, which is not started yet; None: the rows are
@@ -84,16 +92,18 @@ class Blocks:
         self._source, self._dataset, self._mode = source, dataset, mode
         self._normalizes, self._summary = normalize, statistics
         self._writer, self._first = writer, first
-        self._stored = dataset.num_samples(mode)
+        self._end = dataset.num_samples(mode)
+        self._stored = first + known.rows if writer is None else self._end
         self._next_row = first
         self._statistics: dict[str, RunningStatistics] = {}
         for start in range(0, first if normalize else 0, _CHUNK):
             self._add(self._read(start, min(start + _CHUNK, first)))
         self._earlier: dict[int, int] = {}
-        if self._stored > first and writer is None:
-            ends = self._read(max(first, self._stored - source.instance_nb), self._stored)
-            self._earlier = dict(zip(ends["env_id"].tolist(), ends["step"].tolist(), strict=True))
-        self._last = Block()
+        if writer is None:
+            count = source.instance_nb
+            self._earlier = last_steps(dataset, mode, first, self._stored, count)
+        pasts = (known.rows, known.pasts) if known.pasts else None
+        self._last = Block(pasts=pasts)
         self._feeder = feeder
         if feeder is not None:
             feeder.start(lambda count: self._make(count, copies=True), source.cancel)
@@ -127,7 +137,13 @@ class Blocks:
         """
         for count in counts:
             self._make(count)
-        self._last = Block({}, self._dataset.fields(self._mode), self._last.normalization)
+        fields, pasts = self._dataset.fields(self._mode), self._last.pasts
+        self._last = Block({}, fields, self._last.normalization, pasts=pasts)
+
+    @property
+    def pasts(self) -> tuple[int, Mapping[int, Past]] | None:
+        """What streams need to go on after the blocks that were skipped: see `Block`."""
+        return self._last.pasts
 
     def finish(self) -> None:
         """Leave out the rows of the last episodes that no block has taken."""
@@ -141,7 +157,8 @@ class Blocks:
 
     def _make(self, count: int, *, copies: bool = False) -> Block:
         if not count:
-            self._last = Block({}, self._last.fields, self._last.normalization)
+            last = self._last
+            self._last = Block({}, last.fields, last.normalization, pasts=last.pasts)
             return self._last
         start, self._next_row = self._next_row, self._next_row + count
         rows = self._take(start, count, copies=copies)
@@ -150,8 +167,14 @@ class Blocks:
         found = {name: one.normalization() for name, one in self._statistics.items()}
         fields = self._dataset.fields(self._mode)
         summary = self._summary.add(rows, _counted(fields))
-        self._last = Block(rows, fields, found, summary)
+        self._last = Block(rows, fields, found, summary, self._find_pasts())
         return self._last
+
+    def _find_pasts(self) -> tuple[int, Mapping[int, Past]] | None:
+        if self._next_row <= self._stored:  # environments have not yet told again what they knew
+            return self._last.pasts
+        pasts = self._source.take_pasts()
+        return None if pasts is None else (self._next_row - self._first, pasts)
 
     def _take(self, start: int, count: int, *, copies: bool) -> Batch:
         """Return some rows, which are stored from now on at the latest."""
@@ -161,20 +184,29 @@ class Blocks:
         stored = min(count, max(0, self._stored - start))
         rows = self._read(start, start + stored) if stored else {}
         if stored < count:
-            made = self._generate(count - stored, is_whole=not stored)
+            made = self._generate(start + stored, count - stored, is_whole=not stored)
             if rows:
                 return concatenate([rows, made])
             return {name: array.copy() for name, array in made.items()} if copies else made
         return rows
 
-    def _generate(self, count: int, *, is_whole: bool) -> Batch:
+    def _generate(self, start: int, count: int, *, is_whole: bool) -> Batch:
         earlier, self._earlier = self._earlier if is_whole else {}, {}
         with record_beside_rows(self._source, self._dataset, self._mode, earlier):
             rows = self._source.batch(count)
             store_sets(self._source, self._dataset, self._mode)
             self._dataset.define_fields(self._mode, self._source.fields)
-            self._dataset.append(self._mode, rows, checked=True)
+            self._store(start, rows, min(count, max(0, self._end - start)))
         return rows
+
+    def _store(self, start: int, rows: Batch, known: int) -> None:
+        """Store rows, of which an earlier run has stored the first ones."""
+        if known:
+            former, now = self._read(start, start + known), _part(rows, slice(known))
+            if any(former[name].tobytes() != now[name].tobytes() for name in now):
+                self._dataset.update(self._mode, slice(start, start + known), now)
+        if known < len(rows["step"]):
+            self._dataset.append(self._mode, _part(rows, slice(known, None)), checked=True)
 
     def _read(self, start: int, stop: int) -> Batch:
         view = self._dataset[self._mode]
@@ -183,6 +215,10 @@ class Blocks:
     def _add(self, rows: Batch) -> None:
         for name in _counted(self._dataset.fields(self._mode)):
             self._statistics.setdefault(name, RunningStatistics()).update(rows[name])
+
+
+def _part(rows: Batch, part: slice) -> Batch:
+    return {name: values[part] for name, values in rows.items()}
 
 
 def _counted(fields: Mapping[str, Field]) -> list[str]:

@@ -123,16 +123,17 @@ class GeneratedBatches:
             return self.online.block.normalization
         return self._stored.normalization(recompute=False)
 
-    def states(self, batches: int) -> tuple[Index | None, Array | None]:
-        """Return the states of buffer and sampler for a checkpoint; None for one without a state.
+    def states(self, batches: int) -> tuple[Index | None, Array | None, bytes | None]:
+        """Return the states of buffer, sampler and streams for a checkpoint; None: it has none.
 
         Args:
             batches: Number of batches already learned from: all, or all but the last one.
         """
         if self.online is None or self.source is None:
-            return None, None
+            return None, None, None
         learned = self.source.sets.learned
-        return self.online.state(batches), None if learned is None else learned.state(batches)
+        sampler = None if learned is None else learned.state(batches)
+        return self.online.state(batches), sampler, self.online.pasts(batches)
 
     def resume(self, found: checkpoint.Checkpoint, names: Sequence[str]) -> None:
         """Continue where a checkpoint was written, after at least one batch.

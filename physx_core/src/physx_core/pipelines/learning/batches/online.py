@@ -17,6 +17,7 @@ from physx_core.pipelines.learning.batches.blocks import Block, Blocks
 from physx_core.pipelines.learning.batches.drawn_rows import DrawnRows
 from physx_core.pipelines.learning.batches.row_store import RowStore
 from physx_core.typing import Batch, Index
+from physx_core.workers.pasts import Past, pack
 
 _INTERVAL = 1.0
 _LARGEST = 1024
@@ -50,6 +51,7 @@ class OnlineBatches:
         self._drawn, self._first = drawn, first
         self._store: RowStore | None = None
         self._arrived = 0
+        self._pasts: dict[int, tuple[int, Mapping[int, Past]] | None] = {}
         self._meter = _Meter()
         self._summary: Mapping[str, float] = {}
 
@@ -71,6 +73,8 @@ class OnlineBatches:
         self._meter.count(count, self._blocks.waited)
         self._arrived += count
         self.number += 1
+        before = self._pasts.get(self.number - 1)
+        self._pasts = {self.number - 1: before, self.number: self.block.pasts}
         return batch
 
     def _take(self, size: int) -> Batch:
@@ -125,6 +129,7 @@ class OnlineBatches:
             arrived = buffer.arrived
         self._blocks.skip(self._sizes(range(number), arrived))
         self.number, self._arrived = number, arrived
+        self._pasts = {number: self._blocks.pasts}
         if buffer.capacity:
             self._store = self._allocate(dataset.fields(mode), names)
             slots = np.flatnonzero(buffer.rows >= 0)
@@ -184,6 +189,15 @@ class OnlineBatches:
         if self._drawn is not None:
             self._drawn.sync()
         return self._buffer.state(batches)
+
+    def pasts(self, batches: int) -> bytes | None:
+        """Return what streams need to go on, for a checkpoint; None: they repeat the rows.
+
+        Args:
+            batches: See `state`.
+        """
+        found = self._pasts.get(batches)
+        return None if found is None else pack(*found)
 
     def recent_statistics(self) -> dict[str, float]:
         """Return statistics of the rows, the buffer, and the run's throughput, those that are due.

@@ -1,0 +1,107 @@
+"""StoredStreams: the streams of a data generation, which go on in a run that is resumed."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from physx_core.closeable import Closeable
+from physx_core.config import EnvironmentConfig
+from physx_core.dataset import Dataset
+from physx_core.pipelines.generation import Generation
+from physx_core.pipelines.storage import (
+    STREAMS,
+    describe_environment,
+    last_steps,
+    restore_parameters,
+)
+from physx_core.session import Session
+from physx_core.sources.source import Source
+from physx_core.workers.instance import NOTHING
+from physx_core.workers.pasts import PastFiles
+
+_ADVICE = "Start another run for more of them."
+
+
+class StoredStreams(Closeable):
+    """What is stored of streams: their rows in the dataset, and their last states beside it.
+
+    Attributes:
+        skip: What an earlier run has stored.
+        earlier: Step of the last stored row of each instance.
+    """
+
+    def __init__(
+        self,
+        session: Session,
+        dataset: Dataset,
+        mode: str,
+        config: EnvironmentConfig,
+        seed: int,
+        offset: int,
+        former: Generation | None,
+        needed: int,
+    ) -> None:
+        """Record what the rows depend on, or check that they go on.
+
+        Args:
+            session: Where the states are kept.
+            dataset: The session's dataset, open for writing.
+            mode: Mode of the rows.
+            config: The environment.
+            seed: Seed of the run.
+            offset: From what the seed of the streams is derived, besides.
+            former: The streams to go on with; None: they begin.
+            needed: Total number of rows.
+
+        Raises:
+            ConfigError: If they cannot go on with this configuration.
+        """
+        described = describe_environment(config, seed if config.seed is None else config.seed)
+        now = replace(Generation.begin(STREAMS, dataset, mode, seed, described), offset=offset)
+        known = former or now
+        run = f"{known.mode} {known.first} {known.seed}"
+        self._files = PastFiles(session.path / "states", run)
+        self.skip, self.earlier = NOTHING, dict[int, int]()
+        if former is None:
+            self._files.clear()
+            now.start(dataset)
+            return
+        count = config.num_clients
+        self.skip = skip = former.resume(dataset, config, now, needed, _ADVICE)
+        restore_parameters(dataset.directory)
+        stop = former.first + skip.rows
+        self.earlier = last_steps(dataset, mode, former.first, stop, count)
+        if config.state_every:
+            pasts = self._files.read(lambda number, past: skip.covers(number, past, count))
+            self.skip = skip._replace(pasts=pasts)
+
+    @staticmethod
+    def find(dataset: Dataset, mode: str, *, others: bool) -> Generation | None:
+        """Return the description of the streams of a mode with which a run can go on.
+
+        Args:
+            dataset: Contains them.
+            mode: The mode.
+            others: Whether there are independent episodes, too: what was generated last goes on.
+        """
+        former = Generation.find(dataset.info, STREAMS)
+        if former is None or former.mode != mode or (others and former.ended is not None):
+            return None
+        return former
+
+    def missing(self, wanted: int, size: int) -> int:
+        """Return how many rows of a batch are not stored.
+
+        Args:
+            wanted: Number of rows up to its end.
+            size: Its size.
+        """
+        return max(0, min(wanted - self.skip.rows, size))
+
+    def keep(self, source: Source) -> None:
+        """Keep the states up to the last batch, which is stored."""
+        self._files.keep(source.take_pasts() or {})
+
+    def close(self) -> None:
+        """Write the last states, once the dataset is closed."""
+        self._files.close()

@@ -1,0 +1,87 @@
+"""Classes by name: objects are made without running any code of their class."""
+
+from __future__ import annotations
+
+import enum
+import functools
+import sys
+from pathlib import PurePath
+from types import FunctionType, MemberDescriptorType
+from typing import Any
+
+from physx_core.config import SCRIPT_PREFIX
+from physx_core.errors import StateError
+from physx_core.states.kind import RefusedError
+
+
+@functools.cache
+def slots_of(kind: Any) -> list[str]:
+    """Return the names of the slots of a class and its bases."""
+    members = [(name, what) for each in kind.__mro__ for name, what in vars(each).items()]
+    return [
+        name
+        for name, what in members
+        if isinstance(what, MemberDescriptorType) and name != "__dict__"
+    ]
+
+
+@functools.cache
+def recipe_of(kind: Any, base: Any) -> str | None:
+    """Return the name of a class; None if it is the base itself."""
+    if kind is base:
+        return None
+    name = name_of(kind)
+    try:
+        if class_named(name, base) is kind and (
+            base is enum.Enum or new_of(name, base) is not None
+        ):
+            return name
+    except (StateError, TypeError):
+        pass
+    raise RefusedError("is of a class that cannot be found and made by its name, or has __del__")
+
+
+def class_named(name: str, base: type[Any]) -> Any:
+    """Return a class that is imported, and whose objects run no code when they are made or end."""
+    module, _, qualified = name.partition(":")
+    found = _module_named(module)
+    for each in qualified.split("."):
+        found = vars(found).get(each) if hasattr(found, "__dict__") else None
+    is_class = isinstance(found, type) and issubclass(found, base)
+    if not is_class or hasattr(found, "__del__"):
+        raise StateError(
+            f"The state has an object of {name.replace(':', '.')}, which is not a class of an "
+            "imported module, or defines __del__: import it where the environment is defined."
+        )
+    return found
+
+
+def new_of(name: str | None, base: Any, *items: Any) -> Any:
+    """Return an object of a class by its name, made without any method of that class."""
+    kind = base if name is None else class_named(name, base)
+    make = base.__new__ if isinstance(kind.__new__, FunctionType) else kind.__new__
+    return make(kind, *items)
+
+
+def class_of(value: Any) -> Any:
+    """Return the class of an object, as a value of any type."""
+    return type(value)
+
+
+def name_of(kind: type[Any]) -> str:
+    """Return the name by which another process finds a class."""
+    return f"{_file_or_module(kind.__module__)}:{kind.__qualname__}"
+
+
+def _file_or_module(module: str) -> str:
+    """Return the name of a module; of a script's file, as its module has many names."""
+    file = getattr(sys.modules.get(module), "__file__", None)
+    is_script = module == "__main__" or module.startswith(SCRIPT_PREFIX)
+    return PurePath(file).name if is_script and file else module
+
+
+def _module_named(name: str) -> Any:
+    if name in sys.modules or not name.endswith(".py"):
+        return sys.modules.get(name)
+    names = (each for each in list(sys.modules) if _file_or_module(each) == name)
+    return sys.modules.get(next(names, ""))
