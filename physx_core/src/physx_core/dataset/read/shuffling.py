@@ -36,6 +36,8 @@ _SLAB = 2**16
 _ROUNDS = 12  # of the lazy permutation; with fewer, not all orders are equally likely
 _STEP, _FIRST, _SECOND = 0x9E3779B97F4A7C15, 0xBF58476D1CE4E5B9, 0x94D049BB133111EB  # splitmix64
 
+_STEP32, _FIRST32, _SECOND32, _MASK32 = 0x9E3779B9, 0x85EBCA6B, 0xC2B2AE35, 2**32 - 1  # murmur3
+
 Numbers: TypeAlias = NDArray[np.uint64]
 
 
@@ -227,16 +229,24 @@ def key_of(*numbers: int | Sequence[int]) -> int:
 
 
 def permutation(count: int, key: int) -> Index:
-    """Return the numbers from 0 to ``count - 1`` in an order that depends on `count` and `key`."""
-    numbers = np.arange(count, dtype=np.uint64)
-    bits = np.uint64(count.bit_length())
-    hashed = scramble(numbers.copy(), key)
-    hashed >>= bits
-    hashed <<= bits
-    hashed |= numbers  # sorting these is twice as fast as argsort, and there are no ties
-    hashed.sort()
-    hashed &= (np.uint64(1) << bits) - np.uint64(1)
-    return hashed.astype(np.intp, copy=False)
+    """Return the numbers from 0 to ``count - 1`` in an order that depends on `count` and `key`.
+
+    Args:
+        count: How many numbers there are, at most 2**32.
+        key: 64 bits.
+    """
+    numbers = np.arange(count, dtype=np.uint32)
+    hashed = numbers * np.uint32(_STEP32) + np.uint32(key & _MASK32)
+    for factor, shift in ((_FIRST32, 16), (_SECOND32, 13), (key >> 32 | 1, 15)):
+        hashed ^= hashed >> np.uint32(shift)
+        hashed *= np.uint32(factor)
+    hashed ^= hashed >> np.uint32(16)
+    sorted_pairs = hashed.astype(np.uint64)
+    sorted_pairs <<= np.uint64(32)
+    sorted_pairs |= numbers  # sorting these is twice as fast as argsort; no two hashes are equal
+    sorted_pairs.sort()
+    sorted_pairs &= np.uint64(_MASK32)
+    return sorted_pairs.astype(np.intp, copy=False)
 
 
 def scatter(positions: Index, count: int, key: int) -> Index:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 import os
 from collections.abc import Iterator
 from io import FileIO
@@ -59,11 +58,10 @@ class DiskColumn:
         size = self.row_nbytes
         if not size or not hasattr(os, "posix_fadvise"):
             return
-        for start, stop in _runs(index):
-            for number, first, part, _ in self._parts(int(index[start]), stop - start):
-                file, offset = self._open(number)
-                place = offset + first * size
-                os.posix_fadvise(file.fileno(), place, part * size, os.POSIX_FADV_WILLNEED)
+        for number, first, count, _ in self._pieces(index):
+            file, offset = self._open(number)
+            start = offset + first * size
+            os.posix_fadvise(file.fileno(), start, count * size, os.POSIX_FADV_WILLNEED)
 
     def gather(self, index: Index, out: Array) -> None:
         """Copy rows into a contiguous array, shape (rows, *field shape).
@@ -72,11 +70,12 @@ class DiskColumn:
             index: The rows, shape (n,); consecutive ones are read together.
             out: Receives them.
         """
-        rows = self._target(out)
-        for start, stop in _runs(index):
-            target = rows[start:stop]
-            for number, first, _, where in self._parts(int(index[start]), stop - start):
-                self._read(number, first, files.as_bytes(target[where]))
+        rows, size = self._target(out), self.row_nbytes
+        view = files.as_bytes(rows)
+        for number, first, count, at in self._pieces(index) if size else ():
+            file, offset = self._open(number)
+            part = view[at * size : (at + count) * size]
+            self._segments[number].read(file, offset + first * size, part)
         if rows is not out:
             out[...] = rows
 
@@ -94,31 +93,26 @@ class DiskColumn:
             self._scratch = np.empty(out.shape, self._own)
         return self._scratch[: len(out)]
 
-    def _read(self, number: int, first: int, view: memoryview) -> None:
-        """Fill a buffer with the rows of a segment from its row `first` on."""
-        if view:
-            file, offset = self._open(number)
-            self._segments[number].read(file, offset + first * self.row_nbytes, view)
-
-    def _parts(self, start: int, count: int) -> Iterator[tuple[int, int, int, slice]]:
-        """Locate `count` rows of the mode, from `start` on, in the segments.
+    def _pieces(self, index: Index) -> Iterator[tuple[int, int, int, int]]:
+        """Locate rows in the segments, consecutive ones together.
 
         Yields:
-            Segment number, first row there, number of rows, and their places among the `count`.
+            Segment number, first row there, number of rows, and the place of the first in `index`.
         """
-        if not count:
+        if not len(index):
             return
-        number, place, follow = self._index.find(start)
-        if count <= follow:
-            yield number, place, count, slice(0, count)
-            return
-        stop = start + count
-        while number < len(self._segments) and self._segments[number].span.start < stop:
-            span = self._segments[number].span
-            first, part = span.inside(start, stop)
-            if part:
-                yield number, first, part, span.among(first, part, start)
-            number += 1
+        begins = np.append(0, np.flatnonzero(np.diff(index) != 1) + 1)
+        counts = np.diff(begins, append=len(index))
+        numbers, firsts = self._index.locate(index[begins])
+        ends, _ = self._index.locate(index[begins] + counts - 1)
+        columns = (each.tolist() for each in (numbers, ends, firsts, counts, begins))
+        for number, end, first, count, at in zip(*columns, strict=True):
+            while number != end and count:  # it goes on in the next one
+                part = min(count, self._segments[number].rows - first)
+                if part:
+                    yield number, first, part, at
+                number, first, count, at = number + 1, 0, count - part, at + part
+            yield number, first, count, at
 
     def _open(self, number: int) -> tuple[FileIO, int]:
         """Return the open file of a segment and the offset of its first row."""
@@ -128,9 +122,3 @@ class DiskColumn:
                 self._opened.pop(next(iter(self._opened)))[0].close()
             found = self._opened[number] = self._segments[number].open()
         return found
-
-
-def _runs(index: Index) -> Iterator[tuple[int, int]]:
-    """Yield where each run of consecutive rows begins, and where it ends."""
-    ends = np.flatnonzero(np.diff(index) != 1) + 1
-    return itertools.pairwise([0, *ends.tolist(), len(index)]) if len(index) else iter(())
