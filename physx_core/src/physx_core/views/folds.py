@@ -34,7 +34,7 @@ def choose_part(view: View, part: Part, found: Trajectories) -> Trajectories:
         raise ConfigError(f"The view holds nothing back for the part {part!r}: set View.{name}.")
     if len(found.rows) < view.folds and (found.campaign < 0).all():
         return _pieces(view, part, found)
-    folds = folds_of(found.campaign, found.number, view.folds, view.fold_seed)
+    folds = folds_of(found.campaign, found.episode, view.folds, view.fold_seed)
     if part == "training":
         chosen = ~np.isin(folds, [fold for fold in held.values() if fold is not None])
     else:

@@ -91,7 +91,7 @@ class Source:
             if name == "status":
                 keeps &= self._status(found) == _STATUS[given]
             else:
-                values = found.number if name == "episode" else self._values(name, found)
+                values = found.episode if name == "episode" else self._values(name, found)
                 keeps &= _inside(name, values, *given)
         if view.where is not None:
             keeps &= self._call(view.where, found)
@@ -108,7 +108,7 @@ class Source:
     def _call(self, reference: str, found: Trajectories) -> Flags:
         choose = import_component("function", reference)
         names = self.rows.episode_names
-        given = {"episode": found.number, "campaign": found.campaign, "rows": found.rows}
+        given = {"episode": found.episode, "campaign": found.campaign, "rows": found.rows}
         kept = np.asarray(choose(given | {name: self._values(name, found) for name in names}))
         if kept.dtype != bool or kept.shape != found.rows.shape:
             raise ConfigError(

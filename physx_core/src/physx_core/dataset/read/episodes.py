@@ -40,7 +40,7 @@ class Trajectories(NamedTuple):
 
     Attributes:
         campaign: Number of the campaign of an independent episode; -1 for a part of a stream.
-        number: Number of the independent episode in its campaign; of parts of streams, their
+        episode: Number of the independent episode in its campaign; of parts of streams, their
             number in this order, which never changes as rows are added.
         start: Place of the first row in `places`.
         rows: Number of rows.
@@ -48,7 +48,7 @@ class Trajectories(NamedTuple):
     """
 
     campaign: Index
-    number: Index
+    episode: Index
     start: Index
     rows: Index
     places: Index | None
