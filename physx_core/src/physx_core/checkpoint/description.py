@@ -56,6 +56,8 @@ class Progress:
         best: State of `BestEpoch`.
         record: State of `TrainingRecord`.
         snapshots: The stored samples that it learns from: see `Batches.snapshot`, by mode.
+        last_batch: The last batch of stored samples that it learned from: its ``number``, the
+            names of its ``fields``, and their ``digest``; empty if there is none.
         options: Options that a resumed training must have, as returned by `bound_options`; empty
             if an older physx wrote the checkpoint.
         data: The data that the network was trained on, as returned by `record_data`; likewise.
@@ -69,6 +71,7 @@ class Progress:
     best: dict[str, Any] = field(default_factory=dict)
     record: dict[str, Any] = field(default_factory=dict)
     snapshots: dict[str, Any] = field(default_factory=dict)
+    last_batch: dict[str, Any] = field(default_factory=dict)
     options: dict[str, Any] = field(default_factory=dict)
     data: dict[str, Any] = field(default_factory=dict)
 

@@ -73,6 +73,11 @@ def list_within_epochs(network_dir: Path, name: str) -> list[Path]:
     return found
 
 
+def is_one(path: Path) -> bool:
+    """Return whether a folder is a checkpoint."""
+    return (path / DESCRIPTION).exists() or former_path(path).is_dir()
+
+
 def list_all(network_dir: Path) -> list[Path]:
     """Return the folders of all checkpoints, readable or not, by name and number."""
     pattern = re.compile(rf"([^.].*)_(?:{NUMBER}|{BEST})")
@@ -100,7 +105,7 @@ def find(place: Path, name: str | None, which: int | str) -> Checkpoint:
         CheckpointError: If there is no such checkpoint, or it is damaged; the message lists the
             existing ones.
     """
-    if (place / DESCRIPTION).exists() or former_path(place).is_dir():
+    if is_one(place):
         return read(place)
     folder = place / "network" if (place / "network").is_dir() else place
     if name is None:

@@ -23,7 +23,11 @@ from physx_core.errors import ConfigError, DivergedError
 from physx_core.observers import REPORT_SECONDS, statistics_observers
 from physx_core.pipelines.learning.bound_options import bound_options, check_bound
 from physx_core.pipelines.learning.components import create
-from physx_core.pipelines.learning.data_record import describe_changes, record_data
+from physx_core.pipelines.learning.data_record import (
+    describe_batch,
+    describe_changes,
+    record_data,
+)
 from physx_core.pipelines.learning.learner import Learner
 from physx_core.pipelines.learning.opening import DataOpening, join_group, open_dataset
 from physx_core.pipelines.learning.resuming import Start, can_resume, find_start
@@ -44,6 +48,7 @@ from physx_core.processes import Interrupt, deferred_interrupt, is_from_signal
 from physx_core.session import Session
 from physx_core.typing import Batch
 from physx_core.views.dataset_config import DatasetConfig
+from physx_core.views.view import View
 
 _ADVICE = (
     "Lower the learning rate, normalize the data (DatasetConfig.normalize) or limit the gradients; "
@@ -93,8 +98,9 @@ class Training(NewSessionPipeline):
 
     network_config: NetworkConfig
     """The network, its transformation and its optimization."""
-    dataset_config: DatasetConfig | None = None
-    """The stored samples, and how they are read; None: the session's own samples."""
+    dataset_config: DatasetConfig | View | str | Path | None = None
+    """The stored samples, and how they are read; a view, or the folder of a session or dataset, if
+    nothing else is to be said of them. None: the session's own samples."""
     environment_config: EnvironmentConfig | None = None
     """The environment that generates samples, or replays stored ones; None: no environment."""
     _: KW_ONLY
@@ -175,6 +181,19 @@ class Training(NewSessionPipeline):
     _told: Sequence[str] = field(init=False, repr=False, default=())
     _recorded: dict[str, float] | None = field(init=False, repr=False, default=None)
     _batches_read: int = field(init=False, repr=False, default=0)
+
+    def __post_init__(self) -> None:
+        """Store what was given in place of a configuration of the dataset as one."""
+        given = self.dataset_config
+        if isinstance(given, View):
+            self.dataset_config = DatasetConfig(view=given)
+        elif isinstance(given, (str, Path)):
+            self.dataset_config = DatasetConfig(existing_dir=given)
+
+    @property
+    def _dataset_options(self) -> DatasetConfig:
+        given = self.dataset_config
+        return given if isinstance(given, DatasetConfig) else DatasetConfig()
 
     def execute(self) -> None:
         """Train, and write a checkpoint to resume from however the training ends.
@@ -432,12 +451,20 @@ class Training(NewSessionPipeline):
             self.best.state,
             self._record.state,
             self.data.stored.snapshots,
+            self._last_batch(),
             bound_options(self, self._resumed.seed, self.group.size),
             self._data_record(),
         )
         generated = self.data.generated
         states = generated.states(self._blocks) if generated is not None else ()
         return self.learner.save(self.session.network_dir, progress, *states, best=best)
+
+    def _last_batch(self) -> dict[str, Any]:
+        """Return what shows later that the last stored batch was the same, if there is one."""
+        stored = self.data.stored
+        if not stored.count or stored.count != self._batches_read or self.group.size > 1:
+            return {}
+        return describe_batch(stored.count - 1, self.batch, self.learner.batch_fields)
 
     def _leave_batch(self, interrupt: Interrupt) -> None:
         """Write a checkpoint if one is due; after a signal, end within the epoch."""
@@ -527,7 +554,7 @@ class Training(NewSessionPipeline):
     # Opening --------------------------------------------------------------------------------
 
     def _open(self, resources: contextlib.ExitStack) -> None:
-        start = Start(self.dataset_config or DatasetConfig(), self.environment_config)
+        start = Start(self._dataset_options, self.environment_config)
         check_sources(start.config, start.environment)
         reject_client_writers(start.config, "a training")
         self.group, network_class = join_group(self.network_config)
@@ -606,8 +633,7 @@ class Training(NewSessionPipeline):
         environment = self.environment_config
         if environment is not None and environment.load_samples:
             return {}
-        config = self.dataset_config or DatasetConfig()
-        return record_data(self.data.dataset, config.mode)
+        return record_data(self.data.dataset, self._dataset_options.mode)
 
     def _begin_at(self, start: Start) -> None:
         """Start at the first batch, or where a checkpoint was written."""

@@ -1,33 +1,56 @@
-"""``physx verify``: verify and repair the files of a dataset."""
+"""``physx verify``: verify and repair a dataset; verify what a network was trained on."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Annotated
 
 import tyro
 
+from physx_core import checkpoint
 from physx_core.cli.dataset_tables import count
 from physx_core.cli.output import show
+from physx_core.config import read_toml
 from physx_core.dataset import EPISODES, Dataset
-from physx_core.errors import DatasetError, DatasetNotFoundError
+from physx_core.errors import DatasetError, DatasetNotFoundError, UsageError
+from physx_core.pipelines.learning.data_record import (
+    describe_changes,
+    describe_record,
+    read_last_batch,
+)
 
 
 @dataclass
 class Verify:
-    """Check that every file of a dataset exists, is complete, and contains the written rows."""
+    """Check that every file of a dataset exists, is complete, and contains the written rows.
+
+    Of a checkpoint, check that its files and the data that it was trained on are as recorded.
+    """
 
     directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
-    """A session's or a dataset's folder."""
+    """The folder of a session, a dataset, or a checkpoint."""
     repair: bool = False
     """Repair first: rebuild dataset.json, finish partitions that a killed writer left open, and
     move unreadable partitions to the folder "damaged". No file is deleted."""
+    read: bool = False
+    """Of a checkpoint: also read all rows of its data, and compare them with their checksums."""
+    replay: bool = False
+    """Of a checkpoint: also read the last batch that it learned from again, and compare it."""
 
 
 def run(words: Sequence[str]) -> None:
     """Print the repairs and all remaining problems."""
     options = tyro.cli(Verify, args=words, prog="physx verify")
+    if checkpoint.is_one(Path(options.directory)):
+        _verify_checkpoint(Path(options.directory), options)
+        return
+    if options.read or options.replay:
+        raise UsageError(
+            "--read and --replay are for the folder of a checkpoint, such as "
+            f"{options.directory}/network/network_0; rows of a dataset are always read."
+        )
     if options.repair:
         for text in Dataset.repair(options.directory):
             show(f"repaired: {text}")
@@ -38,6 +61,41 @@ def run(words: Sequence[str]) -> None:
         advice = "" if options.repair else " physx verify DIR --repair repairs what it can."
         raise DatasetError(f"{options.directory} has {count(len(problems), 'problem')}.{advice}")
     show(f"sound: {checked}")
+
+
+def _verify_checkpoint(path: Path, options: Verify) -> None:
+    """Print whether a checkpoint, and the data that it was trained on, are as recorded."""
+    if options.repair:
+        raise UsageError("--repair is for a dataset; a checkpoint cannot be repaired.")
+    found = checkpoint.read(path)
+    show(f"files: as recorded, {found.progress.epoch} epochs")
+    if not found.progress.data:
+        show("data: not recorded")
+        return
+    session = path.parent.parent
+    tables = read_toml(session / "config.toml") if (session / "config.toml").is_file() else {}
+    config = tables.get("training", {}).get("dataset", {})
+    mode, fixed = config.get("mode", "training"), found.progress.snapshots
+    places = [*config.get("view", {}).get("sources", {}), config.get("existing_dir") or session]
+    with Dataset.open(places[0]) as dataset:
+        problems = describe_changes(found.progress.data, dataset, mode, fixed)
+        if options.read:
+            problems += dataset.verify()
+        if not problems:
+            how = "read and compared with their checksums" if options.read else "as recorded"
+            show(f"data: {describe_record(found.progress.data)}, {how}")
+        if options.replay:
+            again, before = read_last_batch(found, dataset), found.progress.last_batch
+            if again == before:
+                show(f"batch {before['number']}, its last: read again, with the same values")
+            else:
+                problems.append(f"batch {before['number']}, its last, has other values")
+    for text in problems:
+        show(text)
+    if problems:
+        raise DatasetError(
+            f"The data of {path} are not as they were: {count(len(problems), 'difference')}."
+        )
 
 
 def _problems(directory: str) -> tuple[list[str], str]:

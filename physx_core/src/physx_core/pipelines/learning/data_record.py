@@ -2,12 +2,23 @@
 
 from __future__ import annotations
 
-from collections.abc import Container, Iterator, Mapping
+from collections.abc import Container, Iterator, Mapping, Sequence
+from dataclasses import replace
 from hashlib import blake2b
 from typing import Any
 
+import numpy as np
+from xxhash import xxh3_64
+
+from physx_core import files
+from physx_core.checkpoint import Checkpoint
+from physx_core.config import from_plain
 from physx_core.dataset import Dataset
-from physx_core.errors import DatasetError
+from physx_core.errors import ConfigError, DatasetError
+from physx_core.typing import Batch
+from physx_core.views.batches import Batches
+from physx_core.views.dataset_config import DatasetConfig
+from physx_core.views.view import View
 
 _NOTHING: dict[str, Any] = {"rows": 0, "digest": "none", "partitions": []}
 
@@ -30,6 +41,53 @@ def record_data(dataset: Dataset, mode: str) -> dict[str, Any]:
             rows = sum(each[2] for each in partitions)
             found[name] = {"rows": rows, "digest": digest, "partitions": partitions}
     return found
+
+
+def describe_batch(number: int, batch: Batch, names: Sequence[str]) -> dict[str, Any]:
+    """Return what identifies a batch of stored samples: see `Progress.last_batch`."""
+    content = xxh3_64()
+    for name in names:
+        values = np.ascontiguousarray(batch[name])
+        content.update(repr((name, values.dtype.str, values.shape)).encode())
+        content.update(files.as_bytes(values))
+    return {"number": number, "fields": list(names), "digest": content.hexdigest()}
+
+
+def read_last_batch(found: Checkpoint, dataset: Dataset) -> dict[str, Any]:
+    """Read the last batch that a network learned from again, and return what identifies it.
+
+    Args:
+        found: The network's checkpoint.
+        dataset: The dataset that it was trained on.
+
+    Raises:
+        DatasetError: If samples are missing.
+        ConfigError: If the checkpoint has no such batch.
+    """
+    progress = found.progress
+    if not progress.last_batch:
+        raise ConfigError(f"{found.path} does not say which batch of stored samples was its last.")
+    number, names = progress.last_batch["number"], progress.last_batch["fields"]
+    options = progress.options["dataset"]
+    config = from_plain(DatasetConfig, options)
+    with Batches(
+        training_view(config, dataset),
+        progress.options["batch_size"],
+        progress.seed,
+        data=None if config.view.sources else dataset,
+        mode=config.mode,
+        snapshot=progress.snapshots[config.mode],
+        fields=names,
+        dtype=found.network["data_type"],
+    ) as batches:
+        return describe_batch(number, batches[number], names)
+
+
+def training_view(config: DatasetConfig, dataset: Dataset) -> View:
+    """Return the view of the samples to train on; a mode ``validation`` holds back the others."""
+    order = config.view.order if config.shuffle else "stored"
+    has_mode = dataset.num_samples("validation") > 0
+    return replace(config.view, order=order, fold=None if has_mode else config.view.fold)
 
 
 def describe_record(former: Mapping[str, Any]) -> str:

@@ -12,6 +12,7 @@ from physx_core.config import EnvironmentConfig
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, DatasetError, UsageError, listed
 from physx_core.fields import Field
+from physx_core.pipelines.learning.data_record import training_view
 from physx_core.pipelines.storage import other_samples
 from physx_core.statistics import Normalization
 from physx_core.typing import Batch, Index
@@ -97,9 +98,7 @@ class StoredBatches:
                 "sources and weights of DatasetConfig.view."
             )
         self._has_mode = dataset.num_samples("validation") > 0  # goes before what is held back
-        order = config.view.order if config.shuffle else "stored"
-        fold = None if self._has_mode else config.view.fold
-        self._view = replace(config.view, order=order, fold=fold)
+        self._view = training_view(config, dataset)
 
     def _open(self, mode: str, view: View, size: int, part: Part = "training") -> Batches:
         """Open the samples of a mode as they were at its snapshot, or else are now."""

@@ -1,0 +1,119 @@
+"""Trainings on views: windows, mixtures, weights, and what an interrupted one goes on with."""
+
+import numpy as np
+import pytest
+
+from physx_core import (
+    Dataset,
+    DatasetConfig,
+    EnvironmentConfig,
+    NetworkConfig,
+    Training,
+    View,
+    checkpoint,
+)
+from physx_core.errors import ConfigError
+
+WINDOW = {"past": ("x", [-1, 0]), "next": ("x", 1)}
+
+
+def store(folder, count, first=0):
+    """Write trajectories of 10 rows of one instance; x grows by 1 in each step."""
+    number = np.arange(first * 10, (first + count) * 10)
+    rows = {"x": 1.0 * number[:, None], "y": 2.0 * number[:, None], "step": number % 10,
+            "episode": number // 10, "env_id": np.ones(len(number), int)}  # fmt: skip
+    is_new = not (folder / "dataset.json").exists()
+    with Dataset.create(folder) if is_new else Dataset.open(folder, writable=True) as dataset:
+        dataset.append("training", rows)
+
+
+@pytest.fixture(autouse=True)
+def data(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    store(tmp_path / "a", 40)
+    store(tmp_path / "b", 20)
+
+
+class Followed(Training):
+    """Notes the samples of each batch; may end within an epoch as if it was killed."""
+
+    ends = None
+
+    def optimize(self):
+        if self.ends is not None and len(self.seen) == self.ends:
+            raise KeyboardInterrupt
+        self.seen.append({name: values.copy() for name, values in self.batch.items()})
+        super().optimize()
+
+
+def train(data, fields=("past", "next"), ends=None, **options):
+    network = NetworkConfig("toy/linear", {"net_fields": fields[0], "opt_fields": fields[1]})
+    usual = {"epoch_nb": 2, "batch_size": 16, "seed": 0, "quiet": True, "session_name": "run"}
+    training = Followed(network, data, **(usual | options))
+    training.seen, training.ends = [], ends
+    training.execute()
+    return training
+
+
+def test_a_folder_and_a_view_stand_for_their_configuration():
+    several = [train(each, ("x", "y"), session_name=name).seen for name, each in (
+        ("path", "a"), ("config", DatasetConfig(existing_dir="a")),
+        ("view", View(sources={"a": 1.0})),
+    )]  # fmt: skip
+    for batches in several[1:]:
+        assert [b["x"].tolist() for b in batches] == [b["x"].tolist() for b in several[0]]
+    with pytest.raises(ConfigError, match="dataset_config is 3"):
+        train(3)
+
+
+def test_windows_are_learned_from_and_validated_with():
+    view = View(window=WINDOW, fold=0)
+    training = train(DatasetConfig(existing_dir="a", view=view, normalize=True), epoch_nb=3)
+    assert training.validation_loss < 1e-6
+    for batch in training.seen:
+        assert batch["past"].shape[1:] == (2, 1) and batch["next"].shape[1:] == (1,)
+        np.testing.assert_array_equal(batch["next"], batch["past"][:, 1] + 1)
+    held = {int(row) // 10 for b in train(DatasetConfig(existing_dir="a", view=view)).seen
+            for row in b["next"][:, 0]}  # fmt: skip
+    assert len(held) == 32
+    fields = checkpoint.read(training.checkpoint_path).fields
+    assert fields["past"].shape == (2, 1)
+
+
+VIEWS = [
+    View(window=WINDOW, fold=1, test_fold=2),
+    View(window=WINDOW, sources={"a": 0.7, "b": 0.3}, fold=0),
+    View(window=WINDOW, weights="episode", edges="pad", fold=0),
+    View(window=WINDOW, order="blocks", drop_last=True, fold=None),
+]
+
+
+@pytest.mark.parametrize("view", VIEWS)
+@pytest.mark.parametrize("ends", [5, 20])
+def test_an_interrupted_training_goes_on_with_the_same_batches(tmp_path, view, ends):
+    config = DatasetConfig(existing_dir=None if view.sources else "a", view=view, normalize=True)
+    whole = train(config, session_name="whole")
+    with pytest.raises(KeyboardInterrupt):
+        train(config, ends=ends)
+    store(tmp_path / "a", 15, first=40)
+    rest = train(config, resume=True)
+    assert len(rest.seen) == len(whole.seen) - ends
+    for one, other in zip(rest.seen, whole.seen[ends:], strict=True):
+        assert one.keys() == other.keys()
+        for name in one:
+            np.testing.assert_array_equal(one[name], other[name])
+    np.testing.assert_array_equal(rest.learner.network.weights, whole.learner.network.weights)
+    assert rest.validation_loss == pytest.approx(whole.validation_loss, nan_ok=True, abs=0)
+
+
+def test_contradictions_are_named():
+    with pytest.raises(ConfigError, match="not both"):
+        train(DatasetConfig(existing_dir="a", view=View(sources={"b": 1.0})))
+    environment = EnvironmentConfig("toy/spring", as_tcp_ip_client=False)
+    for view in (View(window=WINDOW), View(fold=0)):
+        with pytest.raises(ConfigError, match="environments generate"):
+            train(DatasetConfig(view=view), environment_config=environment, batch_nb=2)
+    with pytest.raises(ConfigError, match="replay single rows"):
+        replayed = EnvironmentConfig("toy/spring", load_samples=True, as_tcp_ip_client=False)
+        train(DatasetConfig(existing_dir="a", view=View(window=WINDOW)),
+              environment_config=replayed)  # fmt: skip
