@@ -89,6 +89,8 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     EnvironmentConfig: {"environment": "toy/spring", "min_clients": 1, "max_clients": 2, "seed": 3}
     | {"episode_steps": 4, "episode_timeout": 2.5, "independent_episodes": True},
     DatasetConfig: {"max_file_size": 0.25},
+    physx_core.View: {"folds": 4, "fold": 1, "test_fold": 2, "fold_seed": 3, "stride": 2}
+    | {"sources": {"a": 0.5}},
     EpisodeRecord: {"episode": 3, "rows": 2, "seconds": 0.5},
     NetworkConfig: {"lr": 0.5, "which_network": 2, "save_best": True},
     physx_core.DataGeneration: {"environment_config": ENVIRONMENT, "batch_nb": 2, "batch_size": 4},

@@ -373,7 +373,9 @@ def last_checkpoint(name):
         weights = file.read("weights.npy")
     # Which files hold the rows depends on when the training was killed.
     rows = {mode: each["rows"] for mode, each in found.progress.data.items()}
-    return weights, plain(found.normalization), replace(found.progress, data=rows)
+    seen = {mode: each[""][0] for mode, each in found.progress.snapshots.items()}
+    progress = replace(found.progress, data=rows, snapshots=seen)
+    return weights, plain(found.normalization), progress
 
 
 def survives(run_killed, random, kills, words):

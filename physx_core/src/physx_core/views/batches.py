@@ -26,8 +26,8 @@ from physx_core.fields import Field
 from physx_core.statistics import Normalization, RunningStatistics
 from physx_core.typing import Array, Batch, Index
 from physx_core.views.folds import Part
+from physx_core.views.options import ViewOptions
 from physx_core.views.sources import Source, window_of
-from physx_core.views.view import View
 
 _SHARES = 1000
 _PAD = "_is_pad"
@@ -54,7 +54,7 @@ class Batches(Closeable):
 
     def __init__(
         self,
-        view: View,
+        view: ViewOptions,
         batch_size: int,
         seed: int = 0,
         *,
@@ -410,7 +410,7 @@ class Batches(Closeable):
         return f"<{len(self)} batches of {self.batch_size} of {self.num_items} items>"
 
 
-def _reopen(view: View, batch_size: int, seed: int, options: dict[str, Any]) -> Batches:
+def _reopen(view: ViewOptions, batch_size: int, seed: int, options: dict[str, Any]) -> Batches:
     return Batches(view, batch_size, seed, **options)
 
 

@@ -10,12 +10,12 @@ from physx_core.dataset import Trajectories
 from physx_core.dataset.read.shuffling import key_of, scramble
 from physx_core.errors import ConfigError
 from physx_core.typing import Index
-from physx_core.views.view import View
+from physx_core.views.options import ViewOptions
 
 Part: TypeAlias = Literal["training", "validation", "test", "all"]
 
 
-def choose_part(view: View, part: Part, found: Trajectories) -> Trajectories:
+def choose_part(view: ViewOptions, part: Part, found: Trajectories) -> Trajectories:
     """Return those trajectories that are in a part of a view.
 
     Of streams with fewer trajectories than folds, the parts are pieces: the end of each is held
@@ -62,7 +62,7 @@ def folds_of(campaign: Index, number: Index, folds: int, seed: int) -> Index:
     return found
 
 
-def _pieces(view: View, part: Part, found: Trajectories) -> Trajectories:
+def _pieces(view: ViewOptions, part: Part, found: Trajectories) -> Trajectories:
     """Return the part of each trajectory."""
     size = found.rows // view.folds
     end = found.rows - size * (view.fold is not None)

@@ -9,7 +9,7 @@ import numpy as np
 from physx_core.dataset import Trajectories
 from physx_core.dataset.read.episodes import Flags
 from physx_core.typing import Index
-from physx_core.views.view import View
+from physx_core.views.options import ViewOptions
 
 
 class Items:
@@ -21,7 +21,7 @@ class Items:
         is_plain: Whether item k is row k of the mode.
     """
 
-    def __init__(self, view: View, found: Trajectories) -> None:
+    def __init__(self, view: ViewOptions, found: Trajectories) -> None:
         """Count the windows.
 
         Args:

@@ -21,7 +21,7 @@ from physx_core.plugins.references import import_component
 from physx_core.typing import Array, Index
 from physx_core.views.folds import Part, choose_part
 from physx_core.views.items import Items
-from physx_core.views.view import View, Window
+from physx_core.views.options import ViewOptions, Window
 
 _BLOCK = 16  # rows that are held back together where nothing is known of episodes
 _STATUS = {"finished": EpisodeStatus.FINISHED, "cut": EpisodeStatus.CUT}
@@ -38,7 +38,7 @@ class Source:
     """
 
     def __init__(
-        self, view: View, dataset: Dataset, mode: str, part: Part, snapshot: Snapshot | None
+        self, view: ViewOptions, dataset: Dataset, mode: str, part: Part, snapshot: Snapshot | None
     ) -> None:
         """Find the items.
 
@@ -171,7 +171,7 @@ class Source:
         return found.reshape(*rows.shape, *found.shape[1:])
 
 
-def window_of(view: View, name: str) -> Window:
+def window_of(view: ViewOptions, name: str) -> Window:
     """Return the window of a name; of a stored field without one, its value at offset 0."""
     return view.windows.get(name) or Window(name, (0,), is_single=True)
 
