@@ -1,5 +1,6 @@
 """Views against the simplest model: lists of rows by trajectory."""
 
+import itertools
 import multiprocessing
 import os
 import pickle
@@ -418,6 +419,22 @@ def test_rows_that_come_between_change_nothing_with_a_snapshot(tmp_path):
             view.open(4, data=tmp_path, snapshot={"": lost})
     with pytest.raises(ConfigError, match="no rows of the source"):
         view.open(4, data=tmp_path, snapshot={"elsewhere": snapshot[""]})
+
+
+def test_folds_of_one_stream_are_its_pieces(tmp_path):
+    store_streams(tmp_path, episodes([53]), 1)
+    found = []
+    for fold in range(5):
+        view = View(folds=5, fold=fold, test_fold=(fold + 2) % 5)
+        steps = [
+            sorted(int(s) for batch in view.open(8, data=tmp_path, part=part)
+                   for s in batch["x"][:, 1])
+            for part in ("training", "validation", "test")
+        ]  # fmt: skip
+        assert sorted(itertools.chain(*steps)) == list(range(53))
+        assert steps[1] == list(range(steps[1][0], steps[1][-1] + 1))
+        found += steps[1]
+    assert sorted(found) == list(range(53))
 
 
 @pytest.mark.processes

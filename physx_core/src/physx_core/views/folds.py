@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from typing import Literal, TypeAlias
 
 import numpy as np
@@ -18,8 +19,8 @@ Part: TypeAlias = Literal["training", "validation", "test", "all"]
 def choose_part(view: ViewOptions, part: Part, found: Trajectories) -> Trajectories:
     """Return those trajectories that are in a part of a view.
 
-    Of streams with fewer trajectories than folds, the parts are pieces: the end of each is held
-    back for validation, and what is before that for a test.
+    Of streams with fewer trajectories than folds, the folds are pieces of each: fold 0 is its end,
+    fold 1 what is before that, and so on.
 
     Args:
         view: Divides them.
@@ -32,14 +33,13 @@ def choose_part(view: ViewOptions, part: Part, found: Trajectories) -> Trajector
     if part != "training" and held[part] is None:
         name = {"validation": "fold", "test": "test_fold"}[part]
         raise ConfigError(f"The view holds nothing back for the part {part!r}: set View.{name}.")
+    back = {fold for fold in held.values() if fold is not None}
+    wanted = {fold for fold in range(view.folds)
+              if (fold not in back if part == "training" else fold == held[part])}  # fmt: skip
     if len(found.rows) < view.folds and (found.campaign < 0).all():
-        return _pieces(view, part, found)
+        return _pieces(found, view.folds, wanted)
     folds = folds_of(found.campaign, found.episode, view.folds, view.fold_seed)
-    if part == "training":
-        chosen = ~np.isin(folds, [fold for fold in held.values() if fold is not None])
-    else:
-        chosen = folds == held[part]
-    return found.take(chosen)
+    return found.take(np.isin(folds, list(wanted)))
 
 
 def folds_of(campaign: Index, number: Index, folds: int, seed: int) -> Index:
@@ -62,14 +62,21 @@ def folds_of(campaign: Index, number: Index, folds: int, seed: int) -> Index:
     return found
 
 
-def _pieces(view: ViewOptions, part: Part, found: Trajectories) -> Trajectories:
-    """Return the part of each trajectory."""
-    size = found.rows // view.folds
-    end = found.rows - size * (view.fold is not None)
-    before = end - size * (view.test_fold is not None)
-    begin, stop = {
-        "training": (np.zeros_like(end), before),
-        "validation": (end, found.rows),
-        "test": (before, end),
-    }[part]
-    return found._replace(start=found.start + begin, rows=stop - begin)
+def _pieces(found: Trajectories, folds: int, wanted: set[int]) -> Trajectories:
+    """Return some of the pieces of each trajectory; those that follow one another as one."""
+    size = found.rows // folds
+    ends = [found.rows - fold * size for fold in range(folds)] + [np.zeros_like(size)]
+    which, start, rows = [], [], []
+    if not wanted:
+        return found.take(np.zeros(0, np.intp))
+    for is_wanted, run in itertools.groupby(range(folds), wanted.__contains__):
+        pieces = list(run)
+        if is_wanted:
+            begin = ends[pieces[-1] + 1]
+            which.append(np.arange(len(size)))
+            start.append(found.start + begin)
+            rows.append(ends[pieces[0]] - begin)
+    place = np.concatenate(which)
+    order = np.lexsort((np.concatenate(start), place))
+    chosen = found.take(place[order])
+    return chosen._replace(start=np.concatenate(start)[order], rows=np.concatenate(rows)[order])
