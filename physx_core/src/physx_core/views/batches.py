@@ -386,7 +386,7 @@ class Batches(Closeable):
                 f'"{source.order}"'
             )
         if any(source.order == "blocks" for source in self._sources):
-            lines.append("each batch draws from up to 512 places of a source")
+            lines.append("each batch draws from up to 256 places of a source")
         lines += [f"{n} = {w.field} at {list(w.at)}" for n, w in self.view.windows.items()]
         return "\n".join(lines)
 

@@ -61,6 +61,7 @@ class Source:
         chosen = choose_part(view, part, self._chosen(found))
         self.trajectories = len(chosen.rows), len(found.rows)
         self.items = Items(view, chosen)
+        self.rows.loads = self.order == "exact"
 
     def _find(self, part: Part) -> Trajectories:
         """Return the trajectories, or blocks of rows if nothing is known of any."""

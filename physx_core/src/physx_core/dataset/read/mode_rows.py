@@ -8,7 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from xxhash import xxh32_intdigest
 
-from physx_core.dataset.read.access.columns import ColumnCache
+from physx_core.dataset.read.access.columns import ColumnCache, MemoryColumn
+from physx_core.dataset.read.access.mapping import MappedColumn
 from physx_core.dataset.read.epochs import Epoch, Stored, begin_epoch
 from physx_core.dataset.read.shuffling import ItemOrder
 from physx_core.dataset.store.episode_table import EPISODES, TABLE_FIELDS
@@ -39,6 +40,7 @@ class ModeRows:
         mode: Name of the mode.
         snapshot: The snapshot.
         order: Which stored rows they are; None: the first ones.
+        loads: Whether fields from which rows are gathered are read into memory if they fit there.
     """
 
     def __init__(self, columns: ColumnCache, mode: str, snapshot: Snapshot | None = None) -> None:
@@ -54,6 +56,7 @@ class ModeRows:
         """
         self.mode, self._columns, self._reader = mode, columns, columns.reader
         self._numbering = self._reader.manifest.numbering
+        self.loads, self._seen = False, set[str]()
         orders = self._reader.orders
         if snapshot is None:
             self.order = self._reader.order(mode)
@@ -143,8 +146,7 @@ class ModeRows:
     def gather(self, name: str, rows: Index) -> Array:
         """Return some rows of a field, shape (n, *field shape)."""
         stored = self.stored
-        column = self._columns.map(self.mode, name)
-        column.check()
+        column = self._column(name)
         out = np.empty((len(rows), *column.shape[1:]), column.dtype)
         column.gather(rows if stored is None else stored(rows), out)
         return out
@@ -159,9 +161,13 @@ class ModeRows:
             ).any():  # episodes in several parts
                 found = self.gather(name, (first[:, None] + np.arange(count)).ravel())
                 return found.reshape(len(first), count, *found.shape[1:])
-        column = self._columns.map(self.mode, name)
-        column.check()
-        return column.windows(begin, count)
+        return self._column(name).windows(begin, count)
+
+    def _column(self, name: str) -> MemoryColumn | MappedColumn:
+        """Return a field; it is in memory if it was, or may be and fits when it is first used."""
+        loads = self.loads and name not in self._seen
+        self._seen.add(name)
+        return self._columns.by_index(self.mode, name, loads=loads)
 
     def read(self, name: str) -> Array:
         """Return all rows of a field."""

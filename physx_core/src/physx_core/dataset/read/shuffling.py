@@ -22,15 +22,15 @@ OrderName: TypeAlias = Literal["exact", "blocks", "stored"]
 """In which order an epoch visits its items.
 
 - ``exact``: all orders are equally likely.
-- ``blocks``: blocks of 64 kB of consecutive items come in random order, and the items of 512 blocks
+- ``blocks``: blocks of 64 kB of consecutive items come in random order, and the items of 256 blocks
   at a time are shuffled, so that data larger than memory are read in long pieces. Each batch draws
-  from 512 places; items of the same block stay close together.
+  from 256 places; items of the same block stay close together.
 - ``stored``: the order of the rows.
 """
 LARGE_ROW = 4096
 """Bytes from which reading a single row pays off: a disk never reads less at a time."""
 _MOST_SORTED = 2**21
-_BLOCK, _WINDOW, _MOST_BLOCKS = 2**16, 512, 2**21
+_BLOCK, _WINDOW, _MOST_BLOCKS = 2**16, 256, 2**21
 _CHUNK = 2**24  # bytes that are read at once where blocks do not say so
 _SLAB = 2**16
 _ROUNDS = 12  # of the lazy permutation; with fewer, not all orders are equally likely

@@ -9,7 +9,7 @@ import numpy as np
 
 from physx_core.dataset.read.access import memory
 from physx_core.dataset.read.access.disk import DiskColumn
-from physx_core.dataset.read.access.mapping import MappedColumn
+from physx_core.dataset.read.access.mapping import MappedColumn, runs_of
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.shuffling import LARGE_ROW
 from physx_core.fields import Field
@@ -51,6 +51,17 @@ class MemoryColumn:
     def array(self) -> Array:
         """The rows, of shape `shape`."""
         return self._array[: self.shape[0]]
+
+    def windows(self, first: Index, count: int) -> Array:
+        """Return consecutive rows from each of some rows on, shape (n, count, *field shape)."""
+        return (
+            runs_of(self.array, count)[first]
+            .view(self.dtype)
+            .reshape(len(first), count, *self.shape[1:])
+        )
+
+    def check(self) -> None:
+        """Do nothing: what is in memory stays."""
 
     def gather(self, index: Index, out: Array) -> None:
         """Copy the rows of an index array, all in range, into `out`."""
@@ -96,6 +107,23 @@ class ColumnCache:
                 self.reader.check(mode, name)
                 found[name] = DiskColumn(self.reader, mode, name, dtype)
         return [found[name] for name in names]
+
+    def by_index(self, mode: str, name: str, *, loads: bool) -> MemoryColumn | MappedColumn:
+        """Return a field to gather rows from: in memory, or mapped.
+
+        Args:
+            mode: Name of the mode.
+            name: Name of the field.
+            loads: Whether to read it into memory if it fits there.
+        """
+        missing = self.missing(mode, name, None)
+        if self.reader.field(mode, name).nbytes and (
+            not missing or (loads and missing <= memory.memory_budget())
+        ):
+            return self.load(mode, name)
+        found = self.map(mode, name)
+        found.check()
+        return found
 
     def load(self, mode: str, name: str, dtype: np.dtype[Any] | None = None) -> MemoryColumn:
         """Load all currently committed rows of a field into memory and return them."""

@@ -27,6 +27,18 @@ _FIXED = 0x10  # MAP_FIXED, which the module mmap does not define
 _ANONYMOUS = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
 
 
+def runs_of(rows: Array, count: int) -> Array:
+    """Return runs of consecutive rows, from each row on, as single values that may overlap.
+
+    Args:
+        rows: Contiguous rows of at least one byte, at least `count` of them.
+        count: How many follow one another.
+    """
+    size = rows.nbytes // len(rows)
+    run = np.dtype((np.void, count * size))
+    return np.ndarray((len(rows) - count + 1,), run, rows.data, 0, (size,))
+
+
 class _Mapped(NamedTuple):
     path: str
     inode: tuple[int, int]
@@ -75,11 +87,10 @@ class MappedColumn:
         numbers, places = self._index.locate(first)
         ends, _ = self._index.locate(first + (count - 1))
         begins = self._slots[numbers] + places
-        array, size = self._array, self._row_nbytes
-        if not size or len(array) < count:
+        array = self._array
+        if not self._row_nbytes or len(array) < count:
             return np.empty((len(first), count, *array.shape[1:]), array.dtype)
-        run = np.dtype((np.void, count * size))  # gathered in one piece, at any row
-        runs = np.ndarray((len(array) - count + 1,), run, array.data, 0, (size,))
+        runs = runs_of(array, count)
         found: Array = runs[np.minimum(begins, len(runs) - 1)].view(array.dtype)
         found = found.reshape(len(first), count, *array.shape[1:])
         apart = np.flatnonzero(numbers != ends)
