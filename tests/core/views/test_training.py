@@ -80,6 +80,20 @@ def test_windows_are_learned_from_and_validated_with():
     assert fields["past"].shape == (2, 1)
 
 
+def test_a_training_that_ends_before_its_next_batch_keeps_its_last(tmp_path):
+    config = DatasetConfig(existing_dir="a", view=View(fold=0))
+    with pytest.raises(KeyboardInterrupt):
+        train(config, ("x", "y"), ends=20, checkpoint_every=20)
+    before = checkpoint.find(tmp_path / "sessions/run", None, -1).progress.last_batch
+    assert before["number"] == 19 and before["fields"] == ["x", "y"]
+    resumed = train(config, ("x", "y"), resume=True)
+    assert len(resumed.seen) == 20
+    again = train(config, ("x", "y"), resume=True, epoch_nb=2)
+    assert again.seen == []
+    found = checkpoint.find(tmp_path / "sessions/run", None, -1).progress
+    assert (found.last_batch["number"], found.batches_read) == (39, 40)
+
+
 VIEWS = [
     View(window=WINDOW, fold=1, test_fold=2),
     View(window=WINDOW, sources={"a": 0.7, "b": 0.3}, fold=0),

@@ -461,10 +461,14 @@ class Training(NewSessionPipeline):
 
     def _last_batch(self) -> dict[str, Any]:
         """Return what shows later that the last stored batch was the same, if there is one."""
-        stored = self.data.stored
-        if not stored.count or stored.count != self._batches_read or self.group.size > 1:
+        read, stored = self._batches_read, self.data.stored
+        if read == self._resumed.batches_read:
+            return self._resumed.last_batch
+        if self.group.size > 1 or type(self).batch_produce is not Training.batch_produce:
             return {}
-        return describe_batch(stored.count - 1, self.batch, self.learner.batch_fields)
+        names = self.learner.batch_fields
+        batch = self.batch if stored.count == read else stored.read(read - 1, names)
+        return describe_batch(read - 1, batch, names)
 
     def _leave_batch(self, interrupt: Interrupt) -> None:
         """Write a checkpoint if one is due; after a signal, end within the epoch."""

@@ -150,6 +150,10 @@ class StoredBatches:
         self.count += 1
         return self._batches[self.count - 1]
 
+    def read(self, number: int, names: Sequence[str]) -> Batch:
+        """Read a batch by its number, in physical units."""
+        return self._training.reading(names)[number]
+
     def update(self, index: Index, rows: Batch) -> None:
         """Replace samples.
 
