@@ -156,7 +156,7 @@ def test_what_a_pruner_keeps_of_trials_is_passed_on():
 
 def test_trials_that_fall_behind_end_early(write):
     options = {"pruner": "optuna/median", "pruner_kwargs": {"n_startup_trials": 1}, "batch": 1}
-    file = write(parameters={"training.network.lr": [0.3, 0.01, 0.4]}, **options)
+    file = write(parameters={"training.network.lr": [0.05, 0.01, 0.2]}, **options)
     said = []
     study = run_study(Definition.read(file), Path("study"), said.append)
     with Path("study/trials.csv").open(newline="") as table:
