@@ -56,7 +56,7 @@ def test_info_shows_what_there_is(session, run):
         "env_kwargs: {'task': 'excite'}",
         "training: 400 samples, 101 kB in 4 partitions",
         "validation: 3 samples, 24 B in 1 partition",
-        "reading strategy: memory",
+        "shuffled by default: exact",
         "trajectories: 8 of 2 instances, 50 samples each",
         "rad, rad/s, rad/s^2; fingers: m, m/s",
         "all 27     200 … 200",
