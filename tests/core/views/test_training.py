@@ -34,14 +34,18 @@ def data(tmp_path, monkeypatch):
     store(tmp_path / "b", 20)
 
 
+class Stopped(Exception):
+    """Ends a training within an epoch."""
+
+
 class Followed(Training):
-    """Notes the samples of each batch; may end within an epoch as if it was killed."""
+    """Notes the samples of each batch; may end within an epoch."""
 
     ends = None
 
     def optimize(self):
         if self.ends is not None and len(self.seen) == self.ends:
-            raise KeyboardInterrupt
+            raise Stopped
         self.seen.append({name: values.copy() for name, values in self.batch.items()})
         super().optimize()
 
@@ -82,7 +86,7 @@ def test_windows_are_learned_from_and_validated_with():
 
 def test_a_training_that_ends_before_its_next_batch_keeps_its_last(tmp_path):
     config = DatasetConfig(existing_dir="a", view=View(fold=0))
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(Stopped):
         train(config, ("x", "y"), ends=20, checkpoint_every=20)
     before = checkpoint.find(tmp_path / "sessions/run", None, -1).progress.last_batch
     assert before["number"] == 19 and before["fields"] == ["x", "y"]
@@ -107,7 +111,7 @@ VIEWS = [
 def test_an_interrupted_training_goes_on_with_the_same_batches(tmp_path, view, ends):
     config = DatasetConfig(existing_dir=None if view.sources else "a", view=view, normalize=True)
     whole = train(config, session_name="whole")
-    with pytest.raises(KeyboardInterrupt):
+    with pytest.raises(Stopped):
         train(config, ends=ends)
     store(tmp_path / "a", 15, first=40)
     rest = train(config, resume=True)
