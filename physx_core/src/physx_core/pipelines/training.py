@@ -464,10 +464,10 @@ class Training(NewSessionPipeline):
         read, stored = self._batches_read, self.data.stored
         if read == self._resumed.batches_read:
             return self._resumed.last_batch
-        if self.group.size > 1 or type(self).batch_produce is not Training.batch_produce:
-            return {}
         names = self.learner.batch_fields
         batch = self.batch if stored.count == read else stored.read(read - 1, names)
+        if self.group.size > 1 or not batch.keys() >= set(names):
+            return {}
         return describe_batch(read - 1, batch, names)
 
     def _leave_batch(self, interrupt: Interrupt) -> None:
