@@ -252,6 +252,9 @@ def test_samples_that_are_held_back_are_not_replayed(source_dir):
     training = train("one mode", through(factor=1.0), "split", data=config, epoch_nb=2)
     times = rows_of("sessions/split")["times"]
     assert times.sum() == 30 and training.validation_loss < 1e-12
+    held = {"view": View(folds=4, test_fold=0)}
+    train("one mode", through(factor=1.0), "test", data=held, epoch_nb=2)
+    assert rows_of("sessions/test")["times"].sum() == 30
 
 
 def test_too_many_rejected_samples_end_the_training_and_are_kept(source_dir):

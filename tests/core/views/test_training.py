@@ -4,6 +4,7 @@ import numpy as np
 import pytest
 
 from physx_core import (
+    Batches,
     Dataset,
     DatasetConfig,
     EnvironmentConfig,
@@ -12,7 +13,8 @@ from physx_core import (
     View,
     checkpoint,
 )
-from physx_core.errors import ConfigError
+from physx_core.dataset.read.access import memory
+from physx_core.errors import ConfigError, DatasetError
 
 WINDOW = {"past": ("x", [-1, 0]), "next": ("x", 1)}
 
@@ -131,7 +133,44 @@ def test_contradictions_are_named():
     for view in (View(window=WINDOW), View(fold=0)):
         with pytest.raises(ConfigError, match="environments generate"):
             train(DatasetConfig(view=view), environment_config=environment, batch_nb=2)
-    with pytest.raises(ConfigError, match="replay single rows"):
-        replayed = EnvironmentConfig("toy/spring", load_samples=True, as_tcp_ip_client=False)
-        train(DatasetConfig(existing_dir="a", view=View(window=WINDOW)),
-              environment_config=replayed)  # fmt: skip
+    replayed = EnvironmentConfig("toy/spring", load_samples=True, as_tcp_ip_client=False)
+    for place, view in (
+        ("a", View(window=WINDOW)),
+        (None, View(sources={"a": 1.0})),
+        ("a", View(weights="episode")),
+        ("a", View(stride=2)),
+    ):
+        with pytest.raises(ConfigError, match="replay single rows"):
+            config = DatasetConfig(existing_dir=place, view=view)
+            train(config, environment_config=replayed)
+
+
+@pytest.mark.parametrize("view", [View(), View(fold=0), View(drop_last=True)])
+def test_appended_rows_do_not_change_the_normalization_of_a_resumed_training(tmp_path, view):
+    config = DatasetConfig(existing_dir="a", view=view, normalize=True)
+    whole = train(config, ("x", "y"), session_name="whole")
+    with pytest.raises(Stopped):
+        train(config, ("x", "y"), ends=15)
+    store(tmp_path / "a", 15, first=40)
+    rest = train(config, ("x", "y"), resume=True)
+    np.testing.assert_array_equal(rest.learner.network.weights, whole.learner.network.weights)
+
+
+def test_the_network_is_kept_although_its_data_cannot_be_read_any_more(tmp_path, monkeypatch):
+    monkeypatch.setattr(memory, "available_memory", lambda: 0)
+    config = DatasetConfig(existing_dir="a", view=View(order="blocks"))
+
+    def vanish(self, number):
+        raise DatasetError("The disk has failed.")
+
+    class Unlucky(Followed):
+        def batch_end(self):
+            if len(self.seen) == 5:
+                monkeypatch.setattr(Batches, "__getitem__", vanish)
+
+    network = NetworkConfig("toy/linear", {"net_fields": "x", "opt_fields": "y"})
+    training = Unlucky(network, config, epoch_nb=1, batch_size=16, quiet=True, session_name="run")
+    training.seen = []
+    with pytest.raises(DatasetError, match="disk has failed"):
+        training.execute()
+    assert checkpoint.find(tmp_path / "sessions/run", None, -1).progress.batch == 5

@@ -19,7 +19,7 @@ from physx_core.components.buffer import Buffer
 from physx_core.components.group import Group
 from physx_core.config import EnvironmentConfig, NetworkConfig, at_least, options, to_plain
 from physx_core.dataset import Dataset
-from physx_core.errors import ConfigError, DivergedError
+from physx_core.errors import ConfigError, DivergedError, PhysxError
 from physx_core.observers import REPORT_SECONDS, statistics_observers
 from physx_core.pipelines.learning.bound_options import bound_options, check_bound
 from physx_core.pipelines.learning.components import create
@@ -39,7 +39,6 @@ from physx_core.pipelines.run_description import (
     describe_training,
 )
 from physx_core.pipelines.storage import (
-    GENERATION,
     check_sources,
     reject_client_writers,
     reject_environments,
@@ -464,8 +463,12 @@ class Training(NewSessionPipeline):
         read, stored = self._batches_read, self.data.stored
         if read == self._resumed.batches_read:
             return self._resumed.last_batch
-        names = self.learner.batch_fields
-        batch = self.batch if stored.count == read else stored.read(read - 1, names)
+        names, batch = self.learner.batch_fields, self.batch
+        if stored.count != read:
+            try:
+                batch = stored.read(read - 1, names)
+            except PhysxError:  # perhaps why the training ends; its network is kept all the same
+                return {}
         if self.group.size > 1 or not batch.keys() >= set(names):
             return {}
         return describe_batch(read - 1, batch, names)
@@ -679,9 +682,9 @@ class Training(NewSessionPipeline):
         shapes = [fields[name].shape for name in self.learner.batch_fields if name in fields]
         if data.generated is None or None not in shapes:  # else bound with the first batch
             known = data.normalization()
-            was_generated = start.config.existing_dir is None and data.dataset.info.get(GENERATION)
-            if last is not None and was_generated:
-                known = last.normalization  # bit-identical
+            replays = self.environment_config is not None and self.environment_config.load_samples
+            if last is not None and not replays:
+                known = last.normalization  # bit-identical, whatever was appended since
             self.learner.bind(fields, known)
         self._told = self.learner.begin(self.epoch_nb, data.batches_per_epoch)
         self._load_parameters(last)

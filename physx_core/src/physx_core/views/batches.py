@@ -261,6 +261,12 @@ class Batches(Closeable):
             raise UsageError("This needs a view of a single source.")
         return self._sources[0]
 
+    @property
+    def has_all_rows(self) -> bool:
+        """Whether all rows that the mode of a single source has now are in this part."""
+        sources = self._sources
+        return len(sources) == 1 and sources[0].items.num_rows == sources[0].num_samples
+
     def all_rows(self) -> Index:
         """Return the numbers of all rows of a single source in this part, ascending."""
         return self._only.items.all_rows()

@@ -77,11 +77,16 @@ class Items:
         """Return the place of the trajectory of each item, shape (items,)."""
         return self._ends.searchsorted(items, "right")
 
+    @property
+    def num_rows(self) -> int:
+        """Number of rows of the trajectories."""
+        return int(self._found.rows.sum())
+
     def all_rows(self) -> Index:
         """Return the numbers of all rows of the trajectories, ascending."""
         found = self._found
         steps = np.repeat(found.start - np.cumsum(found.rows) + found.rows, found.rows)
-        places = steps + np.arange(int(found.rows.sum()))
+        places = steps + np.arange(self.num_rows)
         return np.sort(places if found.places is None else found.places[places])
 
     def _locate(self, items: Index) -> tuple[Index, Index, Index]:

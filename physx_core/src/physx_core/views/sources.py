@@ -119,6 +119,11 @@ class Source:
         return kept
 
     @property
+    def num_samples(self) -> int:
+        """Number of rows that the mode has now."""
+        return self.dataset.num_samples(self.rows.mode)
+
+    @property
     def count(self) -> int:
         """Number of items of a pass."""
         return self.items.count

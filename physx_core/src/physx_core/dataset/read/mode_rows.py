@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from functools import cached_property
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -38,7 +39,7 @@ class ModeRows:
 
     Attributes:
         mode: Name of the mode.
-        snapshot: The snapshot.
+        count: Number of rows.
         order: Which stored rows they are; None: the first ones.
         loads: Whether fields from which rows are gathered are read into memory if they fit there.
     """
@@ -60,22 +61,25 @@ class ModeRows:
         orders = self._reader.orders
         if snapshot is None:
             self.order = self._reader.order(mode)
-            records = 0 if self.order is None else orders.count(mode)
-            rows = self._reader.rows(mode)
-            snapshot = Snapshot(rows, records, self._digest(rows, records))
+            self._records = 0 if self.order is None else orders.count(mode)
+            self.count = self._reader.rows(mode)
         else:
             self._reader.mode(mode)
+            self.count, self._records = snapshot.rows, snapshot.records
             self.order = orders.at(mode, snapshot.records) if snapshot.records else None
             rows = self._reader.stored_rows(mode) if self.order is None else self.order.rows
-            known = self._digest(snapshot.rows, snapshot.records)
             is_lost = bool(snapshot.records) and self.order is None
-            if is_lost or rows < snapshot.rows or known != snapshot.digest:
+            if is_lost or rows < snapshot.rows or self.snapshot != snapshot:
                 raise DatasetError(
                     f'The {snapshot.rows} samples of mode "{mode}" that there were in '
                     f"{self._reader.directory} are no longer there as they were: some were "
                     "removed, or they were compacted."
                 )
-        self.snapshot = snapshot
+
+    @cached_property
+    def snapshot(self) -> Snapshot:
+        """What identifies the rows; read once, as it takes a pass over the records."""
+        return Snapshot(self.count, self._records, self._digest())
 
     def check(self) -> None:
         """Check that the rows are still there.
@@ -89,26 +93,21 @@ class ModeRows:
                 "compacted, since the batches were opened: open them again."
             )
 
-    def _digest(self, rows: int, records: int) -> int:
-        """Return the digest of the first rows, or of the first records."""
-        if records:
+    def _digest(self) -> int:
+        """Return the digest of the records, or of the partitions of the rows."""
+        if self._records:
             known = self._reader.orders.records(self.mode)
-            content = b"".join(column[:records].tobytes() for column in known)
+            content = b"".join(column[: self._records].tobytes() for column in known)
         else:
             before = itertools.accumulate((p.rows for p in self._parts), initial=0)
             keys = [part.key for part, start in zip(self._parts, before, strict=False)
-                    if start < rows]  # fmt: skip
+                    if start < self.count]  # fmt: skip
             content = repr(keys).encode()
         return int(xxh32_intdigest(content))
 
     @property
     def _parts(self) -> list[Partition]:
         return self._reader.mode(self.mode).with_rows
-
-    @property
-    def count(self) -> int:
-        """Number of rows."""
-        return self.snapshot.rows
 
     @property
     def fields(self) -> dict[str, Field]:
@@ -155,10 +154,8 @@ class ModeRows:
         """Return consecutive rows of a field from some rows on, shape (n, count, *field shape)."""
         stored, begin = self.stored, first
         if stored is not None:
-            begin = stored(first)
-            if (
-                stored(first + (count - 1)) - begin != count - 1
-            ).any():  # episodes in several parts
+            begin, end = stored(first), stored(first + (count - 1))
+            if (end - begin != count - 1).any():  # episodes in several parts
                 found = self.gather(name, (first[:, None] + np.arange(count)).ravel())
                 return found.reshape(len(first), count, *found.shape[1:])
         return self._column(name).windows(begin, count)

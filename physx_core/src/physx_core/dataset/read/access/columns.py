@@ -60,9 +60,6 @@ class MemoryColumn:
             .reshape(len(first), count, *self.shape[1:])
         )
 
-    def check(self) -> None:
-        """Do nothing: what is in memory stays."""
-
     def gather(self, index: Index, out: Array) -> None:
         """Copy the rows of an index array, all in range, into `out`."""
         # All modes but the default write directly to `out`.

@@ -24,6 +24,7 @@ from physx_core.views.view import View
 _SHOWN = 64
 """Largest number of validation samples whose predictions are shown."""
 _PLAIN = View()
+_NOT_REPLAYED = ("window", "sources", "weights", "stride")
 
 Snapshots = dict[str, dict[str, Sequence[int]]]
 """Mode to `Batches.snapshot`."""
@@ -92,11 +93,12 @@ class StoredBatches:
                 "DatasetConfig.view chooses among stored samples, but environments generate "
                 'these. Generate the samples first, or others in the mode "validation".'
             )
-        if replays and (config.view.windows or config.view.sources or config.view.weights):
-            raise ConfigError(
-                "Environments replay single rows of one dataset, each once: leave out window, "
-                "sources and weights of DatasetConfig.view."
-            )
+        for name in _NOT_REPLAYED if replays else ():
+            if getattr(config.view, name) != getattr(_PLAIN, name):
+                raise ConfigError(
+                    "Environments replay single rows of one dataset, each once: leave out "
+                    f"DatasetConfig.view.{name}."
+                )
         self._has_mode = dataset.num_samples("validation") > 0  # goes before what is held back
         self._view = training_view(config, dataset)
 
@@ -114,10 +116,13 @@ class StoredBatches:
             dtype=self._data_type,
             reuse=True,
         )
+        known = self.snapshots.get(mode)
         try:
-            found = open_now(snapshot=self.snapshots.get(mode))
-        except DatasetError:  # samples were removed, as the training has said
-            found = open_now()
+            found = open_now(snapshot=known)
+        except DatasetError:
+            if known is None or view.sources:
+                raise
+            found = open_now()  # samples were removed, as the training has said
         self.snapshots[mode] = {name: list(each) for name, each in found.snapshot.items()}
         return found
 
@@ -197,7 +202,9 @@ class StoredBatches:
     @property
     def rows(self) -> Index | None:
         """The rows to train on, ascending; None: all of the mode."""
-        return None if self._view.fold is None else self._training.all_rows()
+        if not self.has_samples or self._training.has_all_rows:
+            return None
+        return self._training.all_rows()
 
     @property
     def fields(self) -> Mapping[str, Field]:
@@ -214,7 +221,7 @@ class StoredBatches:
         self.has_changed = False
         if not self._config.normalize or not (self.has_samples or self._view.sources):
             return {}
-        if replace(self._view, order=None) != _PLAIN:
+        if self._view.windows or not self._training.has_all_rows:
             return self._training.normalization()
         if self._config.recompute_normalization and recompute:
             return self.dataset.recompute_normalization(self.mode)
