@@ -20,9 +20,10 @@ def data(tmp_path, monkeypatch):
             dataset.append("training", {"x": x, "y": 2 * x, **rows})
 
 
-def train(view=None, folder="data", **options):
+def train(view=None, **options):
     network = NetworkConfig("toy/linear", {"net_fields": ["x"], "opt_fields": ["y"]})
-    config = DatasetConfig(existing_dir=folder, view=view or View(fold=0), **options)
+    place = None if view is not None and view.sources else "data"
+    config = DatasetConfig(existing_dir=place, view=view or View(fold=0), **options)
     Training(network, config, epoch_nb=3, batch_size=7, seed=0, quiet=True).execute()
 
 
@@ -43,6 +44,19 @@ def test_data_as_they_were(capsys, view):
     assert "files: as recorded, 3 epochs" in text
     assert "300 training" in text and "compared with their checksums" in text
     assert "its last: read again, with the same values" in text
+
+
+def test_each_source_of_a_mixture_is_named(capsys):
+    train(View(sources={"data": 0.5, "other": 0.5}, fold=0))
+    status, text = verify(capsys, "--read", "--replay")
+    assert status == 0 and "read again, with the same values" in text
+    assert "data: 300 training" in text and "data: other, read and compared" in text
+    assert main(["info", "sessions/training"]) == 0
+    assert "data in data: unchanged since" in capsys.readouterr().out
+    with Dataset.open("other", writable=True) as dataset:
+        dataset.update("training", np.arange(300), {"x": np.zeros((300, 1))})
+    status, text = verify(capsys, "--replay")
+    assert status == 1 and "its last, has other values" in text
 
 
 def test_rows_that_were_added_change_nothing(capsys):

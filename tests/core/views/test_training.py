@@ -174,3 +174,16 @@ def test_the_network_is_kept_although_its_data_cannot_be_read_any_more(tmp_path,
     with pytest.raises(DatasetError, match="disk has failed"):
         training.execute()
     assert checkpoint.find(tmp_path / "sessions/run", None, -1).progress.batch == 5
+
+
+def test_a_mode_of_validation_samples_that_comes_later_does_not_change_what_is_learned(tmp_path):
+    config = DatasetConfig(existing_dir="a", view=View(fold=0))
+    whole = train(config, ("x", "y"), session_name="whole")
+    with pytest.raises(Stopped):
+        train(config, ("x", "y"), ends=15)
+    with Dataset.open("a", writable=True) as dataset:
+        view = dataset["training"]
+        dataset.append("validation", {name: view[name][:20] for name in view})
+    rest = train(config, ("x", "y"), resume=True)
+    np.testing.assert_array_equal(rest.learner.network.weights, whole.learner.network.weights)
+    assert rest.validation_loss == whole.validation_loss

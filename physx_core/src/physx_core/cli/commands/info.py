@@ -15,10 +15,13 @@ from physx_core.cli import installation
 from physx_core.cli.commands.plugins import load_all
 from physx_core.cli.dataset_tables import print_dataset
 from physx_core.cli.output import show, show_table
-from physx_core.config import read_toml
 from physx_core.dataset import Dataset
 from physx_core.errors import CheckpointError, DatasetNotFoundError, PhysxError, UsageError
-from physx_core.pipelines.learning.data_record import describe_changes, describe_record
+from physx_core.pipelines.learning.data_record import (
+    describe_changes,
+    describe_record,
+    find_data,
+)
 
 
 @dataclass
@@ -75,11 +78,10 @@ def _data_of(place: Path, found: checkpoint.Checkpoint) -> Iterator[str]:
     if not progress.data:
         return
     yield f"trained on {describe_record(progress.data)}"
-    tables = read_toml(place / "config.toml") if (place / "config.toml").is_file() else {}
-    config = tables.get("training", {}).get("dataset", {})
     try:
-        with Dataset.open(config.get("existing_dir") or place) as dataset:
-            changes = describe_changes(progress.data, dataset, config.get("mode", "training"))
+        places, mode = find_data(place)
+        with Dataset.open(places[0]) as dataset:
+            changes = describe_changes(progress.data, dataset, mode)
             yield f"data in {dataset.directory}: {'; '.join(changes) or 'unchanged since'}"
     except PhysxError as error:
         yield f"whether they changed since is not known: {error}"

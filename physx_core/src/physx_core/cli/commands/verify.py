@@ -12,12 +12,12 @@ import tyro
 from physx_core import checkpoint
 from physx_core.cli.dataset_tables import count
 from physx_core.cli.output import show
-from physx_core.config import read_toml
 from physx_core.dataset import EPISODES, Dataset
 from physx_core.errors import DatasetError, DatasetNotFoundError, UsageError
 from physx_core.pipelines.learning.data_record import (
     describe_changes,
     describe_record,
+    find_data,
     read_last_batch,
 )
 
@@ -72,18 +72,16 @@ def _verify_checkpoint(path: Path, options: Verify) -> None:
     if not found.progress.data:
         show("data: not recorded")
         return
-    session = path.parent.parent
-    tables = read_toml(session / "config.toml") if (session / "config.toml").is_file() else {}
-    config = tables.get("training", {}).get("dataset", {})
-    mode, fixed = config.get("mode", "training"), found.progress.snapshots
-    places = [*config.get("view", {}).get("sources", {}), config.get("existing_dir") or session]
-    with Dataset.open(places[0]) as dataset:
-        problems = describe_changes(found.progress.data, dataset, mode, fixed)
+    (place, *others), mode = find_data(path.parent.parent)
+    how = "read and compared with their checksums" if options.read else "as recorded"
+    with Dataset.open(place) as dataset:
+        problems = describe_changes(found.progress.data, dataset, mode, found.progress.snapshots)
         if options.read:
             problems += dataset.verify()
         if not problems:
-            how = "read and compared with their checksums" if options.read else "as recorded"
             show(f"data: {describe_record(found.progress.data)}, {how}")
+        for each in others:
+            problems += _verify_other(each, options)
         if options.replay:
             again, before = read_last_batch(found, dataset), found.progress.last_batch
             if again == before:
@@ -96,6 +94,16 @@ def _verify_checkpoint(path: Path, options: Verify) -> None:
         raise DatasetError(
             f"The data of {path} are not as they were: {count(len(problems), 'difference')}."
         )
+
+
+def _verify_other(place: Path, options: Verify) -> list[str]:
+    """Return the problems of a further source, of which only the number of rows is recorded."""
+    with Dataset.open(place) as dataset:
+        problems = [f"{place}: {text}" for text in (dataset.verify() if options.read else ())]
+    if not problems:
+        how = "read and compared with their checksums" if options.read else "not compared"
+        show(f"data: {place}, {how}; whether rows were updated is not recorded")
+    return problems
 
 
 def _problems(directory: str) -> tuple[list[str], str]:

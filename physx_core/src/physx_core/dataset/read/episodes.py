@@ -70,8 +70,7 @@ def find_trajectories(known: ModeRows) -> Trajectories:
         rows = np.diff(begins, append=len(places))
         by_first = np.argsort(places[begins], kind="stable")
         begins, rows, first = begins[by_first], rows[by_first], places[begins[by_first]]
-        _, stream = _recorded(known)
-        streams = stream[first]
+        streams = columns["stream"][first]
         number = np.where(streams, np.cumsum(streams) - 1, columns["episode"][first])
         campaign = np.where(streams, -1, columns["campaign"][first])
         is_plain = bool((np.diff(places) == 1).all())  # of one instance
@@ -123,22 +122,22 @@ def episode_lengths(known: ModeRows) -> tuple[Index, int]:
 
 def _cut(known: ModeRows) -> tuple[dict[str, Array], Index, Index]:
     """Return the columns, the rows by instance, and where trajectories begin among these."""
-    columns, stream = _columns(known)
+    columns = _columns(known)
     order = np.argsort(columns["env_id"], kind="stable")
     begins = np.zeros(known.count, bool)
     for name in ("env_id", "episode", "entry"):
         begins |= np.diff(columns[name][order], prepend=-1) != 0
     if "step" in columns:
-        begins |= stream[order] & (np.diff(columns["step"][order], prepend=-2) != 1)
+        begins |= columns["stream"][order] & (np.diff(columns["step"][order], prepend=-2) != 1)
     begins[:1] = True
     return columns, order, np.flatnonzero(begins)
 
 
-def _columns(known: ModeRows) -> tuple[dict[str, Array], Flags]:
-    """Return what tells trajectories apart, by row, and which rows belong to a stream.
+def _columns(known: ModeRows) -> dict[str, Array]:
+    """Return what tells trajectories apart, by row.
 
-    The columns are ``env_id``, ``episode``, ``campaign``, ``entry``, the number of the entry in the
-    table of episodes, and ``step`` if there are steps.
+    That is ``env_id``, ``episode``, ``campaign``, ``entry``, the number of the entry in the table
+    of episodes, ``stream``, whether the row belongs to one, and ``step`` if there are steps.
     """
     names = [name for name in ("env_id", "episode", "step") if name in known.fields]
     columns: dict[str, Array] = {name: known.read(name) for name in names}
@@ -152,7 +151,7 @@ def _columns(known: ModeRows) -> tuple[dict[str, Array], Flags]:
         own = columns.get(name, np.zeros(known.count, np.int64))
         columns[name] = np.where(stream, own, found.get(name, 0))
     columns["entry"] = found.get("entry", columns["entry"])
-    return columns, stream
+    return columns | {"stream": stream}
 
 
 def _recorded(known: ModeRows) -> tuple[dict[str, Array], Flags]:

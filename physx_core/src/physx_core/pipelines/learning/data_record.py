@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import replace
 from hashlib import blake2b
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -12,7 +13,7 @@ from xxhash import xxh3_64
 
 from physx_core import files
 from physx_core.checkpoint import Checkpoint
-from physx_core.config import from_plain
+from physx_core.config import from_plain, read_toml
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, DatasetError
 from physx_core.typing import Batch
@@ -53,6 +54,17 @@ def describe_batch(number: int, batch: Batch, names: Sequence[str]) -> dict[str,
     return {"number": number, "fields": list(names), "digest": content.hexdigest()}
 
 
+def find_data(session: Path) -> tuple[list[Path], str]:
+    """Return the folders of the data that a session's networks were trained on, and the mode.
+
+    Only the first is recorded in checkpoints, with the number of rows of the others.
+    """
+    file = session / "config.toml"
+    config = (read_toml(file) if file.is_file() else {}).get("training", {}).get("dataset", {})
+    sources = config.get("view", {}).get("sources") or [config.get("existing_dir") or session]
+    return [Path(each) for each in sources], config.get("mode", "training")
+
+
 def read_last_batch(found: Checkpoint, dataset: Dataset) -> dict[str, Any]:
     """Read the last batch that a network learned from again, and return what identifies it.
 
@@ -71,7 +83,7 @@ def read_last_batch(found: Checkpoint, dataset: Dataset) -> dict[str, Any]:
     options = progress.options["dataset"]
     config = from_plain(DatasetConfig, options)
     with Batches(
-        training_view(config, dataset),
+        training_view(config, has_validation="validation" in progress.snapshots),
         progress.options["batch_size"],
         progress.seed,
         data=None if config.view.sources else dataset,
@@ -83,11 +95,15 @@ def read_last_batch(found: Checkpoint, dataset: Dataset) -> dict[str, Any]:
         return describe_batch(number, batches[number], names)
 
 
-def training_view(config: DatasetConfig, dataset: Dataset) -> View:
-    """Return the view of the samples to train on; a mode ``validation`` holds back the others."""
+def training_view(config: DatasetConfig, *, has_validation: bool) -> View:
+    """Return the view of the samples to train on.
+
+    Args:
+        config: The options.
+        has_validation: Whether the mode ``validation`` has samples; then none are held back.
+    """
     order = config.view.order if config.shuffle else "stored"
-    has_mode = dataset.num_samples("validation") > 0
-    return replace(config.view, order=order, fold=None if has_mode else config.view.fold)
+    return replace(config.view, order=order, fold=None if has_validation else config.view.fold)
 
 
 def describe_record(former: Mapping[str, Any]) -> str:

@@ -99,8 +99,10 @@ class StoredBatches:
                     "Environments replay single rows of one dataset, each once: leave out "
                     f"DatasetConfig.view.{name}."
                 )
-        self._has_mode = dataset.num_samples("validation") > 0  # goes before what is held back
-        self._view = training_view(config, dataset)
+        has_now = dataset.num_samples("validation") > 0
+        had_mode = "validation" in self.snapshots if self.snapshots else has_now
+        self._has_mode = had_mode and has_now  # else its samples were removed
+        self._view = training_view(config, has_validation=had_mode)
 
     def _open(self, mode: str, view: View, size: int, part: Part = "training") -> Batches:
         """Open the samples of a mode as they were at its snapshot, or else are now."""
@@ -128,7 +130,11 @@ class StoredBatches:
 
     @cached_property
     def _training(self) -> Batches:
-        return self._open(self.mode, self._view, self._batch_size)
+        found = self._open(self.mode, self._view, self._batch_size)
+        if self._has_mode:
+            taken = [*self.dataset.rows("validation").snapshot]
+            self.snapshots.setdefault("validation", {"": taken})
+        return found
 
     @cached_property
     def _validation(self) -> Batches:
