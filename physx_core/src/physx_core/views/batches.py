@@ -17,6 +17,7 @@ from numpy.typing import DTypeLike
 from physx_core.closeable import Closeable
 from physx_core.config import to_plain
 from physx_core.dataset import Dataset, Snapshot, rows_per_block
+from physx_core.dataset.read.batch_arrays import BatchArrays
 from physx_core.dataset.read.epochs import Epoch
 from physx_core.dataset.read.shuffling import ItemOrder, key_of
 from physx_core.dataset.store.definitions import compare_fields
@@ -161,7 +162,8 @@ class Batches(Closeable):
         for name in self._names:
             self.fields |= self._described(name)
         self._kinds = {n: field.converted_dtype(self._dtype) for n, field in self.fields.items()}
-        self._buffers = self._allocate(self.batch_size) if reuse else None
+        kinds = {n: (field.shape or (), self._kinds[n]) for n, field in self.fields.items()}
+        self._arrays = BatchArrays(kinds, self.batch_size, reuse=reuse)
 
     def reading(self, fields: Sequence[str]) -> Batches:
         """Return the same batches, of other fields; they share the open files."""
@@ -214,20 +216,16 @@ class Batches(Closeable):
             IndexError: If it is negative.
             DatasetError: If rows cannot be read.
         """
-        if number < 0:
-            raise IndexError(f"There is no batch {number}: the first is 0.")
-        epoch, place = divmod(int(number), len(self))
-        start = place * self.batch_size
-        stop = min(start + self.batch_size, self.num_items)
+        epoch, start, stop = self._place(number)
         for source in self._sources:
             source.rows.check()
         if self._is_plain:
-            batch = self._new_batch(stop - start)
+            batch = self._arrays.take(stop - start)
             self._begin(epoch).fill(start, batch)
             return batch
         if len(self._sources) == 1:
             return self._values(self._sources[0], self._items(0, epoch, 0, start, stop))
-        batch = self._new_batch(stop - start)
+        batch = self._arrays.take(stop - start)
         for source, (slots, items) in zip(
             self._sources, self._drawn(epoch, start, stop), strict=True
         ):
@@ -235,16 +233,21 @@ class Batches(Closeable):
                 batch[name][slots] = values
         return batch
 
+    def _place(self, number: int) -> tuple[int, int, int]:
+        """Return the epoch of a batch, and its first position there and that after its last."""
+        if number < 0:
+            raise IndexError(f"There is no batch {number}: the first is 0.")
+        epoch, place = divmod(int(number), len(self))
+        start = place * self.batch_size
+        return epoch, start, min(start + self.batch_size, self.num_items)
+
     def __iter__(self) -> Iterator[Batch]:
         """Yield the batches of the first epoch."""
         return (self[number] for number in range(len(self)))
 
     def rows(self, number: int) -> list[Index]:
         """Return the reference rows of a batch's items, by source."""
-        epoch, place = divmod(int(number), len(self))
-        start = place * self.batch_size
-        stop = min(start + self.batch_size, self.num_items)
-        drawn = self._drawn(epoch, start, stop)
+        drawn = self._drawn(*self._place(number))
         return [
             source.items.rows(items)[:, 0]
             for source, (_, items) in zip(self._sources, drawn, strict=True)
@@ -334,19 +337,6 @@ class Batches(Closeable):
                 padded = source.items.are_padded(items, window.at)
                 found[name + _PAD] = padded[:, 0] if window.is_single else padded
         return found
-
-    def _new_batch(self, size: int) -> Batch:
-        if self._buffers is None:
-            return self._allocate(size)
-        if size == self.batch_size:
-            return self._buffers.copy()
-        return {name: buffer[:size] for name, buffer in self._buffers.items()}
-
-    def _allocate(self, size: int) -> Batch:
-        return {
-            name: np.empty((size, *(field.shape or ())), self._kinds[name])
-            for name, field in self.fields.items()
-        }
 
     # What it is ---------------------------------------------------------------------------------
 

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from physx_core.dataset.read.access.columns import ColumnCache
+from physx_core.dataset.read.batch_arrays import BatchArrays
 from physx_core.dataset.read.epochs import Epoch
 from physx_core.dataset.read.mode_rows import ModeRows
 from physx_core.dataset.read.shuffling import (
@@ -79,14 +80,14 @@ class BatchReader:
         self._order: OrderName | None = "stored" if not shuffle else order and check_order(order)
         self._key = key_of(secrets.randbits(64) if seed is None else seed)
         self._dtype = None if dtype is None else np.dtype(dtype)
-        self._kinds = {
+        kinds = {
             field.name: (field.shape or (), field.converted_dtype(self._dtype)) for field in known
         }
-        self._buffers = self._allocate(batch_size) if reuse else None
+        self._arrays = BatchArrays(kinds, batch_size, reuse=reuse)
         scales = normalize if isinstance(normalize, Mapping) else {}
         self._scales = [
             (name, np.asarray(scales[name].mean, kind), np.asarray(scales[name].std, kind))
-            for name, (_, kind) in self._kinds.items()
+            for name, (_, kind) in kinds.items()
             if name in scales and kind.kind == "f"
         ]
 
@@ -99,7 +100,7 @@ class BatchReader:
             epoch = self._begin(number, rows)
             try:
                 for start in range(skipped * size, rows.count, size):
-                    batch = self._new_batch(min(size, rows.count - start))
+                    batch = self._arrays.take(min(size, rows.count - start))
                     epoch.fill(start, batch)
                     for name, mean, std in self._scales:
                         values = batch[name]
@@ -114,13 +115,3 @@ class BatchReader:
         name = self._order or choose_order(rows.count, rows.row_nbytes)
         order = make_order(name, rows.count, rows.row_nbytes, key_of(self._key, number))
         return rows.epoch(self._names, self._dtype, order)
-
-    def _new_batch(self, size: int) -> Batch:
-        if self._buffers is None:
-            return self._allocate(size)
-        if size == self._size:
-            return self._buffers.copy()
-        return {name: buffer[:size] for name, buffer in self._buffers.items()}
-
-    def _allocate(self, size: int) -> Batch:
-        return {name: np.empty((size, *shape), kind) for name, (shape, kind) in self._kinds.items()}
