@@ -103,6 +103,8 @@ class Batches(Closeable):
             for name, source in zip(given, self._sources, strict=True)
         }
         self.num_items = self._count(np.array(list(given.values())))
+        whole, rest = divmod(self.num_items, batch_size)
+        self._num_batches = whole + (rest > 0 and not view.drop_last)
         self._check()
         self._choose(fields, dtype, reuse=reuse)
         self._is_plain = len(self._sources) == 1 and not (view.windows or view.weights)
@@ -173,7 +175,7 @@ class Batches(Closeable):
         return other
 
     def _check(self) -> None:
-        if not len(self):
+        if not self._num_batches:
             raise ConfigError(
                 f"An epoch has {self.num_items} items, fewer than a batch of {self.batch_size}, "
                 "and View.drop_last leaves out what is left."
@@ -203,8 +205,7 @@ class Batches(Closeable):
     # Batches --------------------------------------------------------------------------------
 
     def __len__(self) -> int:
-        whole, rest = divmod(self.num_items, self.batch_size)
-        return whole + (rest > 0 and not self.view.drop_last)
+        return self._num_batches
 
     def __getitem__(self, number: int) -> Batch:
         """Return a batch: field name to array of shape (items, *field shape).
@@ -237,7 +238,7 @@ class Batches(Closeable):
         """Return the epoch of a batch, and its first position there and that after its last."""
         if number < 0:
             raise IndexError(f"There is no batch {number}: the first is 0.")
-        epoch, place = divmod(int(number), len(self))
+        epoch, place = divmod(int(number), self._num_batches)
         start = place * self.batch_size
         return epoch, start, min(start + self.batch_size, self.num_items)
 

@@ -208,9 +208,15 @@ class StoredBatches:
     @property
     def rows(self) -> Index | None:
         """The rows to train on, ascending; None: all of the mode."""
-        if not self.has_samples or self._training.has_all_rows:
+        if not self.has_samples or self._has_all_rows:
             return None
         return self._training.all_rows()
+
+    @property
+    def _has_all_rows(self) -> bool:
+        """Whether all samples of the mode are trained on; later ones too, until one is read."""
+        is_chosen = self._view != _PLAIN or self.mode in self.snapshots
+        return not is_chosen or self._training.has_all_rows
 
     @property
     def fields(self) -> Mapping[str, Field]:
@@ -227,7 +233,7 @@ class StoredBatches:
         self.has_changed = False
         if not self._config.normalize or not (self.has_samples or self._view.sources):
             return {}
-        if self._view.windows or not self._training.has_all_rows:
+        if self._view.windows or not self._has_all_rows:
             return self._training.normalization()
         if self._config.recompute_normalization and recompute:
             return self.dataset.recompute_normalization(self.mode)
