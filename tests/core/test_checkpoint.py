@@ -21,6 +21,7 @@ from physx_core import (
     Normalization,
     Prediction,
     Training,
+    View,
     checkpoint,
     files,
 )
@@ -325,7 +326,7 @@ def trained():
 
 def training(epochs, **options):
     config = NetworkConfig("toy/linear", save_each_epoch=True)
-    data = DatasetConfig(existing_dir="data")
+    data = DatasetConfig(existing_dir="data", view=View(hold_back=False))
     return Training(config, data, epoch_nb=epochs, batch_size=5, seed=0, **options)
 
 

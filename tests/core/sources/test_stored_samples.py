@@ -29,6 +29,7 @@ pytestmark = pytest.mark.processes
 
 ENVS = Path(__file__).parents[1] / "programs" / "source_envs.py"
 DOUBLING = f"{ENVS}:Doubling"
+ALL = View(hold_back=False)
 NETWORK = {"network_kwargs": {"net_fields": "x", "opt_fields": "y"}}
 
 
@@ -252,7 +253,7 @@ def test_samples_that_are_held_back_are_not_replayed(source_dir):
     training = train("one mode", through(factor=1.0), "split", data=config, epoch_nb=2)
     times = rows_of("sessions/split")["times"]
     assert times.sum() == 30 and training.validation_loss < 1e-12
-    held = {"view": View(folds=4, test_fold=0)}
+    held = {"view": View(folds=4, hold_back=False, test_fold=0)}
     train("one mode", through(factor=1.0), "test", data=held, epoch_nb=2)
     assert rows_of("sessions/test")["times"].sum() == 30
 
@@ -349,7 +350,7 @@ def test_environments_may_ask_the_network_that_is_trained(replays, nothing_stays
         config = environment(
             "AskingOnlyInTraining", factor=3.0, load_samples=replays, as_tcp_ip_client=over_tcp
         )
-        options = {"batch_nb": 4, "batch_size": 5, "data": {"shuffle": False}}
+        options = {"batch_nb": 4, "batch_size": 5, "data": {"shuffle": False, "view": ALL}}
         train("sessions/run" if replays else None, config, f"asked_{over_tcp}", **options)
         runs.append(rows_of(f"sessions/asked_{over_tcp}"))
     same(*runs)

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from physx_core import Dataset, DatasetConfig, NetworkConfig, Training, Transformation
+from physx_core import Dataset, DatasetConfig, NetworkConfig, Training, Transformation, View
 from physx_core.components import PredictedBatch
 from physx_core.errors import DivergedError
 from physx_core.observers import read_scalars
@@ -201,7 +201,7 @@ def data(tmp_path, monkeypatch):
     x = np.random.default_rng(0).uniform(-1, 1, (40, 2))
     with Dataset.create("data") as dataset:
         dataset.append("training", {"input": x, "ground_truth": x[:, :1]})
-    return DatasetConfig(existing_dir="data")
+    return DatasetConfig(existing_dir="data", view=View(hold_back=False))
 
 
 def config(**options):

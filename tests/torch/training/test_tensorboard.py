@@ -14,6 +14,7 @@ from physx_core import (
     EnvironmentConfig,
     NetworkConfig,
     Training,
+    View,
 )
 from physx_core.components import Factory
 from physx_core.errors import ConfigError, MissingLibraryError
@@ -148,7 +149,7 @@ def test_a_training_sends_numbers_weights_and_gradients():
     )
     pipeline = Training(
         network,
-        DatasetConfig(existing_dir="data"),
+        DatasetConfig(existing_dir="data", view=View(hold_back=False)),
         epoch_nb=4,
         batch_size=5,
         statistics="torch/tensorboard",

@@ -93,7 +93,10 @@ class ViewOptions:
                     f"{self.folds - 1}."
                 )
         if self.hold_back and self.fold == self.test_fold:
-            raise ConfigError(f"View.fold and View.test_fold are the same: {self.fold}.")
+            raise ConfigError(
+                f"View.fold and View.test_fold are the same: {self.fold}. Choose another one, or "
+                "hold nothing back for validation (hold_back=False)."
+            )
         kind, _, name = (self.weights or "episode").partition(":")
         if not ((kind == "episode" and not name) or (kind in ("class", "field") and name)):
             raise ConfigError(

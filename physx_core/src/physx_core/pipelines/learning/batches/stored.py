@@ -23,7 +23,7 @@ from physx_core.views.view import View
 
 _SHOWN = 64
 """Largest number of validation samples whose predictions are shown."""
-_PLAIN = View()
+_PLAIN, _ALL = View(), View(hold_back=False)
 _NOT_REPLAYED = ("window", "sources", "weights", "stride")
 
 Snapshots = dict[str, dict[str, Sequence[int]]]
@@ -88,7 +88,7 @@ class StoredBatches:
                 f"{other_samples(dataset.directory, self.mode)}"
             )
         replays = environment is not None and environment.load_samples
-        if environment is not None and config.view != _PLAIN and not replays:
+        if environment is not None and config.view not in (_PLAIN, _ALL) and not replays:
             raise ConfigError(
                 "DatasetConfig.view chooses among stored samples, but environments generate "
                 'these. Generate the samples first, or others in the mode "validation".'
@@ -234,7 +234,7 @@ class StoredBatches:
     @property
     def _has_all_rows(self) -> bool:
         """Whether all samples of the mode are trained on; later ones too, until one is read."""
-        chooses = self._config.view != _PLAIN or self._view.hold_back
+        chooses = self._config.view not in (_PLAIN, _ALL) or self._view.hold_back
         is_chosen = chooses or self.mode in self.snapshots
         return not is_chosen or self._training.has_all_rows
 
