@@ -14,7 +14,7 @@ from physx_core.config import read_toml
 from physx_core.dataset import EPISODES, Dataset, Progress
 from physx_core.dataset.read.episodes import episode_lengths
 from physx_core.errors import ConfigError, DatasetError
-from physx_core.statistics import Normalization
+from physx_core.normalization import Normalization
 from physx_core.typing import Array
 
 _SMALL = 9

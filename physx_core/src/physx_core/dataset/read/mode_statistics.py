@@ -9,18 +9,27 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
-from physx_core.dataset.read.ordered_statistics import Statistics, compute_in_order
+from physx_core.dataset.read.mode_rows import ModeRows
+from physx_core.dataset.read.ordered_statistics import (
+    Statistics,
+    all_rows,
+    compute_in_order,
+    compute_of_rows,
+    kept_of,
+)
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.store import statistics_file
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
+from physx_core.normalization import Measured
 from physx_core.statistics import RunningStatistics
+from physx_core.typing import Index
 
 
 def compute_statistics(reader: Reader, mode_name: str) -> Statistics:
     """Return the statistics of a mode's floating-point fields over all its committed rows."""
-    mode, order = reader.mode(mode_name), reader.order(mode_name)
-    if order is not None:
-        return compute_in_order(reader, mode_name, order)
+    mode = reader.mode(mode_name)
+    if reader.order(mode_name) is not None:
+        return compute_in_order(reader, mode_name)
     statistics_file.load(reader.directory, reader.manifest)
     for partition in mode.partitions:
         if not partition.counted:
@@ -31,6 +40,24 @@ def compute_statistics(reader: Reader, mode_name: str) -> Statistics:
         if not partition.counted:
             found = merge_statistics(found, partition.running)
     return found
+
+
+def compute_of(
+    known: ModeRows, of: Measured, ranges: tuple[Index, Index] | None = None
+) -> RunningStatistics:
+    """Return statistics of some rows of a mode.
+
+    Args:
+        known: The rows of the mode.
+        of: The field, and what of it.
+        ranges: First rows, ascending, and numbers of rows of the ranges that they consist of; None:
+            all rows.
+    """
+    starts, counts = all_rows(known) if ranges is None else ranges
+    reader, is_all = known.reader, int(counts.sum()) == known.reader.rows(known.mode)
+    if known.order is None and is_all and of == kept_of(known.fields[of.field]):
+        return compute_statistics(reader, known.mode).get(of.field, RunningStatistics())
+    return compute_of_rows(known, of, starts, counts)
 
 
 def count_sealed(directory: Path, manifest: Manifest, mode: Mode) -> None:
@@ -70,7 +97,7 @@ def merge_statistics(
 
 def _update_running(reader: Reader, mode: Mode, partition: Partition) -> None:
     """Bring the running statistics of a partition up to its last committed row."""
-    for name in mode.counted_fields:
-        statistics = partition.running.setdefault(name, RunningStatistics())
+    for name, field in mode.counted_fields.items():
+        statistics = partition.running.setdefault(name, RunningStatistics(field.pooled))
         for block in reader.partition_blocks(partition, name, statistics.count):
             statistics.update(block)

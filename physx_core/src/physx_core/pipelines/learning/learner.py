@@ -30,12 +30,12 @@ from physx_core.errors import (
     listed,
 )
 from physx_core.fields import NUMBERS, Field, is_finite
+from physx_core.normalization import Normalization
 from physx_core.pipelines.learning.components import create, create_network
 from physx_core.plugins import import_component
 from physx_core.plugins.networks import resolve_network
 from physx_core.plugins.references import check_recorded, is_of_plugin, is_recorded_as
 from physx_core.rows import concatenate
-from physx_core.statistics import Normalization
 from physx_core.typing import Array, Batch, Index
 
 
