@@ -124,6 +124,14 @@ class Field:
         """Shape of its statistics: that of a value, but 1 for the axes they are pooled over."""
         return tuple(1 if i in self.pooled else n for i, n in enumerate(self.shape or ()))
 
+    def is_resolution(self, shape: tuple[int, ...]) -> bool:
+        """Return whether a shape differs from its own only in the axes that are `pooled`."""
+        own = self.shape or ()
+        sizes = enumerate(zip(own, shape, strict=False))
+        return len(own) == len(shape) and all(
+            here == there or axis in self.pooled for axis, (here, there) in sizes
+        )
+
     def converted_dtype(self, dtype: np.dtype[Any] | None) -> np.dtype[Any]:
         """Return the type of the values if floating-point fields are converted to `dtype`."""
         own = self.numpy_dtype

@@ -66,7 +66,7 @@ def nothing(field: Field, pooled: tuple[int, ...] | None = None) -> KeptCells:
 
 
 def write(directory: Path, kept: Mapping[tuple[str, str], KeptCells]) -> None:
-    """Write the statistics by mode and field, unless they are there; wait until they are on disk."""
+    """Write statistics by mode and field, unless they are there; wait until they are on disk."""
     arrays: dict[str, Array] = {}
     for (mode, name), (keys, cells) in kept.items():
         columns = {"keys": keys, **cells._asdict()}
