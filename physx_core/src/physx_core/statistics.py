@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from typing import Any, NamedTuple, Self
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -190,7 +190,7 @@ class Cells(NamedTuple):
 
     Attributes:
         rows: Numbers of rows, int64, shape (cells,).
-        mean, squares, minimum, maximum: float64, shape (cells, *statistics shape).
+        mean, squares, minimum, maximum: float64, shape (*statistics shape, cells).
     """
 
     rows: NDArray[np.int64]
@@ -229,8 +229,7 @@ class Cells(NamedTuple):
         squares, mean = reduce(np.add) / size, origin + mean
         mean = np.where(np.isfinite(mean), mean, low / 2 + high / 2)
         squares = np.where(np.isnan(squares), np.inf, squares)
-        columns = (np.ascontiguousarray(np.moveaxis(c, -1, 0)) for c in (mean, squares, low, high))
-        return cls(counts.astype(np.int64), *columns)
+        return cls(counts.astype(np.int64), mean, squares, low, high)
 
     @classmethod
     def one(cls, blocks: Iterable[Array], pooled: tuple[int, ...] = ()) -> Cells:
@@ -238,16 +237,16 @@ class Cells(NamedTuple):
         running = RunningStatistics(pooled)
         for block in blocks:
             running.update(block)
-        return cls(*(array[None] for array in running.arrays().values()))
+        return cls(*(array[..., None] for array in running.arrays().values()))
 
     @classmethod
     def joined(cls, parts: Sequence[Cells]) -> Cells:
         """Return the cells of all parts, in order."""
-        return cls(*map(np.concatenate, zip(*parts, strict=True)))
+        return cls(*(np.concatenate(columns, -1) for columns in zip(*parts, strict=True)))
 
-    def take(self, index: Any) -> Cells:
+    def take(self, index: NDArray[np.intp]) -> Cells:
         """Return some of the cells."""
-        return Cells(*(column[index] for column in self))
+        return Cells(self.rows[index], *(column.take(index, -1) for column in self[1:]))
 
     @_QUIET
     def merged(self) -> RunningStatistics:
@@ -255,13 +254,13 @@ class Cells(NamedTuple):
         found = RunningStatistics()
         if not len(self.rows):
             return found
-        count = self.rows.reshape(-1, *(1,) * (self.mean.ndim - 1))
-        found._start_at(self.mean[0])
+        found._start_at(self.mean[..., 0].copy())
         found.count = int(self.rows.sum())
-        apart = self.mean - self.mean[0]
-        found._mean = np.asarray((count * apart).sum(0) / found.count)
-        found._squares = np.asarray((self.squares + count * (apart - found._mean) ** 2).sum(0))
-        found._minimum, found._maximum = self.minimum.min(0), self.maximum.max(0)
+        apart = self.mean - self.mean[..., :1]
+        found._mean = np.asarray((self.rows * apart).sum(-1) / found.count)
+        apart -= found._mean[..., None]
+        found._squares = np.asarray((self.squares + self.rows * np.square(apart)).sum(-1))
+        found._minimum, found._maximum = self.minimum.min(-1), self.maximum.max(-1)
         return found
 
 

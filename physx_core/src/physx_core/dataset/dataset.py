@@ -328,8 +328,8 @@ class Dataset(EpisodeReading, Closeable):
         """Return a table with one row for each field of each mode.
 
         Returns:
-            Rows with the entries mode, field, role, dtype, shape, unit, samples, partitions and
-            bytes (of the values).
+            Rows with the entries mode, field, role, dtype, shape, unit, axes, like, samples,
+            partitions and bytes (of the values).
         """
         self._prepare_reading()
         return summarize(self._manifest, self._reader.rows)

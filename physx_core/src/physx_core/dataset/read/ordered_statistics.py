@@ -150,6 +150,8 @@ def _divide(known: ModeRows, field: Field, starts: Index, counts: Index) -> _Div
             [np.arange(*each) for each in zip(these, those, strict=True)] or [_NO]
         )
         chunks += np.split(rows, np.arange(most, len(rows), most)) if len(rows) else []
+    if not chunks:
+        return _Division(begin, end - begin, {})
     start = np.append(begin, [chunk[0] for chunk in chunks]).astype(np.intp)
     count = np.append(end - begin, [len(chunk) for chunk in chunks]).astype(np.intp)
     order = np.argsort(start, kind="stable")
@@ -210,26 +212,30 @@ class _Keeper:
 
     def find(self, cells: _Division) -> Cells:
         """Return the statistics of some cells, which are kept from now on."""
-        reader = self._reader
-        kept = reader.cells.get(self._place, nothing(self._field))
-        keys = self._keys(cells, self._live)
-        place = kept.places(keys, cells.size)
-        missing, parts = np.flatnonzero(place < 0), [kept.cells]
-        if len(missing):
-            rest, stored = cells.take(missing), self._stored()
-            there = stored.places(self._keys(rest, self._lasting), rest.size)
-            unknown = np.flatnonzero(there < 0)
-            there[unknown] = len(stored.keys) + np.arange(len(unknown))
-            place[missing] = len(kept.keys) + there
-            parts += [stored.cells, _read(self._known, self._of, rest.take(unknown))]
-        found = Cells.joined(parts).take(place)
-        if len(missing):
-            if kept.cells.mean.nbytes * _ARRAYS < 2 * _KEPT:
-                keys = np.concatenate([kept.keys, keys])
-                reader.cells[self._place] = KeptCells.of(keys, Cells.joined([kept.cells, found]))
-            else:
-                reader.cells[self._place] = KeptCells.of(keys, found)
-        return found
+        place, parts, count = np.full(len(cells.size), -1), [], 0
+        live = self._reader.cells.get(self._place, nothing(self._field))
+        for kept, identify in ((self._stored(), self._lasting), (live, self._live)):
+            missing = np.flatnonzero(place < 0)
+            if len(kept.keys) and len(missing):
+                rest = cells.take(missing)
+                there = kept.places(self._keys(rest, identify), rest.size)
+                place[missing] = np.where(there < 0, -1, count + there)
+                parts.append(kept.cells)
+                count += len(kept.keys)
+        missing = np.flatnonzero(place < 0)
+        if len(missing) or not parts:
+            rest = cells.take(missing)
+            parts.append(_read(self._known, self._of, rest))
+            place[missing] = count + np.arange(len(missing))
+            self._keep(live, KeptCells.of(self._keys(rest, self._live), parts[-1]))
+        return (parts[0] if len(parts) == 1 else Cells.joined(parts)).take(place)
+
+    def _keep(self, known: KeptCells, new: KeptCells) -> None:
+        """Keep cells in memory, beside those that are known unless these are too large."""
+        if known.cells.mean.nbytes * _ARRAYS < _KEPT:
+            keys = np.concatenate([known.keys, new.keys])
+            new = KeptCells.of(keys, Cells.joined([known.cells, new.cells]))
+        self._reader.cells[self._place] = new
 
     def stored(self) -> KeptCells:
         """Return the statistics of all cells of the mode that can be stored."""

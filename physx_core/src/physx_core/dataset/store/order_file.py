@@ -61,7 +61,7 @@ def nothing(field: Field, pooled: tuple[int, ...] | None = None) -> KeptCells:
     """Return no cells of a field, whose statistics are pooled over some axes, or as kept."""
     axes = field.pooled if pooled is None else pooled
     shape = (1 if axis in axes else size for axis, size in enumerate(field.shape or ()))
-    none = np.zeros((0, *shape))
+    none = np.zeros((*shape, 0))
     return KeptCells(np.zeros(0, np.uint64), Cells(np.zeros(0, np.int64), *(none,) * 4))
 
 
@@ -112,10 +112,10 @@ def _checked(field: Field, columns: list[Array | None]) -> KeptCells | None:
     wanted = nothing(field)
     kinds = [wanted.keys, *wanted.cells]
     known = [array for array in columns if array is not None]
-    if len(known) != len(kinds) or len({array.shape[:1] for array in known}) != 1:
+    if len(known) != len(kinds) or len({array.shape[-1:] for array in known}) != 1:
         return None
     if any(
-        a.dtype != kind.dtype or a.shape[1:] != kind.shape[1:]
+        a.dtype != kind.dtype or a.shape[:-1] != kind.shape[:-1]
         for a, kind in zip(known, kinds, strict=True)
     ):
         return None

@@ -360,8 +360,7 @@ class Learner:
             shape = values.shape[1:]
             if not (field.shape in (None, shape) or (field.is_resolution(shape) and not exactly)):
                 raise FieldShapeError(
-                    f'field "{name}" has shape {shape}, but the network takes '
-                    f"{field.shape}.",
+                    f'field "{name}" has shape {shape}, but the network takes {field.shape}.',
                     field=name,
                 )
 
