@@ -38,7 +38,6 @@ def folder(tmp_path, request):
         for start in range(0, 40, 10):
             rows = {name: values[start : start + 10] for name, values in ROWS.items()}
             if request.param == "plain":
-                rows |= {}
                 dataset.append("training", rows)
             else:
                 record = EpisodeRecord(episode=start // 10, rows=10)

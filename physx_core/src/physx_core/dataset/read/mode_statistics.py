@@ -6,6 +6,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 
@@ -20,6 +21,7 @@ from physx_core.dataset.read.ordered_statistics import (
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.store import statistics_file
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
+from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.normalization import Measured
 from physx_core.statistics import RunningStatistics
 from physx_core.typing import Index
@@ -31,14 +33,16 @@ def compute_statistics(reader: Reader, mode_name: str) -> Statistics:
     if reader.order(mode_name) is not None:
         return compute_in_order(reader, mode_name)
     statistics_file.load(reader.directory, reader.manifest)
-    for partition in mode.partitions:
-        if not partition.counted:
-            _update_running(reader, mode, partition)
+    own = {
+        partition.key: _update_running(reader, mode, partition)
+        for partition in mode.partitions
+        if not partition.counted
+    }
     count_sealed(reader.directory, reader.manifest, mode)
     found = mode.statistics or {}
     for partition in mode.partitions:
         if not partition.counted:
-            found = merge_statistics(found, partition.running)
+            found = merge_statistics(found, own[partition.key])
     return found
 
 
@@ -64,16 +68,19 @@ def count_sealed(directory: Path, manifest: Manifest, mode: Mode) -> None:
     """Merge the complete statistics of sealed partitions into those of the mode.
 
     They are merged in the order of the rows, and stored with the next change of the manifest.
-    Partitions with rows that were updated in place are left out until they have checksums again,
-    as the rows may not have reached the disk yet.
+    Partitions with rows that were updated in place are left out, with those after them, until they
+    have checksums again, as the rows may not have reached the disk yet.
     """
     statistics_file.load(directory, manifest)
     for place, partition in enumerate(mode.partitions):
         have = (partition.running.get(name) for name in mode.counted_fields)
         complete = all(s is not None and s.count == partition.rows for s in have)
-        if partition.checksums and not partition.counted and complete:
-            add_counted(manifest, mode, partition.running)
-            mode.partitions[place] = replace(partition, counted=True, running={})
+        if partition.counted:
+            continue
+        if not (partition.checksums and complete):
+            return
+        add_counted(manifest, mode, partition.running)
+        mode.partitions[place] = replace(partition, counted=True, running={})
 
 
 def add_counted(manifest: Manifest, mode: Mode, further: Mapping[str, RunningStatistics]) -> None:
@@ -95,9 +102,17 @@ def merge_statistics(
     return found
 
 
-def _update_running(reader: Reader, mode: Mode, partition: Partition) -> None:
-    """Bring the running statistics of a partition up to its last committed row."""
+def _update_running(reader: Reader, mode: Mode, partition: Partition) -> Statistics:
+    """Bring the statistics of a partition up to its last row, and return them.
+
+    While it may grow, whole blocks are kept, so that it makes no difference when they are asked for.
+    """
+    found = {}
     for name, field in mode.counted_fields.items():
-        statistics = partition.running.setdefault(name, RunningStatistics(field.pooled))
-        for block in reader.partition_blocks(partition, name, statistics.count):
-            statistics.update(block)
+        running = partition.running.setdefault(name, RunningStatistics(field.pooled))
+        for block in reader.partition_blocks(partition, name, running.count):
+            if len(block) < rows_per_block(field.nbytes) and not partition.sealed:
+                running = copy(running)
+            running.update(block)
+        found[name] = running
+    return found
