@@ -105,7 +105,7 @@ def merge_statistics(
 def _update_running(reader: Reader, mode: Mode, partition: Partition) -> Statistics:
     """Bring the statistics of a partition up to its last row, and return them.
 
-    While it may grow, whole blocks are kept, so that it makes no difference when they are asked for.
+    While it may grow, whole blocks are kept: when they are asked for makes no difference.
     """
     found = {}
     for name, field in mode.counted_fields.items():
