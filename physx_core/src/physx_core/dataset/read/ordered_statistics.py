@@ -168,7 +168,7 @@ def _joined(starts: Index, stops: Index) -> tuple[Index, Index]:
     """Return ranges in which those that follow one another are one."""
     inner = starts[1:] == stops[:-1]
     return starts[np.append(True, ~inner)[: len(starts)]], stops[
-        np.append(~inner, True)[-len(stops) :]
+        np.append(~inner, True)[: len(stops)]
     ]
 
 
