@@ -4,7 +4,18 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from physx_core import Dataset, DatasetConfig, Field, Normalization, View
+from physx_core import (
+    Dataset,
+    DatasetConfig,
+    Environment,
+    EnvironmentConfig,
+    Field,
+    NetworkConfig,
+    Normalization,
+    PhysxError,
+    Training,
+    View,
+)
 from physx_core.array_file import pack, unpack
 from physx_core.dataset import EpisodeRecord
 from physx_core.errors import ConfigError, DatasetError, FieldShapeError, FieldsMismatchError
@@ -94,13 +105,12 @@ def test_normalized_batches_of_a_dataset_broadcast(folder):
         assert_allclose(batch[name], (values - known[name].mean) / known[name].std)
 
 
+@pytest.mark.parametrize("folder", ["episodes"], indirect=True)
 def test_windows_have_the_statistics_of_their_field(folder):
     view = View(window={"past": ("next_u", [-1, 0]), "p": ("p", [0, 1]), "v": ("state", 1)})
     with Dataset.open(folder) as dataset:
-        if "episodes" not in dataset.modes:
-            pytest.skip("rows without trajectories have no windows")
         expected = dataset.normalization
-    with view.open(8, data=folder) as batches:
+    with view.open(8, data=folder, part="all") as batches:
         found = batches.normalization()
         assert batches.fields["past"].axes == ("time", *PICTURE)
         assert batches.fields["past"].like == "next_u"
@@ -230,3 +240,58 @@ def test_other_axes_are_other_fields_when_datasets_are_merged(tmp_path):
         check(dataset.normalization["u"], U, (0, 2, 3), (2, 1, 1))
         with pytest.raises(FieldsMismatchError, match="axes"):
             dataset.merge(tmp_path / "c")
+
+
+# While environments generate ---------------------------------------------------------------------
+
+
+class Growth(Environment):
+    """Sizes of many magnitudes, and the next ones."""
+
+    like = "size"
+
+    def create(self):
+        self.size = np.ones(3)
+
+    def init_database(self):
+        later = Field("later", (3,), unit="m", like=self.like)
+        self.define_training_fields([Field("size", (3,), unit="m"), later])
+
+    def step(self):
+        size, self.size = self.size, self.size * self.rng.lognormal(size=3)
+        self.set_training_data(size=size, later=self.size)
+
+
+class Lost(Growth):
+    like = "other"
+
+
+def grow(tmp_path, environment, normalize):
+    network = NetworkConfig("toy/linear", {"net_fields": "size", "opt_fields": "later"})
+    training = Training(
+        network, DatasetConfig(normalize=normalize),
+        EnvironmentConfig(environment, as_tcp_ip_client=False, seed=0),
+        session_dir=str(tmp_path), epoch_nb=1, batch_nb=3, batch_size=4, seed=0, quiet=True,
+    )  # fmt: skip
+    training.execute()
+    return training
+
+
+@pytest.mark.parametrize(
+    ("method", "axes"), [("log-field", None), ("field", None), ("component", 0)]
+)
+def test_generated_samples_are_normalized_by_field(tmp_path, method, axes):
+    training = grow(tmp_path, Growth, {"size": method})
+    found = training.learner.transformation.normalization
+    with Dataset.open(training.session.path) as dataset:
+        rows = dataset["training"]["size"][:]
+        assert len(rows) == 12
+    rows = np.log(rows) if method == "log-field" else rows
+    for name in ("size", "later"):
+        check(found[name], rows, axes, () if axes is None else (3,))
+        assert found[name].log == (method == "log-field")
+
+
+def test_a_quantity_that_an_environment_does_not_define_is_named(tmp_path):
+    with pytest.raises(PhysxError, match='Field "later" is like "other", but there is no such'):
+        grow(tmp_path, Lost, False)

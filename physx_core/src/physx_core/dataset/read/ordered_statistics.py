@@ -130,6 +130,8 @@ class _Division(NamedTuple):
 
 def _divide(known: ModeRows, field: Field, starts: Index, counts: Index) -> _Division:
     """Return the cells of ranges of rows."""
+    if not len(starts):
+        return _Division(_NO, _NO, {})
     starts, stops = _joined(starts, starts + counts)
     fewest, size = _FEWEST, _ARRAYS * _NUMBER * math.prod(field.statistics_shape)
     while known.count * size > fewest * _KEPT:
@@ -139,6 +141,7 @@ def _divide(known: ModeRows, field: Field, starts: Index, counts: Index) -> _Div
     place = np.maximum(starts.searchsorted(begin, "right") - 1, 0)
     inside = (begin >= starts[place]) & (end <= stops[place])
     begin, end = begin[inside], end[inside]
+    # What lies between these episodes, and of this what follows one another without one of them.
     other, other_end = np.sort(np.append(starts, end)), np.sort(np.append(begin, stops))
     is_some = other < other_end
     other, other_end = other[is_some], other_end[is_some]
@@ -166,10 +169,8 @@ def _divide(known: ModeRows, field: Field, starts: Index, counts: Index) -> _Div
 
 def _joined(starts: Index, stops: Index) -> tuple[Index, Index]:
     """Return ranges in which those that follow one another are one."""
-    inner = starts[1:] == stops[:-1]
-    return starts[np.append(True, ~inner)[: len(starts)]], stops[
-        np.append(~inner, True)[: len(stops)]
-    ]
+    apart = starts[1:] != stops[:-1]
+    return starts[np.append(True, apart)], stops[np.append(apart, True)]
 
 
 def _long_episodes(known: ModeRows, fewest: int) -> tuple[Index, Index]:
@@ -289,10 +290,9 @@ class _Keeper:
         first, count = self._known.order.places_of(start, start + int(cells.size[cell]))
         part = ends.searchsorted(first, "right")
         to = ends.searchsorted(first + count - 1, "right")
-        crossing = [
-            np.arange(*each) for each in zip(part, to + 1, strict=True) if each[0] < each[1]
-        ]
-        used = np.unique(np.concatenate([part, *crossing]))
+        over = np.flatnonzero(to > part)  # pieces in several partitions
+        several = [np.arange(part[piece], to[piece] + 1) for piece in over.tolist()]
+        used = np.unique(np.concatenate([part, *several]))
         if not who[used].all():
             return 0
         columns = (
