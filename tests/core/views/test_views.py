@@ -24,6 +24,7 @@ from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.dataset.read import shuffling
 from physx_core.dataset.read.access import memory
 from physx_core.errors import ConfigError, DatasetError
+from physx_core.views import sources
 from physx_core.views.folds import folds_of
 
 MANY = 10**12
@@ -478,3 +479,20 @@ def test_the_picture_of_views_is_of_those_on_the_page():
     drawn = re.findall(r'^    "(.+)": (View\(.*\)),$', script.read_text("utf-8"), re.M)
     assert drawn == re.findall(r"^\| (.+) \| `(View\(.*\))` \|$", page.read_text("utf-8"), re.M)
     assert len(drawn) == 9
+
+
+def test_rows_without_episodes_stay_in_their_part_as_others_are_added(tmp_path, monkeypatch):
+    monkeypatch.setattr(sources, "_SAME_SIZE", 10)  # blocks double after 160 rows
+    held = []
+    for count in (90, 400, 3000):
+        folder = tmp_path / str(count)
+        with Dataset.create(folder) as dataset:
+            dataset.append("training", {"x": np.arange(count, dtype=float)})
+        parts = [View().open(7, data=folder, part=p).all_rows() for p in ("training", "validation")]
+        assert_array_equal(np.sort(np.concatenate(parts)), np.arange(count))
+        held.append(parts[1])
+        for former, now in itertools.pairwise(held):  # the last block may have grown
+            assert set(former) == {row for row in now if row < former[-1] + 1}
+    assert len(held[-1]) == pytest.approx(600, rel=0.2)
+    with View().open(7, data=folder) as batches:
+        assert batches.division == ["41 of 52 blocks of rows"]

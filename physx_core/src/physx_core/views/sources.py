@@ -25,6 +25,7 @@ from physx_core.views.options import ViewOptions, Window
 
 _BLOCK, _SAME_SIZE = 16, 4096
 """Rows held back together where nothing is known of episodes, and after how many they double."""
+_NOUNS = {"episode": "episodes", "trajectory": "trajectories", "block": "blocks of rows"}
 _STATUS = {"finished": EpisodeStatus.FINISHED, "cut": EpisodeStatus.CUT}
 
 
@@ -59,28 +60,30 @@ class Source:
         self.rows = dataset.rows(mode, snapshot)
         self._view, self._drawn = view, (-1, np.zeros(0, np.intp))
         self._weights: Array | None = None
-        kind, found = self._find(part)
+        noun, found = self._find(part)
         chosen = choose_part(view, part, self._chosen(found))
         taken, known = self.trajectories = len(chosen.rows), len(found.rows)
         is_piece = part not in ("all", "training") and taken == known
-        self.division = f"{'a piece of each' if is_piece else taken} of {known} {kind}"
+        self.division = f"{'a piece of each' if is_piece else taken} of {known} {_NOUNS[noun]}"
+        if is_piece and known == 1:
+            self.division = f"a piece of the only {noun}"
         self.items = Items(view, chosen)
         self.rows.loads = self.order == "exact"
 
     def _find(self, part: Part) -> tuple[str, Trajectories]:
-        """Return the trajectories, or blocks of rows if nothing is known of any, and their name."""
+        """Return the trajectories, or blocks of rows if nothing is known of any; first, which."""
         view, rows = self._view, self.rows
         divides = part != "all" and (view.hold_back or view.test_fold is not None)
         chooses = view.windows or view.stride > 1 or view.episodes or view.where or view.weights
         if not (divides or chooses):
-            return "blocks", _blocks(np.zeros(min(1, rows.count), np.intp), rows.count)
+            return "block", _blocks(np.zeros(min(1, rows.count), np.intp), rows.count)
         try:
             found = find_trajectories(rows)
         except DatasetError:
             if chooses:
                 raise
-            return "blocks of rows", _growing_blocks(rows.count)
-        return "trajectories" if (found.campaign < 0).any() else "episodes", found
+            return "block", _growing_blocks(rows.count)
+        return "trajectory" if (found.campaign < 0).any() else "episode", found
 
     def _chosen(self, found: Trajectories) -> Trajectories:
         """Return the trajectories that the view names."""
