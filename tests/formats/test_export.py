@@ -418,3 +418,34 @@ def test_memory_holds_a_few_blocks(folder, tmp_path, to):
         _, peak = tracemalloc.get_traced_memory()
         tracemalloc.stop()
     assert peak < 60e6  # the rows are 80 MB
+
+
+def test_names_of_axes_survive_an_export_and_name_its_dimensions(tmp_path):
+    zarr = pytest.importorskip("zarr")
+    picture = ("channel", "y", "x")
+    fields = {
+        "u": Field("u", (2, 3, 4), axes=picture, unit="m"),
+        "v": Field("v", (2, 3, 4), axes=picture, unit="m", like="u"),
+        "w": Field("w", (5, 3), axes=("node", "channel")),
+        "plain": Field("plain", (2,)),
+    }
+    with Dataset.create(tmp_path / "data") as dataset:
+        dataset.define_fields("training", fields.values())
+        dataset.append("training", {n: np.ones((6, *of.shape)) for n, of in fields.items()})
+        for form, name in (("zarr", "out.zarr"), ("npz", "out.npz"), ("hdf5-single", "out.h5")):
+            export(dataset, form, tmp_path / name)
+    group = zarr.open_group(str(tmp_path / "out.zarr"), mode="r")["training"]
+    names = {name: group[name].metadata.dimension_names for name in fields}
+    assert names["u"] == ("sample", "u_channel", "y", "x")  # of another length than in "w"
+    assert names["v"] == ("sample", "v_channel", "y", "x")
+    assert names["w"] == ("sample", "node", "w_channel")
+    assert names["plain"] == ("sample", "plain_0")
+    with h5py.File(tmp_path / "out.h5") as file:
+        assert [axis.label for axis in file["training/u"].dims] == ["sample", *picture]
+    for name in ("out.npz", "out.h5"):
+        import_file(tmp_path / name, tmp_path / f"from_{name}")
+        with Dataset.open(tmp_path / f"from_{name}") as dataset:
+            assert dataset.fields("training") == fields
+    import_file(tmp_path / "out.npz", tmp_path / "part", fields=["v"])
+    with Dataset.open(tmp_path / "part") as dataset:
+        assert dataset.fields("training")["v"].like == ""

@@ -19,13 +19,13 @@ from .config import NetworkConfig as NetworkConfig
 from .dataset import Dataset as Dataset
 from .errors import PhysxError as PhysxError
 from .fields import Field as Field
+from .normalization import Normalization as Normalization
 from .observers import read_scalars as read_scalars
 from .openmp import limit_openmp_spin as limit_openmp_spin
 from .pipelines import DataGeneration as DataGeneration
 from .pipelines import Prediction as Prediction
 from .pipelines import Replay as Replay
 from .pipelines import Training as Training
-from .statistics import Normalization as Normalization
 from .version import __version__ as __version__
 from .views import Batches as Batches
 from .views import DatasetConfig as DatasetConfig

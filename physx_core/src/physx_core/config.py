@@ -407,6 +407,8 @@ def set_option(where: str, tables: dict[str, Any], path: Sequence[str], value: A
     *places, name = path
     table = tables
     for place in places:
+        if isinstance(table.get(place), bool):  # a switch that may also be a table
+            table[place] = {}
         table = table.setdefault(place, {})
         if not isinstance(table, dict):
             raise ConfigError(f"{where} names an option in {place}, which is not a table.")

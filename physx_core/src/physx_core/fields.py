@@ -12,7 +12,13 @@ import numpy as np
 from numpy.typing import DTypeLike
 
 from physx_core import checks
-from physx_core.errors import ConfigError, FieldShapeError, FieldTypeError, NotFiniteError
+from physx_core.errors import (
+    ConfigError,
+    FieldShapeError,
+    FieldTypeError,
+    NotFiniteError,
+    nearest,
+)
 from physx_core.typing import Array
 
 Role: TypeAlias = Literal["training", "additional", "episode"]
@@ -30,6 +36,9 @@ _FITTING = {"b": "b", "i": "biu", "u": "biu", "f": "biuf", "c": NUMBERS}
 NO_ARRAY = (ValueError, TypeError, OverflowError, RuntimeError)
 """Exceptions of `np.asarray` for values that are ragged or cannot be converted to an array."""
 
+CHANNEL = "channel"
+"""Name of the axis whose entries are different quantities, such as the components of a velocity."""
+
 _SMALL = 8192  # elements
 
 
@@ -44,6 +53,11 @@ class Field:
         unit: Unit of the values, for example ``"N m"``; empty for dimensionless numbers.
         role: ``training`` for data that networks read, ``episode`` for what a whole independent
             episode has once, ``additional`` for everything else.
+        axes: Names of the axes of a value, as many as it has, for example ``("channel", "y",
+            "x")``; empty if they have none. Statistics of two or more named axes are pooled over
+            all but ``"channel"``, so they fit values of any resolution.
+        like: Name of the field that is the same quantity, with the same unit: this one is
+            normalized by its statistics. Empty: it is a quantity of its own.
     """
 
     name: str
@@ -51,13 +65,15 @@ class Field:
     dtype: DTypeLike = "float64"
     unit: str = ""
     role: Role = "training"
+    axes: tuple[str, ...] = ()
+    like: str = ""
 
     def __post_init__(self) -> None:
         """Check the name, and normalize shape and type.
 
         Raises:
-            ConfigError: If the name is not an identifier, the shape is invalid, or the type is not
-                a plain one.
+            ConfigError: If the name is not an identifier, the shape is invalid, the type is not a
+                plain one, or the axes have other names than identifiers, or too many or too few.
         """
         if not isinstance(self.name, str) or not self.name.isidentifier():
             raise ConfigError(f"A field's name must be a Python identifier, not {self.name!r}.")
@@ -74,6 +90,11 @@ class Field:
         object.__setattr__(self, "dtype", dtype.newbyteorder("<").str)
         if self.shape is not None:
             object.__setattr__(self, "shape", _shape(self.name, self.shape))
+        object.__setattr__(self, "axes", _axes(self.name, self.axes, self.shape))
+        if not isinstance(self.like, str) or (self.like and not self.like.isidentifier()):
+            raise ConfigError(
+                f'Field "{self.name}": like is {self.like!r} but must be the name of a field.'
+            )
 
     @cached_property
     def numpy_dtype(self) -> np.dtype[Any]:
@@ -85,6 +106,31 @@ class Field:
         """Size of one sample's value in bytes; 0 while the shape is unknown."""
         count = math.prod(self.shape) if self.shape is not None else 0
         return count * self.numpy_dtype.itemsize
+
+    @property
+    def has_statistics(self) -> bool:
+        """Whether it has statistics: floating-point fields do, unless physx adds them."""
+        return self.name not in RESERVED and self.numpy_dtype.kind == "f"
+
+    @property
+    def pooled(self) -> tuple[int, ...]:
+        """The axes that its statistics are pooled over: of several named ones, not the channels."""
+        if len(self.axes) < 2 or not self.shape or 0 in self.shape:
+            return ()
+        return tuple(place for place, name in enumerate(self.axes) if name != CHANNEL)
+
+    @property
+    def statistics_shape(self) -> tuple[int, ...]:
+        """Shape of its statistics: that of a value, but 1 for the axes they are pooled over."""
+        return tuple(1 if i in self.pooled else n for i, n in enumerate(self.shape or ()))
+
+    def is_resolution(self, shape: tuple[int, ...]) -> bool:
+        """Return whether a shape differs from its own only in the axes that are `pooled`."""
+        own = self.shape or ()
+        sizes = enumerate(zip(own, shape, strict=False))
+        return len(own) == len(shape) and all(
+            here == there or axis in self.pooled for axis, (here, there) in sizes
+        )
 
     def converted_dtype(self, dtype: np.dtype[Any] | None) -> np.dtype[Any]:
         """Return the type of the values if floating-point fields are converted to `dtype`."""
@@ -133,6 +179,8 @@ class Field:
                 text = "is a single value; rows have shape (n, *field shape)"
             elif self.shape is not None and array.shape[axes:] != self.shape:
                 text = f"has shape {array.shape[axes:]} but is defined as {self.shape}"
+            elif self.axes and array.ndim - axes != len(self.axes):
+                text = f"has shape {array.shape[axes:]} but the axes {self.axes}"
             elif array.dtype == self.numpy_dtype:
                 return array
             else:
@@ -167,6 +215,10 @@ class Field:
             plain["shape"] = list(self.shape)
         if self.unit:
             plain["unit"] = self.unit
+        if self.axes:
+            plain["axes"] = list(self.axes)
+        if self.like:
+            plain["like"] = self.like
         return plain
 
     @classmethod
@@ -179,6 +231,8 @@ class Field:
             dtype=plain["dtype"],
             unit=plain.get("unit", ""),
             role=plain.get("role", "training"),
+            axes=tuple(plain.get("axes", ())),
+            like=plain.get("like", ""),
         )
 
 
@@ -193,6 +247,62 @@ def _shape(name: str, given: Any) -> tuple[int, ...]:
     if min(shape, default=0) < 0:
         raise ConfigError(f"{where} is {given!r} but must not be negative.")
     return shape
+
+
+def _axes(name: str, given: Any, shape: tuple[int, ...] | None) -> tuple[str, ...]:
+    """Return the names of axes: one, or several."""
+    try:
+        names = (given,) if isinstance(given, str) else tuple(given)
+    except TypeError:
+        names = (None,)
+    where = f'Field "{name}": the axes'
+    if not all(isinstance(each, str) and each.isidentifier() for each in names):
+        raise ConfigError(f"{where} are {given!r} but must have names that are identifiers.")
+    if len(set(names)) < len(names):
+        raise ConfigError(f"{where} {names} have the same name twice.")
+    if names and shape is not None and len(names) != len(shape):
+        raise ConfigError(f"{where} are {names}, but its shape is {shape}: name each of its axes.")
+    return names
+
+
+def check_quantities(fields: Mapping[str, Field]) -> None:
+    """Check the fields that are the same quantity as another one: see `Field.like`.
+
+    Args:
+        fields: All fields of a mode by name.
+
+    Raises:
+        ConfigError: If the other one does not exist or is itself like a third one, or they differ
+            in unit, or in a shape that statistics of both could have.
+    """
+    for name, field in fields.items():
+        if not field.like:
+            continue
+        where, other = f'Field "{name}" is like "{field.like}"', fields.get(field.like)
+        if other is None:
+            raise ConfigError(f"{where}, but there is no such field.{nearest(field.like, fields)}")
+        if other.like or other is field:
+            raise ConfigError(f'{where}, which is like "{other.like}": name the first of them.')
+        if field.unit != other.unit:
+            raise ConfigError(f"{where}, but has the unit {field.unit!r}, not {other.unit!r}.")
+        if not _is_like(field, other):
+            raise ConfigError(
+                f"{where}, but has the shape {field.shape}, which neither ends with "
+                f'{other.shape} nor has as many entries on a named axis "{CHANNEL}".'
+            )
+
+
+def _is_like(field: Field, other: Field) -> bool:
+    """Return whether statistics of one field can be those of another one."""
+    if field.shape is None or other.shape is None:
+        return True
+    if field.shape[len(field.shape) - len(other.shape) :] == other.shape:
+        return len(field.shape) >= len(other.shape)
+    return bool(field.axes and other.axes) and _channels(field) == _channels(other)
+
+
+def _channels(field: Field) -> int | None:
+    return (field.shape or ())[field.axes.index(CHANNEL)] if CHANNEL in field.axes else None
 
 
 FieldLike: TypeAlias = Field | tuple[str, Any] | str

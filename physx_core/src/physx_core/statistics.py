@@ -1,11 +1,10 @@
-"""Running mean, standard deviation, minimum, and maximum of each component of a field."""
+"""Mean, deviation, minimum, and maximum of the components of a field, which can be merged."""
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Self
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,52 +13,16 @@ from physx_core.typing import Array
 
 Doubles = NDArray[np.float64]
 _WIDTH = 512
+_NARROW = 16  # components
 _QUIET = np.errstate(over="ignore", invalid="ignore")
-_NORMALIZATION = ("mean", "std", "minimum", "maximum")
 _MERGEABLE = {"count", "mean", "squares", "minimum", "maximum"}
-
-
-@dataclass(frozen=True)
-class Normalization:
-    """Statistics of each component of a field; mean and standard deviation normalize it.
-
-    Attributes:
-        mean: Mean, of the field's shape, float64, in the field's unit.
-        std: Standard deviation, of the field's shape, float64, in the field's unit; 1 for a
-            constant component, so that normalization only shifts it to 0.
-        minimum: Smallest value, of the field's shape, float64, in the field's unit; None if
-            unknown.
-        maximum: Largest value, like `minimum`.
-    """
-
-    mean: Array
-    std: Array
-    minimum: Array | None = None
-    maximum: Array | None = None
-
-    def arrays(self) -> dict[str, Array]:
-        """Return the known statistics by name, for a file or another process."""
-        known = ((name, getattr(self, name)) for name in _NORMALIZATION)
-        return {name: values for name, values in known if values is not None}
-
-    @classmethod
-    def from_arrays(cls, arrays: Mapping[str, Array], shape: tuple[int, ...]) -> Normalization:
-        """Return the normalization that `arrays` described.
-
-        Args:
-            arrays: The statistics by name, possibly from an untrusted source.
-            shape: Shape of the field.
-
-        Raises:
-            ValueError: If they are not the finite statistics of such a field.
-        """
-        if not {"mean", "std"} <= arrays.keys() <= set(_NORMALIZATION):
-            raise ValueError(f"the statistics {sorted(arrays)} are not those of a normalization")
-        return cls(**{name: _checked(name, array, shape) for name, array in arrays.items()})
 
 
 class RunningStatistics:
     """Mean, standard deviation, minimum, and maximum of all rows so far, in float64.
+
+    They are those of each component, or of all components along some axes, which are 1 in their
+    shape.
 
     Blocks are combined by the update of Chan, Golub and LeVeque (1979), "Updating formulae and a
     pairwise algorithm for computing sample variances". Values are relative to the first row, so a
@@ -71,11 +34,18 @@ class RunningStatistics:
         count: Number of rows so far.
     """
 
-    def __init__(self) -> None:
+    def __init__(self, pooled: tuple[int, ...] = ()) -> None:
+        """Start without rows.
+
+        Args:
+            pooled: Axes of a value to pool over.
+        """
         self.count = 0
+        self._pooled = pooled
         self._origin: Doubles = np.zeros(())
         self._mean: Doubles = np.zeros(())  # relative to the origin
-        self._squares: Doubles = np.zeros(())  # sum of squared deviations from the mean
+        # Sum over the rows of squared deviations from the mean; of pooled ones, of their mean.
+        self._squares: Doubles = np.zeros(())
         self._minimum: Doubles = np.zeros(())
         self._maximum: Doubles = np.zeros(())
 
@@ -112,13 +82,18 @@ class RunningStatistics:
         if not count:
             return
         if not self.count:
-            self._start_at(np.array(block[0], np.float64))
-        self._widen(_over_rows(np.minimum, block), _over_rows(np.maximum, block))
+            self._start_at(np.array(block[0][_leading(block.ndim - 1, self._pooled)], np.float64))
+        self._widen(self._reduce(np.minimum, block), self._reduce(np.maximum, block))
         deviations = np.subtract(block, self._origin, dtype=np.float64)
-        mean = _over_rows(np.add, deviations) / count
+        size = math.prod(block.shape[1 + axis] for axis in self._pooled)
+        mean = self._reduce(np.add, deviations) / (count * size)
         deviations -= mean
-        squares = _over_rows(np.add, np.square(deviations, out=deviations))
+        squares = self._reduce(np.add, np.square(deviations, out=deviations)) / size
         self._combine(count, mean, squares)
+
+    def _reduce(self, function: np.ufunc, rows: Array) -> Array:
+        found = _over_rows(function, rows)
+        return np.asarray(function.reduce(found, axis=self._pooled, keepdims=True))
 
     @_QUIET
     def merge(self, other: RunningStatistics) -> None:
@@ -136,12 +111,20 @@ class RunningStatistics:
         self._widen(other._minimum, other._maximum)
         self._combine(other.count, np.asarray(mean - self._origin), other._squares)
 
-    def normalization(self) -> Normalization:
-        """Return the normalization; the deviation is 1 where values differ only by rounding."""
-        mean, std = self.mean, self.std
-        resolution = 4 * np.finfo(np.float64).eps * np.abs(mean)
-        std = np.where(std > resolution, std, 1.0)
-        return Normalization(mean, std, self._minimum, self._maximum)
+    @_QUIET
+    def pool(self) -> RunningStatistics:
+        """Return the statistics of all components together, of shape (1, ..., 1)."""
+        found, means = RunningStatistics(), self.mean
+        if not means.size:
+            return self
+        axes = tuple(range(means.ndim))
+        found._start_at(means[(slice(1),) * means.ndim])
+        found._mean = (means - found._origin).mean(axes, keepdims=True)
+        squares = self._squares + self.count * (means - found._origin - found._mean) ** 2
+        found._squares, found.count = squares.mean(axes, keepdims=True), self.count
+        found._minimum = self._minimum.min(axes, keepdims=True)
+        found._maximum = self._maximum.max(axes, keepdims=True)
+        return found
 
     def arrays(self) -> dict[str, Array]:
         """Return all that is needed to merge them, by name, for a file or another process.
@@ -179,9 +162,9 @@ class RunningStatistics:
         if squares.dtype != np.float64 or squares.shape != shape or not (squares >= 0).all():
             raise ValueError("the squares are invalid")
         statistics = cls()
-        statistics._start_at(_checked("mean", arrays["mean"], shape))
-        statistics._minimum = _checked("minimum", arrays["minimum"], shape)
-        statistics._maximum = _checked("maximum", arrays["maximum"], shape)
+        statistics._start_at(check_statistic("mean", arrays["mean"], shape))
+        statistics._minimum = check_statistic("minimum", arrays["minimum"], shape)
+        statistics._maximum = check_statistic("maximum", arrays["maximum"], shape)
         statistics._squares, statistics.count = squares.copy(), int(count)
         return statistics
 
@@ -202,11 +185,95 @@ class RunningStatistics:
         self.count = total
 
 
-def _checked(name: str, array: Array, shape: tuple[int, ...]) -> Doubles:
+class Cells(NamedTuple):
+    """Statistics of several sets of rows, each apart, as `RunningStatistics.arrays` has them.
+
+    Attributes:
+        rows: Numbers of rows, int64, shape (cells,).
+        mean, squares, minimum, maximum: float64, shape (*statistics shape, cells).
+    """
+
+    rows: NDArray[np.int64]
+    mean: Doubles
+    squares: Doubles
+    minimum: Doubles
+    maximum: Doubles
+
+    @classmethod
+    @_QUIET
+    def of(cls, rows: Array, counts: NDArray[np.intp], pooled: tuple[int, ...] = ()) -> Cells:
+        """Return the statistics of rows, of each cell only from its own.
+
+        Args:
+            rows: The rows of all cells, one cell after another, shape (rows, *field shape).
+            counts: Numbers of rows, at least 1, shape (cells,).
+            pooled: Axes of a value to pool over.
+        """
+        begins, shape = np.cumsum(counts) - counts, rows.shape[1:]
+        if not 0 < math.prod(shape) <= _NARROW:  # reducing parts of an array is slow if it is wide
+            parts = [rows[begin : begin + n] for begin, n in zip(begins, counts, strict=True)]
+            return cls.joined([cls.one([part], pooled) for part in parts])
+
+        def reduce(function: np.ufunc) -> Array:
+            found: Array = function.reduceat(values, begins, -1)
+            return np.asarray(function.reduce(found, axis=pooled, keepdims=True))
+
+        values = np.ascontiguousarray(np.moveaxis(rows, 0, -1), np.float64)
+        size = math.prod(shape[axis] for axis in pooled)
+        low, high = reduce(np.minimum), reduce(np.maximum)
+        origin = values[..., begins][_leading(len(shape), pooled)]
+        values -= np.repeat(origin, counts, -1)
+        mean = reduce(np.add) / (counts * size)
+        values -= np.repeat(mean, counts, -1)
+        np.square(values, out=values)
+        squares, mean = reduce(np.add) / size, origin + mean
+        mean = np.where(np.isfinite(mean), mean, low / 2 + high / 2)
+        squares = np.where(np.isnan(squares), np.inf, squares)
+        return cls(counts.astype(np.int64), mean, squares, low, high)
+
+    @classmethod
+    def one(cls, blocks: Iterable[Array], pooled: tuple[int, ...] = ()) -> Cells:
+        """Return the statistics of a single cell, whose rows come in blocks."""
+        running = RunningStatistics(pooled)
+        for block in blocks:
+            running.update(block)
+        return cls(*(array[..., None] for array in running.arrays().values()))
+
+    @classmethod
+    def joined(cls, parts: Sequence[Cells]) -> Cells:
+        """Return the cells of all parts, in order."""
+        return cls(*(np.concatenate(columns, -1) for columns in zip(*parts, strict=True)))
+
+    def take(self, index: NDArray[np.intp]) -> Cells:
+        """Return some of the cells."""
+        return Cells(self.rows[index], *(column.take(index, -1) for column in self[1:]))
+
+    @_QUIET
+    def merged(self) -> RunningStatistics:
+        """Return the statistics of all rows; they depend on the cells and their order alone."""
+        found = RunningStatistics()
+        if not len(self.rows):
+            return found
+        found._start_at(self.mean[..., 0].copy())
+        found.count = int(self.rows.sum())
+        apart = self.mean - self.mean[..., :1]
+        found._mean = np.asarray((self.rows * apart).sum(-1) / found.count)
+        apart -= found._mean[..., None]
+        found._squares = np.asarray((self.squares + self.rows * np.square(apart)).sum(-1))
+        found._minimum, found._maximum = self.minimum.min(-1), self.maximum.max(-1)
+        return found
+
+
+def check_statistic(name: str, array: Array, shape: tuple[int, ...]) -> Doubles:
     """Return a copy of a statistic after checking its type, shape and values."""
     if array.dtype != np.float64 or array.shape != shape or not np.isfinite(array).all():
         raise ValueError(f"the {name} is invalid")
     return array.copy()
+
+
+def _leading(ndim: int, pooled: tuple[int, ...]) -> tuple[slice, ...]:
+    """Return the index of the first of the values that are pooled, of each component."""
+    return tuple(slice(1) if axis in pooled else slice(None) for axis in range(ndim))
 
 
 def _over_rows(function: np.ufunc, rows: Array) -> Array:

@@ -89,6 +89,8 @@ def _write_field(group: Any, table: Table, name: str, compression: str | None, s
         options = {"compression": compression, "shuffle": True, "chunks": (rows, *shape[1:])}
     stored = group.create_dataset(name, shape, np.dtype(field.dtype), **options)
     stored.attrs["unit"], stored.attrs["role"] = field.unit, field.role
+    for axis, label in enumerate(("sample", *field.axes) if field.axes else ()):
+        stored.dims[axis].label = label
     for start, block in table.column(name):
         stored[start : start + len(block)] = block
         sink.check()

@@ -7,6 +7,7 @@ import math
 import re
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from pathlib import Path
 
 from physx_core.config import MODES
@@ -203,7 +204,8 @@ def _make_fields(path: Path, mode: str, columns: Columns, notes: Notes) -> dict[
             "belong together with fields (--fields on the command line)."
         )
     noted = mode if mode in notes.modes else next(iter(notes.modes), mode)
-    return {name: notes.field(noted, name, column) for name, column in columns.items()}
+    fields = {name: notes.field(noted, name, column) for name, column in columns.items()}
+    return {n: f if f.like in fields else replace(f, like="") for n, f in fields.items()}
 
 
 def _copy(

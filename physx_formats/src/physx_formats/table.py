@@ -162,7 +162,7 @@ class Notes:
     """Notes of a file about its rows; empty if physx did not write it.
 
     Attributes:
-        modes: Mode to the fields by name, for their units and roles.
+        modes: Mode to the fields by name, for their units, roles, axes and what they are like.
         info: Where the data come from.
     """
 
@@ -185,11 +185,14 @@ class Notes:
             return cls()  # only notes are lost
 
     def field(self, mode: str, name: str, column: Column) -> Field:
-        """Return the field of a column, with its noted unit and role, if any."""
+        """Return the field of a column, with what is noted of it."""
         known = self.modes.get(mode, {}).get(name)
         role: Role = "additional" if name in RESERVED else "training"
-        unit, role = (known.unit, known.role) if known is not None else (column.unit, role)
-        return Field(name, column.shape[1:], column.dtype, unit, role)
+        shape = column.shape[1:]
+        if known is None:
+            return Field(name, shape, column.dtype, column.unit, role)
+        axes = known.axes if len(known.axes) == len(shape) else ()
+        return Field(name, shape, column.dtype, known.unit, known.role, axes, known.like)
 
 
 def import_library(name: str, purpose: str, extra: str) -> Any:

@@ -56,7 +56,7 @@ def _write_field(group: Any, table: Table, name: str, codecs: list[Any] | None) 
             dtype=np.dtype(field.dtype),
             chunks=(min(step, table.rows), *(max(1, length) for length in shape)),
             compressors=codecs,
-            dimension_names=["sample", *(f"{name}_{axis}" for axis in range(len(shape)))],
+            dimension_names=["sample", *_dimensions(table, name)],
             attributes={"unit": field.unit, "role": field.role},
         )
     except (ValueError, TypeError) as error:
@@ -66,6 +66,24 @@ def _write_field(group: Any, table: Table, name: str, codecs: list[Any] | None) 
     for start, block in table.column(name, step):
         if field.nbytes:
             stored[start : start + len(block)] = block
+
+
+def _dimensions(table: Table, name: str) -> list[str]:
+    """Return the names of a field's axes; in other fields, an axis of that name is as long."""
+    field = table.fields[name]
+    names = list(field.axes) or [str(axis) for axis in range(len(field.shape or ()))]
+    return [
+        axis if field.axes and _length(table, axis) is not None else f"{name}_{axis}"
+        for axis in names
+    ]
+
+
+def _length(table: Table, axis: str) -> int | None:
+    """Return the length of an axis; None if it is not the same in all fields."""
+    found = {
+        (of.shape or ())[of.axes.index(axis)] for of in table.fields.values() if axis in of.axes
+    }
+    return found.pop() if len(found) == 1 and axis != "sample" else None
 
 
 FORMAT = Format(write=write, compressions=COMPRESSIONS, several=True)

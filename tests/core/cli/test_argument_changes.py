@@ -5,9 +5,10 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
+import numpy as np
 import pytest
 
-from physx_core import NetworkConfig
+from physx_core import Dataset, NetworkConfig
 from physx_core.cli import main
 from physx_core.config import read_toml
 from physx_core.errors import UnknownOptionError
@@ -184,3 +185,66 @@ def test_help_and_completion_mention_single_arguments(verb, option, capsys):
     assert capsys.readouterr().out.split() == []
     assert main(["completion", "after", verb, f"{option}.a", "3"]) == 0
     assert f"{option}.NAME" in capsys.readouterr().out.split()
+
+
+# Normalization: a switch, or a table ------------------------------------------------------------
+
+
+TRAIN = [
+    *("train", "--network.network", "toy/linear", "--dataset.existing-dir", "data"),
+    *("--batch-size", "10", "--quiet"),
+]
+
+
+def store_samples():
+    with Dataset.create("data") as dataset:
+        widths = {"state": 2, "force": 1, "next_state": 2}
+        random = np.random.default_rng(0)
+        dataset.append("training", {n: random.random((20, w)) for n, w in widths.items()})
+
+
+@pytest.mark.parametrize(
+    ("file", "words", "expected"),
+    [
+        (None, [], False),
+        (None, ["--dataset.normalize"], True),
+        ("true", ["--dataset.normalize", "False"], False),
+        ("true", ["--dataset.normalize.state", "field"], {"state": "field"}),
+        (None, ["--dataset.normalize.state", "field"], {"state": "field"}),
+        (
+            '{state = "none"}',
+            ["--dataset.normalize.next_state", "field"],
+            {"state": "none", "next_state": "field"},
+        ),
+        ('{state = "none"}', ["--dataset.normalize", "next_state=field"], {"next_state": "field"}),
+    ],
+)  # fmt: skip
+def test_normalization_is_switched_on_or_chosen_by_field(
+    tmp_path, monkeypatch, file, words, expected
+):
+    monkeypatch.chdir(tmp_path)
+    store_samples()
+    if file is not None:
+        Path("run.toml").write_text(f"[training.dataset]\nnormalize = {file}\n")
+        words = ["--config", "run.toml", *words]
+    assert main([*TRAIN, "--session-name", "run", "--epoch-nb", "1", *words]) == 0
+    options = read_toml("sessions/run/config.toml")["training"]["dataset"]
+    assert options["normalize"] == expected
+    found = load_learner("sessions/run").transformation.normalization
+    kinds = expected if isinstance(expected, dict) else {}
+    for name in ("state", "next_state"):
+        assert (name in found) == (expected is not False and kinds.get(name) != "none")
+        if kinds.get(name) == "field":
+            assert found[name].mean.shape == ()
+
+
+def test_a_method_or_field_that_does_not_exist_is_named(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    store_samples()
+    for words, text in (
+        (["--dataset.normalize.state", "chanel"], "state is 'chanel' but must be one of"),
+        (["--dataset.normalize.stat", "field"], 'Did you mean "state"?'),
+        (["--dataset.normalize.state", "channel"], "no axis named"),
+    ):
+        assert main([*TRAIN, "--epoch-nb", "1", *words]) != 0
+        assert text in " ".join(capsys.readouterr().err.split())

@@ -38,7 +38,8 @@ def test_units_and_roles_are_kept(dataset, folder):
         assert fields["tau"] == FIELDS[1] and fields["seen"] == FIELDS[2]
         assert again.describe()[1] == {
             "mode": "training", "field": "tau", "role": "training", "dtype": "float32",
-            "shape": (7,), "unit": "N m", "samples": 2, "partitions": 1, "bytes": 56,
+            "shape": (7,), "unit": "N m", "axes": (), "like": "", "samples": 2,
+            "partitions": 1, "bytes": 56,
         }  # fmt: skip
 
 

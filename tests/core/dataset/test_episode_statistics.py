@@ -2,17 +2,20 @@
 
 import numpy as np
 import pytest
-from numpy.testing import assert_array_equal
+from numpy.testing import assert_allclose, assert_array_equal
 
-from physx_core import Dataset
+from physx_core import Dataset, View
 from physx_core.dataset import EpisodeRecord
 from physx_core.dataset.read import ordered_statistics
 from physx_core.dataset.read.reader import Reader
 
 
-@pytest.fixture(autouse=True)
-def small_grid(monkeypatch):
-    monkeypatch.setattr(ordered_statistics, "_GRID", 8)
+@pytest.fixture(autouse=True, params=[(4, 8), (6, 8)], ids=["long", "short"])
+def cells(request, monkeypatch):
+    """Rows of an episode that has statistics of its own, and of other rows that have."""
+    monkeypatch.setattr(ordered_statistics, "_FEWEST", request.param[0])
+    monkeypatch.setattr(ordered_statistics, "_MOST", request.param[1])
+    return request.param[0] if request.param[0] > 5 else 5
 
 
 @pytest.fixture
@@ -36,18 +39,17 @@ def statistics(dataset):
 @pytest.fixture
 def rows_read(monkeypatch):
     """How many rows have been read."""
-    count = [0]
-    cell = ordered_statistics._cell
+    count, read = [0], ordered_statistics._read
 
-    def counted(view, start, stop):
-        count[0] += stop - start
-        return cell(view, start, stop)
+    def counted(known, of, cells):
+        count[0] += int(cells.size.sum())
+        return read(known, of, cells)
 
-    monkeypatch.setattr(ordered_statistics, "_cell", counted)
+    monkeypatch.setattr(ordered_statistics, "_read", counted)
     return count
 
 
-def test_whoever_opens_the_dataset_reads_less_than_a_cell(folder, rows_read):
+def test_whoever_opens_the_dataset_reads_no_rows(folder, rows_read, cells):
     with Dataset.create(folder) as dataset:
         store(dataset, *range(20, 0, -1))
         assert rows_read[0] == 0
@@ -55,20 +57,39 @@ def test_whoever_opens_the_dataset_reads_less_than_a_cell(folder, rows_read):
     rows_read[0] = 0
     with Dataset.open(folder) as dataset:
         assert statistics(dataset) == expected
-        assert rows_read[0] == 100 % 8
+        assert rows_read[0] == 0
     with Dataset.open(folder, writable=True) as dataset:
         store(dataset, *range(21, 31))
         rows_read[0] = 0
-    assert rows_read[0] == 150 - 96
+    assert rows_read[0] == (50 if cells == 5 else 150 - 96)
     rows_read[0] = 0
     with Dataset.open(folder) as dataset:
         now = statistics(dataset)
-        assert rows_read[0] == 150 % 8
+        assert rows_read[0] == 0
         dataset.recompute_normalization()
+        assert rows_read[0] == 150
         assert statistics(dataset) == now
     next(folder.glob("order_*")).unlink()
     with Dataset.open(folder) as dataset:
         assert statistics(dataset) == now
+
+
+def test_a_fold_of_long_episodes_reads_no_rows(folder, rows_read, cells):
+    with Dataset.create(folder) as dataset:
+        store(dataset, *range(20, 0, -1))
+    for fold in range(5):
+        rows_read[0] = 0
+        view = View(fold=fold)
+        with view.open(8, data=folder) as batches:
+            found = batches.normalization()["x"]
+            rows = batches.all_rows()
+        assert (rows_read[0] == 0) == (cells == 5)
+        with Dataset.open(folder) as dataset:
+            x = dataset["training"]["x"][rows]
+        assert_allclose(found.mean, x.mean(axis=0), rtol=1e-12)
+        assert_allclose(found.std, x.std(axis=0), rtol=1e-12)
+        assert_array_equal(found.minimum, x.min(axis=0))
+        assert_array_equal(found.maximum, x.max(axis=0))
 
 
 def test_changed_rows_records_and_files_are_noticed(folder):

@@ -11,7 +11,7 @@ from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
 from physx_core.fields import Field
-from physx_core.statistics import Normalization
+from physx_core.normalization import Normalization
 
 FORMAT_VERSION = 3
 """Version of the description; earlier ones have the normalization as text, and are refused."""

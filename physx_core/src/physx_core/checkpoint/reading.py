@@ -40,9 +40,9 @@ from physx_core.checkpoint.description import (
 )
 from physx_core.errors import CheckpointError, PhysxError, listed
 from physx_core.fields import Field
+from physx_core.normalization import Normalization
 from physx_core.origin import install_hint
 from physx_core.parsing import parse_toml
-from physx_core.statistics import Normalization
 from physx_core.typing import Array, Index
 
 _END_PATTERN = re.compile(rb'\n\[checksum\]\ncrc32 = "([0-9a-f]{8})"\n')

@@ -41,7 +41,7 @@ from physx_core.components.optimization import Optimization
 from physx_core.config import NetworkConfig, to_plain
 from physx_core.errors import CheckpointError, PhysxError, SessionError, listed
 from physx_core.fields import Field
-from physx_core.statistics import Normalization
+from physx_core.normalization import Normalization
 from physx_core.typing import Array, Index
 
 _FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)

@@ -55,6 +55,26 @@ def argument_registry() -> ConstructorRegistry:
         )
 
     @registry.primitive_rule
+    def switch_or_table(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
+        if info.type != bool | dict[str, str]:
+            return None
+        return PrimitiveConstructorSpec(
+            nargs="*",
+            metavar="[True|False|NAME=VALUE ...]",
+            instance_from_str=lambda words: (
+                dict(_argument(word) for word in words)
+                if any("=" in word for word in words)
+                else bool(_switched(words))
+            ),
+            is_instance=lambda value: isinstance(value, (bool, dict)),
+            str_from_instance=lambda value: (
+                [f"{name}={item}" for name, item in value.items()]
+                if isinstance(value, dict)
+                else [str(value)]
+            ),
+        )
+
+    @registry.primitive_rule
     def switch(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
         if info.type != bool | None:
             return None

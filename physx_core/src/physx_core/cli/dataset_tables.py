@@ -14,7 +14,8 @@ from physx_core.config import read_toml
 from physx_core.dataset import EPISODES, Dataset, Progress
 from physx_core.dataset.read.episodes import episode_lengths
 from physx_core.errors import ConfigError, DatasetError
-from physx_core.statistics import Normalization
+from physx_core.fields import CHANNEL, Field
+from physx_core.normalization import Normalization
 from physx_core.typing import Array
 
 _SMALL = 9
@@ -80,16 +81,18 @@ def _print_mode(dataset: Dataset, mode: str, rows: Sequence[dict[str, Any]]) -> 
     except DatasetError as error:
         show(textwrap.fill(f"damaged: {error}", width(), initial_indent="  "))
         stored = 0
+    likes = ["like"] if any(row["like"] for row in rows) else []
     show_table(
-        ["field", "role", "type", "shape", "size", "unit"],
+        ["field", "role", "type", "shape", "size", "unit", *likes],
         [
             [
                 row["field"],
                 row["role"],
                 row["dtype"],
-                "open" if row["shape"] is None else str(row["shape"]),
+                _shape(row["shape"], row["axes"]),
                 size(row["bytes"]),
                 row["unit"],
+                *(row[name] for name in likes),
             ]
             for row in rows
         ],
@@ -158,28 +161,43 @@ def duration(seconds: float) -> str:
     return f"{seconds / 3600:.3g} h"
 
 
+def _shape(shape: tuple[int, ...] | None, axes: tuple[str, ...]) -> str:
+    """Return a shape as text, with the names of its axes."""
+    if shape is None:
+        return f"open: {', '.join(axes)}" if axes else "open"
+    return ", ".join(f"{n} {size}" for n, size in zip(axes, shape, strict=True)) or str(shape)
+
+
 def _print_normalization(dataset: Dataset, mode: str) -> None:
     try:
         found = dataset.normalization_of(mode)
     except DatasetError as error:
         show(textwrap.fill(f"normalization: {error}", width(), initial_indent="  "))
         return
-    lines = [line for name, item in found.items() for line in _components(name, item)]
+    fields = dataset.fields(mode)
+    lines = [line for name, item in found.items() for line in _components(fields[name], item)]
     if lines:
         show()
         numbers = ("mean", "std", "min", "max")
         show_table(["normalization", "component", *numbers], lines, numbers=numbers, indent=2)
 
 
-def _components(name: str, item: Normalization) -> list[list[str]]:
+def _components(field: Field, item: Normalization) -> list[list[str]]:
     """Return a field's table rows: one for each component, or one with ranges over all."""
-    columns = [item.mean, item.std, item.minimum, item.maximum]
+    name, columns = field.name, [item.mean, item.std, item.minimum, item.maximum]
     if item.mean.size > _SMALL:
         return [[name, f"all {item.mean.size}", *(_range(column) for column in columns)]]
     return [
-        [name, ", ".join(str(i) for i in place), *(_number(column, place) for column in columns)]
+        [name, _place(field, place), *(_number(column, place) for column in columns)]
         for place in np.ndindex(item.mean.shape)
     ]
+
+
+def _place(field: Field, place: tuple[int, ...]) -> str:
+    """Return which components of a field have some statistics."""
+    if not field.pooled:
+        return ", ".join(str(index) for index in place)
+    return f"{CHANNEL} {place[0]}" if place else "all"
 
 
 def _number(values: Array | None, place: tuple[int, ...]) -> str:

@@ -103,7 +103,9 @@ def _argument_path(make: type[Any], option: str) -> tuple[str, ...] | None:
     while (configuration := configuration_in(hints.get(found[-1]))) is not None and path:
         found.append(path.pop(0).replace("-", "_"))
         hints = typing.get_type_hints(configuration)
-    if typing.get_origin(hints.get(found[-1])) is not dict or not path:
+    hint = hints.get(found[-1])
+    takes_table = any(typing.get_origin(h) is dict for h in (hint, *typing.get_args(hint)))
+    if not takes_table or not path:
         return None
     if not all(path):
         raise UsageError(f"{option} names no argument: write {option.rstrip('.')}.NAME VALUE.")

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 
 from physx_core.components.network import Network
-from physx_core.statistics import Normalization
+from physx_core.normalization import Normalization
 from physx_core.typing import Tensors
 
 

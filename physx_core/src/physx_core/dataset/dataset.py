@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from functools import partial
 from pathlib import Path
 from typing import Any, Self, Unpack
 
@@ -13,7 +14,7 @@ from physx_core.closeable import Closeable
 from physx_core.dataset.read.access.columns import ColumnCache
 from physx_core.dataset.read.episode_reading import EpisodeReading
 from physx_core.dataset.read.mode_rows import ModeRows, Snapshot
-from physx_core.dataset.read.mode_statistics import compute_statistics
+from physx_core.dataset.read.mode_statistics import compute_of
 from physx_core.dataset.read.ordered_statistics import compute_in_order, store_in_order
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.sampling import BatchOptions, BatchReader
@@ -34,7 +35,7 @@ from physx_core.dataset.write.updating import check_update
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError, UsageError
 from physx_core.fields import Field
-from physx_core.statistics import Normalization
+from physx_core.normalization import Normalization, Normalize, compute_normalization
 from physx_core.typing import Batch
 
 MAX_FILE_SIZE = 0.25
@@ -289,15 +290,20 @@ class Dataset(EpisodeReading, Closeable):
         """Mean and standard deviation of the floating-point fields of mode ``training``."""
         return self.normalization_of("training") if "training" in self else {}
 
-    def normalization_of(self, mode: str) -> dict[str, Normalization]:
+    def normalization_of(self, mode: str, normalize: Normalize = True) -> dict[str, Normalization]:
         """Return mean and standard deviation of a mode's floating-point fields over all samples.
 
+        Args:
+            mode: Name of the mode.
+            normalize: How: see `DatasetConfig.normalize`.
+
         Raises:
-            DatasetError: If there is no such mode, or a partition is missing or damaged.
+            DatasetError: If there is no such mode, a partition is missing or damaged, or a value
+                has no logarithm.
+            ConfigError: If the fields cannot be normalized so.
         """
-        self._prepare_reading()
-        statistics = compute_statistics(self._reader, mode)
-        return {name: s.normalization() for name, s in statistics.items() if s.count}
+        rows = self.rows(mode)
+        return compute_normalization(normalize, rows.fields, rows.fields, partial(compute_of, rows))
 
     def recompute_normalization(self, mode: str = "training") -> dict[str, Normalization]:
         """Recompute mean and standard deviation from all stored samples and store them.
@@ -307,8 +313,8 @@ class Dataset(EpisodeReading, Closeable):
         """
         self._prepare_reading()
         self._reader.mode(mode).forget_statistics()
-        if (order := self._reader.order(mode)) is not None:
-            compute_in_order(self._reader, mode, order, anew=True)
+        if self._reader.order(mode) is not None:
+            compute_in_order(self._reader, mode, anew=True)
         found = self.normalization_of(mode)
         store = self._appender.writer.store if self._appender is not None else None
         if store is not None and not store.shared:  # of several writers, the next one stores them
@@ -322,8 +328,8 @@ class Dataset(EpisodeReading, Closeable):
         """Return a table with one row for each field of each mode.
 
         Returns:
-            Rows with the entries mode, field, role, dtype, shape, unit, samples, partitions and
-            bytes (of the values).
+            Rows with the entries mode, field, role, dtype, shape, unit, axes, like, samples,
+            partitions and bytes (of the values).
         """
         self._prepare_reading()
         return summarize(self._manifest, self._reader.rows)

@@ -16,15 +16,16 @@ from numpy.typing import DTypeLike
 
 from physx_core.closeable import Closeable
 from physx_core.config import to_plain
-from physx_core.dataset import Dataset, Snapshot, rows_per_block
+from physx_core.dataset import Dataset, Snapshot
 from physx_core.dataset.read.batch_arrays import BatchArrays
 from physx_core.dataset.read.epochs import Epoch
+from physx_core.dataset.read.mode_statistics import compute_of
 from physx_core.dataset.read.shuffling import ItemOrder, key_of
 from physx_core.dataset.store.definitions import compare_fields
-from physx_core.dataset.store.manifest import has_statistics
 from physx_core.errors import ConfigError, DatasetError, UsageError
 from physx_core.fields import Field
-from physx_core.statistics import Normalization, RunningStatistics
+from physx_core.normalization import Measured, Normalization, Normalize, compute_normalization
+from physx_core.statistics import RunningStatistics
 from physx_core.typing import Array, Batch, Index
 from physx_core.views.folds import Part
 from physx_core.views.options import ViewOptions
@@ -197,7 +198,11 @@ class Batches(Closeable):
                 {window.field: stored},
             )
         of_window = () if window.is_single else (len(window.at),)
-        found = {name: replace(stored, name=name, shape=(*of_window, *(stored.shape or ())))}
+        like = stored.name if stored.name != name else stored.like
+        axes = ("time", *stored.axes) if stored.axes and of_window else stored.axes
+        axes = axes if len(set(axes)) == len(axes) else ()
+        shape = (*of_window, *(stored.shape or ()))
+        found = {name: replace(stored, name=name, shape=shape, axes=axes, like=like)}
         if self.view.edges == "pad" and name in self.view.windows:
             found[name + _PAD] = Field(name + _PAD, of_window, "bool", role="additional")
         return found
@@ -348,26 +353,27 @@ class Batches(Closeable):
         bound = to_plain(self.view), known, self._mode, self.part, self.batch_size, self.seed
         return blake2b(repr(bound).encode(), digest_size=8).hexdigest()
 
-    def normalization(self) -> dict[str, Normalization]:
-        """Compute the normalization of the floating-point fields from the rows of this part.
+    def normalization(self, normalize: Normalize = True) -> dict[str, Normalization]:
+        """Return the normalization of the floating-point fields by the rows of this part.
 
         That of a window is that of its stored field, at each offset.
-        """
-        found = {}
-        for name, field in self.fields.items():
-            if has_statistics(field) and not name.endswith(_PAD):
-                window = self._windows[name]
-                found[name] = _repeated(self._statistics(window.field), field.shape or ())
-        return found
 
-    def _statistics(self, name: str) -> Normalization:
+        Args:
+            normalize: How: see `DatasetConfig.normalize`.
+
+        Raises:
+            ConfigError: If the fields cannot be normalized so.
+            DatasetError: If rows cannot be read, or a value has no logarithm.
+        """
+        return compute_normalization(
+            normalize, self.fields, self._sources[0].rows.fields, self._statistics
+        )
+
+    def _statistics(self, of: Measured) -> RunningStatistics:
         total = RunningStatistics()
         for source in self._sources:
-            rows = source.items.all_rows()
-            step = rows_per_block(source.rows.fields[name].nbytes)
-            for start in range(0, len(rows), step):
-                total.update(source.rows.gather(name, rows[start : start + step]))
-        return total.normalization()
+            total.merge(compute_of(source.rows, of, source.items.ranges()))
+        return total
 
     @property
     def datasets(self) -> dict[str, Dataset]:
@@ -419,9 +425,3 @@ class Batches(Closeable):
 
 def _reopen(view: ViewOptions, batch_size: int, seed: int, options: dict[str, Any]) -> Batches:
     return Batches(view, batch_size, seed, **options)
-
-
-def _repeated(known: Normalization, shape: tuple[int, ...]) -> Normalization:
-    """Return the normalization of a window's shape."""
-    arrays = {name: np.broadcast_to(each, shape).copy() for name, each in known.arrays().items()}
-    return Normalization.from_arrays(arrays, shape)

@@ -6,6 +6,7 @@ from dataclasses import field
 from pathlib import Path
 
 from physx_core.config import MODES, WRONG, at_least, configuration
+from physx_core.normalization import check_methods
 from physx_core.views.view import View
 
 
@@ -30,8 +31,21 @@ class DatasetConfig:
     view: View = field(default_factory=View)
     """Which of the samples to learn from, in which form and order, and which of them to hold back
     for validation if the dataset has no mode "validation"; the others define the normalization."""
-    normalize: bool = False
-    """Normalize each component to mean 0 and standard deviation 1 for networks."""
+    normalize: bool | dict[str, str] = False
+    """Normalize fields to mean 0 and standard deviation 1 for networks. A table says how, by field:
+    "component", each component for itself; "channel", each entry of the axis "channel", all others
+    together; "field", all components together; with "log-" in front, the natural logarithm of
+    positive values; "none", not at all. A field that it does not name, and with True every field,
+    is normalized like the one that it is `like`, by that one's statistics; else by "channel", or
+    by "field" without channels, if it has two or more named axes; else by "component"."""
     recompute_normalization: bool = False
     """Recompute mean and standard deviation from the stored rows instead of using the stored
     values."""
+
+    def __post_init__(self) -> None:
+        """Check the methods of normalization.
+
+        Raises:
+            ConfigError: If there is no such method.
+        """
+        check_methods("DatasetConfig.normalize", self.normalize)

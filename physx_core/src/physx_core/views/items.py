@@ -89,6 +89,17 @@ class Items:
         places = steps + np.arange(self.num_rows)
         return np.sort(places if found.places is None else found.places[places])
 
+    def ranges(self) -> tuple[Index, Index]:
+        """Return first rows, ascending, and numbers of rows of the ranges of rows in this part."""
+        found = self._found
+        if found.places is None:
+            some = np.flatnonzero(found.rows)
+            some = some[np.argsort(found.start[some])]
+            return found.start[some], found.rows[some]
+        rows = self.all_rows()
+        begins = np.flatnonzero(np.diff(rows, prepend=-2) != 1)
+        return rows[begins], np.diff(begins, append=len(rows))
+
     def _locate(self, items: Index) -> tuple[Index, Index, Index]:
         """Return start and rows of each item's trajectory, and the place of its reference row."""
         which = self.trajectories(items)

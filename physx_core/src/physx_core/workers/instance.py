@@ -28,7 +28,7 @@ from physx_core.errors import (
     UsageError,
     WrongSamplesError,
 )
-from physx_core.fields import Field
+from physx_core.fields import Field, check_quantities
 from physx_core.plugins import resolve
 from physx_core.plugins.references import adapters_hint
 from physx_core.processes.endings import describe_ending, is_ending
@@ -257,6 +257,8 @@ class Instance(Closeable):
                 f"{type(environment).__name__}.init_database() defined no training fields: "
                 "call define_training_fields()."
             )
+        for fields in (environment.fields, environment.episode_fields):
+            check_quantities({field.name: field for field in fields})
         if with_states:
             self._try(self.track_states)
         self._draws = draw

@@ -14,14 +14,15 @@ from physx_torch.networks.network import TorchNetwork
 
 
 class _Scale(NamedTuple):
-    """Mean and standard deviation of a field as tensors of the field's shape."""
+    """Mean and standard deviation of a field, or of its logarithm, as tensors of their shape."""
 
     mean: torch.Tensor
     std: torch.Tensor
+    log: bool
 
 
 class TorchTransformation(Transformation):
-    """Normalizes each component to mean 0 and standard deviation 1 for the network and the loss.
+    """Normalizes fields to mean 0 and standard deviation 1 for the network and the loss.
 
     Fields of `net_fields` and `opt_fields` are normalized with their own coefficients; the i-th of
     `pred_fields` is converted to physical units with those of the i-th of `opt_fields`. Fields
@@ -79,7 +80,8 @@ class TorchTransformation(Transformation):
         changed = dict(prediction)
         for name, scale in self._predictions.items():
             if name in prediction:
-                changed[name] = torch.addcmul(scale.mean, prediction[name], scale.std)
+                values = torch.addcmul(scale.mean, prediction[name], scale.std)
+                changed[name] = values.exp() if scale.log else values
         return changed
 
 
@@ -88,12 +90,13 @@ def _scale(item: Normalization, network: TorchNetwork) -> _Scale:
         torch.tensor(values, dtype=network.data_type, device=network.device)
         for values in (item.mean, item.std)
     )
-    return _Scale(mean, std)
+    return _Scale(mean, std, item.log)
 
 
 def _normalize(data: Tensors, scales: Mapping[str, _Scale]) -> Tensors:
     changed = dict(data)
     for name, scale in scales.items():
         if name in data:
-            changed[name] = (data[name] - scale.mean) / scale.std
+            values = data[name].log() if scale.log else data[name]
+            changed[name] = (values - scale.mean) / scale.std
     return changed

@@ -12,6 +12,7 @@ from xxhash import xxh32_intdigest
 from physx_core.dataset.read.access.columns import ColumnCache, MemoryColumn
 from physx_core.dataset.read.access.mapping import MappedColumn
 from physx_core.dataset.read.epochs import Epoch, Stored, begin_epoch
+from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.shuffling import ItemOrder
 from physx_core.dataset.store.episode_table import EPISODES, TABLE_FIELDS
 from physx_core.dataset.store.manifest import Partition
@@ -118,6 +119,11 @@ class ModeRows:
     def row_nbytes(self) -> int:
         """Bytes of a stored row, of all its fields."""
         return self._reader.row_nbytes(self.mode)
+
+    @property
+    def reader(self) -> Reader:
+        """Reads the stored rows."""
+        return self._reader
 
     @property
     def stored(self) -> Stored:

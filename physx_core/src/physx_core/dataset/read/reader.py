@@ -12,7 +12,7 @@ from physx_core.dataset.read.order.order import Order, Orders
 from physx_core.dataset.store import manifest_file
 from physx_core.dataset.store.episode_table import EPISODES
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
-from physx_core.dataset.store.order_file import Prefix
+from physx_core.dataset.store.order_file import KeptCells
 from physx_core.dataset.store.partition.commits import name_rows
 from physx_core.dataset.store.partition.format import inspect
 from physx_core.dataset.store.partition.segment import BLOCK, RowsCheck, Segment, rows_per_block
@@ -33,14 +33,17 @@ class Reader:
         directory: The dataset's folder.
         manifest: The manifest; rows added to it later can be read too.
         orders: The orders of the modes with records.
-        prefixes: Statistics of the first rows of modes with records, as far as they are known.
+        cells: Statistics of cells of modes with records, as far as they are known, by mode and
+            field: see `physx_core.dataset.read.ordered_statistics`.
+        stored_cells: Those that were stored, likewise.
     """
 
     def __init__(self, directory: Path, manifest: Manifest) -> None:
         self.directory = directory
         self.manifest = manifest
         self.orders = Orders(manifest, self._read_table)
-        self.prefixes: dict[str, Prefix] = {}
+        self.cells: dict[tuple[str, str], KeptCells] = {}
+        self.stored_cells: dict[tuple[str, str], KeptCells] = {}
 
     def mode(self, mode: str) -> Mode:
         """Return a mode.

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import secrets
 from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
 from typing import TypedDict
 
 import numpy as np
@@ -21,7 +22,7 @@ from physx_core.dataset.read.shuffling import (
     make_order,
 )
 from physx_core.errors import ConfigError, DatasetError
-from physx_core.statistics import Normalization
+from physx_core.normalization import Normalization
 from physx_core.typing import Batch
 
 
@@ -85,11 +86,15 @@ class BatchReader:
         }
         self._arrays = BatchArrays(kinds, batch_size, reuse=reuse)
         scales = normalize if isinstance(normalize, Mapping) else {}
-        self._scales = [
-            (name, np.asarray(scales[name].mean, kind), np.asarray(scales[name].std, kind))
+        self._scales = {
+            name: replace(
+                scales[name],
+                mean=np.asarray(scales[name].mean, kind),
+                std=np.asarray(scales[name].std, kind),
+            )
             for name, (_, kind) in kinds.items()
             if name in scales and kind.kind == "f"
-        ]
+        }
 
     def __iter__(self) -> Iterator[Batch]:
         """Yield the batches of all epochs."""
@@ -102,10 +107,12 @@ class BatchReader:
                 for start in range(skipped * size, rows.count, size):
                     batch = self._arrays.take(min(size, rows.count - start))
                     epoch.fill(start, batch)
-                    for name, mean, std in self._scales:
+                    for name, scale in self._scales.items():
                         values = batch[name]
-                        values -= mean
-                        values /= std
+                        if scale.log:
+                            np.log(values, out=values)
+                        values -= scale.mean
+                        values /= scale.std
                     yield batch
             finally:
                 epoch.close()

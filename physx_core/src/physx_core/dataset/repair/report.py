@@ -33,6 +33,8 @@ def summarize(manifest: Manifest, rows_of: Callable[[str], int]) -> list[dict[st
             "dtype": np.dtype(field.dtype).name,
             "shape": field.shape,
             "unit": field.unit,
+            "axes": field.axes,
+            "like": field.like,
             "samples": counts[mode_name],
             "partitions": len(mode.partitions),
             "bytes": counts[mode_name] * field.nbytes,

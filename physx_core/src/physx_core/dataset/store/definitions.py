@@ -47,4 +47,8 @@ def _difference(known: Field, given: Field) -> str:
         parts.append(f"unit {known.unit!r}, not {given.unit!r}")
     if known.role != given.role:
         parts.append(f"role {known.role}, not {given.role}")
+    if known.axes != given.axes:
+        parts.append(f"axes {known.axes}, not {given.axes}")
+    if known.like != given.like:
+        parts.append(f"like {known.like!r}, not {given.like!r}")
     return f"has {'; '.join(parts)}" if parts else ""

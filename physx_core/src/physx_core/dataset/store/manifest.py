@@ -30,7 +30,7 @@ from physx_core.dataset.store.partition.format import (
 from physx_core.dataset.store.partition.segment import Segment
 from physx_core.dataset.store.partition.spans import Span
 from physx_core.errors import ConfigError, DatasetError
-from physx_core.fields import RESERVED, Field
+from physx_core.fields import Field
 from physx_core.statistics import RunningStatistics
 
 
@@ -181,7 +181,7 @@ class Mode:
     @property
     def counted_fields(self) -> dict[str, Field]:
         """The fields that have statistics."""
-        return {name: of for name, of in self.fields.items() if has_statistics(of)}
+        return {name: of for name, of in self.fields.items() if of.has_statistics}
 
     def place(self, partition: Partition) -> int:
         """Return the position of a partition, even if it has been replaced by a later state."""
@@ -255,11 +255,6 @@ class Mode:
         if self.dropped:
             plain["dropped"] = [partition.to_dict() for partition in self.dropped]
         return plain
-
-
-def has_statistics(of: Field) -> bool:
-    """Return whether a field has statistics: floating-point fields do, unless physx adds them."""
-    return of.name not in RESERVED and np.dtype(of.dtype).kind == "f"
 
 
 def versions() -> dict[str, str]:

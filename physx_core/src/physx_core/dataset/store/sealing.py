@@ -10,7 +10,7 @@ from pathlib import Path
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
-from physx_core.dataset.store.manifest import Partition, has_statistics
+from physx_core.dataset.store.manifest import Partition
 from physx_core.dataset.store.partition.commits import Commit, encode
 from physx_core.dataset.store.partition.file import copy
 from physx_core.fields import Field
@@ -61,9 +61,9 @@ def scan(
     """Return a sealed partition with checksums and statistics, computed in one pass."""
     crc, running = dict.fromkeys(fields, 0), {}
     for name, field in fields.items():
-        counts = statistics and has_statistics(field)
+        counts = statistics and field.has_statistics
         if counts:
-            running[name] = RunningStatistics()
+            running[name] = RunningStatistics(field.pooled)
         for block in partition.segment(directory, field).blocks():
             crc[name] = crc32(files.as_bytes(block), crc[name])
             if counts:

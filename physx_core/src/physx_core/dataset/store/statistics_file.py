@@ -111,7 +111,7 @@ def _find(
     counted, found = sum(p.rows for p in mode.partitions if p.counted), {}
     for name, of in mode.counted_fields.items() if counted else ():
         try:
-            found[name] = RunningStatistics.from_arrays(arrays.get(name, {}), of.shape or ())
+            found[name] = RunningStatistics.from_arrays(arrays.get(name, {}), of.statistics_shape)
         except ValueError:
             return None
         if found[name].count != counted:

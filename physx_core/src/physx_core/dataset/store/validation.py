@@ -45,7 +45,11 @@ def parse_field(plain: Any) -> Field:
     if role not in ROLES:
         raise ValueError(f"the role of {name!r} cannot be {role!r:.60}")
     unit = checked(str, plain.get("unit", ""), f"the unit of {name!r}")
-    field = Field(name, shape, checked(str, plain["dtype"], f"the type of {name!r}"), unit, role)
+    names = checked(list, plain.get("axes", []), f"the axes of {name!r}")
+    axes = tuple(parse_name(each, f"an axis of {name!r}") for each in names)
+    like = plain.get("like", "") and parse_name(plain["like"], f"what {name!r} is like")
+    dtype = checked(str, plain["dtype"], f"the type of {name!r}")
+    field = Field(name, shape, dtype, unit, role, axes, like)
     if math.prod(shape or ()) * np.dtype(field.dtype).itemsize > _WIDEST_ROW:
         raise ValueError(f"the shape of {name!r} cannot be {shape!r:.60}")
     return field

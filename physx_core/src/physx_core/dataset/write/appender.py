@@ -14,7 +14,7 @@ from physx_core.dataset.write.recording import table_rows
 from physx_core.dataset.write.row_validation import check_rows, count_rows, infer_fields
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import ConfigError, UsageError, listed
-from physx_core.fields import Field
+from physx_core.fields import Field, check_quantities
 from physx_core.rows import RowBuffer, infer_shapes
 from physx_core.typing import Batch
 
@@ -45,6 +45,7 @@ class Appender:
                     "A mode needs an identifier as its name and at least one field, not "
                     f"{name!r} with {names}."
                 )
+            check_quantities(given)
         known = self._manifest.modes
         if all(
             n in known and _complete(n, known[n], g) == known[n].fields for n, g in wanted.items()

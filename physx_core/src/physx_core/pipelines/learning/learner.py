@@ -30,12 +30,12 @@ from physx_core.errors import (
     listed,
 )
 from physx_core.fields import NUMBERS, Field, is_finite
+from physx_core.normalization import Normalization
 from physx_core.pipelines.learning.components import create, create_network
 from physx_core.plugins import import_component
 from physx_core.plugins.networks import resolve_network
 from physx_core.plugins.references import check_recorded, is_of_plugin, is_recorded_as
 from physx_core.rows import concatenate
-from physx_core.statistics import Normalization
 from physx_core.typing import Array, Batch, Index
 
 
@@ -335,7 +335,7 @@ class Learner:
         except PhysxError:
             raise
         except Exception:  # from a library; other shapes are fine as long as the network takes them
-            self._check_shapes(read)
+            self._check_shapes(read, exactly=True)
             raise
 
     def answer(self, request: Batch) -> Batch:
@@ -343,23 +343,24 @@ class Learner:
 
         Raises:
             MissingFieldError: If a field that the network reads is missing.
-            FieldShapeError: If a field's shape differs from the one in training.
+            FieldShapeError: If a field's shape differs from the one in training, but for the sizes
+                of two or more named axes other than the channels.
             FieldTypeError: If a value is not an array of numbers.
         """
         self._check_shapes(request)
         return self.predict(request)
 
-    def _check_shapes(self, inputs: Batch) -> None:
+    def _check_shapes(self, inputs: Batch, *, exactly: bool = False) -> None:
         for name in self.network.net_fields:
             values, field = inputs.get(name), self.fields.get(name)
             if values is None or field is None:
                 continue
             if values.dtype.kind not in NUMBERS:
                 raise FieldTypeError(f'field "{name}" does not consist of numbers.', field=name)
-            if field.shape is not None and values.shape[1:] != field.shape:
+            shape = values.shape[1:]
+            if not (field.shape in (None, shape) or (field.is_resolution(shape) and not exactly)):
                 raise FieldShapeError(
-                    f'field "{name}" has shape {values.shape[1:]}, but the network takes '
-                    f"{field.shape}.",
+                    f'field "{name}" has shape {shape}, but the network takes {field.shape}.',
                     field=name,
                 )
 

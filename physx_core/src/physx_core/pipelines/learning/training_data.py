@@ -6,12 +6,12 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 
 from physx_core.dataset import Dataset
 from physx_core.fields import Field
+from physx_core.normalization import Normalization
 from physx_core.pipelines.learning.batches.generated import GeneratedBatches
 from physx_core.pipelines.learning.batches.online import OnlineBatches
 from physx_core.pipelines.learning.batches.replayed import ReplayedBatches
 from physx_core.pipelines.learning.batches.stored import StoredBatches
 from physx_core.sources.source import Source
-from physx_core.statistics import Normalization
 from physx_core.typing import Batch
 
 

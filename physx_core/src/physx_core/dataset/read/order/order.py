@@ -71,17 +71,22 @@ class Order:
         """Return the stored rows of some rows, without the index of all."""
         if not len(rows):
             return rows
-        piece = self._starts.searchsorted(rows, "right") - 1
+        piece = self.piece(rows)
         found: Index = self.places.first[piece] + rows - self._starts[piece]
         return found
 
-    def first_places(self, rows: int) -> Index:
-        """Return the places of the first rows, shape (2, pieces): their first rows, and numbers."""
-        number = int(self._starts.searchsorted(rows))
-        found = np.array([column[:number] for column in self.places])
-        if number:
-            found[1, -1] = min(found[1, -1], rows - int(self._starts[number - 1]))
-        return found
+    def piece(self, rows: Index) -> Index:
+        """Return the numbers of the pieces that some rows belong to."""
+        return self._starts.searchsorted(rows, "right") - 1
+
+    def places_of(self, start: int, stop: int) -> Places:
+        """Return where the rows of a range are stored, at least one row."""
+        first, last = self.piece(np.array([start, stop - 1])).tolist()
+        begins, rows = (column[first : last + 1].copy() for column in self.places)
+        skipped = start - int(self._starts[first])
+        begins[0], rows[0] = begins[0] + skipped, rows[0] - skipped
+        rows[-1] -= int(self._starts[last] + self.places.rows[last]) - stop
+        return Places(begins, rows)
 
     def pieces(self, start: int, stop: int) -> Iterator[tuple[int, int]]:
         """Yield the first stored row and the number of rows of each piece of a range of rows."""

@@ -6,15 +6,21 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 
 from physx_core.dataset import Dataset
-from physx_core.dataset.store.manifest import has_statistics
 from physx_core.fields import Field
+from physx_core.normalization import (
+    Measured,
+    Normalization,
+    Normalize,
+    compute_normalization,
+    measured,
+)
 from physx_core.pipelines.campaign_writer import CampaignWriter
 from physx_core.pipelines.learning.batches.feeder import Feeder
 from physx_core.pipelines.learning.batches.row_statistics import RowStatistics
 from physx_core.pipelines.storage import last_steps, record_beside_rows, store_sets
 from physx_core.rows import concatenate
 from physx_core.sources.source import Source
-from physx_core.statistics import Normalization, RunningStatistics
+from physx_core.statistics import RunningStatistics
 from physx_core.typing import Batch
 from physx_core.workers.instance import Skip
 from physx_core.workers.pasts import Past
@@ -68,7 +74,7 @@ class Blocks:
         dataset: Dataset,
         mode: str,
         *,
-        normalize: bool,
+        normalize: Normalize,
         first: int,
         known: Skip,
         statistics: RowStatistics,
@@ -81,7 +87,7 @@ class Blocks:
             source: The open environments.
             dataset: Stores the rows.
             mode: Mode to store them in.
-            normalize: Whether the blocks have a normalization.
+            normalize: Whether the blocks have a normalization, and which: see `DatasetConfig`.
             first: Number of rows that the mode had before the first block.
             known: The rows that the environments do not return.
             statistics: Summarizes the rows; still without any.
@@ -90,13 +96,13 @@ class Blocks:
                 generated when they are taken.
         """
         self._source, self._dataset, self._mode = source, dataset, mode
-        self._normalizes, self._summary = normalize, statistics
+        self._normalize, self._summary = normalize, statistics
         self._writer, self._first = writer, first
         self._end = dataset.num_samples(mode)
         self._stored = first + known.rows if writer is None else self._end
         self._next_row = first
-        self._statistics: dict[str, RunningStatistics] = {}
-        for start in range(0, first if normalize else 0, _CHUNK):
+        self._statistics: dict[Measured, RunningStatistics] = {}
+        for start in range(0, 0 if normalize is False else first, _CHUNK):
             self._add(self._read(start, min(start + _CHUNK, first)))
         self._earlier: dict[int, int] = {}
         if writer is None:
@@ -162,10 +168,9 @@ class Blocks:
             return self._last
         start, self._next_row = self._next_row, self._next_row + count
         rows = self._take(start, count, copies=copies)
-        if self._normalizes:
-            self._add(rows)
-        found = {name: one.normalization() for name, one in self._statistics.items()}
-        fields = self._dataset.fields(self._mode)
+        self._add(rows)
+        fields, known = self._dataset.fields(self._mode), self._statistics.__getitem__
+        found = compute_normalization(self._normalize, fields, fields, known)
         summary = self._summary.add(rows, _counted(fields))
         self._last = Block(rows, fields, found, summary, self._find_pasts())
         return self._last
@@ -213,8 +218,9 @@ class Blocks:
         return {name: view[name][start:stop] for name in self._dataset.fields(self._mode)}
 
     def _add(self, rows: Batch) -> None:
-        for name in _counted(self._dataset.fields(self._mode)):
-            self._statistics.setdefault(name, RunningStatistics()).update(rows[name])
+        for of in measured(self._normalize, self._dataset.fields(self._mode)):
+            statistics = self._statistics.setdefault(of, RunningStatistics(of.pooled))
+            statistics.update(of.of(rows[of.field]))
 
 
 def _part(rows: Batch, part: slice) -> Batch:
@@ -222,4 +228,4 @@ def _part(rows: Batch, part: slice) -> Batch:
 
 
 def _counted(fields: Mapping[str, Field]) -> list[str]:
-    return [name for name, of in fields.items() if has_statistics(of)]
+    return [name for name, of in fields.items() if of.has_statistics]

@@ -11,11 +11,11 @@ from physx_core import checkpoint
 from physx_core.components.group import Group
 from physx_core.errors import CheckpointError
 from physx_core.fields import Field
+from physx_core.normalization import Normalization
 from physx_core.pipelines.learning.batches.online import OnlineBatches
 from physx_core.pipelines.learning.batches.sharing import SharedBatches
 from physx_core.pipelines.learning.batches.stored import StoredBatches
 from physx_core.sources.source import Source
-from physx_core.statistics import Normalization
 from physx_core.typing import Array, Batch, Index
 
 

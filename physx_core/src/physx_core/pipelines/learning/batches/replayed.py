@@ -8,11 +8,11 @@ import numpy as np
 
 from physx_core.dataset.store.definitions import compare_fields
 from physx_core.fields import RESERVED, Field
+from physx_core.normalization import Normalization
 from physx_core.pipelines.learning.batches.stored import StoredBatches
 from physx_core.pipelines.storage import record_beside_rows
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.sources.source import Source
-from physx_core.statistics import Normalization
 from physx_core.typing import Batch
 
 

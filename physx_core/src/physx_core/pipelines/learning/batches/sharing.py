@@ -8,9 +8,9 @@ from typing import Any
 from physx_core.components.group import Group
 from physx_core.dataset import Dataset
 from physx_core.fields import Field
+from physx_core.normalization import Normalization
 from physx_core.pipelines.learning.batches.blocks import Block
 from physx_core.pipelines.learning.batches.online import OnlineBatches
-from physx_core.statistics import Normalization
 from physx_core.typing import Batch
 
 

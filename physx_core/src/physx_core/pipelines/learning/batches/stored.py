@@ -12,9 +12,9 @@ from physx_core.config import EnvironmentConfig
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, DatasetError, UsageError, listed
 from physx_core.fields import Field
+from physx_core.normalization import Normalization
 from physx_core.pipelines.learning.data_record import training_view
 from physx_core.pipelines.storage import other_samples
-from physx_core.statistics import Normalization
 from physx_core.typing import Batch, Index
 from physx_core.views.batches import Batches
 from physx_core.views.dataset_config import DatasetConfig
@@ -251,10 +251,10 @@ class StoredBatches:
             recompute: Whether it may be recomputed from all samples, if so configured.
         """
         self.has_changed = False
-        if not self._config.normalize or not (self.has_samples or self._view.sources):
+        if self._config.normalize is False or not (self.has_samples or self._view.sources):
             return {}
         if self._view.windows or not self._has_all_rows:
-            return self._training.normalization()
+            return self._training.normalization(self._config.normalize)
         if self._config.recompute_normalization and recompute:
-            return self.dataset.recompute_normalization(self.mode)
-        return self.dataset.normalization_of(self.mode)
+            self.dataset.recompute_normalization(self.mode)
+        return self.dataset.normalization_of(self.mode, self._config.normalize)
