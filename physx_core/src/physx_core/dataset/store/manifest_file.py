@@ -1,9 +1,9 @@
 """Writes and reads the file ``dataset.json``, and the changes since it was written.
 
 Its size does not depend on the fields' shapes: statistics, which do, have a file of their own. Nor
-is it written for each new partition: see `physx_core.dataset.store.changes_file`. Its last entry is a CRC-32 of everything before it, so that truncation or manual edits are noticed
-before a wrong offset yields wrong numbers. Every value is validated: a dataset may come from an
-untrusted source.
+is it written for each new partition: see `physx_core.dataset.store.changes_file`. Its last entry is
+a CRC-32 of everything before it, so that truncation or manual edits are noticed before a wrong
+offset yields wrong numbers. Every value is validated: a dataset may come from an untrusted source.
 """
 
 from __future__ import annotations
