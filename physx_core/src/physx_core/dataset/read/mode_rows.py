@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -15,9 +16,12 @@ from physx_core.dataset.read.epochs import Epoch, Stored, begin_epoch
 from physx_core.dataset.read.shuffling import ItemOrder
 from physx_core.dataset.store.episode_table import EPISODES, TABLE_FIELDS
 from physx_core.dataset.store.manifest import Partition
+from physx_core.dataset.store.partition.segment import RowsCheck, rows_per_block
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
-from physx_core.typing import Array, Index
+from physx_core.typing import Array, Batch, Index
+
+_BLOCK = 2**15  # rows
 
 
 class Snapshot(NamedTuple):
@@ -122,7 +126,7 @@ class ModeRows:
     @property
     def stored(self) -> Stored:
         """Returns the stored rows of some rows; None: they are the same."""
-        return None if self.order is None or self.order.index is None else self.order.stored
+        return None if self.order is None or self.order.is_stored else self.order.stored
 
     def epoch(
         self, names: list[str], dtype: np.dtype[Any] | None, order: ItemOrder, rows: Stored = None
@@ -166,11 +170,33 @@ class ModeRows:
         self._seen.add(name)
         return self._columns.by_index(self.mode, name, loads=loads)
 
-    def read(self, name: str) -> Array:
-        """Return all rows of a field."""
-        if self.stored is None:
-            return self._reader.read(self.mode, name, 0, self.count)
-        return self.gather(name, np.arange(self.count))
+    def blocks(self, names: Sequence[str], start: int, stop: int) -> Iterator[tuple[int, Batch]]:
+        """Yield fields of the rows `start` to `stop` in blocks, each valid until the next.
+
+        Sealed partitions that are read completely are compared with their checksums.
+
+        Args:
+            names: Names of the fields.
+            start: First row.
+            stop: Row before which to stop.
+
+        Yields:
+            The first row of a block, and field name to array of shape (n, *field shape).
+        """
+        count = min([_BLOCK, *(rows_per_block(self.fields[name].nbytes) for name in names)])
+        kinds = {n: ((of.shape or ()), of.numpy_dtype) for n, of in self.fields.items()}
+        buffers = {
+            n: np.empty((min(count, stop - start), *kinds[n][0]), kinds[n][1]) for n in names
+        }
+        checks: dict[str, dict[int, RowsCheck]] = {name: {} for name in names}
+        for first in range(start, stop, count):
+            block = {name: buffer[: stop - first] for name, buffer in buffers.items()}
+            for name, out in block.items():
+                if self.stored is None:
+                    self._reader.read_into(out, self.mode, name, first, checks[name])
+                else:
+                    out[:] = self.gather(name, np.arange(first, first + len(out)))
+            yield first, block
 
     def episode_values(self, name: str, rows: Index) -> Array:
         """Return what the episode of each row has once, shape (n, *shape of the field).
