@@ -473,7 +473,8 @@ def test_normalization_is_that_of_the_part(tmp_path):
 def test_folds_of_recorded_episodes_are_found_without_their_rows(tmp_path):
     with Dataset.create(tmp_path / "data") as dataset:
         rows = {"x": np.arange(40.0), "step": np.tile(np.arange(4), 10)}
-        dataset.append_episodes("training", rows, [EpisodeRecord(episode=k, rows=4) for k in range(10)])
+        known = [EpisodeRecord(episode=k, rows=4) for k in range(10)]
+        dataset.append_episodes("training", rows, known)
     (tmp_path / "data" / "run_training_step_0.h5").unlink()
     with View(fold=0).open(4, data=tmp_path / "data") as batches:
         assert batches.num_items == 32

@@ -61,7 +61,8 @@ class ModeRows:
         """
         self.mode, self._columns, self._reader = mode, columns, columns.reader
         self._numbering = self._reader.manifest.numbering
-        self.loads, self._seen = False, set[str]()
+        self.loads = False
+        self._used: dict[str, tuple[int, MemoryColumn | MappedColumn]] = {}
         orders = self._reader.orders
         if snapshot is None:
             self.order = self._reader.order(mode)
@@ -166,9 +167,15 @@ class ModeRows:
 
     def _column(self, name: str) -> MemoryColumn | MappedColumn:
         """Return a field; it is in memory if it was, or may be and fits when it is first used."""
-        loads = self.loads and name not in self._seen
-        self._seen.add(name)
-        return self._columns.by_index(self.mode, name, loads=loads)
+        generation = self._reader.manifest.generation
+        known = self._used.get(name)
+        if known is None or known[0] != generation:
+            loads = self.loads and known is None
+            column = self._columns.by_index(self.mode, name, loads=loads)
+            known = self._used[name] = generation, column
+        else:
+            known[1].check()
+        return known[1]
 
     def blocks(self, names: Sequence[str], start: int, stop: int) -> Iterator[tuple[int, Batch]]:
         """Yield fields of the rows `start` to `stop` in blocks, each valid until the next.
