@@ -32,6 +32,7 @@ from physx_core.sources import ClientSource
 
 SEED = [0, 0, 0]
 FEW, MANY = 20, 120
+PARTITIONS = 1000
 SMALL, LARGE = 6, 6000  # values of float64
 MARKS = ("<!-- costs: written by benchmarks/transport.py --costs -->", "<!-- end of costs -->")
 
@@ -162,21 +163,20 @@ def partitions(root: Path) -> tuple[float, list[tuple[int, float]]]:
 
     The latter for two numbers of existing partitions.
     """
-    folder, block = root / "partitions", {"x": np.zeros((680, 5)), "y": np.zeros((680, 1))}
-    seen: list[tuple[int, int, float]] = [(0, 0, 0.0)]
+    folder, block = root / "partitions", {"x": np.zeros((340, 5)), "y": np.zeros((340, 1))}
+    spent = []
     with Dataset.create(folder, max_file_size=3e-5) as dataset:
-        for _ in range(90):
+        for _ in range(PARTITIONS):
             began = time.process_time()
             dataset.append("training", block)
-            spent = time.process_time() - began
-            text = (folder / "dataset.json").read_text(encoding="utf-8")
-            count = len(json.loads(text)["modes"]["training"]["partitions"])
-            seen.append((count, len(text), spent / max(count - seen[-1][0], 1)))
-    third = len(seen) // 3
-    early, late = seen[2 : third + 1], seen[-third:]
-    entry = (late[-1][1] - early[0][1]) / (late[-1][0] - early[0][0])
-    return entry, [
-        (part[third // 2][0], float(np.median(part, axis=0)[2])) for part in (early, late)
+            spent.append(time.process_time() - began)
+    text = (folder / "dataset.json").read_text(encoding="utf-8")
+    count = len(json.loads(text)["modes"]["training"]["partitions"])
+    few = PARTITIONS // 30
+    early, late = spent[few // 2 : few + few // 2], spent[-few:]
+    return len(text) / count, [
+        (few, float(np.mean(early))),
+        (PARTITIONS, float(np.mean(late))),
     ]
 
 

@@ -183,6 +183,13 @@ def is_removed(descriptor: int) -> bool:
     return os.fstat(descriptor).st_nlink == 0
 
 
+def names(folder: Path) -> list[str]:
+    """Return the names of everything in a folder, sorted; none if there is no such folder."""
+    with contextlib.suppress(FileNotFoundError, NotADirectoryError):
+        return sorted(os.listdir(folder))
+    return []
+
+
 def read_content(path: Path, limit: int) -> bytes:
     """Return the bytes of a file.
 
@@ -214,6 +221,17 @@ def read_blocks(path: Path, nbytes: int = 2**18) -> Iterator[memoryview]:
 def read_head(descriptor: int, limit: int) -> bytes:
     """Return at most the first `limit` bytes of an open file."""
     return os.pread(descriptor, limit, 0)
+
+
+def read_tail(path: Path, limit: int) -> bytes:
+    """Return at most the last `limit` bytes of a file.
+
+    Raises:
+        OSError: If it cannot be read.
+    """
+    with os.fdopen(open_regular(path), "rb") as file:
+        file.seek(-min(limit, size(file.fileno())), os.SEEK_END)
+        return file.read(limit)
 
 
 def write_at(descriptor: int, content: bytes | memoryview, offset: int) -> None:

@@ -473,6 +473,16 @@ def test_normalization_is_that_of_the_part(tmp_path):
     np.testing.assert_allclose(found["past"].std, x.std(axis=0))
 
 
+def test_folds_of_recorded_episodes_are_found_without_their_rows(tmp_path):
+    with Dataset.create(tmp_path / "data") as dataset:
+        rows = {"x": np.arange(40.0), "step": np.tile(np.arange(4), 10)}
+        known = [EpisodeRecord(episode=k, rows=4) for k in range(10)]
+        dataset.append_episodes("training", rows, known)
+    (tmp_path / "data" / "run_training_step_0.h5").unlink()
+    with View(fold=0).open(4, data=tmp_path / "data") as batches:
+        assert batches.num_items == 32
+
+
 def test_the_picture_of_views_is_of_those_on_the_page():
     docs = Path(__file__).parents[3] / "docs"
     script, page = docs / "nine_views.py", docs / "views.md"

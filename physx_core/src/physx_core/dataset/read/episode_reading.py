@@ -23,7 +23,7 @@ from physx_core.dataset.store import failure_file
 from physx_core.dataset.store.episode_record import EpisodeStatus
 from physx_core.dataset.store.episode_table import EPISODES, TABLE_FIELDS, has_table
 from physx_core.dataset.store.failure_file import FailedEpisode
-from physx_core.dataset.store.manifest import Mode, Partition
+from physx_core.dataset.store.manifest import Mode, Partition, Partitions
 from physx_core.fields import Field
 from physx_core.typing import Array, Batch, Index
 
@@ -99,7 +99,7 @@ class EpisodeReading(ABC):
         for mode in modes:
             order = self._reader.order(mode)
             if order is not None and len(order.last_records):
-                whole = Addresses(Mode({}, [Partition(mode, "", 0, 0, order.rows)]))
+                whole = Addresses(Mode({}, Partitions([Partition(mode, "", 0, 0, order.rows)])))
                 places = self._reader.orders.places(mode)
                 parts.append(records_at(order, places, whole, table, is_open=False))
         return {name: np.concatenate([part[name] for part in parts]) for name in table}

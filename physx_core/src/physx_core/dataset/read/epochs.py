@@ -145,8 +145,9 @@ class RowEpoch:
         start = max(start, self._announced)
         if start < stop:
             self._announced, rows = stop, self._rows(start, stop)
+            pieces = self._disk[0].locate(rows)
             for column in self._disk:
-                column.announce(rows)
+                column.announce(pieces)
 
     def _rows(self, start: int, stop: int) -> Index:
         items = self._order.items(start, stop)
@@ -219,12 +220,16 @@ class ChunkedEpoch:
         """Read the chunk with a position, into these arrays if they are large enough."""
         chunk = self._order.chunk(position)
         rows = chunk.items if self._stored is None else self._stored(chunk.items)
+        pieces = self._disk[0].locate(rows) if self._disk else []
         for on_disk in self._disk:
-            on_disk.announce(rows)
+            on_disk.announce(pieces)
         if len(arrays[0]) < len(rows):
             arrays = self._allocate(len(rows))
         for column, out in zip(self._columns, arrays, strict=True):
-            column.gather(rows, out[: len(rows)])
+            if isinstance(column, DiskColumn):
+                column.gather(rows, out[: len(rows)], pieces)
+            else:
+                column.gather(rows, out[: len(rows)])
         return _Loaded(chunk, arrays)
 
     def _allocate(self, count: int) -> list[Array]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -16,9 +17,12 @@ from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.shuffling import ItemOrder
 from physx_core.dataset.store.episode_table import EPISODES, TABLE_FIELDS
 from physx_core.dataset.store.manifest import Partition
+from physx_core.dataset.store.partition.segment import RowsCheck, rows_per_block
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
-from physx_core.typing import Array, Index
+from physx_core.typing import Array, Batch, Index
+
+_BLOCK = 2**15  # rows
 
 
 class Snapshot(NamedTuple):
@@ -58,7 +62,8 @@ class ModeRows:
         """
         self.mode, self._columns, self._reader = mode, columns, columns.reader
         self._numbering = self._reader.manifest.numbering
-        self.loads, self._seen = False, set[str]()
+        self.loads = False
+        self._used: dict[str, tuple[int, MemoryColumn | MappedColumn]] = {}
         orders = self._reader.orders
         if snapshot is None:
             self.order = self._reader.order(mode)
@@ -128,7 +133,7 @@ class ModeRows:
     @property
     def stored(self) -> Stored:
         """Returns the stored rows of some rows; None: they are the same."""
-        return None if self.order is None or self.order.index is None else self.order.stored
+        return None if self.order is None or self.order.is_stored else self.order.stored
 
     def epoch(
         self, names: list[str], dtype: np.dtype[Any] | None, order: ItemOrder, rows: Stored = None
@@ -168,15 +173,43 @@ class ModeRows:
 
     def _column(self, name: str) -> MemoryColumn | MappedColumn:
         """Return a field; it is in memory if it was, or may be and fits when it is first used."""
-        loads = self.loads and name not in self._seen
-        self._seen.add(name)
-        return self._columns.by_index(self.mode, name, loads=loads)
+        generation = self._reader.manifest.generation
+        known = self._used.get(name)
+        if known is None or known[0] != generation:
+            loads = self.loads and known is None
+            column = self._columns.by_index(self.mode, name, loads=loads)
+            known = self._used[name] = generation, column
+        else:
+            known[1].check()
+        return known[1]
 
-    def read(self, name: str) -> Array:
-        """Return all rows of a field."""
-        if self.stored is None:
-            return self._reader.read(self.mode, name, 0, self.count)
-        return self.gather(name, np.arange(self.count))
+    def blocks(self, names: Sequence[str], start: int, stop: int) -> Iterator[tuple[int, Batch]]:
+        """Yield fields of the rows `start` to `stop` in blocks, each valid until the next.
+
+        Sealed partitions that are read completely are compared with their checksums.
+
+        Args:
+            names: Names of the fields.
+            start: First row.
+            stop: Row before which to stop.
+
+        Yields:
+            The first row of a block, and field name to array of shape (n, *field shape).
+        """
+        count = min([_BLOCK, *(rows_per_block(self.fields[name].nbytes) for name in names)])
+        kinds = {n: ((of.shape or ()), of.numpy_dtype) for n, of in self.fields.items()}
+        buffers = {
+            n: np.empty((min(count, stop - start), *kinds[n][0]), kinds[n][1]) for n in names
+        }
+        checks: dict[str, dict[int, RowsCheck]] = {name: {} for name in names}
+        for first in range(start, stop, count):
+            block = {name: buffer[: stop - first] for name, buffer in buffers.items()}
+            for name, out in block.items():
+                if self.stored is None:
+                    self._reader.read_into(out, self.mode, name, first, checks[name])
+                else:
+                    out[:] = self.gather(name, np.arange(first, first + len(out)))
+            yield first, block
 
     def episode_values(self, name: str, rows: Index) -> Array:
         """Return what the episode of each row has once, shape (n, *shape of the field).

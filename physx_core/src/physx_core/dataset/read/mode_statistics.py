@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping
 from copy import copy
 from dataclasses import replace
 from pathlib import Path
@@ -38,7 +38,8 @@ def compute_statistics(reader: Reader, mode_name: str) -> Statistics:
         for partition in mode.partitions
         if not partition.counted
     }
-    count_sealed(reader.directory, reader.manifest, mode)
+    for partition in count_sealed(reader.directory, reader.manifest, mode, mode.partitions):
+        mode.swap(partition)
     found = mode.statistics or {}
     for partition in mode.partitions:
         if not partition.counted:
@@ -64,23 +65,36 @@ def compute_of(
     return compute_of_rows(known, of, starts, counts)
 
 
-def count_sealed(directory: Path, manifest: Manifest, mode: Mode) -> None:
+def count_sealed(
+    directory: Path, manifest: Manifest, mode: Mode, partitions: Iterable[Partition]
+) -> list[Partition]:
     """Merge the complete statistics of sealed partitions into those of the mode.
 
     They are merged in the order of the rows, and stored with the next change of the manifest.
     Partitions with rows that were updated in place are left out, with those after them, until they
     have checksums again, as the rows may not have reached the disk yet.
+
+    Args:
+        directory: Folder of the dataset.
+        manifest: Its manifest.
+        mode: The mode.
+        partitions: Consecutive ones; those before them are counted.
+
+    Returns:
+        The partitions that count now, for the manifest.
     """
     statistics_file.load(directory, manifest)
-    for place, partition in enumerate(mode.partitions):
+    counted = []
+    for partition in partitions:
         have = (partition.running.get(name) for name in mode.counted_fields)
         complete = all(s is not None and s.count == partition.rows for s in have)
         if partition.counted:
             continue
         if not (partition.checksums and complete):
-            return
+            break
         add_counted(manifest, mode, partition.running)
-        mode.partitions[place] = replace(partition, counted=True, running={})
+        counted.append(replace(partition, counted=True, running={}))
+    return counted
 
 
 def add_counted(manifest: Manifest, mode: Mode, further: Mapping[str, RunningStatistics]) -> None:

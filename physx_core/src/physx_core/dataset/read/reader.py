@@ -100,14 +100,13 @@ class Reader:
         order = self.order(mode)
         return None if order is None else order.index
 
-    def segments(self, mode: str, name: str) -> list[Segment]:
-        """Return where the rows of a field are stored, in order."""
+    def segments(
+        self, mode: str, name: str, start: int = 0, stop: int | None = None
+    ) -> list[Segment]:
+        """Return where the rows of a field are stored, in order, or those that some are in."""
         field, known = self.field(mode, name), self.mode(mode)
-        return [
-            partition.segment(self.directory, field, span)
-            for partition, span in zip(known.partitions, known.spans, strict=True)
-            if partition.rows
-        ]
+        parts = known.partitions.between(start, known.rows if stop is None else stop)
+        return [partition.segment(self.directory, field, span) for partition, span in parts]
 
     def read(self, mode: str, name: str, start: int, stop: int) -> Array:
         """Return rows as a new array, shape (stop - start, *field shape)."""
@@ -120,9 +119,8 @@ class Reader:
 
     def check(self, mode: str, name: str, start: int = 0, stop: int | None = None) -> None:
         """Check that the files are long enough before memory is allocated for their rows."""
-        for segment in self.segments(mode, name):
-            if segment.span.inside(start, self.stored_rows(mode) if stop is None else stop)[1]:
-                segment.open()[0].close()
+        for segment in self.segments(mode, name, start, stop):
+            segment.open()[0].close()
 
     def read_into(
         self,
@@ -145,11 +143,10 @@ class Reader:
         """
         if not self.field(mode, name).nbytes:
             return
-        for segment in self.segments(mode, name):
+        for segment in self.segments(mode, name, start, start + len(out)):
             first, count = segment.span.inside(start, start + len(out))
-            if count:
-                rows = out[segment.span.among(first, count, start)]
-                self._read_part(rows, mode, segment, first, {} if checks is None else checks)
+            rows = out[segment.span.among(first, count, start)]
+            self._read_part(rows, mode, segment, first, {} if checks is None else checks)
 
     def partition_blocks(self, partition: Partition, name: str, start: int) -> Iterator[Array]:
         """Yield a partition's rows from its row `start` on, as `blocks` does for a mode."""

@@ -18,7 +18,7 @@ import numpy as np
 from physx_core import files
 from physx_core.dataset.read.order.order import Order
 from physx_core.dataset.read.reader import Reader
-from physx_core.dataset.store.manifest import Mode, Partition
+from physx_core.dataset.store.manifest import Mode, Partition, Partitions
 from physx_core.dataset.store.partition.spans import FlatIndex
 from physx_core.fields import Field
 
@@ -61,8 +61,8 @@ def _add_mode(group: Any, mode: Mode, order: Order | None) -> None:
 
 def _stored_pieces(mode: Mode) -> Iterator[Piece]:
     """Yield all rows of the sealed partitions, as they are stored."""
-    sealed = Mode(mode.fields, [partition for partition in mode.partitions if partition.sealed])
-    for partition, span in zip(sealed.partitions, sealed.spans, strict=True):
+    sealed = Partitions(partition for partition in mode.partitions if partition.sealed)
+    for partition, span in sealed.between(0, sealed.rows):
         yield partition, slice(0, span.rows), span.among(0, span.rows, 0)
 
 

@@ -11,7 +11,7 @@ from pathlib import Path
 from physx_core import files
 from physx_core.dataset.repair.quarantine import FOLDER, keep, set_aside
 from physx_core.dataset.repair.salvage import seal_without_damage
-from physx_core.dataset.store import manifest_file
+from physx_core.dataset.store import changes_file, manifest_file
 from physx_core.dataset.store.definitions import compare_fields
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition.commits import (
@@ -110,7 +110,7 @@ def load_from_files(directory: Path) -> Manifest:
 
 def damaged_files(directory: Path) -> Iterator[tuple[Path, DatasetError]]:
     """Yield each partition file that cannot be opened, with the error."""
-    for path in (p for p in sorted(directory.glob("*.h5")) if _NAME.fullmatch(p.name)):
+    for path in (directory / n for n in files.names(directory) if _NAME.fullmatch(n)):
         try:
             inspect(path)
         except DatasetError as error:
@@ -326,13 +326,17 @@ def _is_partition(path: Path) -> bool:
         return False
 
 
-def _state(directory: Path) -> tuple[int, int] | None:
-    """Return a value that changes whenever the manifest is replaced."""
-    try:
-        now = (directory / manifest_file.FILE).stat()
-    except OSError:
-        return None
-    return now.st_ino, now.st_mtime_ns
+def _state(directory: Path) -> list[tuple[int, int, int] | None]:
+    """Return a value that changes whenever the manifest or what continues it does."""
+    found: list[tuple[int, int, int] | None] = []
+    for name in (manifest_file.FILE, changes_file.FILE):
+        try:
+            now = (directory / name).stat()
+        except OSError:
+            found.append(None)
+        else:
+            found.append((now.st_ino, now.st_mtime_ns, now.st_size))
+    return found
 
 
 def _adopt(directory: Path, manifest: Manifest, strict: bool) -> None:
@@ -387,9 +391,9 @@ def _role(item: tuple[str, Inspection]) -> tuple[bool, str]:
 def _unlisted(directory: Path, manifest: Manifest) -> list[Path]:
     known = manifest.file_names | {f"{session}.h5" for session in manifest.sessions}
     return [
-        path
-        for path in sorted(directory.glob("*.h5"))
-        if path.name not in known and _NAME.fullmatch(path.name)
+        directory / name
+        for name in files.names(directory)
+        if name.endswith(".h5") and name not in known and _NAME.fullmatch(name)
     ]
 
 

@@ -43,18 +43,14 @@ def seal_without_damage(
     copies = [new for _, new in pairs]
     keys = {new.key for new in copies}
     mode.dropped = [partition for partition in mode.dropped if partition.key not in keys]
-    place = mode.place(partition)
-    mode.partitions[place : place + 1] = [
-        scan(directory, mode.fields, replace(new, sealed=True)) for new in copies
-    ]
+    sealed = [scan(directory, mode.fields, replace(new, sealed=True)) for new in copies]
+    mode.partitions.exchange(mode.place(partition), 1, sealed)
     mode.dropped.append(partition)
 
 
 def _reserve(directory: Path, mode: Mode, partition: Partition, run: Range) -> Partition:
     """List the copy of some rows of a partition as dropped, with the next number without files."""
-    listed = (*mode.partitions, *mode.dropped)
-    used = [each.index for each in listed if each.session == partition.session]
-    index = max(*used, mode.removed.get(partition.session, -1)) + 1
+    index = mode.next_index(partition.session)
     start, stop = run
     new = Partition(
         partition.mode,

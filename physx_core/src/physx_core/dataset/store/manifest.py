@@ -1,7 +1,7 @@
 """The manifest: a dataset's modes, fields, partitions, and origin.
 
-`physx_core.dataset.store.manifest_file` stores it as ``dataset.json``,
-`physx_core.dataset.store.statistics_file` the statistics of its rows beside it.
+`physx_core.dataset.store.manifest_file` stores it as ``dataset.json``, and what changes often in a
+file beside it, `physx_core.dataset.store.statistics_file` the statistics of its rows beside it.
 """
 
 from __future__ import annotations
@@ -10,15 +10,16 @@ import bisect
 import functools
 import json
 import platform
-from collections.abc import Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from importlib import metadata
 from pathlib import Path
-from typing import Any
+from typing import Any, overload
 
 import numpy as np
 from xxhash import xxh3_64_intdigest
 
+from physx_core.dataset.store.changes_file import End
 from physx_core.dataset.store.partition.commits import Kept, Range
 from physx_core.dataset.store.partition.format import (
     Identity,
@@ -143,6 +144,105 @@ class Partition:
         return plain
 
 
+class Partitions(Sequence[Partition]):
+    """The partitions of a mode in the order of their rows; knows which ones have which rows.
+
+    The rows before the first partition that is not sealed are added up once.
+    """
+
+    def __init__(self, partitions: Iterable[Partition] = ()) -> None:
+        self._list = list(partitions)
+        self._keys = {partition.key for partition in self._list}
+        self._starts, self._ends = [0], [0]  # rows and addresses before the first ones and the next
+
+    @overload
+    def __getitem__(self, place: int) -> Partition: ...
+    @overload
+    def __getitem__(self, place: slice) -> list[Partition]: ...
+    def __getitem__(self, place: int | slice) -> Partition | list[Partition]:
+        return self._list[place]
+
+    def __len__(self) -> int:
+        return len(self._list)
+
+    def __iter__(self) -> Iterator[Partition]:
+        return iter(self._list)
+
+    def add(self, partition: Partition) -> None:
+        """Add a partition at its place."""
+        place = bisect.bisect(self._list, partition.first_row, key=lambda each: each.first_row)
+        self.exchange(place, 0, [partition])
+
+    def remove(self, partition: Partition) -> None:
+        """Remove a partition, whatever its state."""
+        self.exchange(self.place(partition.key), 1, [])
+
+    def exchange(self, place: int, count: int, partitions: Sequence[Partition]) -> None:
+        """Let others take the place of some partitions."""
+        del self._starts[place + 1 :], self._ends[place + 1 :]
+        self._keys.difference_update(each.key for each in self._list[place : place + count])
+        self._keys.update(each.key for each in partitions)
+        self._list[place : place + count] = partitions
+
+    def has(self, key: tuple[str, int]) -> bool:
+        """Return whether there is a partition with a key."""
+        return key in self._keys
+
+    def place(self, key: tuple[str, int]) -> int:
+        """Return the number of the partition with a key.
+
+        Raises:
+            ValueError: If there is none.
+        """
+        for place in range(len(self._list) - 1, -1, -1):  # those that change are the last ones
+            if self._list[place].key == key:
+                return place
+        raise ValueError(f"there is no partition {key}")
+
+    def last_index(self, session: str) -> int:
+        """Return the number of a session's last partition, -1 if it has none."""
+        own = (each.index for each in reversed(self._list) if each.session == session)
+        return next(own, -1)
+
+    @property
+    def rows(self) -> int:
+        """Number of rows."""
+        known = self._add_up()
+        return self._starts[-1] + sum(each.rows for each in self._list[known:])
+
+    @property
+    def end(self) -> int:
+        """Address after those of all partitions."""
+        known = self._add_up()
+        return max(self._ends[-1], *(_end(each) for each in self._list[known:]), 0)
+
+    def between(self, start: int, stop: int) -> Iterator[tuple[Partition, Span]]:
+        """Yield the partitions that have some of the rows `start` to `stop`, and their spans."""
+        known = self._add_up()
+        place = bisect.bisect(self._starts, start, hi=known) - 1 if known else 0
+        begin = self._starts[place]
+        for each in self._list[place:]:
+            if begin >= stop:
+                break
+            if start < begin + each.rows and each.rows:
+                yield each, Span(begin, each.rows)
+            begin += each.rows
+
+    def _add_up(self) -> int:
+        """Add up the first partitions, all of them sealed; return how many they are."""
+        known, starts, ends = len(self._starts) - 1, self._starts, self._ends
+        while known < len(self._list) and self._list[known].sealed:
+            each, known = self._list[known], known + 1
+            starts.append(starts[-1] + each.rows)
+            ends.append(max(ends[-1], _end(each)))
+        return known
+
+
+def _end(partition: Partition) -> int:
+    """Return the address after a partition, which takes one at least."""
+    return partition.first_row + max(1, partition.rows)
+
+
 @dataclass
 class Mode:
     """The rows of one mode.
@@ -161,7 +261,7 @@ class Mode:
     """
 
     fields: dict[str, Field]
-    partitions: list[Partition] = field(default_factory=list)
+    partitions: Partitions = field(default_factory=Partitions)
     statistics: dict[str, RunningStatistics] | None = field(default_factory=dict)
     dropped: list[Partition] = field(default_factory=list)
     removed: dict[str, int] = field(default_factory=dict)
@@ -170,13 +270,19 @@ class Mode:
     @property
     def rows(self) -> int:
         """Number of committed rows."""
-        return sum(partition.rows for partition in self.partitions)
+        return self.partitions.rows
 
     @property
     def next_row(self) -> int:
         """First row of the next partition, larger than that of any earlier one."""
-        before = (p.first_row + max(1, p.rows) for p in (*self.partitions, *self.dropped))
-        return max(self.rows, *before, self.taken)
+        dropped = (_end(each) for each in self.dropped)
+        return max(self.rows, self.partitions.end, *dropped, self.taken)
+
+    def next_index(self, session: str) -> int:
+        """Return the number of a session's next partition, which no other one has ever had."""
+        dropped = (each.index for each in self.dropped if each.session == session)
+        last = max(self.partitions.last_index(session), self.removed.get(session, -1), *dropped, -1)
+        return last + 1
 
     @property
     def counted_fields(self) -> dict[str, Field]:
@@ -185,7 +291,7 @@ class Mode:
 
     def place(self, partition: Partition) -> int:
         """Return the position of a partition, even if it has been replaced by a later state."""
-        return [p.key for p in self.partitions].index(partition.key)
+        return self.partitions.place(partition.key)
 
     @property
     def spans(self) -> list[Span]:
@@ -198,19 +304,26 @@ class Mode:
 
     def add(self, partition: Partition) -> None:
         """Add a partition at its place."""
-        bisect.insort(self.partitions, partition, key=lambda each: each.first_row)
+        self.partitions.add(partition)
 
     def swap(self, partition: Partition) -> None:
         """Replace the earlier state of a partition."""
-        self.partitions[self.place(partition)] = partition
+        self.partitions.exchange(self.place(partition), 1, [partition])
+
+    def put(self, partition: Partition) -> None:
+        """Add a partition or replace its earlier state."""
+        if self.partitions.has(partition.key):
+            self.swap(partition)
+        else:
+            self.add(partition)
 
     def forget_statistics(self) -> None:
         """Discard the statistics, so that they are recomputed from all rows."""
         self.statistics = {}
-        for place, partition in enumerate(self.partitions):
+        for place, partition in enumerate([*self.partitions]):
             partition.running = {}
             if partition.counted:
-                self.partitions[place] = replace(partition, counted=False)
+                self.partitions.exchange(place, 1, [replace(partition, counted=False)])
 
     def continues(self, earlier: Mode) -> bool:
         """Return whether all rows of an earlier state still exist under the same numbers."""
@@ -237,7 +350,7 @@ class Mode:
         """Return a copy to change while this one stays; the partitions are shared."""
         return Mode(
             dict(self.fields),
-            list(self.partitions),
+            Partitions(self.partitions),
             None if self.statistics is None else dict(self.statistics),
             list(self.dropped),
             dict(self.removed),
@@ -282,6 +395,7 @@ class Manifest:
         generation: Increases whenever known rows have been changed or renumbered, which makes
             rows kept in memory stale; not stored.
         numbering: Increases whenever known rows have been renumbered; not stored.
+        end: Where changes of what is stored go; None if it is not stored like this.
     """
 
     modes: dict[str, Mode] = field(default_factory=dict)
@@ -291,6 +405,7 @@ class Manifest:
     problems: dict[str, DatasetError] = field(default_factory=dict)
     generation: int = 0
     numbering: int = 0
+    end: End | None = None
 
     @property
     def sessions(self) -> list[str]:
@@ -306,6 +421,11 @@ class Manifest:
         )
 
     @property
+    def has_changes(self) -> bool:
+        """Whether changes were stored that are not in the file of the manifest."""
+        return self.end is not None and self.end.nbytes > 0
+
+    @property
     def file_names(self) -> set[str]:
         """Names of all partition files, including dropped ones."""
         return {
@@ -317,13 +437,13 @@ class Manifest:
 
     def copy(self) -> Manifest:
         """Return a copy to change while this one stays; the partitions are shared."""
-        modes = {name: mode.copy() for name, mode in self.modes.items()}
         return Manifest(
-            modes,
+            {name: mode.copy() for name, mode in self.modes.items()},
             dict(self.info),
             dict(self.versions),
             self.statistics_checksum,
             dict(self.problems),
+            end=self.end,
         )
 
     def renumber(self) -> None:
@@ -341,6 +461,7 @@ class Manifest:
         self.modes, self.info = other.modes, other.info
         self.statistics_checksum = other.statistics_checksum
         self.versions, self.problems = other.versions, other.problems
+        self.end = other.end
 
 
 def to_plain_info(values: Mapping[str, Any]) -> dict[str, Any]:

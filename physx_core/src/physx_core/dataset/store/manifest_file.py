@@ -1,24 +1,27 @@
-"""Writes and reads the file ``dataset.json``.
+"""Writes and reads the file ``dataset.json``, and the changes since it was written.
 
-Its size does not depend on the fields' shapes: statistics, which do, have a file of their own. Its
-last entry is a CRC-32 of everything before it, so that truncation or manual edits are noticed
-before a wrong offset yields wrong numbers. Every value is validated: a dataset may come from an
-untrusted source.
+Its size does not depend on the fields' shapes: statistics, which do, have a file of their own. Nor
+is it written for each new partition: see `physx_core.dataset.store.changes_file`. Its last entry is
+a CRC-32 of everything before it, so that truncation or manual edits are noticed before a wrong
+offset yields wrong numbers. Every value is validated: a dataset may come from an untrusted source.
 """
 
 from __future__ import annotations
 
+import contextlib
 import json
 import re
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
-from physx_core.dataset.store import statistics_file
+from physx_core.dataset.store import changes_file, statistics_file
+from physx_core.dataset.store.changes_file import End
 from physx_core.dataset.store.manifest import Manifest, Partition
-from physx_core.dataset.store.manifest_parsing import parse_manifest
+from physx_core.dataset.store.manifest_parsing import apply_change, parse_manifest
 from physx_core.dataset.store.validation import whole
 from physx_core.errors import ConfigError, DatasetError
 from physx_core.origin import install_hint
@@ -39,10 +42,11 @@ _INVALID = (
 
 
 def save(directory: Path, manifest: Manifest) -> None:
-    """Write the manifest atomically, after the statistics if they are not stored yet."""
-    before, after = manifest.statistics_checksum, manifest.statistics_checksum
-    if before is None:
-        after = statistics_file.write(directory, manifest)
+    """Write the manifest atomically, after the statistics if they are not stored yet.
+
+    It takes over all changes.
+    """
+    before, after = manifest.statistics_checksum, _store_statistics(directory, manifest)
     plain = {
         "format": FORMAT,
         "format_version": VERSION,
@@ -51,14 +55,44 @@ def save(directory: Path, manifest: Manifest) -> None:
         "modes": {name: mode.to_dict() for name, mode in manifest.modes.items()},
     }
     if after is not None:
-        name = statistics_file.file_name(after)
-        plain["statistics"] = {"file": name, "crc32": f"{after:08x}"}
+        plain["statistics"] = statistics_file.reference(after)
     body = _format(plain).encode()[:-2]
-    end = f',\n "crc32": "{crc32(body):08x}"\n}}'.encode()
-    files.replace(directory / FILE, body + end)
+    checksum = crc32(body)
+    content = body + f',\n "crc32": "{checksum:08x}"\n}}'.encode()
+    files.replace(directory / FILE, content)
     manifest.statistics_checksum = after
+    manifest.end = End.of_manifest(checksum, len(content), manifest.statistics_checksum)
+    changes_file.remove(directory)
     if before is None and after is not None:
         statistics_file.clear(directory, after)
+
+
+def append(directory: Path, manifest: Manifest, end: End, partitions: list[Partition]) -> None:
+    """List partitions that were begun or sealed, without writing the whole manifest.
+
+    Args:
+        directory: The dataset's folder.
+        manifest: The manifest, which receives them.
+        end: Where its changes go.
+        partitions: The partitions, at least one.
+    """
+    before, after = end.statistics, _store_statistics(directory, manifest)
+    plain = [{"mode": each.mode, "partition": each.to_dict()} for each in partitions]
+    if after != before and after is not None:
+        plain[-1]["statistics"] = statistics_file.reference(after)
+    end = changes_file.append(directory, end, plain)
+    manifest.end, manifest.statistics_checksum = end._replace(statistics=after), after
+    for each in partitions:
+        manifest.modes[each.mode].put(each)
+    if after != before:
+        statistics_file.remove(directory, before)
+
+
+def _store_statistics(directory: Path, manifest: Manifest) -> int | None:
+    """Store the statistics if they are not stored yet; return the checksum of their file."""
+    if manifest.statistics_checksum is not None:
+        return manifest.statistics_checksum
+    return statistics_file.write(directory, manifest)
 
 
 def read(directory: Path) -> bytes:
@@ -67,7 +101,7 @@ def read(directory: Path) -> bytes:
 
 
 def load(directory: Path, *, edited: bool = False) -> Manifest:
-    """Read the manifest.
+    """Read the manifest and the changes since it was written.
 
     Args:
         directory: The dataset's folder.
@@ -80,7 +114,7 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
         raise
     except OSError as error:
         raise DatasetError(f"{path} cannot be read: {error.strerror}.") from error
-    try:
+    with _parsing(path, len(content)):
         plain = parse_json(content)
         if not isinstance(plain, dict) or plain.get("format") != FORMAT:
             raise ValueError(f'its format is not "{FORMAT}"')
@@ -92,11 +126,48 @@ def load(directory: Path, *, edited: bool = False) -> Manifest:
             )
         if not edited and not _is_whole(content):
             raise ValueError("it was truncated or edited by hand: its checksum does not match")
-        return parse_manifest(plain)
+        manifest = parse_manifest(plain)
+    checksum = _stored_checksum(content)
+    if checksum is not None:
+        manifest.end = End.of_manifest(checksum, len(content), manifest.statistics_checksum)
+        load_changes(directory, manifest)
+    return manifest
+
+
+def load_changes(directory: Path, manifest: Manifest) -> None:
+    """Take over changes that have been added since the manifest was loaded."""
+    path = directory / changes_file.FILE
+    assert manifest.end is not None
+    try:
+        with _parsing(path, manifest.end.nbytes):
+            for change, end in changes_file.read(directory, manifest.end):
+                apply_change(manifest, change)
+                manifest.end = end._replace(statistics=manifest.statistics_checksum)
+    except OSError as error:
+        raise DatasetError(f"{path} cannot be read: {error.strerror}.") from error
+
+
+def is_continued(directory: Path, manifest: Manifest) -> bool:
+    """Return whether the manifest on disk is still the one that this one is or continues."""
+    if manifest.end is None:
+        return False
+    with contextlib.suppress(OSError):
+        content = files.read_tail(directory / FILE, _END_NBYTES)
+        return _stored_checksum(content) == manifest.end.manifest
+    return False
+
+
+@contextlib.contextmanager
+def _parsing(path: Path, nbytes: int) -> Iterator[None]:
+    """Convert errors of parsing to one that names the file."""
+    try:
+        yield
+    except OSError:
+        raise
     except _INVALID as error:
         reason = f"{error.args[0]!r} is missing" if isinstance(error, KeyError) else str(error)
         raise DatasetError(
-            f"{path} ({len(content)} bytes) is not the manifest of a dataset: {reason}. "
+            f"{path} ({nbytes} bytes) is not the manifest of a dataset: {reason}. "
             "`physx verify --repair` or Dataset.repair(directory) repairs it, from the partition "
             "files if necessary; no row is lost."
         ) from error
@@ -117,17 +188,22 @@ def was_updated(directory: Path, partition: Partition, name: str) -> bool:
 
 
 def _format(value: Any, indent: str = "\n") -> str:
-    """Return data as indented JSON with lists of numbers on one line: readable and fast."""
+    """Return data as indented JSON with each item of a list on one line: readable and fast."""
     inner = indent + " "
     if isinstance(value, dict) and value:
         items = (f"{json.dumps(name)}: {_format(item, inner)}" for name, item in value.items())
         return "{" + inner + f",{inner}".join(items) + indent + "}"
     if isinstance(value, list) and any(isinstance(item, dict) for item in value):
-        items = (_format(item, inner) for item in value)
-        return "[" + inner + f",{inner}".join(items) + indent + "]"
+        return "[" + inner + f",{inner}".join(map(json.dumps, value)) + indent + "]"
     return json.dumps(value)
 
 
 def _is_whole(content: bytes) -> bool:
     end = _END.search(content, max(0, len(content) - _END_NBYTES))
     return end is not None and int(end[1], 16) == crc32(content[: end.start()])
+
+
+def _stored_checksum(content: bytes) -> int | None:
+    """Return the checksum that the end of a manifest holds, whether or not it is right."""
+    end = _END.search(content, max(0, len(content) - _END_NBYTES))
+    return None if end is None else int(end[1], 16)

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-from physx_core.dataset.store.manifest import Manifest, Mode, Partition
+from physx_core.dataset.store.manifest import Manifest, Mode, Partition, Partitions
 from physx_core.dataset.store.statistics_file import file_name
 from physx_core.dataset.store.validation import (
     SESSION,
@@ -34,6 +34,21 @@ def parse_manifest(plain: Mapping[str, Any]) -> Manifest:
     return Manifest(modes, info, versions)
 
 
+def apply_change(manifest: Manifest, plain: Any) -> None:
+    """Take over a change of the manifest, described by plain data."""
+    name = checked(str, plain["mode"], "a mode")
+    mode = manifest.modes[name]
+    partition = _partition(name, plain["partition"], mode.fields)
+    if any(partition.key == each.key for each in mode.dropped):
+        raise ValueError("a partition is listed twice")
+    mode.put(partition)
+    whole(mode.rows, "the number of rows")
+    if "statistics" in plain:
+        manifest.statistics_checksum = _statistics_checksum(plain["statistics"])
+        for each in manifest.modes.values():
+            each.statistics = None
+
+
 def _statistics_checksum(plain: Any) -> int:
     checksum = int(checked(str, plain["crc32"], "the checksum of the statistics"), 16)
     if plain["file"] != file_name(checksum):
@@ -52,7 +67,7 @@ def _mode(mode_name: str, plain: Any) -> Mode:
         raise ValueError("a mode has no fields")
     mode = Mode(
         fields,
-        [_partition(mode_name, entry, fields) for entry in plain["partitions"]],
+        Partitions(_partition(mode_name, entry, fields) for entry in plain["partitions"]),
         statistics=None,
         dropped=[_partition(mode_name, entry, fields) for entry in plain.get("dropped", ())],
     )
@@ -72,8 +87,8 @@ def _partition(mode_name: str, plain: Any, fields: Mapping[str, Field]) -> Parti
     sealed = checked(bool, plain["sealed"], "'sealed'")
     offsets = checked(dict, plain["offsets"], "'offsets'")
     crc32 = checked(dict, plain.get("crc32", {}), "'crc32'")
-    unknown = (offsets.keys() | crc32.keys()) - fields.keys()
-    if unknown:
+    if not (offsets.keys() <= fields.keys() and crc32.keys() <= fields.keys()):
+        unknown = (offsets.keys() | crc32.keys()) - fields.keys()
         raise ValueError(f"there is no field {min(unknown)!r:.60}")
     if sealed and (len(offsets) != len(fields) or len(crc32) not in (0, len(fields))):
         raise ValueError("a sealed partition lacks offsets or checksums")

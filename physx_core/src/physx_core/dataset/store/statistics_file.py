@@ -36,6 +36,11 @@ def file_name(checksum: int) -> str:
     return f"statistics_{checksum:08x}.safetensors"
 
 
+def reference(checksum: int) -> dict[str, str]:
+    """Return what the manifest says of the file with a CRC-32."""
+    return {"file": file_name(checksum), "crc32": f"{checksum:08x}"}
+
+
 def write(directory: Path, manifest: Manifest) -> int | None:
     """Write the statistics of all modes to a new file and wait until it is on the disk.
 
@@ -88,6 +93,13 @@ def read(directory: Path, manifest: Manifest) -> bytes:
     if crc32(content) != manifest.statistics_checksum:
         raise ValueError("its checksum does not match")
     return content
+
+
+def remove(directory: Path, checksum: int | None) -> None:
+    """Remove the file with a CRC-32, which nothing refers to any more."""
+    if checksum is not None:
+        with contextlib.suppress(OSError):
+            files.remove(directory / file_name(checksum))
 
 
 def clear(directory: Path, checksum: int | None) -> None:

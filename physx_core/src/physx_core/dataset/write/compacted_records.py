@@ -11,7 +11,7 @@ from physx_core.dataset.read.order.order import Order
 from physx_core.dataset.read.order.rewriting import records_at
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.store.episode_table import EPISODES, mode_index
-from physx_core.dataset.store.manifest import Mode, Partition
+from physx_core.dataset.store.manifest import Mode, Partition, Partitions
 from physx_core.dataset.write.writer import Writer
 from physx_core.typing import Batch
 
@@ -37,7 +37,7 @@ def compacted_records(
     parts = [{name: column[others] for name, column in table.items()}]
     for name, order in orders.items():
         is_open = name not in writer.recorder.recorded
-        addresses = Addresses(Mode({}, list(partitions[name])))
+        addresses = Addresses(Mode({}, Partitions(partitions[name])))
         records = records_at(order, reader.orders.places(name), addresses, table, is_open=is_open)
         parts.append(records)
     return {name: np.concatenate([part[name] for part in parts]) for name in table}

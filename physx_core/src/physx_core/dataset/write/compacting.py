@@ -21,7 +21,7 @@ from physx_core.dataset.read.views import ModeView
 from physx_core.dataset.read.virtual_index import write_index
 from physx_core.dataset.repair.report import find_problem
 from physx_core.dataset.store.episode_table import EPISODES
-from physx_core.dataset.store.manifest import Manifest, Mode, Partition
+from physx_core.dataset.store.manifest import Manifest, Mode, Partition, Partitions
 from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.dataset.store.sealing import seal
 from physx_core.dataset.write.compacted_records import compacted_records
@@ -30,7 +30,7 @@ from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError
 from physx_core.typing import Array, Batch
 
-Partitions = dict[str, list[Partition]]
+PartitionsByMode = dict[str, list[Partition]]
 ReadRows = Callable[[str, int, int], Array]
 
 
@@ -90,7 +90,7 @@ def _is_compact(writer: Writer, reader: Reader, orders: Mapping[str, Order]) -> 
     return len(compacted_records(writer, reader, orders, own)["rows"]) == modes[EPISODES].rows
 
 
-def _check(directory: Path, manifest: Manifest, replaced: Partitions) -> None:
+def _check(directory: Path, manifest: Manifest, replaced: PartitionsByMode) -> None:
     """Check what is to be copied: a copy of damaged rows would look sound."""
     for name, partitions in replaced.items():
         for partition in partitions:
@@ -99,7 +99,9 @@ def _check(directory: Path, manifest: Manifest, replaced: Partitions) -> None:
                     raise DatasetError(f"{problem} Nothing was compacted.")
 
 
-def _replace(writer: Writer, reader: Reader, orders: Mapping[str, Order], old: Partitions) -> None:
+def _replace(
+    writer: Writer, reader: Reader, orders: Mapping[str, Order], old: PartitionsByMode
+) -> None:
     """Write the new partitions, and let them take the place of the old ones."""
     store, new, sealed = writer.store, {}, {}
     with store.change() as manifest:
@@ -172,7 +174,7 @@ def _write(writer: Writer, partitions: Sequence[Partition], read: ReadRows) -> I
 def _exchange(mode: Mode, old: Sequence[Partition], new: Sequence[Partition]) -> None:
     """Let new partitions of a mode take the place of the old ones."""
     mode.forget_statistics()
-    mode.partitions = [*_without(mode.partitions, old), *new]
+    mode.partitions = Partitions([*_without(mode.partitions, old), *new])
     mode.dropped = [*_without(mode.dropped, new), *old]
     for each in old:
         mode.removed[each.session] = max(each.index, mode.removed.get(each.session, -1))

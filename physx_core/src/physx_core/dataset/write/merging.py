@@ -51,7 +51,7 @@ def add_partitions(writer: Writer, source: Path, given: Manifest) -> None:
             for entry in sealed:
                 mode = manifest.modes[EPISODES]
                 mode.dropped = [p for p in mode.dropped if p.key != entry.key]
-                mode.partitions.append(entry)
+                mode.add(entry)
     except BaseException:
         with contextlib.suppress(OSError):  # the next writer removes what is left
             found = {name: [new for _, new in found] for name, found in pairs.items()}
@@ -67,7 +67,7 @@ def drop_partition(writer: Writer, mode_name: str, session: str | None, index: i
     found = _find(writer, mode_name, session, index)
     with writer.store.change() as manifest:
         mode = manifest.modes[mode_name]
-        del mode.partitions[mode.place(found)]
+        mode.partitions.remove(found)
         mode.dropped.append(found)
         mode.removed[found.session] = max(found.index, mode.removed.get(found.session, -1))
         if found.counted:
@@ -158,7 +158,7 @@ def _accept(manifest: Manifest, mode: Mode, other: Mode, pairs: Pairs) -> None:
     known = all(old.counted for old, _ in pairs)
     for new in arrived.values():
         new.sealed, new.counted = True, known
-        mode.partitions.append(new)
+        mode.add(new)
     if known:
         add_counted(manifest, mode, other.statistics or {})
 

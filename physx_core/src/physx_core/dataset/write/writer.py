@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import contextlib
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import replace
 from functools import partial
 from operator import attrgetter
@@ -320,19 +320,41 @@ class Writer:
                     raise
         if not self._sealed:
             return
-        with self.store.change() as manifest:
+        with self.store.turn() as manifest:
             for entry in self._sealed:
                 mode = manifest.modes[entry.mode]
                 if entry.rows < mode.partitions[mode.place(entry)].rows:
                     manifest.renumber()  # some are lost
+            listed: list[Partition] = []
+            for entry in self._sealed:
                 if entry.rows:
-                    mode.swap(entry)
-                    count_sealed(self._directory, manifest, mode)
-                else:
-                    del mode.partitions[mode.place(entry)]
-            write_index(self.reader, self.session)
+                    listed.append(self._counted(entry, listed))
+            self.store.put(listed)
         empty = [entry for entry in self._sealed if not entry.rows]
         self._sealed.clear()
+        if empty or self.store.has_grown:
+            self._fold(empty)
+
+    def _counted(self, entry: Partition, listed: Sequence[Partition]) -> Partition:
+        """Return a sealed partition with its rows in the mode's statistics if it has its own.
+
+        Those before it must be counted, perhaps as they are about to be `listed`.
+        """
+        mode = self.store.manifest.modes[entry.mode]
+        place = mode.place(entry)
+        before = mode.partitions[place - 1] if place else None
+        counted = {(each.mode, each.key) for each in listed if each.counted}
+        if before is not None and not (before.counted or (entry.mode, before.key) in counted):
+            return entry
+        found = count_sealed(self._directory, self.store.manifest, mode, [entry])
+        return found[0] if found else entry
+
+    def _fold(self, empty: Sequence[Partition] = ()) -> None:
+        """Write the manifest as a whole, without partitions that have no rows, and the index."""
+        with self.store.change() as manifest:
+            for entry in empty:
+                manifest.modes[entry.mode].partitions.remove(entry)
+            write_index(self.reader, self.session)
         for entry in empty:
             remove_files(self._directory, self.store.manifest.modes[entry.mode].fields, entry)
 
@@ -354,7 +376,7 @@ class Writer:
         """Create the files of a partition, then list it; rows may be committed only after that."""
         parts: dict[str, PartitionFile] = {}
         try:
-            with self.store.change() as manifest:
+            with self.store.turn() as manifest:
                 mode = manifest.modes[mode_name]
                 capacity = self.capacity(mode)
                 entry = self.new_partition(mode_name, mode)
@@ -368,7 +390,7 @@ class Writer:
                 for part in parts.values():
                     part.publish()
                 files.sync_folder(self._directory)
-                mode.add(entry)
+                self.store.put([entry])
         except BaseException:
             for part in parts.values():
                 part.discard()
@@ -389,10 +411,8 @@ class Writer:
 
     def new_partition(self, mode_name: str, mode: Mode) -> Partition:
         """Return a partition with the first number whose files do not exist yet."""
-        listed = (*mode.partitions, *mode.dropped)
-        used = [partition.index for partition in listed if partition.session == self.session]
-        last = max(mode.removed.get(self.session, -1), *used, -1)
-        entry = Partition(mode_name, self.session, last + 1, mode.next_row)
+        index = mode.next_index(self.session)
+        entry = Partition(mode_name, self.session, index, mode.next_row)
         while any(entry.path(self._directory, name).exists() for name in mode.fields):
             entry = replace(entry, index=entry.index + 1)
         return entry
@@ -402,12 +422,14 @@ class Writer:
         before = self._filled.get(mode_name)
         if before is None:
             return None
-        listed = any(p.key == before.key and not p.sealed for p in mode.partitions)
+        listed = mode.partitions.has(before.key) and not mode.partitions[mode.place(before)].sealed
         return (before.index, before.rows) if listed else None
 
     def _complete(self) -> None:
         """Compute what is missing: checksums of updated partitions, statistics, the index."""
         if self.store.shared:
+            if self.store.manifest.has_changes:
+                self._fold()
             return
         manifest = self.store.manifest
         changed = recovery.complete_checksums(self._directory, manifest)
@@ -416,7 +438,7 @@ class Writer:
                 changed = True
                 with contextlib.suppress(DatasetError):  # a partition is damaged: skip for now
                     compute_statistics(self.reader, name)
-        if changed or manifest.has_new_statistics:
+        if changed or manifest.has_new_statistics or manifest.has_changes:
             manifest_file.save(self._directory, manifest)
         store_in_order(self.reader)
         write_index(self.reader, self.session, wait=True)

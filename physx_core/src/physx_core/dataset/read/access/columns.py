@@ -9,7 +9,7 @@ import numpy as np
 
 from physx_core.dataset.read.access import memory
 from physx_core.dataset.read.access.disk import DiskColumn
-from physx_core.dataset.read.access.mapping import MappedColumn, runs_of
+from physx_core.dataset.read.access.mapping import MappedColumn, Runs
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.shuffling import LARGE_ROW
 from physx_core.fields import Field
@@ -31,6 +31,10 @@ class MemoryColumn:
         self._mode, self._name = mode, field.name
         self._plain = np.dtype(field.dtype) == dtype
         self._array = np.empty(self.shape, dtype)
+        self._runs = Runs()
+
+    def check(self) -> None:
+        """Check nothing: the rows are in memory, whatever becomes of the files."""
 
     def extend(self, rows: int) -> None:
         """Read those of the first `rows` rows that are not in memory yet."""
@@ -45,7 +49,7 @@ class MemoryColumn:
             for block in self._reader.blocks(self._mode, self._name, have, rows):
                 self._array[have : have + len(block)] = block
                 have += len(block)
-        self.shape = (rows, *self.shape[1:])
+        self.shape, self._runs = (rows, *self.shape[1:]), Runs()
 
     @property
     def array(self) -> Array:
@@ -55,7 +59,7 @@ class MemoryColumn:
     def windows(self, first: Index, count: int) -> Array:
         """Return consecutive rows from each of some rows on, shape (n, count, *field shape)."""
         return (
-            runs_of(self.array, count)[first]
+            self._runs.of(self.array, count)[first]
             .view(self.dtype)
             .reshape(len(first), count, *self.shape[1:])
         )

@@ -16,6 +16,10 @@ from physx_core.typing import Array, Index
 
 _OPEN_FILES = 64
 
+Piece = tuple[int, int, int, int]
+"""Segment, first row there, number of rows, and the place of the first among the sought ones."""
+Pieces = list[Piece]
+
 
 class DiskColumn:
     """The stored rows of a field on disk; close it after use.
@@ -49,30 +53,33 @@ class DiskColumn:
         self._index = FlatIndex([segment.span for segment in self._segments])
         self._opened: dict[int, tuple[FileIO, int]] = {}
 
-    def announce(self, index: Index) -> None:
+    def announce(self, pieces: Pieces) -> None:
         """Tell the operating system that rows will be read soon.
 
         Args:
-            index: The rows, shape (n,); consecutive ones are announced together.
+            pieces: The rows.
         """
         size = self.row_nbytes
         if not size or not hasattr(os, "posix_fadvise"):
             return
-        for number, first, count, _ in self._pieces(index):
+        for number, first, count, _ in pieces:
             file, offset = self._open(number)
             start = offset + first * size
             os.posix_fadvise(file.fileno(), start, count * size, os.POSIX_FADV_WILLNEED)
 
-    def gather(self, index: Index, out: Array) -> None:
+    def gather(self, index: Index, out: Array, pieces: Pieces | None = None) -> None:
         """Copy rows into a contiguous array, shape (rows, *field shape).
 
         Args:
             index: The rows, shape (n,); consecutive ones are read together.
             out: Receives them.
+            pieces: The rows, if any field of the mode has located them already.
         """
         rows, size = self._target(out), self.row_nbytes
         view = files.as_bytes(rows)
-        for number, first, count, at in self._pieces(index) if size else ():
+        if pieces is None:
+            pieces = self.locate(index)
+        for number, first, count, at in pieces if size else ():
             file, offset = self._open(number)
             part = view[at * size : (at + count) * size]
             self._segments[number].read(file, offset + first * size, part)
@@ -93,14 +100,11 @@ class DiskColumn:
             self._scratch = np.empty(out.shape, self._own)
         return self._scratch[: len(out)]
 
-    def _pieces(self, index: Index) -> Iterator[tuple[int, int, int, int]]:
-        """Locate rows in the segments, consecutive ones together.
+    def locate(self, index: Index) -> Pieces:
+        """Locate rows in the segments, consecutive ones together; the same for all fields."""
+        return list(self._pieces(index)) if len(index) else []
 
-        Yields:
-            Segment number, first row there, number of rows, and the place of the first in `index`.
-        """
-        if not len(index):
-            return
+    def _pieces(self, index: Index) -> Iterator[Piece]:
         begins = np.append(0, np.flatnonzero(np.diff(index) != 1) + 1)
         counts = np.diff(begins, append=len(index))
         numbers, firsts = self._index.locate(index[begins])

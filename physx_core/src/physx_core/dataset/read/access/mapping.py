@@ -27,16 +27,29 @@ _FIXED = 0x10  # MAP_FIXED, which the module mmap does not define
 _ANONYMOUS = mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS
 
 
-def runs_of(rows: Array, count: int) -> Array:
-    """Return runs of consecutive rows, from each row on, as single values that may overlap.
+class Runs:
+    """Runs of consecutive rows of an array as single values, which overlap.
 
-    Args:
-        rows: Contiguous rows of at least one byte, at least `count` of them.
-        count: How many follow one another.
+    Indexing them is a single copy for each; `take` would copy all of them first.
     """
-    size = rows.nbytes // len(rows)
-    run = np.dtype((np.void, count * size))
-    return np.ndarray((len(rows) - count + 1,), run, rows.data, 0, (size,))
+
+    def __init__(self) -> None:
+        self._known: dict[int, Array] = {}
+
+    def of(self, rows: Array, count: int) -> Array:
+        """Return the runs from each row on, shape (runs,).
+
+        Args:
+            rows: Contiguous rows of at least one byte, at least `count` of them; always the same.
+            count: How many follow one another.
+        """
+        found = self._known.get(count)
+        if found is None:
+            size = rows.nbytes // len(rows)
+            run = np.dtype((np.void, count * size))
+            found = np.ndarray((len(rows) - count + 1,), run, rows.data, 0, (size,))
+            self._known[count] = found
+        return found
 
 
 class _Mapped(NamedTuple):
@@ -68,7 +81,7 @@ class MappedColumn:
         self._mapped: list[_Mapped] = []
         self._slots, slots = _places(segments, field.nbytes)
         self._index = FlatIndex([segment.span for segment in segments])
-        self._single = len(segments) == 1
+        self._single, self._runs = len(segments) == 1, Runs()
         if field.nbytes and slots:
             content = self._map(segments, slots * field.nbytes)
             self._array = content.view(self.dtype).reshape(slots, *self.shape[1:])
@@ -90,7 +103,7 @@ class MappedColumn:
         array = self._array
         if not self._row_nbytes or len(array) < count:
             return np.empty((len(first), count, *array.shape[1:]), array.dtype)
-        runs = runs_of(array, count)
+        runs = self._runs.of(array, count)
         found: Array = runs[np.minimum(begins, len(runs) - 1)].view(array.dtype)
         found = found.reshape(len(first), count, *array.shape[1:])
         apart = np.flatnonzero(numbers != ends)

@@ -59,12 +59,18 @@ class Order:
         """Number of rows."""
         return int(self.found.rows.sum())
 
+    @property
+    def is_stored(self) -> bool:
+        """Whether they are the first stored rows."""
+        first = self.places.first
+        return not len(first) or (len(first) == 1 and first[0] == 0)
+
     @cached_property
     def index(self) -> Index | None:
         """The stored row of each row, shape (rows,); None if they are the first stored rows."""
-        first, rows = self.places
-        if not len(first) or (len(first) == 1 and first[0] == 0):
+        if self.is_stored:
             return None
+        first, rows = self.places
         return np.repeat(first - self._starts, rows) + np.arange(self.rows)
 
     def stored(self, rows: Index) -> Index:
