@@ -82,7 +82,7 @@ def stream(every: int, **kwargs: Any) -> ClientSource:
     config = EnvironmentConfig(
         f"{Path(__file__).resolve()}:Walk",
         env_kwargs=kwargs,
-        restarts=1000,
+        retries=1000,
         state_every=every,
     )
     return ClientSource(config, Services(), [7], run_ahead=0)  # type: ignore[arg-type]

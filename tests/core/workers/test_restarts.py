@@ -19,7 +19,7 @@ from physx_core.workers.server.journal import Journal
 
 ENVS = Path(__file__).parents[1] / "programs" / "restart_envs.py"
 WANDERER = f"{ENVS}:SimulatedWanderer"
-ONCE = {"run_ahead": 0, "restarts": 1}
+ONCE = {"run_ahead": 0, "retries": 1}
 
 
 @pytest.fixture
@@ -98,7 +98,7 @@ def test_rows_depend_on_the_seed_alone(simulated, batch_services, kill_one, asks
             num_clients=3,
             env_kwargs={"asks": asks, "delay": delay, "refuse": 4},
             run_ahead=ahead,
-            restarts=int(attempt == 3),
+            retries=int(attempt == 3),
         )
         kill = kill_one if attempt == 3 else None
         hashes.add(digest(run(source, sizes, apply=asks, kill=kill)))
@@ -107,7 +107,7 @@ def test_rows_depend_on_the_seed_alone(simulated, batch_services, kill_one, asks
 
 def test_run_ends_before_restarted_client_joined(simulated, batch_services, simulation, caplog):
     arguments = {"fault": "dawdle", "place": "close", "pace": 0.1}
-    source = simulated(WANDERER, num_clients=2, env_kwargs=arguments, run_ahead=0, restarts=1)
+    source = simulated(WANDERER, num_clients=2, env_kwargs=arguments, run_ahead=0, retries=1)
     with source:
         source.batch(3)
         simulation.alive[1].kill()
@@ -139,7 +139,7 @@ def test_failed_client_is_restarted(
     expected = digest(run(local(WANDERER, **settings), sizes, apply=True))
     fresh_notes()
     settings["env_kwargs"] |= {"fault": fault, "place": place, "at": 7}
-    source = simulated(WANDERER, run_ahead=0, restarts=1, **settings)
+    source = simulated(WANDERER, run_ahead=0, retries=1, **settings)
     assert digest(run(source, sizes, apply=True)) == expected
     (warning,) = [record for record in caplog.records if record.name == "physx"]
     assert warning.levelname == "WARNING"
@@ -158,7 +158,7 @@ def test_several_restarts_of_several_clients(local, simulated, fresh_notes, capl
     fresh_notes()
     victims = [1, 3, 1]
     batches = []
-    with simulated(WANDERER, restarts=2, run_ahead=2, **settings) as source:
+    with simulated(WANDERER, retries=2, run_ahead=2, **settings) as source:
         while victims or len(batches) < 30:
             batches.append({name: values.copy() for name, values in source.batch(1).items()})
             if victims and victims[0] in simulation.alive:
@@ -175,7 +175,7 @@ def test_restart_keeps_batches_of_prediction_requests(simulated, batch_services,
         batch_services.sizes.clear()
         kwargs = {"asks": True, "fault": fault, "place": "step", "at": 4}
         with simulated(
-            WANDERER, num_clients=3, env_kwargs=kwargs, run_ahead=0, restarts=1
+            WANDERER, num_clients=3, env_kwargs=kwargs, run_ahead=0, retries=1
         ) as source:
             for _ in range(4):
                 source.batch(6)
@@ -191,7 +191,7 @@ def test_restart_repeats_no_drawing_and_no_saved_parameters(simulated, services,
         services.shown.clear()
         services.kept.clear()
         kwargs = {"fault": fault, "place": "step", "at": 6}
-        settings = {"num_clients": 2, "visualizer": "any", "restarts": 1}
+        settings = {"num_clients": 2, "visualizer": "any", "retries": 1}
         with simulated(WANDERER, env_kwargs=kwargs, total=20, **settings) as source:
             source.batch(20)
         drawn = sorted((i, step, str(events)) for i, step, events in services.shown)
@@ -206,7 +206,7 @@ def test_restart_keeps_rejected_rows(simulated, fresh_notes):
     seen = []
     for fault in ("", "kill", "leave"):
         kwargs = {"refuse": 3, "fault": fault, "at": 11, "pace": 0.002}
-        settings = {"num_clients": 2, "record_wrong_samples": True, "restarts": 1}
+        settings = {"num_clients": 2, "record_wrong_samples": True, "retries": 1}
         rejected = []
         with simulated(WANDERER, env_kwargs=kwargs, **settings) as source:
             for size in (5, 20, 11):
@@ -223,7 +223,7 @@ def test_restart_resends_stored_rows(simulated, fresh_notes):
     for fault in ("", "kill"):
         kwargs = {"fault": fault, "at": 6}
         with simulated(
-            WANDERER, num_clients=2, env_kwargs=kwargs, run_ahead=0, restarts=1
+            WANDERER, num_clients=2, env_kwargs=kwargs, run_ahead=0, retries=1
         ) as source:
             rows = []
             for part in stored:
@@ -238,7 +238,7 @@ def test_regenerating_rows_after_restart_is_no_timeout(simulated, caplog):
     """Making twelve rows again takes longer than a client may be silent."""
     timeout = 1.0
     kwargs = {"pace": timeout / 10, "fault": "kill", "at": 12, "who": 1}
-    with simulated(WANDERER, env_kwargs=kwargs, run_ahead=0, restarts=1, timeout=timeout) as source:
+    with simulated(WANDERER, env_kwargs=kwargs, run_ahead=0, retries=1, timeout=timeout) as source:
         for row in range(14):
             assert source.batch(1)["step"] == [row]
     assert len([record for record in caplog.records if record.name == "physx"]) == 1
@@ -255,7 +255,7 @@ def test_client_beyond_restart_limit_ends_run(simulated, caplog, fresh_notes, fa
     kwargs = {"fault": fault, "at": 3, "times": 9}
     with (
         pytest.raises(error, match="SIGKILL|no more beans"),
-        simulated(WANDERER, num_clients=2, env_kwargs=kwargs, restarts=2) as source,
+        simulated(WANDERER, num_clients=2, env_kwargs=kwargs, retries=2) as source,
     ):
         source.batch(20)
     said = [record.getMessage() for record in caplog.records if record.name == "physx"]
@@ -269,7 +269,7 @@ def test_deterministic_error_is_not_restarted(simulated, caplog, fresh_notes):
     kwargs = {"fault": "refuse_rows", "at": 3, "times": 9}
     with (
         pytest.raises(SampleError, match="this would come again"),
-        simulated(WANDERER, num_clients=2, env_kwargs=kwargs, restarts=2) as source,
+        simulated(WANDERER, num_clients=2, env_kwargs=kwargs, retries=2) as source,
     ):
         source.batch(20)
     assert not [record for record in caplog.records if record.name == "physx"]
@@ -299,7 +299,7 @@ ASKS = {"num_clients": 2, "env_kwargs": {"asks": True}}
 
 def test_run_continues_at_journal_limit_with_one_warning(local, simulated, batch_services, said):
     expected = digest(run(local(WANDERER, **ASKS), [30, 30], apply=True))
-    source = simulated(WANDERER, run_ahead=0, restarts=1, journal_size=2e-6, **ASKS)
+    source = simulated(WANDERER, run_ahead=0, retries=1, journal_size=2e-6, **ASKS)
     assert digest(run(source, [30, 30], apply=True)) == expected
     assert [text.partition(":")[0] for text in said()] == [
         f"Instance {number} can no longer be restarted" for number in (1, 2)
@@ -310,7 +310,7 @@ def test_run_continues_at_journal_limit_with_one_warning(local, simulated, batch
 def test_client_crash_beyond_journal_limit_ends_run_with_reason(
     simulated, batch_services, simulation
 ):
-    with simulated(WANDERER, run_ahead=0, restarts=3, journal_size=2e-6, **ASKS) as source:
+    with simulated(WANDERER, run_ahead=0, retries=3, journal_size=2e-6, **ASKS) as source:
         source.batch(60)
         simulation.alive[2].kill()
         with pytest.raises(ClientError, match="SIGKILL") as caught:
@@ -322,7 +322,7 @@ def test_client_crash_beyond_journal_limit_ends_run_with_reason(
 
 def test_restart_below_journal_limit(local, simulated, batch_services, simulation, said):
     expected = digest(run(local(WANDERER, **ASKS), [10, 90], apply=False))
-    with simulated(WANDERER, run_ahead=0, restarts=1, journal_size=4e-6, **ASKS) as source:
+    with simulated(WANDERER, run_ahead=0, retries=1, journal_size=4e-6, **ASKS) as source:
         batches = [{name: rows.copy() for name, rows in source.batch(10).items()}]
         assert not said()
         simulation.alive[1].kill()
@@ -336,7 +336,7 @@ def test_full_temporary_folder_is_reported_and_run_continues(
     local, simulated, batch_services, full_disk, said
 ):
     expected = digest(run(local(WANDERER, **ASKS), [200], apply=True))
-    source = simulated(WANDERER, run_ahead=0, restarts=1, **ASKS)
+    source = simulated(WANDERER, run_ahead=0, retries=1, **ASKS)
     assert digest(run(source, [200], apply=True)) == expected
     assert len(said(f"cannot grow in {full_disk}: No space left")) == 2
 

@@ -81,7 +81,7 @@ def test_rows_do_not_depend_on_kills_at_every_row(states, every, options):
     kwargs = options.pop("env_kwargs", {})
     expected = run(states(every, env_kwargs=kwargs, **options))
     kwargs = {**kwargs, "kills": ["create", *PLACES]}
-    assert run(states(every, env_kwargs=kwargs, restarts=100, **options)) == expected
+    assert run(states(every, env_kwargs=kwargs, retries=100, **options)) == expected
     assert len([*Path().glob("*-1")]) > 30
 
 
@@ -90,21 +90,21 @@ def test_rows_do_not_depend_on_a_kill(states, place):
     options = {"record_wrong_samples": True}
     expected = run(states(4, env_kwargs={"parameters": True}, **options))
     kwargs = {"parameters": True, "kills": [place]}
-    assert run(states(4, env_kwargs=kwargs, restarts=1, **options)) == expected
+    assert run(states(4, env_kwargs=kwargs, retries=1, **options)) == expected
 
 
 @pytest.mark.parametrize("every", [1, 4])
 def test_stored_rows_do_not_depend_on_kills(states, every):
     expected = run(states(every), stored=True)
     kwargs = {"kills": PLACES}
-    assert run(states(every, env_kwargs=kwargs, restarts=100), stored=True) == expected
+    assert run(states(every, env_kwargs=kwargs, retries=100), stored=True) == expected
 
 
 def test_rows_that_run_ahead_do_not_depend_on_kills(states):
     options = {"run_ahead": 30, "record_wrong_samples": True}
     expected = run(states(3, env_kwargs={"asks": False}, **options), applies=False)
     kwargs = {"asks": False, "kills": PLACES, "pace": 0.003}
-    source = states(3, env_kwargs=kwargs, restarts=100, **options)
+    source = states(3, env_kwargs=kwargs, retries=100, **options)
     assert run(source, applies=False) == expected
 
 
@@ -123,7 +123,7 @@ def test_drawings_and_saved_parameters_are_not_repeated(states, services):
     seen = []
     for kills in ([], PLACES[:40:3]):
         services.shown.clear()
-        run(states(3, env_kwargs={"kills": kills}, visualizer="any", restarts=100))
+        run(states(3, env_kwargs={"kills": kills}, visualizer="any", retries=100))
         drawn = sorted((i, step, str(events)) for i, step, events in services.shown)
         seen.append((drawn, dict(services.kept)))
     assert seen[0] == seen[1]
@@ -132,7 +132,7 @@ def test_drawings_and_saved_parameters_are_not_repeated(states, services):
 @pytest.mark.parametrize("every", [0, 5])
 def test_only_rows_after_the_state_are_repeated(states, simulation, every):
     kwargs = {"asks": False, "refuse": 0, "kills": [f"step {row}" for row in range(1, 200)]}
-    with states(every, env_kwargs=kwargs, restarts=400, num_clients=1) as source:
+    with states(every, env_kwargs=kwargs, retries=400, num_clients=1) as source:
         for _ in range(200):
             source.batch(1)
     assert simulation.steps < 200 + 200 * 6 if every else simulation.steps > 10_000
@@ -183,14 +183,14 @@ def test_rows_are_the_same_in_any_order_of_events_and_kills(undisturbed, choose,
                 [*simulation.alive.values()][choose(len(simulation.alive))].kill()
 
         simulation.plan.update(dict.fromkeys(events, kill))
-        source = drawn_source(simulation, restarts=10)
+        source = drawn_source(simulation, retries=10)
         assert run(source) == undisturbed
 
 
 @pytest.mark.parametrize("every", [0, 2])
 def test_a_long_past_that_is_repeated_is_said(states, said, every):
     kwargs = {"pace": 30.0, "kills": ["step 4"]}
-    with states(every, env_kwargs=kwargs, restarts=1, timeout=100.0) as source:
+    with states(every, env_kwargs=kwargs, retries=1, timeout=100.0) as source:
         source.batch(10)
     hints = said("It repeats 3 rows first; with EnvironmentConfig.state_every")
     assert len(hints) == (0 if every else 2)
@@ -205,7 +205,7 @@ def test_streams_without_states_repeat_their_rows_with_one_warning(states, said,
     expected = run(states(3, environment))
     (warning,) = said("repeat all rows")
     assert f".{lock}" in warning
-    source = states(3, environment, env_kwargs={"kills": PLACES[:40:7]}, restarts=20)
+    source = states(3, environment, env_kwargs={"kills": PLACES[:40:7]}, retries=20)
     assert run(source) == expected
     assert len(said("repeat all rows")) == 2
 
@@ -214,7 +214,7 @@ def test_a_state_of_another_environment_is_an_error_that_names_what_differs(stat
     environment = f"{ENVS}:Changing"
     kwargs = {"kills": ["step 9"]}
     with pytest.raises(StateError, match=r"differ: marker\b"):
-        run(states(3, environment, env_kwargs=kwargs, restarts=3))
+        run(states(3, environment, env_kwargs=kwargs, retries=3))
 
 
 # The journal -------------------------------------------------------------------------------------
@@ -222,7 +222,7 @@ def test_a_state_of_another_environment_is_an_error_that_names_what_differs(stat
 
 def test_a_journal_is_bounded_by_the_rows_between_states(states, said, simulation):
     """Without states it has 100 kB for these rows."""
-    source = states(10, env_kwargs={"refuse": 0}, restarts=1, journal_size=15e-6)
+    source = states(10, env_kwargs={"refuse": 0}, retries=1, journal_size=15e-6)
     batches = []
     with source:
         for _ in range(60):

@@ -94,7 +94,7 @@ class DataOpening:
         open_source: Opens environments: `Pipeline._open_source` without its first argument.
         predict: The network's prediction for a batch; called in the training's thread.
         show: Receives drawing events; called in the training's thread.
-        run_ahead, retries, max_failed: See `Training`.
+        run_ahead, max_failed: See `Training`.
     """
 
     start: Start
@@ -112,7 +112,6 @@ class DataOpening:
     predict: Predict
     show: Show
     run_ahead: int
-    retries: int
     max_failed: int
     _generation: Generation | None = field(init=False, default=None)
 
@@ -240,7 +239,7 @@ class DataOpening:
         else:
             reject_episode_fields(source)
             return None
-        queue = RowQueue(self.buffer.total, campaign.ended(dataset), self.retries)
+        queue = RowQueue(self.buffer.total, campaign.ended(dataset), environment.retries)
         writer = CampaignWriter(
             dataset,
             campaign,

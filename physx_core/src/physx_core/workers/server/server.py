@@ -204,12 +204,18 @@ class Server:
             self._requests.forget(peer)
             peer.vacant, peer.failure, peer.heard = True, None, self._clock.monotonic()
 
+    def forget_pasts(self) -> None:
+        """Forget what clients were told, as no other one goes on where they end."""
+        for peer in self.peers.values():
+            if peer.journal is not None:
+                peer.journal.close()
+            peer.journal = None
+
     def close(self) -> None:
         """Close all connections; calling it again does nothing."""
         for peer in self.peers.values():
             self._drop(peer)
-            if peer.journal is not None:
-                peer.journal.close()
+        self.forget_pasts()
         self._strangers.drop_all()
         self._listener.close()
 

@@ -1,0 +1,122 @@
+"""StreamPool: what a run of streams does about clients that are lost."""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Mapping
+
+from physx_core.clock import Clock
+from physx_core.config import EnvironmentConfig
+from physx_core.errors import ClientError, EnvironmentFailedError, PhysxError, ProgramError
+from physx_core.workers.episode_queue import Losses
+from physx_core.workers.parameter_sets import ParameterSets
+from physx_core.workers.server.peer import Peer
+
+_LONG_PAST = 60.0  # s
+_PASSING = (EnvironmentFailedError, ProgramError, ClientError)  # errors that may not recur
+_LOG = logging.getLogger("physx")
+
+
+class StreamPool:
+    """Clients each of which has a stream until it is lost; then the next client goes on with it.
+
+    Attributes:
+        least: How many clients there must be.
+        is_ending: Whether no other client is needed.
+    """
+
+    is_ending = False
+
+    def __init__(
+        self,
+        config: EnvironmentConfig,
+        clock: Clock,
+        sets: ParameterSets,
+        peers: Mapping[int, Peer],
+        *,
+        by_hand: bool,
+        address: Callable[[], str],
+    ) -> None:
+        """Begin without clients.
+
+        Args:
+            config: How many streams there are, and how often each may be lost.
+            clock: Tells how long clients have lived.
+            sets: Chooses the streams' parameters.
+            peers: The current or last client of each stream.
+            by_hand: Whether users start the clients.
+            address: Returns where these can connect.
+        """
+        self.least = config.num_clients
+        self._config, self._clock, self._sets, self._peers = config, clock, sets, peers
+        self._by_hand, self._address = by_hand, address
+        self._losses = Losses(config.retries or 0)
+        self._began = dict.fromkeys(range(1, self.least + 1), clock.monotonic())
+
+    def replaces(self, number: int, error: PhysxError | None) -> bool:
+        """Return whether another client replaces one that failed, or left without an error."""
+        if self._given_up(number):
+            return False
+        if error is None and self._by_hand:
+            return True
+        passing = error is None or isinstance(error, _PASSING)
+        return passing and self._losses.may_return(number)
+
+    def lose(self, number: int, error: PhysxError, peer: Peer | None, *, launched: bool) -> bool:
+        """Give a lost client's stream to the next one, and log what follows.
+
+        Args:
+            number: The stream.
+            error: How its client was lost.
+            peer: Its connection; None: it has none.
+            launched: Whether the launcher started it.
+
+        Returns:
+            Whether the launcher should start another one.
+
+        Raises:
+            PhysxError: If there is none.
+        """
+        left = peer is not None and peer.closed and not (peer.failure or peer.violation)
+        left = left and (not launched or (peer is not None and peer.has_left))
+        if (self._by_hand and peer is None) or not self.replaces(number, None if left else error):
+            raise self._final(number, error)
+        text, _, details = str(error).partition("\n")
+        self._losses[number] += not left
+        follows = self._describe_next(number)
+        if not left:
+            follows = f"Restart {self._losses[number]} of {self._losses.retries}. {follows}"
+        _LOG.warning("%s. %s%s", text.rstrip("."), follows, details and "\n" + details)
+        return True
+
+    def _given_up(self, number: int) -> str:
+        """Return why a stream cannot go on although it could before; empty if it can."""
+        peer = self._peers.get(number)
+        return "" if peer is None or peer.journal is None else peer.journal.given_up
+
+    def _final(self, number: int, error: PhysxError) -> PhysxError:
+        """Add to an error that ends the run why its stream cannot go on, if so."""
+        if reason := self._given_up(number):
+            error.add_note(f"{reason}.")
+        if peer := self._peers.get(number):
+            self._sets.explain(number, peer.episode, error)
+        return error
+
+    def _describe_next(self, number: int) -> str:
+        peer, began = self._peers.get(number), self._began[number]
+        self._began[number] = now = self._clock.monotonic()
+        if self.is_ending:
+            return "The run was ending, and it has all its rows."
+        text = "Another client takes its place."
+        if self._by_hand:
+            text = (
+                f"The run waits up to {self._config.timeout:g} s for another client to take its "
+                f"place, at {self._address()}."
+            )
+        is_long = peer is not None and peer.received > 1 and now - began > _LONG_PAST
+        if peer is not None and is_long and not self._config.state_every:
+            text += (
+                f" It repeats {peer.received} rows first; with EnvironmentConfig.state_every it "
+                "would go on from a state."
+            )
+        return text
