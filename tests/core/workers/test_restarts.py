@@ -15,7 +15,7 @@ import pytest
 
 from physx_core.errors import ClientError, EnvironmentFailedError, SampleError
 from physx_core.net import Kind, pack
-from physx_core.workers.server.journal import Journal
+from physx_core.workers.journal import Journal
 
 ENVS = Path(__file__).parents[1] / "programs" / "restart_envs.py"
 WANDERER = f"{ENVS}:SimulatedWanderer"
@@ -302,7 +302,8 @@ def test_run_continues_at_journal_limit_with_one_warning(local, simulated, batch
     source = simulated(WANDERER, run_ahead=0, retries=1, journal_size=2e-6, **ASKS)
     assert digest(run(source, [30, 30], apply=True)) == expected
     assert [text.partition(":")[0] for text in said()] == [
-        f"Instance {number} can no longer be restarted" for number in (1, 2)
+        f"Instance {number} can no longer be restarted, nor go on in a later run"
+        for number in (1, 2)
     ]
     assert all("journal_size = 2e-06 GB" in text for text in said())
 
@@ -342,7 +343,7 @@ def test_full_temporary_folder_is_reported_and_run_continues(
 
 
 def test_full_temporary_folder_during_restart_is_an_error(full_disk):
-    journal = Journal(2, 1e9)
+    journal = Journal(2, 1e9, None, None)
     journal.record(pack(Kind.APPLY, bytes(3_000), 1))
     with pytest.raises(ClientError, match=rf"Client 2 .* {full_disk}, fails: No space .* TMPDIR"):
         journal.record(pack(Kind.APPLY, bytes(3_000), 1), is_read=True)
@@ -353,7 +354,7 @@ def test_full_temporary_folder_during_restart_is_an_error(full_disk):
 
 
 def test_journal_replays_messages():
-    journal = Journal(1, 1e9)
+    journal = Journal(1, 1e9, None, None)
     told = [
         pack(Kind.CREDIT, number=2),
         pack(Kind.ANSWER, b"first", 1),
@@ -367,15 +368,15 @@ def test_journal_replays_messages():
         pack(Kind.CREDIT, number=5),
     ]
     assert [journal.record(message) for message in told] == [1, 0, 1, 1, 1, 0, 1, 1, 0, 1]
-    orders = [told[2], told[3], told[4], told[6], told[7]]
-    assert [journal.order(index) for index in range(6)] == [*orders, None]
+    orders = [told[2] + told[3], told[4] + told[6], told[7]]
+    assert [journal.order(index) for index in range(4)] == [*orders, None]
     assert journal.credit == told[9]
     assert [journal.answer(number) for number in (1, 2, 3, 4)] == [told[1], None, told[5], None]
     journal.close()
 
 
 def test_journal_at_limit_is_dropped_once_client_is_up_to_date(said):
-    journal = Journal(3, 1000)
+    journal = Journal(3, 1000, None, None)
     answers = [pack(Kind.ANSWER, b"x" * 400, number) for number in (1, 2, 3, 4)]
     for answer in answers[:3]:
         journal.record(answer, is_read=True)
@@ -392,7 +393,7 @@ def test_journal_at_limit_is_dropped_once_client_is_up_to_date(said):
 
 
 def test_a_journal_of_credit_alone_does_not_grow():
-    journal = Journal(1, 1e9)
+    journal = Journal(1, 1e9, None, None)
     for number in range(1000):
         journal.record(pack(Kind.CREDIT, number=number))
     assert journal.order(0) is None

@@ -19,7 +19,7 @@ from physx_core import EnvironmentConfig
 from physx_core.errors import ConnectionRefusedByPeerError, StateError
 from physx_core.net import Kind, encode, pack
 from physx_core.sources import ClientSource
-from physx_core.workers.server.journal import Journal
+from physx_core.workers.journal import Journal
 from physx_core.workers.server.validation import parse_state
 
 ENVS = Path(__file__).parents[1] / "programs" / "state_envs.py"
@@ -236,39 +236,37 @@ def test_a_journal_is_bounded_by_the_rows_between_states(states, said, simulatio
 
 
 def test_journal_forgets_what_comes_before_a_state():
-    journal = Journal(1, 1e9)
+    journal = Journal(1, 1e9, None, None)
     orders = [pack(Kind.APPLY, b"%d" % number, 1) for number in range(5)]
     answers = {number: pack(Kind.ANSWER, b"a%d" % number, number) for number in range(1, 8)}
     for number in (1, 2):
         journal.record(answers[number])
-    journal.created = 2
+    journal.end_creation()
     for number, order in enumerate(orders):
         journal.record(pack(Kind.CREDIT, number=number + 1))
         journal.record(order)
     for number in (3, 4, 5):
         journal.record(answers[number])
-    assert journal.state is None
-    journal.keep_state(b"state", 3, 4)
-    assert bytes(journal.state) == b"state"
-    assert journal.resumed_requests == 4
-    assert journal.first_order == 6
-    found = [journal.order(index) for index in range(6, 11)]
+    assert journal.newest.describe() is None
+    journal.keep_state(9, b"state", 0, obeyed=3, requests=4)
+    assert journal.newest.past.state == b"state"
+    assert (journal.newest.obeyed, journal.newest.requests) == (3, 4)
     credits = [pack(Kind.CREDIT, number=number) for number in (4, 5)]
-    assert found == [credits[0], orders[3], credits[1], orders[4], None]
+    found = [journal.order(index) for index in range(3, 6)]
+    assert found == [credits[0] + orders[3], credits[1] + orders[4], None]
     journal.record(answers[7])
     found = [journal.answer(number) for number in (1, 2, 5, 6, 7, 8)]
-    assert found == [answers[1], answers[2], answers[5], None, answers[7], None]
+    assert found == [answers[1], answers[2], None, None, answers[7], None]
     assert journal.answers == 7
-    journal.keep_state(b"next", 5, 7)
-    assert [journal.answer(number) for number in (1, 2, 8)] == [answers[1], answers[2], None]
-    assert journal.order(10) is None
-    assert journal.find_order(6) is None
+    journal.keep_state(12, b"next", 0, obeyed=5, requests=7)
+    assert [journal.answer(number) for number in (1, 2, 7)] == [answers[1], answers[2], None]
+    assert journal.order(5) is None
     journal.close()
 
 
 def test_a_journal_that_cannot_keep_a_state_stays_as_it_is(monkeypatch):
-    journal = Journal(1, 1e9)
-    journal.keep_state(b"first", 0, 0)
+    journal = Journal(1, 1e9, None, None)
+    journal.keep_state(1, b"first", 0)
     order = pack(Kind.APPLY, b"order", 1)
     journal.record(order)
 
@@ -277,8 +275,8 @@ def test_a_journal_that_cannot_keep_a_state_stays_as_it_is(monkeypatch):
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(tempfile, "SpooledTemporaryFile", lambda *_: Full())
-    journal.keep_state(b"second", 1, 0)
-    assert bytes(journal.state) == b"first"
+    journal.keep_state(2, b"second", 0)
+    assert journal.newest.past.state == b"first"
     assert journal.order(0) == order
     journal.close()
 

@@ -25,8 +25,8 @@ from physx_core.rows import ROW_FIELDS, concatenate
 from physx_core.sources.source import Canceled, Source, check_stored
 from physx_core.typing import Batch
 from physx_core.workers.instance import NOTHING, Skip
+from physx_core.workers.journal import Journal
 from physx_core.workers.parameter_sets import ParameterSets
-from physx_core.workers.pasts import Pasts
 from physx_core.workers.row_codec import row_bytes
 from physx_core.workers.server.client_group import ClientGroup
 from physx_core.workers.server.peer import Peer
@@ -90,8 +90,7 @@ class ClientSource(Source):
         self._episodes: ClientEpisodes | None = None
         self.instance_nb = config.num_clients
         self.sets = ParameterSets(config, seed, skip)
-        if keeps_pasts and config.state_every:
-            self.pasts = Pasts(1e9 * config.journal_size, skip.pasts)
+        self._keeps_pasts = keeps_pasts and config.state_every > 0
         self._group = ClientGroup(
             config,
             services,
@@ -101,7 +100,7 @@ class ClientSource(Source):
             skip=skip,
             written=self._written,
             transport=transport,
-            pasts=self.pasts,
+            keeps_pasts=self._keeps_pasts,
         )
         self._rejections = 0
         if config.record_wrong_samples:
@@ -116,6 +115,11 @@ class ClientSource(Source):
         self._out: Batch = {}
         self._capacity = 0
         self._failed = self._closed = False
+
+    @property
+    def _journals(self) -> dict[int, Journal]:
+        peers = self._group.server.peers.values() if self._keeps_pasts else ()
+        return {peer.instance_id: peer.journal for peer in peers if peer.journal is not None}
 
     @property
     def fields(self) -> list[Field]:

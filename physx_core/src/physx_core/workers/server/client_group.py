@@ -21,13 +21,12 @@ from physx_core.net.addresses import format_address, is_loopback, parse_address
 from physx_core.net.handshake import TOKEN_VARIABLE
 from physx_core.net.link import SOCKETS, Transport
 from physx_core.net.tokens import choose_token, find_token
-from physx_core.net.values import decode, encode
+from physx_core.net.values import encode
 from physx_core.plugins import reference_of, resolve
 from physx_core.plugins.references import locate
 from physx_core.workers.instance import NOTHING, Skip, instance_arguments
 from physx_core.workers.launchers import describe_states, stop
 from physx_core.workers.parameter_sets import ParameterSets
-from physx_core.workers.pasts import Pasts
 from physx_core.workers.server.client_errors import exit_error, overdue_error, timeout_error
 from physx_core.workers.server.episode_pool import EpisodePool
 from physx_core.workers.server.leases import Leases
@@ -65,7 +64,7 @@ class ClientGroup:
         skip: Skip = NOTHING,
         written: WrittenRows | None = None,
         transport: Transport = SOCKETS,
-        pasts: Pasts | None = None,
+        keeps_pasts: bool = False,
     ) -> None:
         """Store the arguments; `open` starts the clients.
 
@@ -78,11 +77,10 @@ class ClientGroup:
             skip: What an earlier run already got: clients generate it again, but do not send it.
             written: Takes note of the rows that the clients write themselves; None: they send them.
             transport: What connects the clients, and the clock that the run follows.
-            pasts: Keeps what a later run needs, and what an earlier one has left; None: nobody
-                needs it.
+            keeps_pasts: Whether a later run may go on.
         """
         self._clock = transport.clock
-        self._written, self._pasts = written, pasts
+        self._written = written
         self.config = config
         self._seed = list(seed)
         self._accepts_all = accept_all
@@ -110,7 +108,7 @@ class ClientGroup:
             self._reserved,
             {} if written is None else written.dispatch,
             transport,
-            pasts,
+            keeps_pasts=keeps_pasts and not config.is_elastic,
         )
         self._pool: EpisodePool | StreamPool = (
             self._make_pool()
@@ -446,22 +444,8 @@ class ClientGroup:
             first["folder"] = self._written.describe()
         if self._is_shared:
             skip = dict.fromkeys(skip, 0)
-        first["state"] = self._find_state(peer)
+        first["state"] = None if peer.journal is None else peer.journal.newest.describe()
         return self._encode(peer.instance_id, skip=skip, **first)
-
-    def _find_state(self, peer: Peer) -> dict[str, Any] | None:
-        """Return the state with which a client begins: of its predecessor, or of an earlier run.
-
-        What a client of an earlier run has counted is not continued, as this run has not seen it.
-        """
-        if peer.journal is not None and peer.journal.state is not None:
-            state: dict[str, Any] = decode(peer.journal.state)
-            return state
-        past = None if self._pasts is None else self._pasts.former(peer.instance_id)
-        if past is None or not past.state:
-            return None
-        counts = {"rows": past.rows, "rejected": past.rejected, "orders": 0}
-        return {**counts, "shown": None, "requests": None, "state": past.state}
 
     def _encode(self, instance_id: int, **progress: Any) -> bytes:
         config = self.config

@@ -23,10 +23,9 @@ from physx_core.net.pending import Handshakes
 from physx_core.net.remote_errors import decode_error, encode_error
 from physx_core.net.spin_wait import has_core_for_each
 from physx_core.workers.instance import NOTHING, Skip
+from physx_core.workers.journal import Journal
 from physx_core.workers.parameter_sets import ParameterSets
-from physx_core.workers.pasts import Pasts
 from physx_core.workers.row_codec import unpack_rows
-from physx_core.workers.server.journal import Journal
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.service_requests import ServiceRequests
 from physx_core.workers.server.validation import (
@@ -71,7 +70,8 @@ class Server:
         reserved: Callable[[], Collection[int]] = tuple,
         dispatch: Mapping[Kind, Callable[[Peer, Frame], None]] = MappingProxyType({}),
         transport: Transport = SOCKETS,
-        pasts: Pasts | None = None,
+        *,
+        keeps_pasts: bool = False,
     ) -> None:
         """Store the arguments; `open` starts listening.
 
@@ -91,17 +91,17 @@ class Server:
             dispatch: Handles the messages about rows, by their kind, if clients do not just send
                 rows of streams.
             transport: What connects the clients, and the clock that the server follows.
-            pasts: Keeps what a later run needs; None: nobody needs it.
+            keeps_pasts: Whether a later run may go on.
         """
         self.peers: dict[int, Peer] = {}
         self.token = token
         self._transport, self._clock = transport, transport.clock
         self._ip_address, self._port, self._instance_nb = ip_address, port, instance_nb
         self._spin_time = _SPIN_TIME if has_core_for_each(instance_nb) else 0.0
-        self._requests = ServiceRequests(services, sets, pasts)
-        self._services, self._pasts = services, pasts
+        self._requests = ServiceRequests(services, sets)
+        self._services, self._sets = services, sets
         self._setup, self._replaces, self._skip = setup, replaces, skip
-        self._journal_size = journal_size
+        self._journal_size, self._keeps_pasts = journal_size, keeps_pasts
         self._reserved = reserved
         self._ending = self._has_news = self._has_no_states = False
         self._listener = Listener[Peer](
@@ -206,6 +206,7 @@ class Server:
 
     def forget_pasts(self) -> None:
         """Forget what clients were told, as no other one goes on where they end."""
+        self._keeps_pasts = False
         for peer in self.peers.values():
             if peer.journal is not None:
                 peer.journal.close()
@@ -323,8 +324,12 @@ class Server:
         else:
             peer.received = self._skip.rows_of(peer.instance_id, self._instance_nb)
             peer.rejected.count = self._skip.rejected_of(peer.instance_id)
-        if former is None and self._replaces(peer.instance_id, None):
-            peer.journal = Journal(peer.instance_id, self._journal_size)
+        number, keeps = peer.instance_id, self._keeps_pasts
+        if former is None and (keeps or self._replaces(number, None)):
+            past = self._skip.pasts.get(number)
+            peer.journal = Journal(
+                number, self._journal_size, self._sets, self._services, past, keeps=keeps
+            )
         peer.send(pack(Kind.SETUP, self._setup(peer)))
 
     def _give_up(self, peer: Peer) -> None:
@@ -348,14 +353,12 @@ class Server:
 
     def _take_ready(self, peer: Peer, frame: Frame) -> None:
         _take_ready(peer, frame)
-        if self._pasts is not None:
-            self._pasts.created(peer.instance_id, self._services)
+        if peer.journal is not None:
+            peer.journal.end_creation()
 
     def _take_state(self, peer: Peer, frame: Frame) -> None:
         if frame.number:
-            state = parse_state(frame.payload)
-            peer.keep_state(frame.number, state)
-            self._requests.keep_state(peer, frame.number, state)
+            peer.keep_state(frame.number, parse_state(frame.payload))
         elif not self._has_no_states:
             self._has_no_states = True
             _LOG.warning(
@@ -382,8 +385,6 @@ def _take_ready(peer: Peer, frame: Frame) -> None:
     peer.is_independent = bool(frame.number)
     if peer.resumed_requests is not None:
         peer.requests = peer.resumed_requests
-    elif peer.journal is not None:
-        peer.journal.created = peer.requests
 
 
 def _take_fields(peer: Peer, frame: Frame) -> None:
