@@ -41,7 +41,7 @@ from physx_core.sources.source import Source
 from physx_core.typing import Batch
 from physx_core.views.dataset_config import DatasetConfig
 from physx_core.workers.episode_queue import EpisodeQueue
-from physx_core.workers.instance import NOTHING
+from physx_core.workers.pasts import NOTHING
 from physx_core.workers.row_queue import RowQueue
 
 

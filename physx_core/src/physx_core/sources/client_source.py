@@ -24,9 +24,9 @@ from physx_core.net.values import encode
 from physx_core.rows import ROW_FIELDS, concatenate
 from physx_core.sources.source import Canceled, Source, check_stored
 from physx_core.typing import Batch
-from physx_core.workers.instance import NOTHING, Skip
 from physx_core.workers.journal import Journal
 from physx_core.workers.parameter_sets import ParameterSets
+from physx_core.workers.pasts import NOTHING, Skip
 from physx_core.workers.row_codec import row_bytes
 from physx_core.workers.server.client_group import ClientGroup
 from physx_core.workers.server.peer import Peer

@@ -18,10 +18,10 @@ from physx_core.net.values import decode, encode
 from physx_core.rows import ROW_FIELDS, RowBuffer, concatenate, copy_row, infer_shapes
 from physx_core.sources.source import Source, check_stored
 from physx_core.typing import Batch, Sample
-from physx_core.workers.instance import NOTHING, Instance, Skip, instance_arguments
+from physx_core.workers.instance import Instance, instance_arguments
 from physx_core.workers.journal import Journal
 from physx_core.workers.parameter_sets import ParameterSets
-from physx_core.workers.pasts import Answer, Past
+from physx_core.workers.pasts import NOTHING, Answer, Past, Skip
 
 if TYPE_CHECKING:
     from physx_core.sources.episode_source import LocalEpisodes

@@ -12,7 +12,7 @@ from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from zlib_ng.zlib_ng import crc32
 
@@ -87,6 +87,48 @@ class Past:
                 raise ValueError("an answer is not one")
         own = rows, state, rejected, recorded, sets, saved
         return cls(*own, tuple(created), answers, len(answers))
+
+
+class Skip(NamedTuple):
+    """What an earlier run with the same seed already got from the same instances.
+
+    Attributes:
+        rows: Number of rows from all instances together.
+        rejected: Number of rejected samples of each instance; empty: none.
+        sets: Numbers of the recorded sets of parameters.
+        pasts: From where instances go on, by their number; the others repeat all of their rows.
+    """
+
+    rows: int = 0
+    rejected: tuple[int, ...] = ()
+    sets: frozenset[int] = frozenset()
+    pasts: Mapping[int, Past] = {}
+
+    def rows_of(self, number: int, instance_nb: int) -> int:
+        """Return how many of the rows an instance generated; instances are numbered from 1."""
+        return (self.rows - number + instance_nb) // instance_nb
+
+    def rejected_of(self, number: int) -> int:
+        """Return how many samples of an instance were rejected."""
+        return self.rejected[number - 1] if self.rejected else 0
+
+    def covers(self, number: int, past: Past, instance_nb: int) -> bool:
+        """Return whether it has all that came before the past of an instance."""
+        return (
+            1 <= number <= instance_nb
+            and past.rows <= self.rows_of(number, instance_nb)
+            and past.rejected <= self.rejected_of(number)
+            and (past.recorded < 0 or past.recorded in self.sets)
+        )
+
+    def repeated(self, instance_nb: int) -> int:
+        """Return how many rows instances simulate again, all together."""
+        known = sum(past.rows for past in self.pasts.values())
+        return self.rows - known
+
+
+NOTHING = Skip()
+"""For a new run: there is no earlier one."""
 
 
 def pack(rows: int, pasts: Mapping[int, Past]) -> bytes:

@@ -44,8 +44,7 @@ from physx_core.plugins.networks import resolve_network
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
-from physx_core.workers.instance import NOTHING, Skip
-from physx_core.workers.pasts import unpack
+from physx_core.workers.pasts import NOTHING, Skip, unpack
 from physx_core.workers.row_queue import RowQueue
 
 

@@ -24,9 +24,10 @@ from physx_core.net.tokens import choose_token, find_token
 from physx_core.net.values import encode
 from physx_core.plugins import reference_of, resolve
 from physx_core.plugins.references import locate
-from physx_core.workers.instance import NOTHING, Skip, instance_arguments
+from physx_core.workers.instance import instance_arguments
 from physx_core.workers.launchers import describe_states, stop
 from physx_core.workers.parameter_sets import ParameterSets
+from physx_core.workers.pasts import NOTHING, Skip
 from physx_core.workers.server.client_errors import exit_error, overdue_error, timeout_error
 from physx_core.workers.server.episode_pool import EpisodePool
 from physx_core.workers.server.leases import Leases
@@ -94,33 +95,22 @@ class ClientGroup:
         self._exits: dict[int, float] = {}
         self._checked = self._served = self._said = self._began = self._looked = 0.0
         self._host: str | None = None
-        self.server = Server(
-            config.ip_address,
-            config.port,
-            config.places,
-            services,
-            self._encode_setup,
-            token,
-            sets,
-            self._replaces,
-            1e9 * config.journal_size,
-            skip,
-            self._reserved,
-            {} if written is None else written.dispatch,
-            transport,
-            keeps_pasts=keeps_pasts and not config.is_elastic,
-        )
-        self._pool: EpisodePool | StreamPool = (
+        pool = (
             self._make_pool()
             if config.is_elastic
             else StreamPool(
                 config,
                 self._clock,
                 sets,
-                self.server.peers,
+                services,
+                skip,
+                keeps_pasts=keeps_pasts,
                 by_hand=launcher.by_hand,
                 address=self._public_address,
             )
+        )
+        self.server = Server(
+            config, services, self._encode_setup, token, sets, pool, self._reserved, transport
         )
 
     def open(self) -> None:
@@ -146,9 +136,11 @@ class ClientGroup:
     def lease(self, leases: Leases) -> None:
         """Have the clients, which are ready, simulate episodes instead of streams."""
         pool = self._pool
-        self._pool = pool = pool if isinstance(pool, EpisodePool) else self._make_pool()
+        if not isinstance(pool, EpisodePool):
+            pool.close()
+            self.server.pool = pool = self._make_pool()
+            self.server.dispatch.update(pool.dispatch)
         pool.leases = leases
-        self.server.forget_pasts()
         self.server.dispatch.update(leases.dispatch)
 
     def refuse(self, peer: Peer, error: PhysxError) -> None:
@@ -233,6 +225,10 @@ class ClientGroup:
         return range(1, self.config.places + 1)
 
     @property
+    def _pool(self) -> StreamPool | EpisodePool:
+        return self.server.pool
+
+    @property
     def _is_shared(self) -> bool:
         """Whether any client can simulate what another one does."""
         return isinstance(self._pool, EpisodePool)
@@ -240,7 +236,7 @@ class ClientGroup:
     def _make_pool(self) -> EpisodePool:
         is_known = find_token(self.config.token_file) is not None
         is_open = self._launcher.by_hand or is_known
-        return EpisodePool(self.config, self._clock, is_open=is_open)
+        return EpisodePool(self.config, self._clock, self._written, is_open=is_open)
 
     def _starting(self) -> list[int]:
         """Return the instances that the run waits for before it begins."""
@@ -314,7 +310,7 @@ class ClientGroup:
         for number in self._numbers:
             handle, peer = self._handles.get(number), self._find_peer(number)
             if peer is not None and peer.failure is not None:
-                if self._replaces(number, peer.failure):
+                if self._pool.replaces(number, peer.failure):
                     self._lose(number, peer.failure)
                 continue
             if peer is not None and peer.finished:
@@ -365,10 +361,6 @@ class ClientGroup:
             )
 
     # Replacing clients -----------------------------------------------------------------
-
-    def _replaces(self, number: int, error: PhysxError | None) -> bool:
-        """Return whether another client goes on where one failed, or left without an error."""
-        return self._pool.replaces(number, error)
 
     def _lose(self, number: int, error: PhysxError) -> None:
         """Replace a lost client, or do without it; raise its error if that ends the run."""
@@ -442,8 +434,6 @@ class ClientGroup:
         first: dict[str, Any] = {"heartbeat": min(_SAY_EVERY, self.config.timeout / 4)}
         if self._written is not None:
             first["folder"] = self._written.describe()
-        if self._is_shared:
-            skip = dict.fromkeys(skip, 0)
         first["state"] = None if peer.journal is None else peer.journal.newest.describe()
         return self._encode(peer.instance_id, skip=skip, **first)
 

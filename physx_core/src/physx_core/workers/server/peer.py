@@ -13,7 +13,7 @@ from physx_core.net.frames import FrameReader
 from physx_core.net.handshake import HANDSHAKE_LIMIT
 from physx_core.net.link import Link
 from physx_core.workers.journal import Journal
-from physx_core.workers.row_codec import RejectedRows, RowQueue
+from physx_core.workers.row_codec import ReceivedRows, RejectedRows
 from physx_core.workers.server.pace import Pace
 from physx_core.workers.server.validation import ClientState
 
@@ -71,7 +71,7 @@ class Peer(Connection):
         self.episode_fields: list[Field] = []
         self.is_independent = False
         self.row_fields: list[Field] = []
-        self.rows = RowQueue()
+        self.rows = ReceivedRows()
         self.received = self.granted = self.wanted = 0
         self.rejected = RejectedRows()
         self.rejected_limit = 0

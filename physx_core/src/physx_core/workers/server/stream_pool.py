@@ -3,14 +3,27 @@
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 
 from physx_core.clock import Clock
+from physx_core.components.services import Services
 from physx_core.config import EnvironmentConfig
-from physx_core.errors import ClientError, EnvironmentFailedError, PhysxError, ProgramError
+from physx_core.errors import (
+    ClientError,
+    ConnectionRefusedByPeerError,
+    EnvironmentFailedError,
+    PhysxError,
+    ProgramError,
+)
+from physx_core.net.frames import Frame, Kind
+from physx_core.net.remote_errors import decode_error
 from physx_core.workers.episode_queue import Losses
+from physx_core.workers.journal import Journal
 from physx_core.workers.parameter_sets import ParameterSets
+from physx_core.workers.pasts import Skip
+from physx_core.workers.row_codec import unpack_rows
 from physx_core.workers.server.peer import Peer
+from physx_core.workers.server.validation import check_rows, parse_state
 
 _LONG_PAST = 60.0  # s
 _PASSING = (EnvironmentFailedError, ProgramError, ClientError)  # errors that may not recur
@@ -23,6 +36,7 @@ class StreamPool:
     Attributes:
         least: How many clients there must be.
         is_ending: Whether no other client is needed.
+        dispatch: Handles the messages of a client, by their kind.
     """
 
     is_ending = False
@@ -32,8 +46,10 @@ class StreamPool:
         config: EnvironmentConfig,
         clock: Clock,
         sets: ParameterSets,
-        peers: Mapping[int, Peer],
+        services: Services,
+        skip: Skip,
         *,
+        keeps_pasts: bool,
         by_hand: bool,
         address: Callable[[], str],
     ) -> None:
@@ -43,15 +59,44 @@ class StreamPool:
             config: How many streams there are, and how often each may be lost.
             clock: Tells how long clients have lived.
             sets: Chooses the streams' parameters.
-            peers: The current or last client of each stream.
+            services: Know the parameters that streams have saved.
+            skip: What an earlier run already got from the streams.
+            keeps_pasts: Whether a later run may go on.
             by_hand: Whether users start the clients.
             address: Returns where these can connect.
         """
         self.least = config.num_clients
-        self._config, self._clock, self._sets, self._peers = config, clock, sets, peers
+        self.dispatch: dict[Kind, Callable[[Peer, Frame], None]] = {
+            Kind.ROWS: _take_rows,
+            Kind.WRONG: _take_wrong,
+            Kind.STATE: self._take_state,
+        }
+        self._config, self._clock, self._sets, self._services = config, clock, sets, services
+        self._skip, self._keeps_pasts, self._has_no_states = skip, keeps_pasts, False
+        self._peers: dict[int, Peer] = {}  # the present or last one of each stream
         self._by_hand, self._address = by_hand, address
         self._losses = Losses(config.retries or 0)
         self._began = dict.fromkeys(range(1, self.least + 1), clock.monotonic())
+
+    def adopt(self, peer: Peer) -> None:
+        """Give a client its stream, with what earlier ones have left."""
+        number, keeps = peer.instance_id, self._keeps_pasts
+        if number in self._peers:
+            peer.succeed(self._peers[number])
+        else:
+            peer.received = self._skip.rows_of(number, self.least)
+            peer.rejected.count = self._skip.rejected_of(number)
+            if keeps or self.replaces(number, None):
+                limit, past = 1e9 * self._config.journal_size, self._skip.pasts.get(number)
+                peer.journal = Journal(number, limit, self._sets, self._services, past, keeps=keeps)
+        self._peers[number] = peer
+
+    def close(self) -> None:
+        """Forget what the streams were told."""
+        for peer in self._peers.values():
+            if peer.journal is not None:
+                peer.journal.close()
+            peer.journal = None
 
     def replaces(self, number: int, error: PhysxError | None) -> bool:
         """Return whether another client replaces one that failed, or left without an error."""
@@ -120,3 +165,35 @@ class StreamPool:
                 "would go on from a state."
             )
         return text
+
+    def _take_state(self, peer: Peer, frame: Frame) -> None:
+        if frame.number:
+            peer.keep_state(frame.number, parse_state(frame.payload))
+        elif not self._has_no_states:
+            self._has_no_states = True
+            _LOG.warning(
+                "A client that takes the place of another one, also in a run that is resumed, will "
+                "repeat all rows since the last state, as instance %d gives none. %s",
+                peer.instance_id,
+                decode_error(frame.payload),
+            )
+
+
+def _take_rows(peer: Peer, frame: Frame) -> None:
+    count = frame.number
+    if not peer.row_fields or not 0 < count <= peer.granted - peer.received:
+        raise ConnectionRefusedByPeerError(f"It sent {count} rows that nobody asked for.")
+    block = unpack_rows(frame.payload, peer.row_fields, count)
+    peer.last_step = check_rows(block, peer.row_fields, peer.instance_id, peer.last_step)
+    peer.rows.append(block, count)
+    peer.received += count
+    peer.pace.rows(count, goes_on=peer.received < peer.granted)
+
+
+def _take_wrong(peer: Peer, frame: Frame) -> None:
+    count = frame.number
+    if not peer.row_fields or not 0 < count <= peer.rejected_limit - peer.rejected.count:
+        raise ConnectionRefusedByPeerError(f"It sent {count} rejected rows that nobody asked for.")
+    block = unpack_rows(frame.payload, peer.row_fields, count)
+    check_rows(block, peer.row_fields, peer.instance_id, peer.last_step)
+    peer.rejected.append(block, count)
