@@ -63,7 +63,7 @@ def test_a_later_run_is_told_all_answers_since_the_newest_state_that_counts(even
         elif event == "state" and made > states[-1][0]:
             states.append((made, len(history)))
             kept.saved[1] = {"rows": made}
-            journal.keep_state(made, b"%d" % made, 0)
+            journal.keep_state(Past(made, b"%d" % made))
         elif event == "batch":
             content = pack_pasts(made, {1: journal.at(made)})
             checkpoint = made, states[-1][0], history[states[-1][1] :], content
@@ -91,7 +91,7 @@ def test_a_stream_that_is_ahead_keeps_the_state_before_the_batch():
     journal = journal_of(Kept())
     journal.end_creation()
     for rows in (5, 10, 15, 20):
-        journal.keep_state(rows, b"state", 0)
+        journal.keep_state(Past(rows, b"state"))
     assert [journal.at(rows).rows for rows in (12, 14, 20)] == [10, 10, 20]
 
 
@@ -104,7 +104,7 @@ def test_answers_beyond_the_limit_are_given_up(caplog):
     for _ in range(10):
         answer(journal, (True, bytes(30)))
     assert journal.at(1) is None
-    journal.keep_state(2, b"state", 0)
+    journal.keep_state(Past(2, b"state"))
     assert journal.at(2) is None
     assert caplog.text.count("nor go on in a later run") == 1
 

@@ -20,6 +20,7 @@ from physx_core.errors import ConnectionRefusedByPeerError, StateError
 from physx_core.net import Kind, encode, pack
 from physx_core.sources import ClientSource
 from physx_core.workers.journal import Journal
+from physx_core.workers.pasts import Past
 from physx_core.workers.server.validation import parse_state
 
 ENVS = Path(__file__).parents[1] / "programs" / "state_envs.py"
@@ -248,7 +249,7 @@ def test_journal_forgets_what_comes_before_a_state():
     for number in (3, 4, 5):
         journal.record(answers[number])
     assert journal.newest.describe() is None
-    journal.keep_state(9, b"state", 0, obeyed=3, requests=4)
+    journal.keep_state(Past(9, b"state"), obeyed=3, requests=4)
     assert journal.newest.past.state == b"state"
     assert (journal.newest.obeyed, journal.newest.requests) == (3, 4)
     credits = [pack(Kind.CREDIT, number=number) for number in (4, 5)]
@@ -258,7 +259,7 @@ def test_journal_forgets_what_comes_before_a_state():
     found = [journal.answer(number) for number in (1, 2, 5, 6, 7, 8)]
     assert found == [answers[1], answers[2], None, None, answers[7], None]
     assert journal.answers == 7
-    journal.keep_state(12, b"next", 0, obeyed=5, requests=7)
+    journal.keep_state(Past(12, b"next"), obeyed=5, requests=7)
     assert [journal.answer(number) for number in (1, 2, 7)] == [answers[1], answers[2], None]
     assert journal.order(5) is None
     journal.close()
@@ -266,7 +267,7 @@ def test_journal_forgets_what_comes_before_a_state():
 
 def test_a_journal_that_cannot_keep_a_state_stays_as_it_is(monkeypatch):
     journal = Journal(1, 1e9, None, None)
-    journal.keep_state(1, b"first", 0)
+    journal.keep_state(Past(1, b"first"))
     order = pack(Kind.APPLY, b"order", 1)
     journal.record(order)
 
@@ -275,7 +276,7 @@ def test_a_journal_that_cannot_keep_a_state_stays_as_it_is(monkeypatch):
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(tempfile, "SpooledTemporaryFile", lambda *_: Full())
-    journal.keep_state(2, b"second", 0)
+    journal.keep_state(Past(2, b"second"))
     assert journal.newest.past.state == b"first"
     assert journal.order(0) == order
     journal.close()

@@ -24,7 +24,6 @@ from physx_core.net.values import encode
 from physx_core.rows import ROW_FIELDS, concatenate
 from physx_core.sources.source import Canceled, Source, check_stored
 from physx_core.typing import Batch
-from physx_core.workers.journal import Journal
 from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.pasts import NOTHING, Skip
 from physx_core.workers.row_codec import row_bytes
@@ -90,7 +89,7 @@ class ClientSource(Source):
         self._episodes: ClientEpisodes | None = None
         self.instance_nb = config.num_clients
         self.sets = ParameterSets(config, seed, skip)
-        self._keeps_pasts = keeps_pasts and config.state_every > 0
+        keeps_pasts = keeps_pasts and config.state_every > 0
         self._group = ClientGroup(
             config,
             services,
@@ -100,8 +99,9 @@ class ClientSource(Source):
             skip=skip,
             written=self._written,
             transport=transport,
-            keeps_pasts=self._keeps_pasts,
+            keeps_pasts=keeps_pasts,
         )
+        self._journals = self._group.journals if keeps_pasts else {}
         self._rejections = 0
         if config.record_wrong_samples:
             self._rejections = config.max_wrong_samples_per_step + 1
@@ -115,11 +115,6 @@ class ClientSource(Source):
         self._out: Batch = {}
         self._capacity = 0
         self._failed = self._closed = False
-
-    @property
-    def _journals(self) -> dict[int, Journal]:
-        peers = self._group.server.peers.values() if self._keeps_pasts else ()
-        return {peer.instance_id: peer.journal for peer in peers if peer.journal is not None}
 
     @property
     def fields(self) -> list[Field]:

@@ -81,15 +81,13 @@ class LocalSource(Source):
         self._restored = [past.rows for past in pasts]
         self._rejections = [past.rejected for past in pasts]
         self._says_refusal = config.state_every > 0
-        self._kept: dict[int, Journal] = {}
+        self._journals: dict[int, Journal] = {}
         if keeps_pasts and config.state_every:
             for number in range(1, self.instance_nb + 1):
                 past, limit = skip.pasts.get(number), 1e9 * config.journal_size
-                self._kept[number] = Journal(number, limit, self.sets, services, past, keeps=True)
-
-    @property
-    def _journals(self) -> dict[int, Journal]:
-        return self._kept
+                self._journals[number] = Journal(
+                    number, limit, self.sets, services, past, keeps=True
+                )
 
     @property
     def fields(self) -> list[Field]:
@@ -139,7 +137,7 @@ class LocalSource(Source):
         draw, with_states = self._config.visualizer is not None, self._config.state_every > 0
         choose = partial(self._choose, instance.instance_id)
         number, services = instance.instance_id, self._services
-        journal = self._kept.get(number)
+        journal = self._journals.get(number)
         if journal is not None:
             services = _Remembering(services, journal)
         instance.open(services, draw, choose, with_states=with_states)
@@ -202,10 +200,10 @@ class LocalSource(Source):
                     error,
                 )
             return
-        if number in self._kept:
+        if number in self._journals:
             encoded = encode({"instance": state, "stored": []}, "the state")
             rejected = self._rejections[number - 1]
-            self._kept[number].keep_state(rows, encoded, rejected)
+            self._journals[number].keep_state(Past(rows, encoded, rejected))
 
     def _generate_again(self) -> None:
         """Generate the rows that an earlier run already got, and discard them."""

@@ -85,6 +85,7 @@ class Source(Opened):
     is_plain = False
     rows = 0
     _is_canceled = False
+    _journals: Mapping[int, Journal] = {}  # if a later run may go on
     _name = ""
 
     @property
@@ -143,15 +144,9 @@ class Source(Opened):
         """
         nb, found = self.instance_nb, dict[int, Past]()
         for number, journal in self._journals.items():
-            past = journal.at((self.rows - number + nb) // nb)
-            if past is not None:
+            if (past := journal.at((self.rows - number + nb) // nb)) is not None:
                 found[number] = past
         return found if len(found) == nb else None
-
-    @property
-    @abstractmethod
-    def _journals(self) -> Mapping[int, Journal]:
-        """What the instances were told, by number, if a later run may go on; else empty."""
 
     def check_independent(self) -> None:
         """Check that the environment's episodes are independent.

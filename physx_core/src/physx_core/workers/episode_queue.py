@@ -12,23 +12,6 @@ from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.typing import Index
 
 
-class Losses(Counter[int]):
-    """How often each number was lost."""
-
-    def __init__(self, retries: int) -> None:
-        """Begin without losses.
-
-        Args:
-            retries: How often a number may be lost and given out again.
-        """
-        super().__init__()
-        self.retries = retries
-
-    def may_return(self, number: int) -> bool:
-        """Return whether a number is given out again if it is lost."""
-        return self[number] < self.retries
-
-
 class EpisodeQueue:
     """Gives out each number once; one whose simulation was lost is given out again, and first.
 
@@ -54,7 +37,7 @@ class EpisodeQueue:
         numbers = numbers[(numbers < total) & (np.diff(numbers, prepend=-1) > 0)]
         self.finished = len(numbers)
         self._begins, self._ends = _gaps(numbers, total)
-        self._losses = Losses(1 if retries is None else retries)
+        self._losses, self._retries = Counter[int](), 1 if retries is None else retries
         self._returned: list[int] = []
         self._gap, self._next = 0, 0
 
@@ -106,7 +89,7 @@ class EpisodeQueue:
 
     def give_back(self, number: int) -> bool:
         """Return a number whose simulation was lost; False if that has happened too often."""
-        if not self._losses.may_return(number):
+        if self._losses[number] >= self._retries:
             return False
         self._losses[number] += 1
         heapq.heappush(self._returned, number)

@@ -86,24 +86,13 @@ class Journal:
             self._services.save_parameters(self._number, dict(self._former.saved))
         self._is_created = True
 
-    def keep_state(
-        self,
-        rows: int,
-        state: bytes,
-        rejected: int,
-        *,
-        obeyed: int = 0,
-        shown: int = 0,
-        requests: int = 0,
-    ) -> None:
+    def keep_state(self, past: Past, *, obeyed: int = 0, shown: int = 0, requests: int = 0) -> None:
         """Keep a state, and forget what a client that begins with it is not told.
 
         If the disk has no space, the journal stays as it is, with the state before.
 
         Args:
-            rows: Number of rows before it.
-            state: The encoded state.
-            rejected: Number of rejected samples before it.
+            past: The state, and how many rows and rejected samples there were before.
             obeyed: How many orders other than credit its client had obeyed.
             shown: How many messages with drawing events this had sent.
             requests: How many requests this had sent.
@@ -111,9 +100,8 @@ class Journal:
         Raises:
             ClientError: If the journal cannot be read.
         """
-        if self.given_up or rows <= self.newest.past.rows:
+        if self.given_up or past.rows <= self.newest.past.rows:
             return
-        past = Past(rows, state, rejected)
         if self._keeps:
             recorded, given = self._sets.waiting(self._number)
             saved = self._services.load_parameters(self._number)
@@ -191,10 +179,7 @@ class Journal:
         Args:
             number: Number of the request, counted from 1.
         """
-        try:
-            return self._created.answers.find(number) or self.newest.answers.find(number)
-        except OSError as error:
-            raise self._failure(error) from error
+        return self._find(self._created.answers, number) or self._find(self.newest.answers, number)
 
     def order(self, index: int) -> bytes | None:
         """Return an order, with the credit before it; None if there are no more.
@@ -202,8 +187,11 @@ class Journal:
         Args:
             index: Its index, counted from 0 since the run began, at least `State.obeyed`.
         """
+        return self._find(self.newest.orders, index)
+
+    def _find(self, messages: _Messages, number: int) -> bytes | None:
         try:
-            return self.newest.orders.find(index)
+            return messages.find(number)
         except OSError as error:
             raise self._failure(error) from error
 

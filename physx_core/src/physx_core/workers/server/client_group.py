@@ -52,6 +52,7 @@ class ClientGroup:
     Attributes:
         server: The server.
         config: The environment, the number of clients, and how long they may be silent.
+        journals: What streams were told, by number, if others may go on with them.
     """
 
     def __init__(
@@ -109,6 +110,7 @@ class ClientGroup:
                 address=self._public_address,
             )
         )
+        self.journals = {} if isinstance(pool, EpisodePool) else pool.journals
         self.server = Server(
             config, services, self._encode_setup, token, sets, pool, self._reserved, transport
         )

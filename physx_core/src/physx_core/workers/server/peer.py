@@ -13,6 +13,7 @@ from physx_core.net.frames import FrameReader
 from physx_core.net.handshake import HANDSHAKE_LIMIT
 from physx_core.net.link import Link
 from physx_core.workers.journal import Journal
+from physx_core.workers.pasts import Past
 from physx_core.workers.row_codec import ReceivedRows, RejectedRows
 from physx_core.workers.server.pace import Pace
 from physx_core.workers.server.validation import ClientState
@@ -141,14 +142,8 @@ class Peer(Connection):
         sent = newest.next_order if sent is None else sent
         if not newest.obeyed <= state["orders"] <= sent:
             raise ConnectionRefusedByPeerError("Its state is after orders that nobody gave.")
-        journal.keep_state(
-            rows,
-            state["state"],
-            state["rejected"],
-            obeyed=state["orders"],
-            shown=state["shown"],
-            requests=self.requests,
-        )
+        past, shown = Past(rows, state["state"], state["rejected"]), state["shown"]
+        journal.keep_state(past, obeyed=state["orders"], shown=shown, requests=self.requests)
 
     def hear(self, *, whole: bool) -> None:
         """Note a sign of life: a whole frame, or a substantial part of a long one.

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+from collections import Counter
 from collections.abc import Callable
 
 from physx_core.clock import Clock
@@ -17,7 +18,6 @@ from physx_core.errors import (
 )
 from physx_core.net.frames import Frame, Kind
 from physx_core.net.remote_errors import decode_error
-from physx_core.workers.episode_queue import Losses
 from physx_core.workers.journal import Journal
 from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.pasts import Skip
@@ -37,6 +37,7 @@ class StreamPool:
         least: How many clients there must be.
         is_ending: Whether no other client is needed.
         dispatch: Handles the messages of a client, by their kind.
+        journals: What streams were told, by number, if others may go on with them.
     """
 
     is_ending = False
@@ -74,8 +75,9 @@ class StreamPool:
         self._config, self._clock, self._sets, self._services = config, clock, sets, services
         self._skip, self._keeps_pasts, self._has_no_states = skip, keeps_pasts, False
         self._peers: dict[int, Peer] = {}  # the present or last one of each stream
+        self.journals: dict[int, Journal] = {}
         self._by_hand, self._address = by_hand, address
-        self._losses = Losses(config.retries or 0)
+        self._losses, self._retries = Counter[int](), config.retries or 0
         self._began = dict.fromkeys(range(1, self.least + 1), clock.monotonic())
 
     def adopt(self, peer: Peer) -> None:
@@ -88,15 +90,15 @@ class StreamPool:
             peer.rejected.count = self._skip.rejected_of(number)
             if keeps or self.replaces(number, None):
                 limit, past = 1e9 * self._config.journal_size, self._skip.pasts.get(number)
-                peer.journal = Journal(number, limit, self._sets, self._services, past, keeps=keeps)
+                journal = Journal(number, limit, self._sets, self._services, past, keeps=keeps)
+                self.journals[number] = peer.journal = journal
         self._peers[number] = peer
 
     def close(self) -> None:
         """Forget what the streams were told."""
-        for peer in self._peers.values():
-            if peer.journal is not None:
-                peer.journal.close()
-            peer.journal = None
+        for number, journal in self.journals.items():
+            journal.close()
+            self._peers[number].journal = None
 
     def replaces(self, number: int, error: PhysxError | None) -> bool:
         """Return whether another client replaces one that failed, or left without an error."""
@@ -105,7 +107,7 @@ class StreamPool:
         if error is None and self._by_hand:
             return True
         passing = error is None or isinstance(error, _PASSING)
-        return passing and self._losses.may_return(number)
+        return passing and self._losses[number] < self._retries
 
     def lose(self, number: int, error: PhysxError, peer: Peer | None, *, launched: bool) -> bool:
         """Give a lost client's stream to the next one, and log what follows.
@@ -130,14 +132,13 @@ class StreamPool:
         self._losses[number] += not left
         follows = self._describe_next(number)
         if not left:
-            follows = f"Restart {self._losses[number]} of {self._losses.retries}. {follows}"
+            follows = f"Restart {self._losses[number]} of {self._retries}. {follows}"
         _LOG.warning("%s. %s%s", text.rstrip("."), follows, details and "\n" + details)
         return True
 
     def _given_up(self, number: int) -> str:
         """Return why a stream cannot go on although it could before; empty if it can."""
-        peer = self._peers.get(number)
-        return "" if peer is None or peer.journal is None else peer.journal.given_up
+        return self.journals[number].given_up if number in self.journals else ""
 
     def _final(self, number: int, error: PhysxError) -> PhysxError:
         """Add to an error that ends the run why its stream cannot go on, if so."""
