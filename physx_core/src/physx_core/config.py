@@ -236,7 +236,7 @@ class EnvironmentConfig:
     0: there are none, and it repeats all rows. Where an engine keeps memory of its last step, rows
     depend on this number in the last bits."""
     journal_size: float = at_least(1e-6, 1.0)
-    """Largest size in GB of the journal of a stream that has `retries`, in the folder for
+    """Largest size in GB of the journal of a stream that may go on elsewhere, in the folder for
     temporary files: all predictions and stored samples that its client was given, since the last
     state if there are states. Beyond it, the run goes on, but the instance can no longer be
     restarted."""

@@ -202,16 +202,21 @@ class Journal:
         self._created, self._states, self.credit = State(Past()), deque([State(Past())]), b""
 
     @property
+    def size(self) -> int:
+        """Size in bytes of what the next client will be told."""
+        return self._created.size + self.newest.size
+
+    @property
     def _place(self) -> State:
         """Where answers are kept."""
         return self.newest if self._is_created else self._created
 
     def _check_size(self) -> None:
-        if self._created.size + self.newest.size > self._limit and not self.given_up:
-            size = f"{self._limit / 1e9:g} GB"
+        if self.size > self._limit and not self.given_up:
+            limit = f"{self._limit / 1e9:g} GB"
             self._give_up(
-                f"has reached its limit, EnvironmentConfig.journal_size = {size}; take states more "
-                "often (state_every)"
+                f"has reached its limit, EnvironmentConfig.journal_size = {limit}; take states "
+                "more often (state_every)"
             )
 
     def _give_up(self, reason: str) -> None:
@@ -259,7 +264,7 @@ class State:
     @property
     def size(self) -> int:
         """Size in bytes of what is kept."""
-        return self.orders.size + self.answers.size
+        return len(self.past.state) + self.orders.size + self.answers.size
 
     def describe(self) -> dict[str, Any] | None:
         """Return what a client needs to begin with it; None: it begins anew."""
