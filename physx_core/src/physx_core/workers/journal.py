@@ -125,9 +125,9 @@ class Journal:
 
         Returns:
             The newest state that is not after them, and the predictions since; None: the journal
-            has been given up.
+            has been given up, or closed.
         """
-        if self.given_up:
+        if not self._keeps:
             return None
         while len(self._states) > 1 and self._states[1].past.rows <= rows:
             self._states.popleft().close()
@@ -200,6 +200,7 @@ class Journal:
         for state in (self._created, *self._states):
             state.close()
         self._created, self._states, self.credit = State(Past()), deque([State(Past())]), b""
+        self._keeps = False
 
     @property
     def size(self) -> int:
