@@ -25,6 +25,7 @@ from physx_core.net.values import encode
 from physx_core.plugins import reference_of, resolve
 from physx_core.plugins.references import locate
 from physx_core.workers.instance import instance_arguments
+from physx_core.workers.journal import Journal
 from physx_core.workers.launchers import describe_states, stop
 from physx_core.workers.parameter_sets import ParameterSets
 from physx_core.workers.pasts import NOTHING, Skip
@@ -110,10 +111,14 @@ class ClientGroup:
                 address=self._public_address,
             )
         )
-        self.journals = {} if isinstance(pool, EpisodePool) else pool.journals
+        self.journals: dict[int, Journal] = {}
         self.server = Server(
             config, services, self._encode_setup, token, sets, pool, self._reserved, transport
         )
+        if isinstance(pool, StreamPool):
+            self.journals = pool.journals
+            self.server.dispatch.update(pool.dispatch)
+        self.server.dispatch.update({} if written is None else written.dispatch)
 
     def open(self) -> None:
         """Start the clients and wait until their environments are ready."""
@@ -141,7 +146,6 @@ class ClientGroup:
         if not isinstance(pool, EpisodePool):
             pool.close()
             self.server.pool = pool = self._make_pool()
-            self.server.dispatch.update(pool.dispatch)
         pool.leases = leases
         self.server.dispatch.update(leases.dispatch)
 
@@ -238,7 +242,7 @@ class ClientGroup:
     def _make_pool(self) -> EpisodePool:
         is_known = find_token(self.config.token_file) is not None
         is_open = self._launcher.by_hand or is_known
-        return EpisodePool(self.config, self._clock, self._written, is_open=is_open)
+        return EpisodePool(self.config, self._clock, is_open=is_open)
 
     def _starting(self) -> list[int]:
         """Return the instances that the run waits for before it begins."""

@@ -13,7 +13,6 @@ from physx_core.errors import ConfigError, PhysxError, TooFewClientsError
 from physx_core.workers.launchers import describe_states
 from physx_core.workers.server.leases import Leases
 from physx_core.workers.server.peer import Peer
-from physx_core.workers.server.written_rows import WrittenRows
 
 _SAY_EVERY = 5.0
 _IDLE_LOSSES = 3  # in a row at the same place; then something is wrong there
@@ -27,26 +26,17 @@ class EpisodePool:
         least: How many clients there must be.
         is_open: Whether others who know the token may start clients, besides the launcher.
         is_ending: Whether no other client is needed.
-        dispatch: Handles the messages of a client, by their kind.
         leases: The episodes that they simulate; None before the first one is ready.
     """
 
     is_ending = False
 
-    def __init__(
-        self,
-        config: EnvironmentConfig,
-        clock: Clock,
-        written: WrittenRows | None,
-        *,
-        is_open: bool,
-    ) -> None:
+    def __init__(self, config: EnvironmentConfig, clock: Clock, *, is_open: bool) -> None:
         """Begin without clients.
 
         Args:
             config: How many clients there may be, and how long the run waits for them.
             clock: Tells how long there have been too few.
-            written: Takes note of the rows that the clients write themselves; None: they send them.
             is_open: Whether others who know the token may start clients, besides the launcher.
 
         Raises:
@@ -54,7 +44,6 @@ class EpisodePool:
         """
         self.least, self.is_open = config.min_clients or 1, is_open
         self.leases: Leases | None = None
-        self.dispatch = {} if written is None else written.dispatch
         self._config, self._clock = config, clock
         self._idle_losses: Counter[int] = Counter()
         self._short_since: float | None = None

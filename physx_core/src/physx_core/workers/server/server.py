@@ -98,7 +98,6 @@ class Server:
             Kind.BYE: self._take_bye,
             Kind.PING: _take_sign_of_life,
             **dict.fromkeys(_REQUESTS, self._requests.take),
-            **pool.dispatch,
         }
 
     def open(self, host: str | None = None) -> None:
