@@ -43,6 +43,7 @@ from physx_core import (
     EnvironmentConfig,
     NetworkConfig,
     Training,
+    View,
 )
 from physx_core.observers import read_scalars
 from physx_core.pipelines.pipeline import Pipeline
@@ -59,9 +60,8 @@ NETWORK = NetworkConfig(
 
 def learner_alone(folder: str) -> float:
     """Return batches per second of a training on stored samples."""
-    training = Training(
-        NETWORK, DatasetConfig(existing_dir=folder), epoch_nb=1, batch_nb=BATCHES, **common(folder)
-    )
+    data = DatasetConfig(existing_dir=folder, view=View(hold_back=False))
+    training = Training(NETWORK, data, epoch_nb=1, batch_nb=BATCHES, **common(folder))
     return batches_per_second(training)
 
 
@@ -290,9 +290,8 @@ def losses(problem: Problem, folder: str, seed: int) -> list[float]:
         problem.network, None, seen, batch_nb=often,
         online="physx/reservoir", online_kwargs=reservoir, **options,
     )  # fmt: skip
-    shuffled = Examined(
-        problem.network, DatasetConfig(existing_dir=offline), **{**options, "epoch_nb": VIEWS}
-    )
+    every = DatasetConfig(existing_dir=offline, view=View(hold_back=False))
+    shuffled = Examined(problem.network, every, **{**options, "epoch_nb": VIEWS})
     return [stream.learn(data, once), mixed.learn(data, often), shuffled.learn(data, often)]
 
 

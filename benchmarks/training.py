@@ -20,7 +20,7 @@ import numpy as np
 import torch
 from measure import device, finish, rates, report
 
-from physx_core import Dataset, DatasetConfig, NetworkConfig, Training
+from physx_core import Dataset, DatasetConfig, NetworkConfig, Training, View
 from physx_core.observers import Observers, ProgressBar
 from physx_torch import FC
 
@@ -127,7 +127,7 @@ def main() -> None:
             training = partial(
                 Training,
                 network,
-                DatasetConfig(existing_dir=str(folder)),
+                DatasetConfig(existing_dir=str(folder), view=View(hold_back=False)),
                 session_dir=name,
                 epoch_nb=ROUNDS + 1,
                 batch_nb=batches,

@@ -150,7 +150,7 @@ def test_help_shows_the_arguments_without_names_and_examples(verb, arguments, ca
     ("verb", "text"),
     [
         ("generate", "None: `num_clients`, which the launcher starts."),
-        ("train", "if the dataset has a validation mode or `View.fold` "),
+        ("train", "if the dataset has a validation mode or"),
     ],
 )
 def test_help_breaks_lines_only_where_they_are_full(verb, text, capsys, monkeypatch):

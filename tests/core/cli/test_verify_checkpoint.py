@@ -35,7 +35,7 @@ def verify(capsys, *words):
 
 @pytest.mark.parametrize(
     "view",
-    [None, View(fold=None), View(weights="episode", fold=1), View(order="blocks", fold=2)],
+    [None, View(hold_back=False), View(weights="episode", fold=1), View(order="blocks", fold=2)],
 )
 def test_data_as_they_were(capsys, view):
     train(view)
@@ -50,13 +50,16 @@ def test_each_source_of_a_mixture_is_named(capsys):
     train(View(sources={"data": 0.5, "other": 0.5}, fold=0))
     status, text = verify(capsys, "--read", "--replay")
     assert status == 0 and "read again, with the same values" in text
-    assert "data: 300 training" in text and "data: other, read and compared" in text
+    assert "data: 300 training of data" in text and "300 training of other" in text
     assert main(["info", "sessions/training"]) == 0
-    assert "data in data: unchanged since" in capsys.readouterr().out
+    assert "data in data, other: unchanged since" in capsys.readouterr().out
     with Dataset.open("other", writable=True) as dataset:
         dataset.update("training", np.arange(300), {"x": np.zeros((300, 1))})
     status, text = verify(capsys, "--replay")
     assert status == 1 and "its last, has other values" in text
+    assert "training of other: rows were updated" in text
+    assert main(["info", "sessions/training"]) == 0
+    assert "data, other: training of other: rows were updated" in capsys.readouterr().out
 
 
 def test_rows_that_were_added_change_nothing(capsys):

@@ -156,13 +156,13 @@ def test_who_may_not_compact(folder):
 def test_open_batches_are_an_error_instead_of_other_rows(folder):
     with Dataset.create(folder) as dataset:
         fill(dataset)
-        with View(fold=None).open(2, data=dataset) as batches:
+        with View(hold_back=False).open(2, data=dataset) as batches:
             batches[0]
             dataset.compact()
             with pytest.raises(DatasetError, match="open them again"):
                 batches[1]
             with pytest.raises(DatasetError, match="compacted"):
-                View(fold=None).open(2, data=dataset, snapshot=batches.snapshot)
+                View(hold_back=False).open(2, data=dataset, snapshot=batches.snapshot)
 
 
 def test_a_reader_sees_the_same_rows_after_refreshing(folder):

@@ -22,6 +22,7 @@ from physx_core import (
     Prediction,
     Replay,
     Training,
+    View,
     Visualizer,
 )
 from physx_core.cli import main
@@ -32,6 +33,8 @@ from physx_core.errors import (
     PhysxError,
     WrongSamplesError,
 )
+
+ALL = View(hold_back=False)
 
 pytestmark = pytest.mark.processes
 
@@ -46,10 +49,9 @@ def generate(environment=SPRING, **options):
     return pipeline
 
 
-def train(source, **options):
-    pipeline = Training(
-        LINEAR, DatasetConfig(existing_dir=source), epoch_nb=2, batch_size=5, **options
-    )
+def train(source, view=ALL, **options):
+    data = DatasetConfig(existing_dir=source, view=view)
+    pipeline = Training(LINEAR, data, epoch_nb=2, batch_size=5, **options)
     pipeline.execute()
     return pipeline
 
@@ -72,6 +74,24 @@ def said(capsys):
 
 
 # Announcements ----------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("rows", "words"),
+    [
+        (3, "3 samples to train on, 0 held back for validation: a piece of the only block"),
+        (20, "16 samples to train on, 4 held back for validation: a piece of the only trajectory"),
+        (30, "24 samples to train on, 6 held back for validation: 1 of 5 trajectories"),
+    ],
+)
+def test_a_training_says_what_it_holds_back(said, rows, words):
+    n = np.arange(rows)
+    known = {"episode": n // (20 if rows == 20 else 6), "env_id": np.ones(rows, int), "step": n}
+    with Dataset.create("data") as dataset:
+        state = {name: np.ones((rows, 2)) for name in ("state", "next_state", "force")}
+        dataset.append("training", state | (known if rows > 3 else {}))
+    train("data", View())
+    assert words in said()
 
 
 def test_a_generation_says_where_it_writes_what_it_left_and_how_to_continue(said):
@@ -121,7 +141,7 @@ def test_a_prediction_and_a_replay_say_what_they_left(said):
         "samples: 3 prediction in sessions/training/dataset",
         "next: physx info sessions/training",
     ]
-    Replay(DatasetConfig(existing_dir="sessions/spring"), SPRING).execute()
+    Replay(DatasetConfig(existing_dir="sessions/spring", view=ALL), SPRING).execute()
     assert said() == ["session: sessions/replay", "20 steps of toy/spring"]
 
 
@@ -200,7 +220,7 @@ def test_a_prediction_without_an_end_says_how_it_ends(said):
 def test_a_batch_that_is_larger_than_the_dataset_is_announced(said):
     made = generate().session.path
     said()
-    data = DatasetConfig(existing_dir=made)
+    data = DatasetConfig(existing_dir=made, view=ALL)
     Training(LINEAR, data, epoch_nb=1, batch_size=21).execute()
     assert said()[2] == "batches of 20 samples, because there are no more"
     Training(LINEAR, data, epoch_nb=1, batch_size=20).execute()
@@ -269,7 +289,7 @@ def test_a_quiet_run_says_nothing(said):
     made = generate(quiet=True).session.path
     network = train(made, quiet=True).session
     Prediction(NetworkConfig(), SPRING, session_name=network.name, step_nb=2, quiet=True).execute()
-    Replay(DatasetConfig(existing_dir=made), SPRING, quiet=True).execute()
+    Replay(DatasetConfig(existing_dir=made, view=ALL), SPRING, quiet=True).execute()
     words = ["generate", "toy/spring", "--batch-nb", "1", "--batch-size", "2", "--quiet"]
     assert main([*words, "--environment.no-as-tcp-ip-client"]) == 0
     assert said() == []
@@ -362,7 +382,7 @@ class Loses(Training):
 
 def test_neither_does_a_training_without_a_batch(said):
     made = generate().session.path
-    data = DatasetConfig(existing_dir=made)
+    data = DatasetConfig(existing_dir=made, view=ALL)
     with pytest.raises(ZeroDivisionError):
         Loses(LINEAR, data, epoch_nb=1, batch_size=5).execute()
     assert sessions() == ["spring"]
@@ -578,12 +598,12 @@ def test_the_only_name_in_a_session_is_that_of_the_network():
     named = NetworkConfig(
         "toy/linear", network_kwargs={"net_fields": ["state", "force"]}, network_name="line"
     )
-    Training(named, DatasetConfig(existing_dir=made), epoch_nb=1, batch_size=5).execute()
+    Training(named, DatasetConfig(existing_dir=made, view=ALL), epoch_nb=1, batch_size=5).execute()
     Prediction(NetworkConfig(), SPRING, step_nb=1).execute()
     other = NetworkConfig(
         "toy/linear", network_kwargs={"net_fields": ["state", "force"]}, network_name="other"
     )
-    data = DatasetConfig(existing_dir=made)
+    data = DatasetConfig(existing_dir=made, view=ALL)
     Training(other, data, new_session=False, epoch_nb=1, batch_size=5).execute()
     with pytest.raises(PhysxError, match="Available: line_0, other_0"):
         Prediction(NetworkConfig(), SPRING, step_nb=1).execute()

@@ -19,6 +19,7 @@ from physx_core import (
     EnvironmentConfig,
     NetworkConfig,
     Training,
+    View,
     checkpoint,
     files,
     read_scalars,
@@ -27,11 +28,13 @@ from physx_core.cli import main
 from physx_core.errors import ConfigError, DivergedError, EnvironmentFailedError, UsageError
 from physx_core.toy import LeastSquares, Linear, Spring
 
+ALL = View(hold_back=False)
+
 pytestmark = pytest.mark.processes
 
 SPRING = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, seed=1)
 NETWORK = NetworkConfig("toy/linear", network_kwargs={"net_fields": ["state", "force"]})
-DATA = DatasetConfig(existing_dir="sessions/run")
+DATA = DatasetConfig(existing_dir="sessions/run", view=ALL)
 OPTIONS = {"epoch_nb": 3, "batch_size": 10, "seed": 2}
 
 
@@ -131,7 +134,7 @@ HEAD = """
 from physx_core import *
 from physx_core.pipelines import Replay
 if __name__ == "__main__":
-    data = DatasetConfig(existing_dir="sessions/run")
+    data = DatasetConfig(existing_dir="sessions/run", view=View(hold_back=False))
     spring = EnvironmentConfig("toy/spring", num_clients=2, seed=1)
     alone = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, always_produce=True)
     busy = EnvironmentConfig("toy/spring", num_clients=2, always_produce=True)
@@ -255,7 +258,7 @@ def test_the_command_ends_with_143_too():
     process.send_signal(signal.SIGTERM)
     _, errors = process.communicate(timeout=60)
     assert process.returncode == 143 and "terminated" in errors
-    assert checkpoints("new") == ["network_0"]
+    assert checkpoints("new") == ["network_0", "network_best"]
 
 
 def test_sigterm_is_left_alone_where_it_is_handled():

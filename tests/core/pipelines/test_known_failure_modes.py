@@ -23,6 +23,7 @@ from physx_core import (
     NetworkConfig,
     Prediction,
     Training,
+    View,
 )
 from physx_core.components import options_of
 from physx_core.errors import (
@@ -37,6 +38,8 @@ from physx_core.errors import (
     UnknownFieldError,
     UsageError,
 )
+
+ALL = View(hold_back=False)
 
 pytestmark = pytest.mark.processes
 
@@ -209,7 +212,9 @@ def test_old_data_are_normalized_without_touching_them(recompute):
     with Dataset.create("data") as dataset:
         dataset.append("training", {"state": state, "next_state": 2 * state})
     before = content("data")
-    config = DatasetConfig(existing_dir="data", normalize=True, recompute_normalization=recompute)
+    config = DatasetConfig(
+        existing_dir="data", view=ALL, normalize=True, recompute_normalization=recompute
+    )
     with Training(NetworkConfig("toy/linear"), config, epoch_nb=1, batch_size=60) as training:
         training.execute()
         used = training.learner.transformation.normalization
@@ -245,7 +250,7 @@ def test_batches_have_their_size_however_small_the_dataset_is():
     for size, batch_nb, sizes in ((8, 5, [8, 2, 8, 2, 8]), (16, 2, [10, 10])):
         del batches[:]
         Mine(
-            NETWORK, DatasetConfig(existing_dir="sessions/run"),
+            NETWORK, DatasetConfig(existing_dir="sessions/run", view=ALL),
             epoch_nb=1, batch_nb=batch_nb, batch_size=size,
         ).execute()  # fmt: skip
         assert [len(batch) for batch in batches] == sizes
@@ -257,7 +262,7 @@ def test_a_recorded_prediction_leaves_the_data_alone_that_were_learned_from():
     DataGeneration(SPRING, session_name="run", batch_nb=1, batch_size=20).execute()
     before = content("sessions/run")
     Training(
-        NETWORK, DatasetConfig(existing_dir="sessions/run"), epoch_nb=1, batch_size=20
+        NETWORK, DatasetConfig(existing_dir="sessions/run", view=ALL), epoch_nb=1, batch_size=20
     ).execute()
     for _ in range(2):
         Prediction(NetworkConfig(), SPRING, step_nb=3, record=True).execute()

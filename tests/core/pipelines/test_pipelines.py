@@ -17,6 +17,7 @@ from physx_core import (
     Observer,
     Prediction,
     Training,
+    View,
 )
 from physx_core.cli import main
 from physx_core.config import read_toml
@@ -249,7 +250,7 @@ def test_training_with_environments_stores_the_first_epoch_and_reads_it_again():
 def test_each_epoch_is_kept_when_asked():
     generate()
     config = NetworkConfig("toy/linear", save_each_epoch=True)
-    data = DatasetConfig(existing_dir="sessions/run")
+    data = DatasetConfig(existing_dir="sessions/run", view=View(hold_back=False))
     Training(config, data, epoch_nb=3, batch_size=50).execute()
     names = sorted(p.name for p in Path("sessions/training/network").iterdir())
     assert names == ["network_0", "network_1", "network_2"]

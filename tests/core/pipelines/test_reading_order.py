@@ -42,8 +42,9 @@ class Followed(Training):
 def train(epoch_nb, name="run", before=lambda epoch: None, existing="data", **options):
     fields = options.pop("fields", ["x"])
     network = NetworkConfig("toy/linear", {"net_fields": fields, "opt_fields": ["y"]})
+    config = {"view": View(hold_back=False), **options.pop("config", {})}
     training = Followed(
-        network, DatasetConfig(existing_dir=existing, **options.pop("config", {})),
+        network, DatasetConfig(existing_dir=existing, **config),
         epoch_nb=epoch_nb, batch_size=300, seed=0, session_name=name, **options,
     )  # fmt: skip
     training.before, training.rows = before, []

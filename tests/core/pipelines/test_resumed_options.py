@@ -47,7 +47,7 @@ BOUND = [
     ({"network": {"network_kwargs": {"net_fields": ["next_state"]}}}, "network.network_kwargs"),
     ({"dataset": {"normalize": True}}, "dataset.normalize was False and is now True"),
     ({"dataset": {"shuffle": False}}, "dataset.shuffle was True and is now False"),
-    ({"dataset": {"view": View(fold=1)}}, "dataset.view.fold was None and is now 1"),
+    ({"dataset": {"view": View(fold=1)}}, "dataset.view.fold was 0 and is now 1"),
     ({"online": "physx/reservoir"}, "online was 'physx/stream' and is now 'physx/reservoir'"),
 ]
 

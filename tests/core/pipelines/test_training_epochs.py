@@ -24,7 +24,7 @@ from physx_core.components import Group
 from physx_core.errors import CheckpointError, ConfigError, UnknownOptionError
 from physx_core.toy import LeastSquares, Linear
 
-DATA = DatasetConfig(existing_dir="data")
+DATA = DatasetConfig(existing_dir="data", view=View(hold_back=False))
 
 
 class Scripted(LeastSquares):

@@ -104,7 +104,7 @@ VIEWS = [
     View(window=WINDOW, fold=1, test_fold=2),
     View(window=WINDOW, sources={"a": 0.7, "b": 0.3}, fold=0),
     View(window=WINDOW, weights="episode", edges="pad", fold=0),
-    View(window=WINDOW, order="blocks", drop_last=True, fold=None),
+    View(window=WINDOW, order="blocks", drop_last=True, hold_back=False),
 ]
 
 
@@ -130,7 +130,7 @@ def test_contradictions_are_named():
     with pytest.raises(ConfigError, match="not both"):
         train(DatasetConfig(existing_dir="a", view=View(sources={"b": 1.0})))
     environment = EnvironmentConfig("toy/spring", as_tcp_ip_client=False)
-    for view in (View(window=WINDOW), View(fold=0)):
+    for view in (View(window=WINDOW), View(fold=1)):
         with pytest.raises(ConfigError, match="environments generate"):
             train(DatasetConfig(view=view), environment_config=environment, batch_nb=2)
     replayed = EnvironmentConfig("toy/spring", load_samples=True, as_tcp_ip_client=False)

@@ -4,6 +4,7 @@ import itertools
 import multiprocessing
 import os
 import pickle
+import re
 import subprocess
 import sys
 from collections import Counter
@@ -23,6 +24,7 @@ from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.dataset.read import shuffling
 from physx_core.dataset.read.access import memory
 from physx_core.errors import ConfigError, DatasetError
+from physx_core.views import sources
 from physx_core.views.folds import folds_of
 
 MANY = 10**12
@@ -91,7 +93,7 @@ class Model:
         self.view = view
         kept = [
             x for x, fold in zip(trajectories, folds, strict=True)
-            if fold not in (view.fold, view.test_fold)
+            if fold not in view.held.values()
         ]  # fmt: skip
         offsets = [o for window in view.windows.values() for o in window.at] or [0]
         low, high = min(0, *offsets), max(0, *offsets)
@@ -138,7 +140,7 @@ def test_views_have_the_items_of_the_model(
     trajectories = episodes(lengths)
     view = View(
         window=window, stride=stride, edges=edges, folds=folds, order=order,
-        fold=0 if held else None, test_fold=1 if held else None, fold_seed=seed,
+        hold_back=held, test_fold=1 if held else None, fold_seed=seed,
     )  # fmt: skip
     with TemporaryDirectory() as name, mock.patch.object(memory, "available_memory", lambda: free):
         folder = Path(name, "data")
@@ -147,7 +149,7 @@ def test_views_have_the_items_of_the_model(
             trajectories.sort(key=lambda x: first_row(folder, x))
         else:
             store(folder, trajectories)
-        if held and instances and len(lengths) < folds:
+        if held and len(lengths) < folds:
             return  # pieces: see below
         numbers, campaign = np.arange(len(lengths)), np.full(len(lengths), -1 if instances else 0)
         of = folds_of(campaign, numbers, folds, seed)
@@ -281,8 +283,8 @@ def test_wrong_choices_are_named(tmp_path):
     ):
         with pytest.raises((ConfigError, DatasetError), match=message):
             View(**options).open(4, data=tmp_path / data)[0]
-    with pytest.raises(ConfigError, match="set View.fold"):
-        View().open(4, data=tmp_path / "a", part="validation")
+    with pytest.raises(ConfigError, match="set View.hold_back"):
+        View(hold_back=False).open(4, data=tmp_path / "a", part="validation")
 
 
 @pytest.mark.parametrize(
@@ -323,7 +325,8 @@ def test_each_batch_has_its_share_of_each_source(shares, seed, epoch, size):
             with Dataset.create(folder) as dataset:
                 n = np.arange(count)
                 dataset.append("training", {"n": n, "of": np.full(count, folders.index(folder))})
-        view = View(sources=dict(zip(folders, map(float, shares), strict=True)), epoch=epoch)
+        sources = dict(zip(folders, map(float, shares), strict=True))
+        view = View(sources=sources, epoch=epoch, hold_back=False)
         with view.open(size, seed) as batches:
             pairs = np.concatenate([np.stack([b["of"], b["n"]], 1) for b in batches])
         total = len(pairs)
@@ -346,15 +349,15 @@ def test_each_batch_has_its_share_of_each_source(shares, seed, epoch, size):
 def test_weighted_items_come_in_proportion(tmp_path):
     lengths = [4] * 9 + [40]
     store(tmp_path, episodes(lengths))
-    with View(weights="episode").open(8, data=tmp_path) as batches:
+    with View(weights="episode", hold_back=False).open(8, data=tmp_path) as batches:
         found = Counter(int(e) for b in batches for e in b["x"][:, 0])
         assert max(found.values()) - min(found.values()) <= 4 and sum(found.values()) == 76
         again = Counter(int(e) for b in batches for e in b["x"][:, 0])
         assert found == again
-    with View(weights="class:label").open(8, data=tmp_path) as batches:
+    with View(weights="class:label", hold_back=False).open(8, data=tmp_path) as batches:
         found = Counter(int(n) for b in batches for n in b["label"])
         assert max(found.values()) - min(found.values()) <= 2
-    with View(weights="field:step").open(8, data=tmp_path) as batches:
+    with View(weights="field:step", hold_back=False).open(8, data=tmp_path) as batches:
         steps = np.concatenate([b["step"] for b in batches])
         assert 0 not in steps
         total = sum(n * (n - 1) / 2 for n in lengths)
@@ -468,3 +471,28 @@ def test_normalization_is_that_of_the_part(tmp_path):
     assert found.keys() == {"past"}
     np.testing.assert_allclose(found["past"].mean, np.broadcast_to(x.mean(axis=0), (2, 2)))
     np.testing.assert_allclose(found["past"].std, np.broadcast_to(x.std(axis=0), (2, 2)))
+
+
+def test_the_picture_of_views_is_of_those_on_the_page():
+    docs = Path(__file__).parents[3] / "docs"
+    script, page = docs / "nine_views.py", docs / "views.md"
+    drawn = re.findall(r'^    "(.+)": (View\(.*\)),$', script.read_text("utf-8"), re.M)
+    assert drawn == re.findall(r"^\| (.+) \| `(View\(.*\))` \|$", page.read_text("utf-8"), re.M)
+    assert len(drawn) == 9
+
+
+def test_rows_without_episodes_stay_in_their_part_as_others_are_added(tmp_path, monkeypatch):
+    monkeypatch.setattr(sources, "_SAME_SIZE", 10)  # blocks double after 160 rows
+    held = []
+    for count in (90, 400, 3000):
+        folder = tmp_path / str(count)
+        with Dataset.create(folder) as dataset:
+            dataset.append("training", {"x": np.arange(count, dtype=float)})
+        parts = [View().open(7, data=folder, part=p).all_rows() for p in ("training", "validation")]
+        assert_array_equal(np.sort(np.concatenate(parts)), np.arange(count))
+        held.append(parts[1])
+        for former, now in itertools.pairwise(held):  # the last block may have grown
+            assert set(former) == {row for row in now if row < former[-1] + 1}
+    assert len(held[-1]) == pytest.approx(600, rel=0.2)
+    with View().open(7, data=folder) as batches:
+        assert batches.division == ["41 of 52 blocks of rows"]

@@ -127,7 +127,7 @@ class Training(NewSessionPipeline):
     """Number of independent episodes that may fail before the training fails."""
     validation_every: int = at_least(0, 1)
     """Number of epochs between validations, if the dataset has a validation mode or
-    `View.fold` holds samples back; 0: never."""
+    `View.hold_back` does; 0: never."""
     validation_batch_size: int | None = at_least(1, None)
     """Number of validation samples predicted at once, in each process; None: `batch_size`. It
     changes the memory and the time that a validation takes, but not its losses."""
@@ -604,7 +604,7 @@ class Training(NewSessionPipeline):
         self.data = opening.open(resources, dataset)
         self._prepare_learner(start)
         if start.checkpoint is not None and start.environment is None and self._is_main:
-            self._tell_changed_data(dataset, start.config.mode)
+            self._tell_changed_data(start.config.mode)
         resources.push(self._close)
 
     def _begin(self) -> None:
@@ -617,16 +617,16 @@ class Training(NewSessionPipeline):
         now = bound_options(self, seed, self.group.size)
         check_bound(session, self._resumed.options, now)
 
-    def _tell_changed_data(self, dataset: Dataset, mode: str) -> None:
+    def _tell_changed_data(self, mode: str) -> None:
         """Warn if the data are not those that the training had, as then it is another one."""
-        fixed = self._resumed.snapshots
-        changes = describe_changes(self._resumed.data, dataset, mode, fixed)
+        fixed, datasets = self._resumed.snapshots, self.data.stored.datasets
+        changes = describe_changes(self._resumed.data, datasets, mode, fixed)
         if changes:
             text = (
-                f"The data in {dataset.directory} changed since the checkpoint was written: "
-                f"{'; '.join(changes)}. The training goes on with the data as they are, so their "
-                "order, normalization and validation samples may differ, and the network will not "
-                "be the one of an uninterrupted training."
+                f"The data in {self.data.dataset.directory} changed since the checkpoint was "
+                f"written: {'; '.join(changes)}. The training goes on with the data as they are, "
+                "so their order, normalization and validation samples may differ, and the network "
+                "will not be the one of an uninterrupted training."
             )
             warnings.warn(text, stacklevel=2)
             self.session.note(text)
@@ -636,7 +636,7 @@ class Training(NewSessionPipeline):
         environment = self.environment_config
         if environment is not None and environment.load_samples:
             return {}
-        return record_data(self.data.dataset, self._dataset_options.mode)
+        return record_data(self.data.stored.datasets, self._dataset_options.mode)
 
     def _begin_at(self, start: Start) -> None:
         """Start at the first batch, or where a checkpoint was written."""
@@ -716,6 +716,7 @@ class Training(NewSessionPipeline):
             yield describe_samples(self.data.dataset.directory)
         if self.data.online is not None:
             yield from self.data.online.announce()
+        yield from self.data.stored.describe_parts()
         size = self.batch_size * self.group.size
         if self.data.generated is None and size > self.data.stored.num_samples:
             yield f"batches of {self.data.stored.num_samples:,} samples, because there are no more"

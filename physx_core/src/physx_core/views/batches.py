@@ -132,14 +132,6 @@ class Batches(Closeable):
     def _count(self, shares: Array) -> int:
         """Return the number of items of an epoch, and find out which source has which of them."""
         counts = np.array([source.count for source in self._sources])
-        if not counts.all():
-            empty = self._sources[int(np.argmin(counts))]
-            raise DatasetError(
-                f'There is nothing to read for the part "{self.part}" in '
-                f'{empty.dataset.directory}: mode "{self._mode}" has {empty.rows.count} rows in '
-                f"{empty.trajectories[1]} trajectories, of which the view takes "
-                f"{empty.trajectories[0]}, and no window fits into one."
-            )
         exact = shares / shares.sum() * _SHARES
         each = np.floor(exact).astype(int)
         each[np.argsort(each - exact)[: _SHARES - each.sum()]] += 1
@@ -149,8 +141,16 @@ class Batches(Closeable):
         of = np.repeat(np.arange(len(each)), each)[np.argsort(places, kind="stable")]
         self._source_of, self._shares = of, each
         self._before = np.array([np.cumsum(of == k) - (of == k) for k in range(len(each))])
-        if len(counts) == 1:
-            return int(counts[0])
+        if not counts.all() and self.part not in ("validation", "test"):
+            empty = self._sources[int(np.argmin(counts))]
+            raise DatasetError(
+                f'There is nothing to read for the part "{self.part}" in '
+                f'{empty.dataset.directory}: mode "{self._mode}" has {empty.rows.count} rows in '
+                f"{empty.trajectories[1]} trajectories, of which the view takes "
+                f"{empty.trajectories[0]}, and no window fits into one."
+            )
+        if len(counts) == 1 or not counts.all():
+            return int(counts.min())
         if self.view.epoch == "first":
             return int((counts * _SHARES // each).min())
         return int((-(-counts * _SHARES // each)).max())
@@ -175,7 +175,7 @@ class Batches(Closeable):
         return other
 
     def _check(self) -> None:
-        if not self._num_batches:
+        if self.num_items and not self._num_batches:
             raise ConfigError(
                 f"An epoch has {self.num_items} items, fewer than a batch of {self.batch_size}, "
                 "and View.drop_last leaves out what is left."
@@ -214,7 +214,7 @@ class Batches(Closeable):
             number: Its number, from 0; those of each epoch follow those of the one before.
 
         Raises:
-            IndexError: If it is negative.
+            IndexError: If it is negative, or nothing is in this part.
             DatasetError: If rows cannot be read.
         """
         epoch, start, stop = self._place(number)
@@ -236,8 +236,8 @@ class Batches(Closeable):
 
     def _place(self, number: int) -> tuple[int, int, int]:
         """Return the epoch of a batch, and its first position there and that after its last."""
-        if number < 0:
-            raise IndexError(f"There is no batch {number}: the first is 0.")
+        if number < 0 or not self._num_batches:
+            raise IndexError(f"There is no batch {number} of {self._num_batches} in an epoch.")
         epoch, place = divmod(int(number), self._num_batches)
         start = place * self.batch_size
         return epoch, start, min(start + self.batch_size, self.num_items)
@@ -369,6 +369,17 @@ class Batches(Closeable):
                 total.update(source.rows.gather(name, rows[start : start + step]))
         return total.normalization()
 
+    @property
+    def datasets(self) -> dict[str, Dataset]:
+        """The dataset of each source, by its folder as the view names it; "" if it names none."""
+        names = self.view.sources or ("",)
+        return {n: each.dataset for n, each in zip(names, self._sources, strict=True)}
+
+    @property
+    def division(self) -> list[str]:
+        """What is in this part of each source, in words."""
+        return [source.division for source in self._sources]
+
     def explain(self) -> str:
         """Return in words what the batches are made of."""
         lines = [
@@ -376,10 +387,9 @@ class Batches(Closeable):
             f'("{self.part}")'
         ]
         for source, share in zip(self._sources, self._shares.tolist(), strict=True):
-            taken, known = source.trajectories
             lines.append(
                 f"{source.dataset.directory}: {source.count} items of {source.rows.count} rows, "
-                f"{taken} of {known} trajectories, {share / 10:g} % of each batch; order "
+                f"{source.division}, {share / 10:g} % of each batch; order "
                 f'"{source.order}"'
             )
         if any(source.order == "blocks" for source in self._sources):

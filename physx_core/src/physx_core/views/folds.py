@@ -19,24 +19,24 @@ Part: TypeAlias = Literal["training", "validation", "test", "all"]
 def choose_part(view: ViewOptions, part: Part, found: Trajectories) -> Trajectories:
     """Return those trajectories that are in a part of a view.
 
-    Of streams with fewer trajectories than folds, the folds are pieces of each: fold 0 is its end,
-    fold 1 what is before that, and so on.
+    Of fewer trajectories than folds, the folds are pieces of each: fold 0 is its end, fold 1 what
+    is before that, and so on.
 
     Args:
         view: Divides them.
         part: The part.
         found: All trajectories.
     """
-    held = {"validation": view.fold, "test": view.test_fold}
+    held = view.held
     if part == "all" or (part == "training" and held == dict.fromkeys(held)):
         return found
     if part != "training" and held[part] is None:
-        name = {"validation": "fold", "test": "test_fold"}[part]
+        name = {"validation": "hold_back", "test": "test_fold"}[part]
         raise ConfigError(f"The view holds nothing back for the part {part!r}: set View.{name}.")
     back = {fold for fold in held.values() if fold is not None}
     wanted = {fold for fold in range(view.folds)
               if (fold not in back if part == "training" else fold == held[part])}  # fmt: skip
-    if len(found.rows) < view.folds and (found.campaign < 0).all():
+    if len(found.rows) < view.folds:
         return _pieces(found, view.folds, wanted)
     folds = folds_of(found.campaign, found.episode, view.folds, view.fold_seed)
     return found.take(np.isin(folds, list(wanted)))

@@ -51,8 +51,10 @@ class ViewOptions:
     folds: int = at_least(2, 5)
     """Number of parts into which the episodes are divided evenly, by their numbers: more episodes
     never move one from one part to another."""
-    fold: int | None = at_least(0, None)
-    """The part that is held back for validation; None: none is."""
+    hold_back: bool = True
+    """Whether a part is held back for validation."""
+    fold: int = at_least(0, 0)
+    """The part that is. Of fewer episodes than `folds`, a piece of each is: with 0 its end."""
     test_fold: int | None = at_least(0, None)
     """The part that is held back for a test; None: none is."""
     fold_seed: int = at_least(0, 0)
@@ -83,14 +85,14 @@ class ViewOptions:
         for name, share in self.sources.items():
             if not share > 0:
                 raise ConfigError(f"View.sources: the share of {name} is {share}, not positive.")
-        for name in ("fold", "test_fold"):
-            fold = getattr(self, name)
+        for part, fold in self.held.items():
+            name = {"validation": "fold", "test": "test_fold"}[part]
             if fold is not None and fold >= self.folds:
                 raise ConfigError(
                     f"View.{name} is {fold}, but of {self.folds} folds the last is "
                     f"{self.folds - 1}."
                 )
-        if self.fold is not None and self.fold == self.test_fold:
+        if self.hold_back and self.fold == self.test_fold:
             raise ConfigError(f"View.fold and View.test_fold are the same: {self.fold}.")
         kind, _, name = (self.weights or "episode").partition(":")
         if not ((kind == "episode" and not name) or (kind in ("class", "field") and name)):
@@ -99,6 +101,11 @@ class ViewOptions:
                 '"field:FIELD".'
             )
         _check_ranges(self.episodes)
+
+    @property
+    def held(self) -> dict[str, int | None]:
+        """The number of the part that is held back for "validation" and "test"."""
+        return {"validation": self.fold if self.hold_back else None, "test": self.test_fold}
 
     @property
     def windows(self) -> dict[str, Window]:

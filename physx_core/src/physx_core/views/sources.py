@@ -23,7 +23,9 @@ from physx_core.views.folds import Part, choose_part
 from physx_core.views.items import Items
 from physx_core.views.options import ViewOptions, Window
 
-_BLOCK = 16  # rows that are held back together where nothing is known of episodes
+_BLOCK, _SAME_SIZE = 16, 4096
+"""Rows held back together where nothing is known of episodes, and after how many they double."""
+_NOUNS = {"episode": "episodes", "trajectory": "trajectories", "block": "blocks of rows"}
 _STATUS = {"finished": EpisodeStatus.FINISHED, "cut": EpisodeStatus.CUT}
 
 
@@ -35,6 +37,7 @@ class Source:
         rows: Its rows at the snapshot.
         items: The items of the part.
         trajectories: How many trajectories the part has, and how many there are.
+        division: The same in words.
     """
 
     def __init__(
@@ -57,25 +60,30 @@ class Source:
         self.rows = dataset.rows(mode, snapshot)
         self._view, self._drawn = view, (-1, np.zeros(0, np.intp))
         self._weights: Array | None = None
-        found = self._find(part)
+        noun, found = self._find(part)
         chosen = choose_part(view, part, self._chosen(found))
-        self.trajectories = len(chosen.rows), len(found.rows)
+        taken, known = self.trajectories = len(chosen.rows), len(found.rows)
+        is_piece = part not in ("all", "training") and taken == known
+        self.division = f"{'a piece of each' if is_piece else taken} of {known} {_NOUNS[noun]}"
+        if is_piece and known == 1:
+            self.division = f"a piece of the only {noun}"
         self.items = Items(view, chosen)
         self.rows.loads = self.order == "exact"
 
-    def _find(self, part: Part) -> Trajectories:
-        """Return the trajectories, or blocks of rows if nothing is known of any."""
+    def _find(self, part: Part) -> tuple[str, Trajectories]:
+        """Return the trajectories, or blocks of rows if nothing is known of any; first, which."""
         view, rows = self._view, self.rows
-        divides = part != "all" and (view.fold, view.test_fold) != (None, None)
+        divides = part != "all" and (view.hold_back or view.test_fold is not None)
         chooses = view.windows or view.stride > 1 or view.episodes or view.where or view.weights
         if not (divides or chooses):
-            return _blocks(rows.count, max(1, rows.count))
+            return "block", _blocks(np.zeros(min(1, rows.count), np.intp), rows.count)
         try:
-            return find_trajectories(rows)
+            found = find_trajectories(rows)
         except DatasetError:
             if chooses:
                 raise
-            return _blocks(rows.count, _BLOCK)
+            return "block", _growing_blocks(rows.count)
+        return "trajectory" if (found.campaign < 0).any() else "episode", found
 
     def _chosen(self, found: Trajectories) -> Trajectories:
         """Return the trajectories that the view names."""
@@ -182,13 +190,20 @@ def window_of(view: ViewOptions, name: str) -> Window:
     return view.windows.get(name) or Window(name, (0,), is_single=True)
 
 
-def _blocks(count: int, size: int) -> Trajectories:
-    """Return blocks of rows."""
-    start = np.arange(0, count, size)
+def _growing_blocks(count: int) -> Trajectories:
+    """Return blocks of rows, larger ones where there are many before, so that they stay few."""
+    size, stop = _BLOCK, _BLOCK * _SAME_SIZE
+    starts = [np.arange(0, min(stop, count), size)]
+    while stop < count:
+        starts.append(np.arange(stop, min(2 * stop, count), size))
+        size, stop = 2 * size, 2 * stop
+    return _blocks(np.concatenate(starts), count)
+
+
+def _blocks(start: Index, count: int) -> Trajectories:
+    """Return the blocks of `count` rows that begin at some of them."""
     number = np.arange(len(start))
-    return Trajectories(
-        np.full(len(start), -1), number, start, np.minimum(size, count - start), None
-    )
+    return Trajectories(np.full(len(start), -1), number, start, np.diff(start, append=count), None)
 
 
 def _inside(name: str, values: Array, low: float, high: float) -> Flags:

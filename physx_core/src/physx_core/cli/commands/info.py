@@ -15,12 +15,11 @@ from physx_core.cli import installation
 from physx_core.cli.commands.plugins import load_all
 from physx_core.cli.dataset_tables import print_dataset
 from physx_core.cli.output import show, show_table
-from physx_core.dataset import Dataset
 from physx_core.errors import CheckpointError, DatasetNotFoundError, PhysxError, UsageError
 from physx_core.pipelines.learning.data_record import (
     describe_changes,
     describe_record,
-    find_data,
+    open_data,
 )
 
 
@@ -79,10 +78,10 @@ def _data_of(place: Path, found: checkpoint.Checkpoint) -> Iterator[str]:
         return
     yield f"trained on {describe_record(progress.data)}"
     try:
-        places, mode = find_data(place)
-        with Dataset.open(places[0]) as dataset:
-            changes = describe_changes(progress.data, dataset, mode)
-            yield f"data in {dataset.directory}: {'; '.join(changes) or 'unchanged since'}"
+        with open_data(place) as (datasets, config):
+            changes = describe_changes(progress.data, datasets, config.mode)
+            places = ", ".join(str(dataset.directory) for dataset in datasets.values())
+            yield f"data in {places}: {'; '.join(changes) or 'unchanged since'}"
     except PhysxError as error:
         yield f"whether they changed since is not known: {error}"
 

@@ -17,7 +17,7 @@ from physx_core.errors import DatasetError, DatasetNotFoundError, UsageError
 from physx_core.pipelines.learning.data_record import (
     describe_changes,
     describe_record,
-    find_data,
+    open_data,
     read_last_batch,
 )
 
@@ -72,18 +72,16 @@ def _verify_checkpoint(path: Path, options: Verify) -> None:
     if not found.progress.data:
         show("data: not recorded")
         return
-    (place, *others), mode = find_data(path.parent.parent)
     how = "read and compared with their checksums" if options.read else "as recorded"
-    with Dataset.open(place) as dataset:
-        problems = describe_changes(found.progress.data, dataset, mode, found.progress.snapshots)
-        if options.read:
+    with open_data(path.parent.parent) as (datasets, config):
+        progress = found.progress
+        problems = describe_changes(progress.data, datasets, config.mode, progress.snapshots)
+        for dataset in datasets.values() if options.read else ():
             problems += dataset.verify()
         if not problems:
-            show(f"data: {describe_record(found.progress.data)}, {how}")
-        for each in others:
-            problems += _verify_other(each, options)
+            show(f"data: {describe_record(progress.data)}, {how}")
         if options.replay:
-            again, before = read_last_batch(found, dataset), found.progress.last_batch
+            again, before = read_last_batch(found, datasets, config), progress.last_batch
             if again == before:
                 show(f"batch {before['number']}, its last: read again, with the same values")
             else:
@@ -94,16 +92,6 @@ def _verify_checkpoint(path: Path, options: Verify) -> None:
         raise DatasetError(
             f"The data of {path} are not as they were: {count(len(problems), 'difference')}."
         )
-
-
-def _verify_other(place: Path, options: Verify) -> list[str]:
-    """Return the problems of a further source, of which only the number of rows is recorded."""
-    with Dataset.open(place) as dataset:
-        problems = [f"{place}: {text}" for text in (dataset.verify() if options.read else ())]
-    if not problems:
-        how = "read and compared with their checksums" if options.read else "not compared"
-        show(f"data: {place}, {how}; whether rows were updated is not recorded")
-    return problems
 
 
 def _problems(directory: str) -> tuple[list[str], str]:

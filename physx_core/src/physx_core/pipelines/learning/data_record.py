@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import replace
 from hashlib import blake2b
@@ -16,6 +17,7 @@ from physx_core.checkpoint import Checkpoint
 from physx_core.config import from_plain, read_toml
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, DatasetError
+from physx_core.pipelines.storage import GENERATION
 from physx_core.typing import Batch
 from physx_core.views.batches import Batches
 from physx_core.views.dataset_config import DatasetConfig
@@ -24,23 +26,27 @@ from physx_core.views.view import View
 _NOTHING: dict[str, Any] = {"rows": 0, "digest": "none", "partitions": []}
 
 
-def record_data(dataset: Dataset, mode: str) -> dict[str, Any]:
-    """Return what identifies the rows that a training reads, by mode, from the manifest alone.
+def record_data(datasets: Mapping[str, Dataset], mode: str) -> dict[str, Any]:
+    """Return what identifies the rows that a training reads, by mode, from manifests alone.
 
     Each mode has its number of ``rows``, a ``digest`` of their checksums, and its ``partitions``,
     each with session, number, rows and checksum; a partition that is still written has none.
 
     Args:
-        dataset: The dataset.
+        datasets: The datasets, by the names of `View.sources`, with which theirs begin; a single
+            one of the name "" is that of the run.
         mode: Mode of the training samples.
     """
     found = {}
-    for name in dict.fromkeys((mode, "validation")):
-        if name in dataset:
+    for source, dataset in datasets.items():
+        for name in dict.fromkeys((mode, "validation")):
+            if name not in dataset:
+                continue
             partitions: list[list[Any]] = [list(each) for each in dataset.contents(name)]
             digest = blake2b(repr(partitions).encode(), digest_size=8).hexdigest()
             rows = sum(each[2] for each in partitions)
-            found[name] = {"rows": rows, "digest": digest, "partitions": partitions}
+            key = f"{name} of {source}" if source else name
+            found[key] = {"rows": rows, "digest": digest, "partitions": partitions}
     return found
 
 
@@ -54,23 +60,32 @@ def describe_batch(number: int, batch: Batch, names: Sequence[str]) -> dict[str,
     return {"number": number, "fields": list(names), "digest": content.hexdigest()}
 
 
-def find_data(session: Path) -> tuple[list[Path], str]:
-    """Return the folders of the data that a session's networks were trained on, and the mode.
+@contextlib.contextmanager
+def open_data(session: Path) -> Iterator[tuple[dict[str, Dataset], DatasetConfig]]:
+    """Open the data that a session's networks were trained on; yield them and their options.
 
-    Only the first is recorded in checkpoints, with the number of rows of the others.
+    Raises:
+        DatasetError: If they are not there.
     """
     file = session / "config.toml"
-    config = (read_toml(file) if file.is_file() else {}).get("training", {}).get("dataset", {})
-    sources = config.get("view", {}).get("sources") or [config.get("existing_dir") or session]
-    return [Path(each) for each in sources], config.get("mode", "training")
+    recorded = (read_toml(file) if file.is_file() else {}).get("training", {})
+    config = from_plain(DatasetConfig, recorded.get("dataset", {}))
+    places: dict[str, str | Path] = {each: each for each in config.view.sources}
+    places = places or {"": config.existing_dir or session}
+    with contextlib.ExitStack() as opened:
+        datasets = {n: opened.enter_context(Dataset.open(place)) for n, place in places.items()}
+        yield datasets, config
 
 
-def read_last_batch(found: Checkpoint, dataset: Dataset) -> dict[str, Any]:
+def read_last_batch(
+    found: Checkpoint, datasets: Mapping[str, Dataset], config: DatasetConfig
+) -> dict[str, Any]:
     """Read the last batch that a network learned from again, and return what identifies it.
 
     Args:
         found: The network's checkpoint.
-        dataset: The dataset that it was trained on.
+        datasets: What it was trained on: see `record_data`.
+        config: The options of that.
 
     Raises:
         DatasetError: If samples are missing.
@@ -80,13 +95,12 @@ def read_last_batch(found: Checkpoint, dataset: Dataset) -> dict[str, Any]:
     if not progress.last_batch:
         raise ConfigError(f"{found.path} does not say which batch of stored samples was its last.")
     number, names = progress.last_batch["number"], progress.last_batch["fields"]
-    options = progress.options["dataset"]
-    config = from_plain(DatasetConfig, options)
+    info = next(iter(datasets.values())).info
     with Batches(
-        training_view(config, has_validation="validation" in progress.snapshots),
+        training_view(config, info, has_validation="validation" in progress.snapshots),
         progress.options["batch_size"],
         progress.seed,
-        data=None if config.view.sources else dataset,
+        data=datasets.get(""),
         mode=config.mode,
         snapshot=progress.snapshots[config.mode],
         fields=names,
@@ -95,15 +109,25 @@ def read_last_batch(found: Checkpoint, dataset: Dataset) -> dict[str, Any]:
         return describe_batch(number, batches[number], names)
 
 
-def training_view(config: DatasetConfig, *, has_validation: bool) -> View:
+def training_view(
+    config: DatasetConfig, info: Mapping[str, Any], *, has_validation: bool, generates: bool = False
+) -> View:
     """Return the view of the samples to train on.
+
+    None are held back of those that the training's environments generate, because each is learned
+    from as it comes.
 
     Args:
         config: The options.
+        info: The info of the dataset.
         has_validation: Whether the mode ``validation`` has samples; then none are held back.
+        generates: Whether environments are about to generate the samples.
     """
-    order = config.view.order if config.shuffle else "stored"
-    return replace(config.view, order=order, fold=None if has_validation else config.view.fold)
+    view, is_own = config.view, config.existing_dir is None and not config.view.sources
+    is_generated = generates or (is_own and bool(info.get(GENERATION)))
+    order = view.order if config.shuffle else "stored"
+    holds_back = view.hold_back and not (has_validation or is_generated)
+    return replace(view, order=order, hold_back=holds_back)
 
 
 def describe_record(former: Mapping[str, Any]) -> str:
@@ -113,25 +137,30 @@ def describe_record(former: Mapping[str, Any]) -> str:
 
 
 def describe_changes(
-    former: Mapping[str, Any], dataset: Dataset, mode: str, fixed: Container[str] = ()
+    former: Mapping[str, Any],
+    datasets: Mapping[str, Dataset],
+    mode: str,
+    fixed: Container[str] = (),
 ) -> list[str]:
     """Return how the data differ from what a checkpoint recorded; empty if they do not.
 
     Args:
         former: What `record_data` returned then; empty if an older physx wrote the checkpoint.
-        dataset: The dataset now.
+        datasets: The datasets now: see `record_data`.
         mode: Mode of the training samples.
         fixed: Modes of which further rows are not read, and so are no difference.
     """
     if not former:
         return []
     try:
-        now = record_data(dataset, mode)
+        now = record_data(datasets, mode)
         return [
             f"{name}: {text}"
             for name in dict.fromkeys([*former, *now])
             for text in _changes(
-                former.get(name, _NOTHING), now.get(name, _NOTHING), grows=name not in fixed
+                former.get(name, _NOTHING),
+                now.get(name, _NOTHING),
+                grows=name.partition(" of ")[0] not in fixed,
             )
         ]
     except (DatasetError, LookupError, TypeError, ValueError) as error:

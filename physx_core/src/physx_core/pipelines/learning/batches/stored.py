@@ -102,7 +102,12 @@ class StoredBatches:
         has_now = dataset.num_samples("validation") > 0
         had_mode = "validation" in self.snapshots if self.snapshots else has_now
         self._has_mode = had_mode and has_now  # else its samples were removed
-        self._view = training_view(config, has_validation=had_mode)
+        self._view = training_view(
+            config,
+            dataset.info,
+            has_validation=had_mode,
+            generates=environment is not None and not replays,
+        )
 
     def _open(self, mode: str, view: View, size: int, part: Part = "training") -> Batches:
         """Open the samples of a mode as they were at its snapshot, or else are now."""
@@ -141,7 +146,7 @@ class StoredBatches:
         view = replace(self._view, order="stored", weights=None, drop_last=False)
         size = self._validation_batch_size
         if self._has_mode:
-            return self._open("validation", replace(view, sources={}, fold=None), size)
+            return self._open("validation", replace(view, sources={}, hold_back=False), size)
         return self._open(self.mode, view, size, "validation")
 
     def begin_epoch(self, names: Sequence[str], batches: int) -> None:
@@ -186,9 +191,23 @@ class StoredBatches:
         return self._validation.reading(names).take(chosen)
 
     @property
+    def datasets(self) -> dict[str, Dataset]:
+        """The datasets by the names of `View.sources`; "" is that of the run."""
+        return self._training.datasets if self._view.sources else {"": self.dataset}
+
+    @property
     def has_validation(self) -> bool:
         """Whether there are validation samples."""
-        return self._has_mode or self._view.fold is not None
+        return self._has_mode or (self._view.hold_back and self._validation.num_items > 0)
+
+    def describe_parts(self) -> Iterator[str]:
+        """Say what is held back for validation, unless a mode is for that."""
+        if self._view.hold_back and not self._has_mode:
+            held = self._validation
+            yield (
+                f"{self.num_samples:,} samples to train on, {held.num_items:,} held back for "
+                f"validation: {' and '.join(held.division)}"
+            )
 
     @property
     def has_samples(self) -> bool:
@@ -215,7 +234,8 @@ class StoredBatches:
     @property
     def _has_all_rows(self) -> bool:
         """Whether all samples of the mode are trained on; later ones too, until one is read."""
-        is_chosen = self._view != _PLAIN or self.mode in self.snapshots
+        chooses = self._config.view != _PLAIN or self._view.hold_back
+        is_chosen = chooses or self.mode in self.snapshots
         return not is_chosen or self._training.has_all_rows
 
     @property
