@@ -36,7 +36,8 @@ from physx_core import DataGeneration, Environment, EnvironmentConfig, Field
 from physx_core.net import decode, encode
 from physx_core.sources import ClientSource
 from physx_core.workers import Instance
-from physx_core.workers.server.journal import Journal
+from physx_core.workers.journal import Journal
+from physx_core.workers.pasts import Past
 
 ROUNDS = 5
 WORK, INTERVAL, STEP = 10.0, 3.0, 5e-3
@@ -82,7 +83,7 @@ def stream(every: int, **kwargs: Any) -> ClientSource:
     config = EnvironmentConfig(
         f"{Path(__file__).resolve()}:Walk",
         env_kwargs=kwargs,
-        restarts=1000,
+        retries=1000,
         state_every=every,
     )
     return ClientSource(config, Services(), [7], run_ahead=0)  # type: ignore[arg-type]
@@ -213,13 +214,13 @@ def check_states() -> bool:
     """Time what client and server do for a state."""
     instance = Instance(Walk, {}, instance_id=1, instance_nb=1, seed=[7])
     instance.open(None, draw=False, with_states=True)
-    journal, times = Journal(1, 1e9), []
-    for _ in range(200):
+    journal, times = Journal(1, 1e9, None, None), []
+    for rows in range(1, 201):
         instance.step()
         began = time.process_time()
         kept = encode({"instance": instance.get_state()}, "the state")
         plain = decode(encode({"state": kept}))
-        journal.keep_state(encode(plain), 0, 0)
+        journal.keep_state(Past(rows, plain["state"]))
         times.append(time.process_time() - began)
     seconds = statistics.median(times)
     print(f"A state of {len(kept)} bytes takes {1e6 * seconds:.0f} us")

@@ -87,7 +87,7 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
         "deviation": 0.5,
     },
     EnvironmentConfig: {"environment": "toy/spring", "min_clients": 1, "max_clients": 2, "seed": 3}
-    | {"episode_steps": 4, "episode_timeout": 2.5, "independent_episodes": True},
+    | {"episode_steps": 4, "episode_timeout": 2.5, "independent_episodes": True, "retries": 2},
     DatasetConfig: {"max_file_size": 0.25},
     physx_core.View: {"folds": 4, "fold": 1, "test_fold": 2, "fold_seed": 3, "stride": 2}
     | {"sources": {"a": 0.5}},

@@ -226,15 +226,17 @@ class EnvironmentConfig:
     episode_timeout: float | None = at_least(0.1, None)
     """Longest time in s that an independent episode may take; its client is ended then, and the
     episode counts as lost. None: any time."""
-    restarts: int = at_least(0, 0)
-    """Number of times that each client is restarted after a failure; the samples are the same as
-    without the failure."""
+    retries: int | None = at_least(0, None)
+    """Number of times that an independent episode, or a stream, is given to another client after
+    its client was lost, a stream also after an error; the samples are the same as without that.
+    Then an episode has failed, and a stream ends the run. None: once for an episode, never for a
+    stream."""
     state_every: int = at_least(0, 0)
-    """Number of rows after which each stream gives a state, from which a restarted client goes on;
+    """Number of rows after which each stream gives a state, from which the next client goes on;
     0: there are none, and it repeats all rows. Where an engine keeps memory of its last step, rows
     depend on this number in the last bits."""
     journal_size: float = at_least(1e-6, 1.0)
-    """Largest size in GB of the journal of an instance that can be restarted, in the folder for
+    """Largest size in GB of the journal of a stream that may go on elsewhere, in the folder for
     temporary files: all predictions and stored samples that its client was given, since the last
     state if there are states. Beyond it, the run goes on, but the instance can no longer be
     restarted."""

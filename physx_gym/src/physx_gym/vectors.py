@@ -15,7 +15,7 @@ from physx_core.plugins import reference_of
 
 _OPTIONS = (
     *("num_processes", "batch_size", "autoreset_mode", "copy", "timeout"),
-    *("launcher", "launcher_kwargs", "ip_address", "restarts"),
+    *("launcher", "launcher_kwargs", "ip_address", "retries"),
 )
 _KNOWN_EVERYWHERE = ("gymnasium", "physx_gym")
 
@@ -27,7 +27,7 @@ def make_vector(id: str, num_envs: int, **options: Any) -> Any:
         id: Id of the environment.
         num_envs: Number of environments.
         options: ``num_processes``, ``batch_size``, ``autoreset_mode``, ``copy``, ``timeout``,
-            ``launcher``, ``launcher_kwargs``, ``ip_address`` and ``restarts`` of
+            ``launcher``, ``launcher_kwargs``, ``ip_address`` and ``retries`` of
             `ParallelVectorEnv`; all others go to each environment.
     """
     from physx_gym.vector.vector_env import ParallelVectorEnv

@@ -304,7 +304,7 @@ def _same_rows(subject: Subject) -> None:
 def _restarts(subject: Subject) -> None:
     _by_hand(subject)
     folder = str(subject.folder)
-    config = _config(subject, "Dying", env_kwargs={"folder": folder}, restarts=1)
+    config = _config(subject, "Dying", env_kwargs={"folder": folder}, retries=1)
     with ClientSource(config, Services(), _SEED, total=_ROWS) as source:
         found = source.batch(_ROWS)
         expect_equal(found, _wanted(), "after a client was killed and restarted, rows differ")

@@ -51,7 +51,7 @@ def test_killed_ray_node_restarts_client_with_same_rows(runs, local_rows, ray_cl
     lost = ray_cluster.nodes.pop()
     process = runs.start(
         *on(ray_cluster, "num_cpus=0.5"),
-        *("--environment.restarts", "1"),
+        *("--environment.retries", "1"),
         batches=20,
         pace=0.05,
         **ray_cluster.variables,
@@ -118,7 +118,7 @@ def test_run_survives_crash_of_ray_head(runs, local_rows, mortal_ray, eventually
 def test_no_restart_without_ray_head(runs, mortal_ray, eventually):
     process = runs.start(
         *on(mortal_ray),
-        "--environment.restarts",
+        "--environment.retries",
         "2",
         batches=1000,
         pace=0.1,

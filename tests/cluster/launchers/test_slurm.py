@@ -60,7 +60,7 @@ def test_local_jobs_make_the_rows_of_a_local_run(runs, local_rows, eventually):
 @pytest.mark.faults
 def test_preempted_local_job_is_requeued_with_same_rows(runs, local_rows, eventually):
     expected = local_rows(batches=20)
-    words = (*LOCAL, "--environment.restarts", "1")
+    words = (*LOCAL, "--environment.retries", "1")
     process = runs.start(*words, batches=20, pace=0.05)
     runs.wait_for_clients(2, process)
     jobs = jobs_of(runs.folder)
@@ -132,7 +132,7 @@ def test_preempted_slurm_job_is_requeued_with_same_rows(runs, local_rows, slurm,
     expected = local_rows(batches=20)
     words = slurm_words("slurm_partition='low'")
     process = runs.start(
-        *words, "--environment.restarts", "1", batches=20, pace=0.05, **slurm.variables
+        *words, "--environment.retries", "1", batches=20, pace=0.05, **slurm.variables
     )
     runs.wait_for_clients(2, process)
     before = {node for *_, node in runs.clients()}

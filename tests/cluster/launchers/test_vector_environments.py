@@ -48,7 +48,7 @@ def test_steps_are_those_of_processes_that_share_memory(launcher, request, tmp_p
 def test_killed_ray_node_restarts_vector_environment(ray_cluster):
     lost = ray_cluster.nodes.pop()
     kwargs = {"address": ray_cluster.variables["RAY_ADDRESS"], "num_cpus": 0.5}
-    options = {"launcher": "cluster/ray", "launcher_kwargs": kwargs, "restarts": 1}
+    options = {"launcher": "cluster/ray", "launcher_kwargs": kwargs, "retries": 1}
     with cartpoles() as local, cartpoles(**options) as vector:
         vector.reset(seed=2)
         local.reset(seed=2)

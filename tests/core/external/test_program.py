@@ -225,7 +225,7 @@ def test_a_client_whose_program_fails_is_started_again(local, clients, heat):
     fails = "if [ -e first -a ! -e again ]; then touch again; exit 3; fi; touch first"
     script = f'if [ "$PHYSX_INSTANCE" = 2 ]; then {fails}; fi; {command}'
     kwargs = options("/bin/sh", "-c", script)
-    others = run(clients("external/program", env_kwargs=kwargs, num_clients=2, restarts=1), 14)
+    others = run(clients("external/program", env_kwargs=kwargs, num_clients=2, retries=1), 14)
     assert Path("again").exists()
     for name in rows:
         assert rows[name].tobytes() == others[name].tobytes()

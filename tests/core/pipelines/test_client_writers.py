@@ -139,7 +139,7 @@ def test_episode_of_a_lost_client_writer_is_simulated_again():
 
 @pytest.mark.faults
 def test_client_writers_killed_at_random_moments(process_ids):
-    options = {"episodes": 300, "retries": 1000}
+    options = {"episodes": 300}
     wanted = contents(generate("server", "server", options=options))
     chance, ended = random.Random(seed()), threading.Event()
 
@@ -154,7 +154,12 @@ def test_client_writers_killed_at_random_moments(process_ids):
     threading.Timer(6.0, ended.set).start()
     try:
         folder = generate(
-            "clients", env_kwargs={"delay": 0.02}, num_clients=3, min_clients=1, options=options
+            "clients",
+            env_kwargs={"delay": 0.02},
+            num_clients=3,
+            min_clients=1,
+            retries=1000,
+            options=options,
         )
     finally:
         ended.set()

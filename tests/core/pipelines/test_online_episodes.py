@@ -147,8 +147,8 @@ def test_resumed_training_may_have_more_failures():
     expected = result(train("whole", 1, training={**options, "max_failed": 2}, **lesson))
     with pytest.raises(FailedEpisodesError, match="--max-failed"):
         train("run", 1, training=options, **lesson)
-    options |= {"resume": True, "max_failed": 2, "retries": 0}
-    assert result(train("run", 2, training=options, **lesson)) == expected
+    options |= {"resume": True, "max_failed": 2}
+    assert result(train("run", 2, training=options, retries=0, **lesson)) == expected
 
 
 def test_rejected_samples_do_not_depend_on_the_number_of_clients():

@@ -64,7 +64,7 @@ class Recorded(Training):
         self.seen.append((rows, means, dict(self.losses)))
 
 
-def pupil(over_tcp=True, *, instances=3, delay=0.0, restarts=0, **options):
+def pupil(over_tcp=True, *, instances=3, delay=0.0, retries=0, **options):
     named = ("asks", "refuse", "fails_at", "kill_at")
     kwargs = {name: options.pop(name) for name in named if name in options}
     return EnvironmentConfig(
@@ -73,7 +73,7 @@ def pupil(over_tcp=True, *, instances=3, delay=0.0, restarts=0, **options):
         as_tcp_ip_client=over_tcp,
         num_clients=instances,
         seed=4,
-        restarts=restarts,
+        retries=retries,
         **options,
     )
 
@@ -211,7 +211,7 @@ def test_prediction_error_during_online_training_is_raised(nothing_stays_behind,
 
 def test_client_restart_does_not_change_online_training(nothing_stays_behind):
     runs = []
-    for name, options in (("whole", {}), ("broken", {"kill_at": 9, "restarts": 1, "delay": 0.01})):
+    for name, options in (("whole", {}), ("broken", {"kill_at": 9, "retries": 1, "delay": 0.01})):
         run = training(pupil(asks=True, **options), name)
         run.execute()
         runs.append((run.seen, stored(name), run.learner.network.weights))

@@ -146,7 +146,7 @@ def test_the_command_line_chooses_the_sampler(tmp_path, capsys):
 
 def test_restarted_client_gets_same_parameters(tmp_path):
     kwargs = {"how": "once", "folder": str(tmp_path)}
-    failing = generate(tmp_path, restarts=1, sampler="physx/sobol", kwargs=kwargs)
+    failing = generate(tmp_path, retries=1, sampler="physx/sobol", kwargs=kwargs)
     whole = generate(tmp_path, clients=False, sampler="physx/sobol")
     assert len(list(tmp_path.glob("died_*"))) == 2
     for mode in ("training", "parameters"):

@@ -146,7 +146,7 @@ def main(writers, clients, episodes):
     """Simulate what is missing in the session."""
     environment = EnvironmentConfig(
         Walks, num_clients=int(clients), env_kwargs={"delay": 0.003}, seed=3,
-        record_wrong_samples=True,
+        record_wrong_samples=True, retries=1000,
     )  # fmt: skip
     with DataGeneration(
         environment,
@@ -154,7 +154,6 @@ def main(writers, clients, episodes):
         episodes=int(episodes),
         session_name="run",
         resume=Path("sessions/run/dataset/dataset.json").exists(),
-        retries=1000,
         quiet=True,
     ) as run:
         run.execute()

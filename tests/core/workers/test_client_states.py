@@ -133,7 +133,7 @@ class Run:
         Simulation.current = current
 
 
-@pytest.mark.parametrize("restarts", [0, 1])
+@pytest.mark.parametrize("retries", [0, 1])
 @pytest.mark.parametrize(("state", "event"), TABLE)
 @settings(
     max_examples=size(4, 1),
@@ -141,15 +141,15 @@ class Run:
     suppress_health_check=[HealthCheck.function_scoped_fixture],
 )
 @given(choose=drawn, who=st.sampled_from([1, 2]))
-def test_client_is_named_and_replaced_as_in_the_table(caplog, state, event, restarts, choose, who):
+def test_client_is_named_and_replaced_as_in_the_table(caplog, state, event, retries, choose, who):
     caplog.clear()
     fate, row = Fate(state, event, 2), TABLE[state, event]
     with Simulation(choose) as simulation:
-        run = Run(simulation, {who: [fate]}, [6, 5, 4], 2, restarts=restarts)
+        run = Run(simulation, {who: [fate]}, [6, 5, 4], 2, retries=retries)
     run.check_rows()
-    is_replaced = restarts == 1 and state != "closing"
+    is_replaced = retries == 1 and state != "closing"
     assert len(run.launches[who]) == 1 + is_replaced
-    assert (run.error is None) == (restarts == 1)
+    assert (run.error is None) == (retries == 1)
     assert is_named(who, fate, caplog.text if run.error is None else str(run.error))
     noticed = run.launches[who][1] if is_replaced else run.ended
     assert row.after <= noticed - run.since(fate) <= row.before + TICK
@@ -158,7 +158,7 @@ def test_client_is_named_and_replaced_as_in_the_table(caplog, state, event, rest
 def test_replaced_client_waits_for_run_that_is_busy_between_batches():
     with Simulation() as simulation:
         fates = {1: [Fate("idle", "is killed", 1)]}
-        options = {"pauses": [1, 1, 1, 300], "run_ahead": 30, "restarts": 1}
+        options = {"pauses": [1, 1, 1, 300], "run_ahead": 30, "retries": 1}
         run = Run(simulation, fates, [2, 2, 2, 2], 2, **options)
     assert run.error is None
     run.check_rows()
@@ -167,7 +167,7 @@ def test_replaced_client_waits_for_run_that_is_busy_between_batches():
 def test_client_is_not_called_slow_because_the_run_was_busy(caplog):
     with Simulation() as simulation:
         fates = {2: [Fate("busy", "vanishes", 4)]}
-        options = {"pauses": [1, 1, 300], "run_ahead": 30, "restarts": 1}
+        options = {"pauses": [1, 1, 300], "run_ahead": 30, "retries": 1}
         run = Run(simulation, fates, [6, 5, 13], 3, **options)
     assert run.error is None
     assert "for a row" not in caplog.text
@@ -191,25 +191,25 @@ FATES = st.lists(
     st.lists(st.sampled_from([0, 1, 10 * TIMEOUT]), min_size=4, max_size=4),
 )
 def test_clients_of_any_history_are_named_and_replaced_as_in_the_table(
-    choose, fates, restarts, run_ahead, pace, pauses
+    choose, fates, retries, run_ahead, pace, pauses
 ):
     """An instance's clients meet their fates one after another, as long as it is restarted."""
     given = dict(enumerate(fates, 1))
     with Simulation(choose) as simulation:
-        options = {"pauses": pauses, "run_ahead": run_ahead, "pace": pace, "restarts": restarts}
+        options = {"pauses": pauses, "run_ahead": run_ahead, "pace": pace, "retries": retries}
         run = Run(simulation, given, [6, 5, 13, 4], 3, **options)
     run.check_rows()
     final = []
     for number, each in given.items():
         met = [fate for fate in each if fate.began is not None]
-        lost = [fate for fate in met[:restarts] if fate.state != "closing"]
+        lost = [fate for fate in met[:retries] if fate.state != "closing"]
         missing = 1 + len(lost) - len(run.launches[number])  # the last one, as the run has ended
         had_all = "idle" in {fate.state for fate in lost[-2:]}  # rows, so nobody had to start
         assert missing == 0 or (missing == 1 and (run.error or had_all))
         for fate, noticed in zip(lost, run.launches[number][1:], strict=False):
             assert noticed - run.since(fate) >= TABLE[fate.state, fate.event].after
-        final += [(number, fate) for fate in met[restarts:]]
-        if run.error is None and met[restarts:]:  # the run had all rows of the instance
+        final += [(number, fate) for fate in met[retries:]]
+        if run.error is None and met[retries:]:  # the run had all rows of the instance
             assert "idle" in {fate.state for fate in met[-2:]}
     if run.error is not None:
         assert any(is_named(number, fate, str(run.error)) for number, fate in final)

@@ -164,7 +164,7 @@ def test_custom_launcher_restarts_client(clients, notes):
     settings = {"launcher": CommandLauncher, "launcher_kwargs": {"notes": str(notes)}}
     kwargs = {"fault": "fail", "at": 3}
     wanderer = f"{HERE.parents[1] / 'programs' / 'restart_envs.py'}:Wanderer"
-    with clients(wanderer, num_clients=2, restarts=1, env_kwargs=kwargs, **settings) as source:
+    with clients(wanderer, num_clients=2, retries=1, env_kwargs=kwargs, **settings) as source:
         assert source.batch(20)["step"].tolist() == [step // 2 for step in range(20)]
     launches = [file.read_text() for file in sorted(notes.glob("*.launch"))]
     assert launches == ["[1, 2]", "[2]"]

@@ -7,14 +7,16 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from sizes import size
 
-from physx_core.net import encode
-from physx_core.workers.pasts import Past, Pasts, pack, unpack
+from physx_core.net import Kind, encode, pack
+from physx_core.workers.journal import Journal
+from physx_core.workers.pasts import Past, unpack
+from physx_core.workers.pasts import pack as pack_pasts
 
 EVENTS = st.lists(st.sampled_from(["row", "answer", "state", "batch", "die"]), max_size=60)
 
 
 class Kept:
-    """The services of a run; they keep parameters only."""
+    """The services and parameters of a run; they keep saved ones only."""
 
     def __init__(self):
         self.saved = {}
@@ -22,16 +24,34 @@ class Kept:
     def save_parameters(self, instance_id, values):
         self.saved[instance_id] = values
 
+    def load_parameters(self, instance_id):
+        return self.saved.get(instance_id, {})
+
+    def waiting(self, instance_id):
+        return -1, {}
+
+
+def journal_of(kept, former=None, limit=1e9):
+    return Journal(1, limit, kept, kept, former, keeps=True)
+
+
+def answer(journal, told):
+    """Tell a stream the answer to its next request for a prediction."""
+    kind = Kind.ANSWER if told[0] else Kind.REFUSAL
+    message = pack(kind, told[1], journal.answers + 1)
+    journal.record(message, is_prediction=True)
+
 
 @settings(max_examples=size(300, 60), deadline=None)
 @given(EVENTS, st.integers(0, 2))
 def test_a_later_run_is_told_all_answers_since_the_newest_state_that_counts(events, asked):
-    """One instance against lists of all that happened."""
-    services, pasts = Kept(), Pasts(1e9)
+    """One stream against lists of all that happened."""
+    kept = Kept()
+    journal = journal_of(kept)
     created = [(True, encode(f"created {number}")) for number in range(asked)]
-    for answer in created:
-        pasts.answered(1, answer)
-    pasts.created(1, services)
+    for told in created:
+        answer(journal, told)
+    journal.end_creation()
     history, states, made = [], [(0, 0)], 0  # answers; rows and answers before each state
     checkpoint = None
     for event in events:
@@ -39,50 +59,54 @@ def test_a_later_run_is_told_all_answers_since_the_newest_state_that_counts(even
             made += 1
         elif event == "answer":
             history.append((len(history) % 3 != 0, encode(len(history))))
-            pasts.answered(1, history[-1])
+            answer(journal, history[-1])
         elif event == "state" and made > states[-1][0]:
             states.append((made, len(history)))
-            pasts.note(1, Past(made, b"%d" % made, saved={"rows": made}))
+            kept.saved[1] = {"rows": made}
+            journal.keep_state(Past(made, b"%d" % made))
         elif event == "batch":
-            content = pack(made, pasts.at(lambda number, rows=made: rows, 1))
+            content = pack_pasts(made, {1: journal.at(made)})
             checkpoint = made, states[-1][0], history[states[-1][1] :], content
         elif event == "die" and checkpoint is not None:
-            made, newest, kept, content = checkpoint
-            history = [*kept]
+            made, newest, since, content = checkpoint
+            history = [*since]
             rows, former = unpack(content)
             assert (rows, former[1].rows) == (made, newest)
             assert former[1].state == (b"%d" % newest if newest else b"")
-            services, pasts = Kept(), Pasts(1e9, former)
-            assert [pasts.tell(1) for _ in range(asked)] == created
-            pasts.created(1, services)
-            assert services.saved == ({1: {"rows": newest}} if newest else {})
-            assert [pasts.tell(1) for _ in history] == history
-            assert pasts.tell(1) is None
+            kept = Kept()
+            journal = journal_of(kept, former[1])
+            for told in created:
+                assert journal.tell() == told
+                answer(journal, told)
+            journal.end_creation()
+            assert kept.saved == ({1: {"rows": newest}} if newest else {})
+            for told in history:
+                assert journal.tell() == told
+                answer(journal, told)
+            assert journal.tell() is None
             states = [(newest, 0)]
 
 
-def test_an_instance_that_is_ahead_keeps_the_state_before_the_batch():
-    pasts = Pasts(1e9)
-    pasts.created(1, Kept())
+def test_a_stream_that_is_ahead_keeps_the_state_before_the_batch():
+    journal = journal_of(Kept())
+    journal.end_creation()
     for rows in (5, 10, 15, 20):
-        pasts.note(1, Past(rows, b"state"))
-    assert pasts.at(lambda number: 12, 1)[1].rows == 10
-    assert pasts.at(lambda number: 14, 1)[1].rows == 10
-    assert pasts.at(lambda number: 20, 1)[1].rows == 20
+        journal.keep_state(Past(rows, b"state"))
+    assert [journal.at(rows).rows for rows in (12, 14, 20)] == [10, 10, 20]
 
 
 def test_answers_beyond_the_limit_are_given_up(caplog):
-    pasts = Pasts(100)
-    pasts.created(1, Kept())
+    journal = journal_of(Kept(), limit=300)
+    journal.end_creation()
     for _ in range(3):
-        pasts.answered(1, (True, bytes(30)))
-    assert pasts.at(lambda number: 1, 1)[1].count == 3
-    for _ in range(3):
-        pasts.answered(1, (True, bytes(30)))
-    assert pasts.at(lambda number: 1, 1) is None
-    pasts.note(1, Past(2, b"state"))
-    assert pasts.at(lambda number: 2, 1) is None
-    assert caplog.text.count("cannot be resumed within this epoch") == 1
+        answer(journal, (True, bytes(30)))
+    assert journal.at(1).count == 3
+    for _ in range(10):
+        answer(journal, (True, bytes(30)))
+    assert journal.at(1) is None
+    journal.keep_state(Past(2, b"state"))
+    assert journal.at(2) is None
+    assert caplog.text.count("nor go on in a later run") == 1
 
 
 @pytest.mark.parametrize(
@@ -105,4 +129,4 @@ def test_what_is_no_past_is_refused(plain):
 def test_pasts_are_the_same_after_packing():
     sets = {3: {"load": 0.5}}
     past = Past(4, b"state", 2, 1, sets, {"a": [1]}, ((False, b"x"),), [(True, b"y")], 1)
-    assert unpack(pack(9, {2: past})) == (9, {2: past})
+    assert unpack(pack_pasts(9, {2: past})) == (9, {2: past})

@@ -35,7 +35,7 @@ def test_a_process_that_breaks_is_started_again(
         expected = digest([source.batch(19)])
     settings["env_kwargs"] |= {"fault": fault, "place": place, "at": 7}
     timeout = unhurried(2.0) if fault == "stop" else 60.0
-    with clients(WANDERER, run_ahead=0, restarts=1, timeout=timeout, **settings) as source:
+    with clients(WANDERER, run_ahead=0, retries=1, timeout=timeout, **settings) as source:
         assert digest([source.batch(19)]) == expected
     assert len([*Path().glob("started-*")]) == 2 + 3
 
@@ -48,7 +48,7 @@ def test_a_pipeline_stores_the_same_rows_whatever_happens(nothing_stays_behind):
             WANDERER,
             env_kwargs={"fault": fault, "at": 30, "delay": 0.004},
             num_clients=3,
-            restarts=1,
+            retries=1,
             seed=3,
         )
         generation = DataGeneration(config, batch_nb=10, batch_size=20)
@@ -71,7 +71,7 @@ def test_a_stream_ends_though_each_of_its_processes_makes_few_rows(nothing_stays
             MORTAL,
             env_kwargs={"life": life},
             num_clients=2,
-            restarts=20,
+            retries=20,
             state_every=5,
             seed=3,
         )

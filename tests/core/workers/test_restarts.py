@@ -15,11 +15,11 @@ import pytest
 
 from physx_core.errors import ClientError, EnvironmentFailedError, SampleError
 from physx_core.net import Kind, pack
-from physx_core.workers.server.journal import Journal
+from physx_core.workers.journal import Journal
 
 ENVS = Path(__file__).parents[1] / "programs" / "restart_envs.py"
 WANDERER = f"{ENVS}:SimulatedWanderer"
-ONCE = {"run_ahead": 0, "restarts": 1}
+ONCE = {"run_ahead": 0, "retries": 1}
 
 
 @pytest.fixture
@@ -98,7 +98,7 @@ def test_rows_depend_on_the_seed_alone(simulated, batch_services, kill_one, asks
             num_clients=3,
             env_kwargs={"asks": asks, "delay": delay, "refuse": 4},
             run_ahead=ahead,
-            restarts=int(attempt == 3),
+            retries=int(attempt == 3),
         )
         kill = kill_one if attempt == 3 else None
         hashes.add(digest(run(source, sizes, apply=asks, kill=kill)))
@@ -107,7 +107,7 @@ def test_rows_depend_on_the_seed_alone(simulated, batch_services, kill_one, asks
 
 def test_run_ends_before_restarted_client_joined(simulated, batch_services, simulation, caplog):
     arguments = {"fault": "dawdle", "place": "close", "pace": 0.1}
-    source = simulated(WANDERER, num_clients=2, env_kwargs=arguments, run_ahead=0, restarts=1)
+    source = simulated(WANDERER, num_clients=2, env_kwargs=arguments, run_ahead=0, retries=1)
     with source:
         source.batch(3)
         simulation.alive[1].kill()
@@ -139,7 +139,7 @@ def test_failed_client_is_restarted(
     expected = digest(run(local(WANDERER, **settings), sizes, apply=True))
     fresh_notes()
     settings["env_kwargs"] |= {"fault": fault, "place": place, "at": 7}
-    source = simulated(WANDERER, run_ahead=0, restarts=1, **settings)
+    source = simulated(WANDERER, run_ahead=0, retries=1, **settings)
     assert digest(run(source, sizes, apply=True)) == expected
     (warning,) = [record for record in caplog.records if record.name == "physx"]
     assert warning.levelname == "WARNING"
@@ -158,7 +158,7 @@ def test_several_restarts_of_several_clients(local, simulated, fresh_notes, capl
     fresh_notes()
     victims = [1, 3, 1]
     batches = []
-    with simulated(WANDERER, restarts=2, run_ahead=2, **settings) as source:
+    with simulated(WANDERER, retries=2, run_ahead=2, **settings) as source:
         while victims or len(batches) < 30:
             batches.append({name: values.copy() for name, values in source.batch(1).items()})
             if victims and victims[0] in simulation.alive:
@@ -175,7 +175,7 @@ def test_restart_keeps_batches_of_prediction_requests(simulated, batch_services,
         batch_services.sizes.clear()
         kwargs = {"asks": True, "fault": fault, "place": "step", "at": 4}
         with simulated(
-            WANDERER, num_clients=3, env_kwargs=kwargs, run_ahead=0, restarts=1
+            WANDERER, num_clients=3, env_kwargs=kwargs, run_ahead=0, retries=1
         ) as source:
             for _ in range(4):
                 source.batch(6)
@@ -191,7 +191,7 @@ def test_restart_repeats_no_drawing_and_no_saved_parameters(simulated, services,
         services.shown.clear()
         services.kept.clear()
         kwargs = {"fault": fault, "place": "step", "at": 6}
-        settings = {"num_clients": 2, "visualizer": "any", "restarts": 1}
+        settings = {"num_clients": 2, "visualizer": "any", "retries": 1}
         with simulated(WANDERER, env_kwargs=kwargs, total=20, **settings) as source:
             source.batch(20)
         drawn = sorted((i, step, str(events)) for i, step, events in services.shown)
@@ -206,7 +206,7 @@ def test_restart_keeps_rejected_rows(simulated, fresh_notes):
     seen = []
     for fault in ("", "kill", "leave"):
         kwargs = {"refuse": 3, "fault": fault, "at": 11, "pace": 0.002}
-        settings = {"num_clients": 2, "record_wrong_samples": True, "restarts": 1}
+        settings = {"num_clients": 2, "record_wrong_samples": True, "retries": 1}
         rejected = []
         with simulated(WANDERER, env_kwargs=kwargs, **settings) as source:
             for size in (5, 20, 11):
@@ -223,7 +223,7 @@ def test_restart_resends_stored_rows(simulated, fresh_notes):
     for fault in ("", "kill"):
         kwargs = {"fault": fault, "at": 6}
         with simulated(
-            WANDERER, num_clients=2, env_kwargs=kwargs, run_ahead=0, restarts=1
+            WANDERER, num_clients=2, env_kwargs=kwargs, run_ahead=0, retries=1
         ) as source:
             rows = []
             for part in stored:
@@ -238,7 +238,7 @@ def test_regenerating_rows_after_restart_is_no_timeout(simulated, caplog):
     """Making twelve rows again takes longer than a client may be silent."""
     timeout = 1.0
     kwargs = {"pace": timeout / 10, "fault": "kill", "at": 12, "who": 1}
-    with simulated(WANDERER, env_kwargs=kwargs, run_ahead=0, restarts=1, timeout=timeout) as source:
+    with simulated(WANDERER, env_kwargs=kwargs, run_ahead=0, retries=1, timeout=timeout) as source:
         for row in range(14):
             assert source.batch(1)["step"] == [row]
     assert len([record for record in caplog.records if record.name == "physx"]) == 1
@@ -255,7 +255,7 @@ def test_client_beyond_restart_limit_ends_run(simulated, caplog, fresh_notes, fa
     kwargs = {"fault": fault, "at": 3, "times": 9}
     with (
         pytest.raises(error, match="SIGKILL|no more beans"),
-        simulated(WANDERER, num_clients=2, env_kwargs=kwargs, restarts=2) as source,
+        simulated(WANDERER, num_clients=2, env_kwargs=kwargs, retries=2) as source,
     ):
         source.batch(20)
     said = [record.getMessage() for record in caplog.records if record.name == "physx"]
@@ -269,7 +269,7 @@ def test_deterministic_error_is_not_restarted(simulated, caplog, fresh_notes):
     kwargs = {"fault": "refuse_rows", "at": 3, "times": 9}
     with (
         pytest.raises(SampleError, match="this would come again"),
-        simulated(WANDERER, num_clients=2, env_kwargs=kwargs, restarts=2) as source,
+        simulated(WANDERER, num_clients=2, env_kwargs=kwargs, retries=2) as source,
     ):
         source.batch(20)
     assert not [record for record in caplog.records if record.name == "physx"]
@@ -299,10 +299,11 @@ ASKS = {"num_clients": 2, "env_kwargs": {"asks": True}}
 
 def test_run_continues_at_journal_limit_with_one_warning(local, simulated, batch_services, said):
     expected = digest(run(local(WANDERER, **ASKS), [30, 30], apply=True))
-    source = simulated(WANDERER, run_ahead=0, restarts=1, journal_size=2e-6, **ASKS)
+    source = simulated(WANDERER, run_ahead=0, retries=1, journal_size=2e-6, **ASKS)
     assert digest(run(source, [30, 30], apply=True)) == expected
     assert [text.partition(":")[0] for text in said()] == [
-        f"Instance {number} can no longer be restarted" for number in (1, 2)
+        f"Instance {number} can no longer be restarted, nor go on in a later run"
+        for number in (1, 2)
     ]
     assert all("journal_size = 2e-06 GB" in text for text in said())
 
@@ -310,7 +311,7 @@ def test_run_continues_at_journal_limit_with_one_warning(local, simulated, batch
 def test_client_crash_beyond_journal_limit_ends_run_with_reason(
     simulated, batch_services, simulation
 ):
-    with simulated(WANDERER, run_ahead=0, restarts=3, journal_size=2e-6, **ASKS) as source:
+    with simulated(WANDERER, run_ahead=0, retries=3, journal_size=2e-6, **ASKS) as source:
         source.batch(60)
         simulation.alive[2].kill()
         with pytest.raises(ClientError, match="SIGKILL") as caught:
@@ -322,7 +323,7 @@ def test_client_crash_beyond_journal_limit_ends_run_with_reason(
 
 def test_restart_below_journal_limit(local, simulated, batch_services, simulation, said):
     expected = digest(run(local(WANDERER, **ASKS), [10, 90], apply=False))
-    with simulated(WANDERER, run_ahead=0, restarts=1, journal_size=4e-6, **ASKS) as source:
+    with simulated(WANDERER, run_ahead=0, retries=1, journal_size=4e-6, **ASKS) as source:
         batches = [{name: rows.copy() for name, rows in source.batch(10).items()}]
         assert not said()
         simulation.alive[1].kill()
@@ -336,13 +337,13 @@ def test_full_temporary_folder_is_reported_and_run_continues(
     local, simulated, batch_services, full_disk, said
 ):
     expected = digest(run(local(WANDERER, **ASKS), [200], apply=True))
-    source = simulated(WANDERER, run_ahead=0, restarts=1, **ASKS)
+    source = simulated(WANDERER, run_ahead=0, retries=1, **ASKS)
     assert digest(run(source, [200], apply=True)) == expected
     assert len(said(f"cannot grow in {full_disk}: No space left")) == 2
 
 
 def test_full_temporary_folder_during_restart_is_an_error(full_disk):
-    journal = Journal(2, 1e9)
+    journal = Journal(2, 1e9, None, None)
     journal.record(pack(Kind.APPLY, bytes(3_000), 1))
     with pytest.raises(ClientError, match=rf"Client 2 .* {full_disk}, fails: No space .* TMPDIR"):
         journal.record(pack(Kind.APPLY, bytes(3_000), 1), is_read=True)
@@ -353,7 +354,7 @@ def test_full_temporary_folder_during_restart_is_an_error(full_disk):
 
 
 def test_journal_replays_messages():
-    journal = Journal(1, 1e9)
+    journal = Journal(1, 1e9, None, None)
     told = [
         pack(Kind.CREDIT, number=2),
         pack(Kind.ANSWER, b"first", 1),
@@ -367,15 +368,15 @@ def test_journal_replays_messages():
         pack(Kind.CREDIT, number=5),
     ]
     assert [journal.record(message) for message in told] == [1, 0, 1, 1, 1, 0, 1, 1, 0, 1]
-    orders = [told[2], told[3], told[4], told[6], told[7]]
-    assert [journal.order(index) for index in range(6)] == [*orders, None]
+    orders = [told[2] + told[3], told[4] + told[6], told[7]]
+    assert [journal.order(index) for index in range(4)] == [*orders, None]
     assert journal.credit == told[9]
     assert [journal.answer(number) for number in (1, 2, 3, 4)] == [told[1], None, told[5], None]
     journal.close()
 
 
 def test_journal_at_limit_is_dropped_once_client_is_up_to_date(said):
-    journal = Journal(3, 1000)
+    journal = Journal(3, 1000, None, None)
     answers = [pack(Kind.ANSWER, b"x" * 400, number) for number in (1, 2, 3, 4)]
     for answer in answers[:3]:
         journal.record(answer, is_read=True)
@@ -392,7 +393,7 @@ def test_journal_at_limit_is_dropped_once_client_is_up_to_date(said):
 
 
 def test_a_journal_of_credit_alone_does_not_grow():
-    journal = Journal(1, 1e9)
+    journal = Journal(1, 1e9, None, None)
     for number in range(1000):
         journal.record(pack(Kind.CREDIT, number=number))
     assert journal.order(0) is None

@@ -92,7 +92,7 @@ def test_rows_are_the_same_whenever_a_client_is_lost(program, choose, room, even
     kwargs = {"delay": 10e-3}  # so that there are some rows in each message
     expected = run(local(program("Walk"), env_kwargs=kwargs))
     with Simulation(choose, room) as simulation:
-        source = simulate(simulation, program("Walk"), restarts=1, env_kwargs=kwargs)
+        source = simulate(simulation, program("Walk"), retries=1, env_kwargs=kwargs)
 
         def lose():
             simulation.plan[simulation.events + event] = simulation.clients[victim - 1].kill
@@ -130,7 +130,7 @@ def test_a_client_that_hangs_is_named_after_its_time(program, choose, timeout):
 def test_a_client_whose_machine_is_gone_is_replaced(program, caplog):
     expected = run(local(program("Walk")))
     with Simulation() as simulation:
-        source = simulate(simulation, program("Walk"), restarts=1, run_ahead=2)
+        source = simulate(simulation, program("Walk"), retries=1, run_ahead=2)
         simulation.plan[60] = lambda: simulation.clients[1].vanish()
         began = simulation.monotonic()
         assert run(source) == expected
@@ -155,7 +155,7 @@ def test_a_silent_connection_is_dropped_after_a_while(simulated, simulation, cap
 
 
 def test_many_silent_connections_do_not_keep_clients_out(simulated, simulation):
-    with simulated(port=1, num_clients=1, restarts=1, run_ahead=2) as source:
+    with simulated(port=1, num_clients=1, retries=1, run_ahead=2) as source:
         crowd = []
         for _ in range(200):
             crowd.append(simulation.connect((HOST, 1), 60))

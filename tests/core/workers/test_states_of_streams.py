@@ -19,7 +19,8 @@ from physx_core import EnvironmentConfig
 from physx_core.errors import ConnectionRefusedByPeerError, StateError
 from physx_core.net import Kind, encode, pack
 from physx_core.sources import ClientSource
-from physx_core.workers.server.journal import Journal
+from physx_core.workers.journal import Journal
+from physx_core.workers.pasts import Past
 from physx_core.workers.server.validation import parse_state
 
 ENVS = Path(__file__).parents[1] / "programs" / "state_envs.py"
@@ -81,7 +82,7 @@ def test_rows_do_not_depend_on_kills_at_every_row(states, every, options):
     kwargs = options.pop("env_kwargs", {})
     expected = run(states(every, env_kwargs=kwargs, **options))
     kwargs = {**kwargs, "kills": ["create", *PLACES]}
-    assert run(states(every, env_kwargs=kwargs, restarts=100, **options)) == expected
+    assert run(states(every, env_kwargs=kwargs, retries=100, **options)) == expected
     assert len([*Path().glob("*-1")]) > 30
 
 
@@ -90,21 +91,21 @@ def test_rows_do_not_depend_on_a_kill(states, place):
     options = {"record_wrong_samples": True}
     expected = run(states(4, env_kwargs={"parameters": True}, **options))
     kwargs = {"parameters": True, "kills": [place]}
-    assert run(states(4, env_kwargs=kwargs, restarts=1, **options)) == expected
+    assert run(states(4, env_kwargs=kwargs, retries=1, **options)) == expected
 
 
 @pytest.mark.parametrize("every", [1, 4])
 def test_stored_rows_do_not_depend_on_kills(states, every):
     expected = run(states(every), stored=True)
     kwargs = {"kills": PLACES}
-    assert run(states(every, env_kwargs=kwargs, restarts=100), stored=True) == expected
+    assert run(states(every, env_kwargs=kwargs, retries=100), stored=True) == expected
 
 
 def test_rows_that_run_ahead_do_not_depend_on_kills(states):
     options = {"run_ahead": 30, "record_wrong_samples": True}
     expected = run(states(3, env_kwargs={"asks": False}, **options), applies=False)
     kwargs = {"asks": False, "kills": PLACES, "pace": 0.003}
-    source = states(3, env_kwargs=kwargs, restarts=100, **options)
+    source = states(3, env_kwargs=kwargs, retries=100, **options)
     assert run(source, applies=False) == expected
 
 
@@ -123,7 +124,7 @@ def test_drawings_and_saved_parameters_are_not_repeated(states, services):
     seen = []
     for kills in ([], PLACES[:40:3]):
         services.shown.clear()
-        run(states(3, env_kwargs={"kills": kills}, visualizer="any", restarts=100))
+        run(states(3, env_kwargs={"kills": kills}, visualizer="any", retries=100))
         drawn = sorted((i, step, str(events)) for i, step, events in services.shown)
         seen.append((drawn, dict(services.kept)))
     assert seen[0] == seen[1]
@@ -132,7 +133,7 @@ def test_drawings_and_saved_parameters_are_not_repeated(states, services):
 @pytest.mark.parametrize("every", [0, 5])
 def test_only_rows_after_the_state_are_repeated(states, simulation, every):
     kwargs = {"asks": False, "refuse": 0, "kills": [f"step {row}" for row in range(1, 200)]}
-    with states(every, env_kwargs=kwargs, restarts=400, num_clients=1) as source:
+    with states(every, env_kwargs=kwargs, retries=400, num_clients=1) as source:
         for _ in range(200):
             source.batch(1)
     assert simulation.steps < 200 + 200 * 6 if every else simulation.steps > 10_000
@@ -183,14 +184,14 @@ def test_rows_are_the_same_in_any_order_of_events_and_kills(undisturbed, choose,
                 [*simulation.alive.values()][choose(len(simulation.alive))].kill()
 
         simulation.plan.update(dict.fromkeys(events, kill))
-        source = drawn_source(simulation, restarts=10)
+        source = drawn_source(simulation, retries=10)
         assert run(source) == undisturbed
 
 
 @pytest.mark.parametrize("every", [0, 2])
 def test_a_long_past_that_is_repeated_is_said(states, said, every):
     kwargs = {"pace": 30.0, "kills": ["step 4"]}
-    with states(every, env_kwargs=kwargs, restarts=1, timeout=100.0) as source:
+    with states(every, env_kwargs=kwargs, retries=1, timeout=100.0) as source:
         source.batch(10)
     hints = said("It repeats 3 rows first; with EnvironmentConfig.state_every")
     assert len(hints) == (0 if every else 2)
@@ -205,7 +206,7 @@ def test_streams_without_states_repeat_their_rows_with_one_warning(states, said,
     expected = run(states(3, environment))
     (warning,) = said("repeat all rows")
     assert f".{lock}" in warning
-    source = states(3, environment, env_kwargs={"kills": PLACES[:40:7]}, restarts=20)
+    source = states(3, environment, env_kwargs={"kills": PLACES[:40:7]}, retries=20)
     assert run(source) == expected
     assert len(said("repeat all rows")) == 2
 
@@ -214,7 +215,7 @@ def test_a_state_of_another_environment_is_an_error_that_names_what_differs(stat
     environment = f"{ENVS}:Changing"
     kwargs = {"kills": ["step 9"]}
     with pytest.raises(StateError, match=r"differ: marker\b"):
-        run(states(3, environment, env_kwargs=kwargs, restarts=3))
+        run(states(3, environment, env_kwargs=kwargs, retries=3))
 
 
 # The journal -------------------------------------------------------------------------------------
@@ -222,7 +223,7 @@ def test_a_state_of_another_environment_is_an_error_that_names_what_differs(stat
 
 def test_a_journal_is_bounded_by_the_rows_between_states(states, said, simulation):
     """Without states it has 100 kB for these rows."""
-    source = states(10, env_kwargs={"refuse": 0}, restarts=1, journal_size=15e-6)
+    source = states(10, env_kwargs={"refuse": 0}, retries=1, journal_size=15e-6)
     batches = []
     with source:
         for _ in range(60):
@@ -236,39 +237,37 @@ def test_a_journal_is_bounded_by_the_rows_between_states(states, said, simulatio
 
 
 def test_journal_forgets_what_comes_before_a_state():
-    journal = Journal(1, 1e9)
+    journal = Journal(1, 1e9, None, None)
     orders = [pack(Kind.APPLY, b"%d" % number, 1) for number in range(5)]
     answers = {number: pack(Kind.ANSWER, b"a%d" % number, number) for number in range(1, 8)}
     for number in (1, 2):
         journal.record(answers[number])
-    journal.created = 2
+    journal.end_creation()
     for number, order in enumerate(orders):
         journal.record(pack(Kind.CREDIT, number=number + 1))
         journal.record(order)
     for number in (3, 4, 5):
         journal.record(answers[number])
-    assert journal.state is None
-    journal.keep_state(b"state", 3, 4)
-    assert bytes(journal.state) == b"state"
-    assert journal.resumed_requests == 4
-    assert journal.first_order == 6
-    found = [journal.order(index) for index in range(6, 11)]
+    assert journal.newest.describe() is None
+    journal.keep_state(Past(9, b"state"), obeyed=3, requests=4)
+    assert journal.newest.past.state == b"state"
+    assert (journal.newest.obeyed, journal.newest.requests) == (3, 4)
     credits = [pack(Kind.CREDIT, number=number) for number in (4, 5)]
-    assert found == [credits[0], orders[3], credits[1], orders[4], None]
+    found = [journal.order(index) for index in range(3, 6)]
+    assert found == [credits[0] + orders[3], credits[1] + orders[4], None]
     journal.record(answers[7])
     found = [journal.answer(number) for number in (1, 2, 5, 6, 7, 8)]
-    assert found == [answers[1], answers[2], answers[5], None, answers[7], None]
+    assert found == [answers[1], answers[2], None, None, answers[7], None]
     assert journal.answers == 7
-    journal.keep_state(b"next", 5, 7)
-    assert [journal.answer(number) for number in (1, 2, 8)] == [answers[1], answers[2], None]
-    assert journal.order(10) is None
-    assert journal.find_order(6) is None
+    journal.keep_state(Past(12, b"next"), obeyed=5, requests=7)
+    assert [journal.answer(number) for number in (1, 2, 7)] == [answers[1], answers[2], None]
+    assert journal.order(5) is None
     journal.close()
 
 
 def test_a_journal_that_cannot_keep_a_state_stays_as_it_is(monkeypatch):
-    journal = Journal(1, 1e9)
-    journal.keep_state(b"first", 0, 0)
+    journal = Journal(1, 1e9, None, None)
+    journal.keep_state(Past(1, b"first"))
     order = pack(Kind.APPLY, b"order", 1)
     journal.record(order)
 
@@ -277,8 +276,8 @@ def test_a_journal_that_cannot_keep_a_state_stays_as_it_is(monkeypatch):
             raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(tempfile, "SpooledTemporaryFile", lambda *_: Full())
-    journal.keep_state(b"second", 1, 0)
-    assert bytes(journal.state) == b"first"
+    journal.keep_state(Past(2, b"second"))
+    assert journal.newest.past.state == b"first"
     assert journal.order(0) == order
     journal.close()
 

@@ -128,7 +128,7 @@ def test_an_unknown_launcher_is_named(nothing_stays_behind):
 
 def test_one_that_dies_is_started_again_and_goes_on(nothing_stays_behind):
     draw = random.Random(1)
-    with vectors(restarts=3) as vector, vectors(launcher=None) as shared:
+    with vectors(retries=3) as vector, vectors(launcher=None) as shared:
         for number in range(60):
             if number in (10, 30, 50):
                 pid = draw.choice(vector.get_attr("pid"))

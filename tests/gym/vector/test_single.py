@@ -145,7 +145,7 @@ def test_a_launcher_has_its_process_all_the_same(nothing_stays_behind):
 
 @pytest.mark.parametrize(
     "options",
-    [{"restarts": 20}, {"launcher_kwargs": {"affinity": True}}, {"ip_address": "0.0.0.0"}],
+    [{"retries": 20}, {"launcher_kwargs": {"affinity": True}}, {"ip_address": "0.0.0.0"}],
 )
 @pytest.mark.parametrize("count", [1, 2])
 def test_options_of_a_launcher_are_refused_without_one(options, count):

@@ -41,7 +41,7 @@ class RayLauncher(Launcher):
     The clients' resources are reserved as one placement group. On each node an actor, the agent,
     starts the clients that Ray placed there as child processes and monitors them; on its own node,
     the run does that itself. If a node is lost, Ray moves its part of the group to another node,
-    where the run restarts the clients (`EnvironmentConfig.restarts`); the rows are the same. In an
+    where the run restarts the clients (`EnvironmentConfig.retries`); the rows are the same. In an
     elastic run, each client has its own group and waits for a place independently.
 
     Ray is connected to by another process, the driver. If the cluster is lost, the run goes on with

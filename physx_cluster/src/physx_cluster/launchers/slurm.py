@@ -55,7 +55,7 @@ class SlurmLauncher(Launcher):
     """Starts each client as a Slurm job; clients that start together form one job array.
 
     A job that is preempted or reaches its time limit is requeued; its client then resumes where it
-    was (`EnvironmentConfig.restarts`), with the same rows. Time in the queue does not count as
+    was (`EnvironmentConfig.retries`), with the same rows. Time in the queue does not count as
     silence of the client (`EnvironmentConfig.timeout`).
     """
 

@@ -65,8 +65,6 @@ class Kind(enum.IntEnum):
     """Server: stored rows from which to generate the next rows [number of rows]."""
     WRONG = 20
     """Client: rows that `check_sample` rejected, before the next accepted ones [their number]."""
-    AGAIN = 21
-    """Client: repeats rows that its predecessor has already sent [number of rows so far]."""
     REQUEST = 22
     """Client of a served environment: a request [number of the request]."""
     ACTIONS = 23

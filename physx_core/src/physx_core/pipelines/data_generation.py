@@ -41,7 +41,7 @@ from physx_core.sources.source import Source
 from physx_core.typing import Batch
 from physx_core.views.dataset_config import DatasetConfig
 from physx_core.workers.episode_queue import EpisodeQueue
-from physx_core.workers.instance import NOTHING
+from physx_core.workers.pasts import NOTHING
 from physx_core.workers.row_queue import RowQueue
 
 
@@ -75,9 +75,6 @@ class DataGeneration(NewSessionPipeline):
     """Number of samples in a batch."""
     episodes: int | None = at_least(1, None)
     """Number of independent episodes to simulate, instead of batches; those that fail count."""
-    retries: int = at_least(0, 1)
-    """Number of times that an episode is simulated again after its client was lost; then it has
-    failed."""
     max_failed: int = at_least(0, 0)
     """Number of episodes that may fail before the run fails."""
     prove_independence: bool = True
@@ -392,10 +389,11 @@ class DataGeneration(NewSessionPipeline):
     def _make_writer(self, campaign: Campaign) -> CampaignWriter:
         ended = campaign.ended(self.dataset, failed=not self.retry_failed)
         queue: EpisodeQueue
+        retries = self.environment_config.retries
         if self.episodes is None:
-            queue = RowQueue(self._amount()[0], ended, self.retries)
+            queue = RowQueue(self._amount()[0], ended, retries)
         else:
-            queue = EpisodeQueue(self.episodes, ended.all_numbers, self.retries)
+            queue = EpisodeQueue(self.episodes, ended.all_numbers, retries)
         keeps_rejected = self.environment_config.record_wrong_samples
         return CampaignWriter(
             self.dataset, campaign, queue, self.max_failed, keeps_rejected=keeps_rejected

@@ -14,7 +14,7 @@ from physx_core.dataset import Dataset
 from physx_core.dataset.store.manifest import to_plain_info
 from physx_core.errors import ConfigError
 from physx_core.pipelines.storage import GENERATIONS, end_generation, keep_parameters
-from physx_core.workers.instance import NOTHING, Skip
+from physx_core.workers.pasts import NOTHING, Skip
 
 _SAME = (
     "environment",

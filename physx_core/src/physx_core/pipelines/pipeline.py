@@ -32,7 +32,7 @@ from physx_core.processes import (
 )
 from physx_core.session import Session
 from physx_core.sources.source import Source
-from physx_core.workers.instance import NOTHING, Skip
+from physx_core.workers.pasts import NOTHING, Skip
 
 _STREAMS = {"training": 0, "validation": 1, "prediction": 2}
 

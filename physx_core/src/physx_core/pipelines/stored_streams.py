@@ -16,8 +16,7 @@ from physx_core.pipelines.storage import (
 )
 from physx_core.session import Session
 from physx_core.sources.source import Source
-from physx_core.workers.instance import NOTHING
-from physx_core.workers.pasts import PastFiles
+from physx_core.workers.pasts import NOTHING, PastFiles
 
 _ADVICE = "Start another run for more of them."
 

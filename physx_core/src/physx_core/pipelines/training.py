@@ -123,9 +123,6 @@ class Training(NewSessionPipeline):
     """For a sampler that learns: how many independent episodes may be simulated beyond the first
     missing one. The parameters of episode k depend on the losses of the batches made only of
     samples of episodes before ``k - run_ahead``."""
-    retries: int = at_least(0, 1)
-    """Number of times that an independent episode is simulated again after its client was lost;
-    then it has failed."""
     max_failed: int = at_least(0, 0)
     """Number of independent episodes that may fail before the training fails."""
     validation_every: int = at_least(0, 1)
@@ -602,7 +599,6 @@ class Training(NewSessionPipeline):
             predict=self._predict,
             show=self.observers.events,
             run_ahead=self.run_ahead,
-            retries=self.retries,
             max_failed=self.max_failed,
         )
         self.data = opening.open(resources, dataset)

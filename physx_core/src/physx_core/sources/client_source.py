@@ -24,9 +24,8 @@ from physx_core.net.values import encode
 from physx_core.rows import ROW_FIELDS, concatenate
 from physx_core.sources.source import Canceled, Source, check_stored
 from physx_core.typing import Batch
-from physx_core.workers.instance import NOTHING, Skip
 from physx_core.workers.parameter_sets import ParameterSets
-from physx_core.workers.pasts import Pasts
+from physx_core.workers.pasts import NOTHING, Skip
 from physx_core.workers.row_codec import row_bytes
 from physx_core.workers.server.client_group import ClientGroup
 from physx_core.workers.server.peer import Peer
@@ -90,8 +89,7 @@ class ClientSource(Source):
         self._episodes: ClientEpisodes | None = None
         self.instance_nb = config.num_clients
         self.sets = ParameterSets(config, seed, skip)
-        if keeps_pasts and config.state_every:
-            self.pasts = Pasts(1e9 * config.journal_size, skip.pasts)
+        keeps_pasts = keeps_pasts and config.state_every > 0
         self._group = ClientGroup(
             config,
             services,
@@ -101,8 +99,9 @@ class ClientSource(Source):
             skip=skip,
             written=self._written,
             transport=transport,
-            pasts=self.pasts,
+            keeps_pasts=keeps_pasts,
         )
+        self._journals = self._group.journals if keeps_pasts else {}
         self._rejections = 0
         if config.record_wrong_samples:
             self._rejections = config.max_wrong_samples_per_step + 1

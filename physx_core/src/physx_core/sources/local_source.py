@@ -12,14 +12,16 @@ from physx_core.components.services import Services
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import ConfigError, PhysxError, StateError, UsageError
 from physx_core.fields import Field
+from physx_core.net.frames import Kind, pack
 from physx_core.net.remote_errors import decode_error, encode_error
 from physx_core.net.values import decode, encode
 from physx_core.rows import ROW_FIELDS, RowBuffer, concatenate, copy_row, infer_shapes
 from physx_core.sources.source import Source, check_stored
 from physx_core.typing import Batch, Sample
-from physx_core.workers.instance import NOTHING, Instance, Skip, instance_arguments
+from physx_core.workers.instance import Instance, instance_arguments
+from physx_core.workers.journal import Journal
 from physx_core.workers.parameter_sets import ParameterSets
-from physx_core.workers.pasts import Past, Pasts
+from physx_core.workers.pasts import NOTHING, Answer, Past, Skip
 
 if TYPE_CHECKING:
     from physx_core.sources.episode_source import LocalEpisodes
@@ -79,8 +81,13 @@ class LocalSource(Source):
         self._restored = [past.rows for past in pasts]
         self._rejections = [past.rejected for past in pasts]
         self._says_refusal = config.state_every > 0
+        self._journals: dict[int, Journal] = {}
         if keeps_pasts and config.state_every:
-            self.pasts = Pasts(1e9 * config.journal_size, skip.pasts)
+            for number in range(1, self.instance_nb + 1):
+                past, limit = skip.pasts.get(number), 1e9 * config.journal_size
+                self._journals[number] = Journal(
+                    number, limit, self.sets, services, past, keeps=True
+                )
 
     @property
     def fields(self) -> list[Field]:
@@ -130,11 +137,12 @@ class LocalSource(Source):
         draw, with_states = self._config.visualizer is not None, self._config.state_every > 0
         choose = partial(self._choose, instance.instance_id)
         number, services = instance.instance_id, self._services
-        if self.pasts is not None:
-            services = _Remembering(services, self.pasts, number)
+        journal = self._journals.get(number)
+        if journal is not None:
+            services = _Remembering(services, journal)
         instance.open(services, draw, choose, with_states=with_states)
-        if self.pasts is not None:
-            self.pasts.created(number, self._services)
+        if journal is not None:
+            journal.end_creation()
         past = self._skip.pasts.get(number)
         if past is not None and past.state:
             instance.set_state(decode(past.state)["instance"])
@@ -192,12 +200,10 @@ class LocalSource(Source):
                     error,
                 )
             return
-        if self.pasts is not None:
+        if number in self._journals:
             encoded = encode({"instance": state, "stored": []}, "the state")
-            recorded, sets = self.sets.waiting(number)
-            saved = self._services.load_parameters(number)
-            past = Past(rows, encoded, self._rejections[number - 1], recorded, sets, saved)
-            self.pasts.note(number, past)
+            rejected = self._rejections[number - 1]
+            self._journals[number].keep_state(Past(rows, encoded, rejected))
 
     def _generate_again(self) -> None:
         """Generate the rows that an earlier run already got, and discard them."""
@@ -245,24 +251,30 @@ class LocalSource(Source):
 class _Remembering:
     """The run's services for one instance; what they predict is noted, and told again."""
 
-    def __init__(self, services: Services, pasts: Pasts, number: int) -> None:
-        self._services, self._pasts, self._number = services, pasts, number
+    def __init__(self, services: Services, journal: Journal) -> None:
+        self._services, self._journal = services, journal
         self.save_parameters = services.save_parameters
         self.load_parameters = services.load_parameters
         self.show = services.show
 
     def predict(self, fields: Sample) -> Sample:
         """Return the prediction for one sample: see `Services.predict`."""
-        answer = self._pasts.tell(self._number)
+        answer = self._journal.tell()
         if answer is None:
             try:
                 found = self._services.predict(fields)
             except PhysxError as error:
-                self._pasts.answered(self._number, (False, encode_error(error)))
+                self._keep((False, encode_error(error)))
                 raise
-            self._pasts.answered(self._number, (True, encode(found, "the prediction")))
+            self._keep((True, encode(found, "the prediction")))
             return found
+        self._keep(answer)
         if not answer[0]:
             raise decode_error(answer[1])
         told: Sample = decode(answer[1])
         return told
+
+    def _keep(self, answer: Answer) -> None:
+        kind = Kind.ANSWER if answer[0] else Kind.REFUSAL
+        number = self._journal.answers + 1
+        self._journal.record(pack(kind, answer[1], number), is_prediction=True)

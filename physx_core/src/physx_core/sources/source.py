@@ -12,8 +12,9 @@ from physx_core.closeable import Closeable
 from physx_core.errors import PhysxError, UsageError
 from physx_core.fields import Field
 from physx_core.typing import Batch
+from physx_core.workers.journal import Journal
 from physx_core.workers.parameter_sets import ParameterSets
-from physx_core.workers.pasts import Past, Pasts
+from physx_core.workers.pasts import Past
 
 if TYPE_CHECKING:
     from physx_core.sources.episode_source import EpisodeSource
@@ -74,7 +75,6 @@ class Source(Opened):
         is_plain: Whether all that an open source produces are rows: there are no parameters, and
             rejected samples are not recorded.
         rows: Number of rows that have been returned, with those of an earlier run.
-        pasts: Keeps what a later run needs to go on from states; None: it repeats the rows.
     """
 
     instance_nb: int
@@ -84,8 +84,8 @@ class Source(Opened):
     episode_fields: Sequence[Field] = ()
     is_plain = False
     rows = 0
-    pasts: Pasts | None = None
     _is_canceled = False
+    _journals: Mapping[int, Journal] = {}  # if a later run may go on
     _name = ""
 
     @property
@@ -142,10 +142,11 @@ class Source(Opened):
         Returns:
             The past of each instance by number; None: a later run has to repeat the rows.
         """
-        if self.pasts is None:
-            return None
-        nb = self.instance_nb
-        return self.pasts.at(lambda number: (self.rows - number + nb) // nb, nb)
+        nb, found = self.instance_nb, dict[int, Past]()
+        for number, journal in self._journals.items():
+            if (past := journal.at((self.rows - number + nb) // nb)) is not None:
+                found[number] = past
+        return found if len(found) == nb else None
 
     def check_independent(self) -> None:
         """Check that the environment's episodes are independent.

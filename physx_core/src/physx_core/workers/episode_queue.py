@@ -22,14 +22,14 @@ class EpisodeQueue:
     """
 
     def __init__(
-        self, total: int, recorded: Collection[int] | Index = (), retries: int = 1
+        self, total: int, recorded: Collection[int] | Index = (), retries: int | None = None
     ) -> None:
         """Start with all numbers that are not recorded.
 
         Args:
             total: Number of episodes.
             recorded: Numbers that an earlier run has recorded; those from `total` on are ignored.
-            retries: How often a number is given out again after it was lost.
+            retries: How often a number is given out again after it was lost; None: once.
         """
         self.total = self.end = total
         known = recorded if isinstance(recorded, np.ndarray) else np.array([*recorded], np.int64)
@@ -37,8 +37,7 @@ class EpisodeQueue:
         numbers = numbers[(numbers < total) & (np.diff(numbers, prepend=-1) > 0)]
         self.finished = len(numbers)
         self._begins, self._ends = _gaps(numbers, total)
-        self._retries = retries
-        self._losses: Counter[int] = Counter()
+        self._losses, self._retries = Counter[int](), 1 if retries is None else retries
         self._returned: list[int] = []
         self._gap, self._next = 0, 0
 
@@ -90,9 +89,9 @@ class EpisodeQueue:
 
     def give_back(self, number: int) -> bool:
         """Return a number whose simulation was lost; False if that has happened too often."""
-        self._losses[number] += 1
-        if self._losses[number] > self._retries:
+        if self._losses[number] >= self._retries:
             return False
+        self._losses[number] += 1
         heapq.heappush(self._returned, number)
         return True
 

@@ -5,16 +5,14 @@ from __future__ import annotations
 import copy
 import inspect
 import traceback
-import warnings
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 from physx_core.closeable import Closeable
 from physx_core.components.environment import (
     Environment,
     PredictedFields,
     explain_missing_attribute,
-    options_of,
 )
 from physx_core.components.parameter import Parameter
 from physx_core.components.scene.factory import Factory
@@ -24,20 +22,17 @@ from physx_core.errors import (
     EnvironmentFailedError,
     PhysxError,
     StateError,
-    UnknownOptionError,
     UsageError,
     WrongSamplesError,
 )
 from physx_core.fields import Field, check_quantities
-from physx_core.plugins import resolve
-from physx_core.plugins.references import adapters_hint
 from physx_core.processes.endings import describe_ending, is_ending
 from physx_core.rows import RejectedSamples
 from physx_core.typing import Array, Sample
+from physx_core.workers.creation import create_environment
 
 if TYPE_CHECKING:
     from physx_core.states import Baseline
-    from physx_core.workers.pasts import Past
 
 PARAMETER = "parameters/"
 """Name prefix of a stored row's entries that hold the parameters it was generated with; no field
@@ -56,48 +51,6 @@ _COUNTERS = (
 )
 """What changes about an instance."""
 _STEPPING = ("reset_parameters", "step", "check_sample", "apply_prediction", "close")
-
-
-class Skip(NamedTuple):
-    """What an earlier run with the same seed already got from the same instances.
-
-    Attributes:
-        rows: Number of rows from all instances together.
-        rejected: Number of rejected samples of each instance; empty: none.
-        sets: Numbers of the recorded sets of parameters.
-        pasts: From where instances go on, by their number; the others repeat all of their rows.
-    """
-
-    rows: int = 0
-    rejected: tuple[int, ...] = ()
-    sets: frozenset[int] = frozenset()
-    pasts: Mapping[int, Past] = {}
-
-    def rows_of(self, number: int, instance_nb: int) -> int:
-        """Return how many of the rows an instance generated; instances are numbered from 1."""
-        return (self.rows - number + instance_nb) // instance_nb
-
-    def rejected_of(self, number: int) -> int:
-        """Return how many samples of an instance were rejected."""
-        return self.rejected[number - 1] if self.rejected else 0
-
-    def covers(self, number: int, past: Past, instance_nb: int) -> bool:
-        """Return whether it has all that came before the past of an instance."""
-        return (
-            1 <= number <= instance_nb
-            and past.rows <= self.rows_of(number, instance_nb)
-            and past.rejected <= self.rejected_of(number)
-            and (past.recorded < 0 or past.recorded in self.sets)
-        )
-
-    def repeated(self, instance_nb: int) -> int:
-        """Return how many rows instances simulate again, all together."""
-        known = sum(past.rows for past in self.pasts.values())
-        return self.rows - known
-
-
-NOTHING = Skip()
-"""For a new run: there is no earlier one."""
 
 
 def instance_arguments(
@@ -244,10 +197,11 @@ class Instance(Closeable):
             UsageError: If the environment's constructor does not pass on its arguments.
             PhysxError: If the environment raises one; it is raised unchanged.
         """
-        environment = self.environment = self._create()
+        environment = self.environment = create_environment(
+            self._reference, self._arguments, self._call
+        )
         environment._services, environment._choose_parameters = services, choose
         self._configure_episodes(environment)
-        _warn_of_misspelt_methods(type(environment))
         self._call("create", environment.create)
         self._call("init", environment.init)
         self._call("init_database", environment.init_database)
@@ -281,32 +235,6 @@ class Instance(Closeable):
             track()
         except StateError as error:
             self._refusal = error
-
-    def _create(self) -> Environment:
-        """Create the environment, and check that its constructor passed on its arguments."""
-        make = self._call("import", resolve, "environment", self._reference)
-        name = getattr(make, "__name__", repr(make))
-        try:
-            _check_constructor(name, make, self._arguments)
-            environment = self._call("__init__", make, **self._arguments)
-        except PhysxError as error:
-            if not isinstance(make, type) and "instance_id" in str(error):
-                error.add_note(adapters_hint("environment", self._reference).strip())
-            raise
-        if not isinstance(environment, Environment):
-            raise UsageError(
-                f"{self._reference!r} returned {environment!r}, which is not an Environment."
-                f"{adapters_hint('environment', self._reference)}"
-            )
-        if environment._has_seed is None:
-            raise UsageError(f"{name}.__init__() must call super().__init__(**kwargs).")
-        given = (environment.instance_id, environment.instance_nb, environment._has_seed)
-        if given != (self._arguments["instance_id"], self._arguments["instance_nb"], True):
-            raise UsageError(
-                f"{name}.__init__() must pass instance_id, instance_nb and seed to "
-                "super().__init__(): take **kwargs and call super().__init__(**kwargs)."
-            )
-        return environment
 
     def _configure_episodes(self, environment: Environment) -> None:
         """Make the episodes independent if the run's configuration says so."""
@@ -686,45 +614,3 @@ def _check_empty(environment: Environment, count: int) -> None:
             f"{type(environment).__name__} ended {count} episodes in a row without a row: call "
             "set_training_data() in the step that calls end_episode()."
         )
-
-
-def _warn_of_misspelt_methods(cls: type[Environment]) -> None:
-    """Warn about methods that are never called but whose names resemble optional ones."""
-    own = [name for name in dir(cls) if not name.startswith("_") and not hasattr(Environment, name)]
-    optional = ("init_visualization", "check_sample", "apply_prediction", "reset_parameters")
-    for method in optional:
-        if getattr(cls, method) is getattr(Environment, method):
-            import difflib
-
-            for name in difflib.get_close_matches(method, own, n=1, cutoff=0.85):
-                warnings.warn(
-                    f"physx does not call {cls.__name__}.{name}(). Did you mean {method}()?",
-                    stacklevel=2,
-                )
-
-
-def _check_constructor(name: str, make: Any, arguments: Mapping[str, Any]) -> None:
-    """Check that an environment can be created with the arguments.
-
-    Raises:
-        UsageError: If it does not accept those that every environment gets.
-        UnknownOptionError: If it does not accept one of the user's.
-    """
-    try:
-        parameters = inspect.signature(make).parameters.values()
-    except (TypeError, ValueError):  # unknown, for example for a class in C
-        return
-    if any(parameter.kind is parameter.VAR_KEYWORD for parameter in parameters):
-        return
-    named = (inspect.Parameter.KEYWORD_ONLY, inspect.Parameter.POSITIONAL_OR_KEYWORD)
-    known = {parameter.name for parameter in parameters if parameter.kind in named}
-    missing = [option for option in ("instance_id", "instance_nb", "seed") if option not in known]
-    if missing:
-        raise UsageError(
-            f"{name}.__init__() does not take {', '.join(missing)}: it must take **kwargs and pass "
-            "them to super().__init__(**kwargs)."
-        )
-    unknown = arguments.keys() - known
-    if unknown:
-        options = options_of(make) if isinstance(make, type) else known
-        raise UnknownOptionError(name, unknown, options)

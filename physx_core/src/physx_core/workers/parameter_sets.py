@@ -23,8 +23,8 @@ from physx_core.errors import (
 from physx_core.fields import Field
 from physx_core.plugins import resolve
 from physx_core.typing import Batch
-from physx_core.workers.instance import NOTHING, Skip
 from physx_core.workers.learned_sets import LearnedSets
+from physx_core.workers.pasts import NOTHING, Skip
 from physx_core.workers.row_queue import RowQueue
 
 _DEFAULT = "physx/uniform"

@@ -1,26 +1,24 @@
 """Pasts: what instances of streams need to go on in a later run, without repeating all rows.
 
 That is the last state before some row, and what cannot be computed again after it: the predictions
-that the instance has got since. `Pasts` collects this while the rows are generated, in the run's
-process; a checkpoint keeps it, and `PastFiles` keeps it in a session.
+that the instance has got since. A `Journal` collects this while the rows are generated, in the
+run's process; a checkpoint keeps it, and `PastFiles` keeps it in a session.
 """
 
 from __future__ import annotations
 
-import logging
 import math
-from collections import Counter, deque
+from collections import Counter
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
 from physx_core.clock import SYSTEM_CLOCK, Clock
 from physx_core.closeable import Closeable
-from physx_core.components.services import Services
 from physx_core.errors import ConnectionRefusedByPeerError
 from physx_core.net.values import decode, encode
 
@@ -31,7 +29,6 @@ _PERIOD = 0.1
 _SETTLED = 2.0
 """Time in s after which stored rows are on the disk: they are synced every second."""
 _CHECKSUM = 4
-_LOG = logging.getLogger("physx")
 
 Answer = tuple[bool, bytes]
 """Whether a request for a prediction was answered, not refused; and the encoded answer or error."""
@@ -92,123 +89,46 @@ class Past:
         return cls(*own, tuple(created), answers, len(answers))
 
 
-class Pasts:
-    """The pasts of a run's instances, and what an earlier run has left of them."""
+class Skip(NamedTuple):
+    """What an earlier run with the same seed already got from the same instances.
 
-    def __init__(self, limit: float, former: Mapping[int, Past] | None = None) -> None:
-        """Begin with what an earlier run has left.
+    Attributes:
+        rows: Number of rows from all instances together.
+        rejected: Number of rejected samples of each instance; empty: none.
+        sets: Numbers of the recorded sets of parameters.
+        pasts: From where instances go on, by their number; the others repeat all of their rows.
+    """
 
-        Args:
-            limit: Largest number of bytes of an instance's answers between two states.
-            former: The pasts by number of the instance.
-        """
-        self._limit, self._former = limit, dict(former or {})
-        self._of: dict[int, _Growing] = {}
-        self._told = {number: deque(past.told) for number, past in self._former.items()}
+    rows: int = 0
+    rejected: tuple[int, ...] = ()
+    sets: frozenset[int] = frozenset()
+    pasts: Mapping[int, Past] = {}
 
-    def former(self, number: int) -> Past | None:
-        """Return the past of an instance with which this run began."""
-        return self._former.get(number)
+    def rows_of(self, number: int, instance_nb: int) -> int:
+        """Return how many of the rows an instance generated; instances are numbered from 1."""
+        return (self.rows - number + instance_nb) // instance_nb
 
-    def tell(self, number: int) -> Answer | None:
-        """Return what an earlier run answered to the instance's next request for a prediction."""
-        told = self._told.get(number)
-        if not told:
-            return None
-        answer = told.popleft()
-        self.answered(number, answer)
-        return answer
+    def rejected_of(self, number: int) -> int:
+        """Return how many samples of an instance were rejected."""
+        return self.rejected[number - 1] if self.rejected else 0
 
-    def answered(self, number: int, answer: Answer) -> None:
-        """Note the answer to a request for a prediction."""
-        self._growing(number).add(answer)
+    def covers(self, number: int, past: Past, instance_nb: int) -> bool:
+        """Return whether it has all that came before the past of an instance."""
+        return (
+            1 <= number <= instance_nb
+            and past.rows <= self.rows_of(number, instance_nb)
+            and past.rejected <= self.rejected_of(number)
+            and (past.recorded < 0 or past.recorded in self.sets)
+        )
 
-    def created(self, number: int, services: Services) -> None:
-        """Note that an instance is created; it then has the parameters that its past had saved.
-
-        Further calls, for a client that takes the place of another one, do nothing.
-        """
-        former, is_first = self._former.get(number), self._growing(number).end_creation()
-        if is_first and former is not None and former.saved:
-            services.save_parameters(number, dict(former.saved))
-
-    def note(self, number: int, past: Past) -> None:
-        """Note a state; answers are added to it.
-
-        Args:
-            number: The instance.
-            past: The state, without answers.
-        """
-        self._growing(number).begin(past)
-
-    def at(self, rows_of: Callable[[int], int], count: int) -> dict[int, Past] | None:
-        """Return the pasts of all instances, and forget what came before them.
-
-        Args:
-            rows_of: Returns how many rows an instance has generated.
-            count: Number of instances.
-
-        Returns:
-            The newest past of each instance with no more than these rows; None: there are none, as
-            one of them has got too large.
-        """
-        found = {n: self._growing(n).at(rows_of(n)) for n in range(1, count + 1)}
-        whole = {n: past for n, past in found.items() if past is not None}
-        return whole if len(whole) == count else None
-
-    def _growing(self, number: int) -> _Growing:
-        if number not in self._of:
-            self._of[number] = _Growing(number, self._limit, self._former.get(number, Past()))
-        return self._of[number]
+    def repeated(self, instance_nb: int) -> int:
+        """Return how many rows instances simulate again, all together."""
+        known = sum(past.rows for past in self.pasts.values())
+        return self.rows - known
 
 
-class _Growing:
-    """The past of one instance: states that may still be needed, each with the answers after it."""
-
-    def __init__(self, number: int, limit: float, former: Past) -> None:
-        self._number, self._limit, self._nbytes = number, limit, 0
-        self._answers: list[Answer] = []
-        self._created: tuple[Answer, ...] | None = None
-        self._states = deque([replace(former, created=(), answers=self._answers, count=0)])
-        self._is_given_up = False
-
-    def add(self, answer: Answer) -> None:
-        if self._is_given_up:
-            return
-        self._answers.append(answer)
-        self._nbytes += len(answer[1])
-        if self._nbytes > self._limit:
-            self._is_given_up = True
-            self._states.clear()
-            self._answers = []
-            _LOG.warning(
-                "The training cannot be resumed within this epoch: the predictions for instance "
-                "%d since its last state have more than EnvironmentConfig.journal_size = %g GB. "
-                "Take states more often (state_every).",
-                self._number,
-                self._limit / 1e9,
-            )
-
-    def end_creation(self) -> bool:
-        is_first = self._created is None
-        if is_first:
-            self._created = tuple(self._answers)
-            self._answers.clear()
-            self._nbytes = 0
-        return is_first
-
-    def begin(self, past: Past) -> None:
-        if not self._is_given_up and past.rows > self._states[-1].rows:
-            self._answers, self._nbytes = [], 0
-            self._states.append(replace(past, answers=self._answers))
-
-    def at(self, rows: int) -> Past | None:
-        if self._is_given_up:
-            return None
-        while len(self._states) > 1 and self._states[1].rows <= rows:
-            self._states.popleft()
-        found, created = self._states[0], self._created or ()
-        return replace(found, created=created, count=len(found.answers))
+NOTHING = Skip()
+"""For a new run: there is no earlier one."""
 
 
 def pack(rows: int, pasts: Mapping[int, Past]) -> bytes:

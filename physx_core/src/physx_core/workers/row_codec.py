@@ -59,7 +59,7 @@ def unpack_rows(payload: bytearray, fields: Sequence[Field], count: int) -> Batc
     return block
 
 
-class RowQueue:
+class ReceivedRows:
     """Queue of rows received from one client.
 
     Attributes:

@@ -57,13 +57,13 @@ class RowQueue(EpisodeQueue):
 
     choose: Callable[[RowQueue, int], int] | None = None
 
-    def __init__(self, goal: int, recorded: Ended = NONE_ENDED, retries: int = 1) -> None:
+    def __init__(self, goal: int, recorded: Ended = NONE_ENDED, retries: int | None = None) -> None:
         """Start with the numbers that are not recorded.
 
         Args:
             goal: How many rows are wanted.
             recorded: Episodes that an earlier run has recorded.
-            retries: How often a number is given out again after it was lost.
+            retries: How often a number is given out again after it was lost; None: once.
         """
         super().__init__(_NO_END, recorded.all_numbers, retries)
         first, numbers, rows = recorded

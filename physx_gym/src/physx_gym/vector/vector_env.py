@@ -70,7 +70,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         launcher: str | type[Any] | None = None,
         launcher_kwargs: Mapping[str, Any] | None = None,
         ip_address: str = _HERE,
-        restarts: int = 0,
+        retries: int = 0,
     ) -> None:
         """Start the processes.
 
@@ -95,7 +95,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
                 clients, on any machine, and `recv` waits for all pending results.
             launcher_kwargs: Keyword arguments of the launcher.
             ip_address: Address at which clients reach this process, if the launcher knows none.
-            restarts: How often to restart a launcher's process that exits. The new one repeats all
+            retries: How often to restart a launcher's process that exits. The new one repeats all
                 actions, so its environments must be deterministic; the actions are kept for this.
 
         Raises:
@@ -110,7 +110,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         batch_size = num_envs if batch_size is None else batch_size
         _check(num_envs, workers, batch_size, env_kwargs, autoreset_mode)
         if launcher is None:
-            _check_without_launcher(launcher_kwargs, ip_address, restarts)
+            _check_without_launcher(launcher_kwargs, ip_address, retries)
         name, options = reference_of(env), dict(env_kwargs or {})
         self.num_envs, self.batch_size = num_envs, batch_size
         self.autoreset_mode = AutoresetMode(autoreset_mode)
@@ -148,7 +148,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
                     "launcher": launcher,
                     "launcher_kwargs": dict(launcher_kwargs or {}),
                     "ip_address": ip_address,
-                    "restarts": restarts,
+                    "retries": retries,
                     "timeout": timeout,
                 }
                 self._workers = ClientWorkers(self._batch, setup, config)
@@ -496,12 +496,12 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
 
 
 def _check_without_launcher(
-    launcher_kwargs: Mapping[str, Any] | None, ip_address: str, restarts: int
+    launcher_kwargs: Mapping[str, Any] | None, ip_address: str, retries: int
 ) -> None:
     given = {
         "launcher_kwargs": bool(launcher_kwargs),
         "ip_address": ip_address != _HERE,
-        "restarts": restarts != 0,
+        "retries": retries != 0,
     }
     if unused := [name for name, is_given in given.items() if is_given]:
         raise ConfigError(

@@ -44,8 +44,7 @@ from physx_core.plugins.networks import resolve_network
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
-from physx_core.workers.instance import NOTHING, Skip
-from physx_core.workers.pasts import unpack
+from physx_core.workers.pasts import NOTHING, Skip, unpack
 from physx_core.workers.row_queue import RowQueue
 
 
@@ -94,7 +93,7 @@ class DataOpening:
         open_source: Opens environments: `Pipeline._open_source` without its first argument.
         predict: The network's prediction for a batch; called in the training's thread.
         show: Receives drawing events; called in the training's thread.
-        run_ahead, retries, max_failed: See `Training`.
+        run_ahead, max_failed: See `Training`.
     """
 
     start: Start
@@ -112,7 +111,6 @@ class DataOpening:
     predict: Predict
     show: Show
     run_ahead: int
-    retries: int
     max_failed: int
     _generation: Generation | None = field(init=False, default=None)
 
@@ -240,7 +238,7 @@ class DataOpening:
         else:
             reject_episode_fields(source)
             return None
-        queue = RowQueue(self.buffer.total, campaign.ended(dataset), self.retries)
+        queue = RowQueue(self.buffer.total, campaign.ended(dataset), environment.retries)
         writer = CampaignWriter(
             dataset,
             campaign,

@@ -101,7 +101,7 @@ class Producer:
             if self._is_due():
                 self.flush()
                 if self.made < self._skip:
-                    self._link.send(pack(Kind.AGAIN, number=self.made))
+                    self._link.send(pack(Kind.PING))
                 self._listen()
 
     def flush(self) -> None:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 import socket
 import sys
-from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
@@ -16,27 +15,27 @@ from physx_core.config import EnvironmentConfig
 from physx_core.errors import (
     ClientError,
     ConfigError,
-    EnvironmentFailedError,
     PhysxError,
-    ProgramError,
 )
 from physx_core.net.addresses import format_address, is_loopback, parse_address
 from physx_core.net.handshake import TOKEN_VARIABLE
 from physx_core.net.link import SOCKETS, Transport
 from physx_core.net.tokens import choose_token, find_token
-from physx_core.net.values import decode, encode
+from physx_core.net.values import encode
 from physx_core.plugins import reference_of, resolve
 from physx_core.plugins.references import locate
-from physx_core.workers.instance import NOTHING, Skip, instance_arguments
+from physx_core.workers.instance import instance_arguments
+from physx_core.workers.journal import Journal
 from physx_core.workers.launchers import describe_states, stop
 from physx_core.workers.parameter_sets import ParameterSets
-from physx_core.workers.pasts import Pasts
+from physx_core.workers.pasts import NOTHING, Skip
 from physx_core.workers.server.client_errors import exit_error, overdue_error, timeout_error
 from physx_core.workers.server.episode_pool import EpisodePool
 from physx_core.workers.server.leases import Leases
 from physx_core.workers.server.pace import Laggards
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.server import Server
+from physx_core.workers.server.stream_pool import StreamPool
 from physx_core.workers.server.written_rows import WrittenRows
 
 _ALL = ("", "0.0.0.0", "::")  # all addresses of this machine
@@ -45,8 +44,6 @@ _GRACE = 1.0
 _BUSY = 1.0
 _EXIT_TIME = 5.0
 _SAY_EVERY = 5.0
-_LONG_PAST = 60.0
-_PASSING = (EnvironmentFailedError, ProgramError, ClientError)  # errors that may not recur
 _LOG = logging.getLogger("physx")
 
 
@@ -56,6 +53,7 @@ class ClientGroup:
     Attributes:
         server: The server.
         config: The environment, the number of clients, and how long they may be silent.
+        journals: What streams were told, by number, if others may go on with them.
     """
 
     def __init__(
@@ -69,7 +67,7 @@ class ClientGroup:
         skip: Skip = NOTHING,
         written: WrittenRows | None = None,
         transport: Transport = SOCKETS,
-        pasts: Pasts | None = None,
+        keeps_pasts: bool = False,
     ) -> None:
         """Store the arguments; `open` starts the clients.
 
@@ -82,43 +80,45 @@ class ClientGroup:
             skip: What an earlier run already got: clients generate it again, but do not send it.
             written: Takes note of the rows that the clients write themselves; None: they send them.
             transport: What connects the clients, and the clock that the run follows.
-            pasts: Keeps what a later run needs, and what an earlier one has left; None: nobody
-                needs it.
+            keeps_pasts: Whether a later run may go on.
         """
         self._clock = transport.clock
-        self._written, self._pasts = written, pasts
+        self._written = written
         self.config = config
-        self._seed, self._sets = list(seed), sets
+        self._seed = list(seed)
         self._accepts_all = accept_all
         self._launcher = launcher = _make_launcher(config)
         launcher.elastic = config.is_elastic
         token = choose_token(config, launcher.by_hand, launcher.elsewhere)
-        self._pool = self._make_pool() if config.is_elastic else None
         self._laggards, self._named = Laggards(self._clock), set[str]()
         self._handles: dict[int, ClientHandle] = {}
         self._launched: dict[int, float] = {}
         self._queued: dict[int, float] = {}
         self._exits: dict[int, float] = {}
-        self._restarts: Counter[int] = Counter()
         self._checked = self._served = self._said = self._began = self._looked = 0.0
-        self._closing = False
         self._host: str | None = None
-        self.server = Server(
-            config.ip_address,
-            config.port,
-            config.places,
-            services,
-            self._encode_setup,
-            token,
-            sets,
-            self._replaces,
-            1e9 * config.journal_size,
-            skip,
-            self._reserved,
-            {} if written is None else written.dispatch,
-            transport,
-            pasts,
+        pool = (
+            self._make_pool()
+            if config.is_elastic
+            else StreamPool(
+                config,
+                self._clock,
+                sets,
+                services,
+                skip,
+                keeps_pasts=keeps_pasts,
+                by_hand=launcher.by_hand,
+                address=self._public_address,
+            )
         )
+        self.journals: dict[int, Journal] = {}
+        self.server = Server(
+            config, services, self._encode_setup, token, sets, pool, self._reserved, transport
+        )
+        if isinstance(pool, StreamPool):
+            self.journals = pool.journals
+            self.server.dispatch.update(pool.dispatch)
+        self.server.dispatch.update({} if written is None else written.dispatch)
 
     def open(self) -> None:
         """Start the clients and wait until their environments are ready."""
@@ -127,8 +127,8 @@ class ClientGroup:
         self.server.open(self._host if is_loopback(self.config.ip_address) else None)
         self._launch(range(1, self.config.num_clients + 1))
         if self._launcher.by_hand:
-            count = self.config.num_clients if self._pool is None else self._pool.least
-            most = "" if self._pool is None else f" (at most {self.config.places} may join)"
+            count, places = self._pool.least, self.config.places
+            most = f" (at most {places} may join)" if self.config.is_elastic else ""
             _LOG.warning(
                 "The run waits for %d %s%s. Start each with: physx client --connect %s "
                 "(and the token in %s, or in a file with --token-file)",
@@ -142,8 +142,11 @@ class ClientGroup:
 
     def lease(self, leases: Leases) -> None:
         """Have the clients, which are ready, simulate episodes instead of streams."""
-        self._pool = self._pool or self._make_pool()
-        self._pool.leases = leases
+        pool = self._pool
+        if not isinstance(pool, EpisodePool):
+            pool.close()
+            self.server.pool = pool = self._make_pool()
+        pool.leases = leases
         self.server.dispatch.update(leases.dispatch)
 
     def refuse(self, peer: Peer, error: PhysxError) -> None:
@@ -179,7 +182,7 @@ class ClientGroup:
         if was_busy:  # what arrived meanwhile may have waited to be read
             for each in self.server.peers.values():
                 each.pace.leave_out()
-        if self._pool is not None and not was_busy:
+        if self._is_shared and not was_busy:
             began = self._began  # others' episodes end this wait, but not that for a silent client
         self._began = began
         if began - self._served > _TICK / 10:
@@ -204,7 +207,7 @@ class ClientGroup:
                 briefly and raise nothing.
         """
         patience = 0.0
-        self._closing = True
+        self._pool.is_ending = True
         try:
             absent = [number for number in self._handles if self._find_peer(number) is None]
             stop([self._handles.pop(number) for number in absent], 0.0)
@@ -227,6 +230,15 @@ class ClientGroup:
     def _numbers(self) -> range:
         return range(1, self.config.places + 1)
 
+    @property
+    def _pool(self) -> StreamPool | EpisodePool:
+        return self.server.pool
+
+    @property
+    def _is_shared(self) -> bool:
+        """Whether any client can simulate what another one does."""
+        return isinstance(self._pool, EpisodePool)
+
     def _make_pool(self) -> EpisodePool:
         is_known = find_token(self.config.token_file) is not None
         is_open = self._launcher.by_hand or is_known
@@ -234,8 +246,7 @@ class ClientGroup:
 
     def _starting(self) -> list[int]:
         """Return the instances that the run waits for before it begins."""
-        is_enough = self._pool is not None and len(self.ready) >= self._pool.least
-        return [] if is_enough else self.absent
+        return [] if len(self.ready) >= self._pool.least else self.absent
 
     def _reserved(self) -> set[int]:
         """Return the instances for which the launcher has started a client that has not joined."""
@@ -300,19 +311,18 @@ class ClientGroup:
         return peer is not None and bool(peer.fields) and not peer.closed
 
     def _check_ended(self, now: float, listened_since: float) -> None:
-        if self._pool is not None and not self._closing:
+        if isinstance(self._pool, EpisodePool) and not self._pool.is_ending:
             self._check_pool(self._pool)
         for number in self._numbers:
             handle, peer = self._handles.get(number), self._find_peer(number)
             if peer is not None and peer.failure is not None:
-                if self._replaces(number, peer.failure):
+                if self._pool.replaces(number, peer.failure):
                     self._lose(number, peer.failure)
                 continue
             if peer is not None and peer.finished:
                 continue
             if peer is not None and peer.closed:
-                left = peer.has_left or (handle is None and not peer.violation)
-                self._lose(number, exit_error(number, peer, handle), left=left)
+                self._lose(number, exit_error(number, peer, handle))
             elif handle is not None and handle.exit_status() is not None:
                 # What it sent before it ended may still be in transit or unread.
                 since = self._exits.setdefault(number, now)
@@ -335,7 +345,7 @@ class ClientGroup:
     def _look_for_laggards(self, waited: Sequence[int]) -> None:
         """Report clients that the run waits for because they are much slower than the others."""
         now = self._served
-        if self._pool is not None or len(self._numbers) < 2 or now - self._looked < _TICK:
+        if self._is_shared or len(self._numbers) < 2 or now - self._looked < _TICK:
             return
         self._looked = now
         late = self.server.holding_up(waited)
@@ -358,50 +368,14 @@ class ClientGroup:
 
     # Replacing clients -----------------------------------------------------------------
 
-    def _replaces(self, number: int, error: PhysxError | None) -> bool:
-        """Return whether another client replaces one that failed, or left without an error."""
-        if self._pool is not None or self._given_up(number):
-            return False  # it does not go on where the other one ended
-        if error is None and self._launcher.by_hand:
-            return True
-        passing = error is None or isinstance(error, _PASSING)
-        return passing and self._restarts[number] < self.config.restarts
-
-    def _lose(self, number: int, error: PhysxError, *, left: bool = False) -> None:
-        """Replace a lost client.
-
-        Args:
-            number: The instance.
-            error: How it was lost.
-            left: Whether it closed the connection, as clients that were started by hand may.
-        """
-        if self._pool is not None:
-            self._lose_any(number, error, self._pool)
-            return
-        absent = self._launcher.by_hand and self._find_peer(number) is None
-        if absent or not self._replaces(number, None if left else error):
-            raise self._final(number, error)
-        text, _, details = str(error).partition("\n")
-        self._restarts[number] += not left
-        follows = self._describe_next(number, left)
-        _LOG.warning("%s. %s%s", text.rstrip("."), follows, details and "\n" + details)
-        handle = self._handles.pop(number, None)
+    def _lose(self, number: int, error: PhysxError) -> None:
+        """Replace a lost client, or do without it; raise its error if that ends the run."""
+        peer, handle = self._find_peer(number), self._handles.get(number)
+        again = self._pool.lose(number, error, peer, launched=handle is not None)
+        self._handles.pop(number, None)
         closes = not isinstance(error, ClientError)  # which takes a moment
         self._vacate(number, handle, _GRACE if closes else 0.0)
-        if not self._closing:
-            self._launch([number])
-
-    def _lose_any(self, number: int, error: PhysxError, pool: EpisodePool) -> None:
-        """Do without a client of which others can simulate the episodes, or start another one."""
-        peer, handle = self._find_peer(number), self._handles.pop(number, None)
-        if peer is not None and peer.has_left:
-            pool.leave(number)
-            again = False
-        else:
-            ready = peer is not None and bool(peer.fields)
-            again = pool.lose(number, error, ready=ready, launched=handle is not None)
-        self._vacate(number, handle)
-        if again and not self._closing:
+        if again and not self._pool.is_ending:
             self._launch([number])
 
     def _vacate(self, number: int, former: ClientHandle | None, patience: float = 0.0) -> None:
@@ -410,42 +384,6 @@ class ClientGroup:
         self.server.vacate(number)
         stop([] if former is None else [former], patience)
         self._exits.pop(number, None)
-
-    def _given_up(self, number: int) -> str:
-        """Return why an instance cannot be restarted although it could before; empty if it can."""
-        peer = self.server.peers.get(number)
-        return "" if peer is None or peer.journal is None else peer.journal.given_up
-
-    def _final(self, number: int, error: PhysxError) -> PhysxError:
-        """Add to an error that ends the run why its instance cannot be restarted, if so."""
-        if reason := self._given_up(number):
-            error.add_note(f"{reason}.")
-        if peer := self.server.peers.get(number):
-            self._sets.explain(number, peer.episode, error)
-        return error
-
-    def _describe_next(self, number: int, left: bool) -> str:
-        if self._closing:
-            return "The run was ending, and it has all its rows."
-        text = "Another client takes its place."
-        if self._launcher.by_hand:
-            text = (
-                f"The run waits up to {self.config.timeout:g} s for another client to take its "
-                f"place, at {self._public_address()}."
-            )
-        restart = f"Restart {self._restarts[number]} of {self.config.restarts}."
-        if not self.config.state_every and self._has_long_past(number):
-            text += (
-                f" It repeats {self.server.peers[number].received} rows first; with "
-                "EnvironmentConfig.state_every it would go on from a state."
-            )
-        return text if left else f"{restart} {text}"
-
-    def _has_long_past(self, number: int) -> bool:
-        """Return whether an instance has taken so long that its user may not want it repeated."""
-        peer, now = self.server.peers.get(number), self._clock.monotonic()
-        took = now - self._launched.get(number, now)
-        return peer is not None and peer.received > 1 and took > _LONG_PAST
 
     def _report_missing(self, waited: Sequence[int], began: float) -> None:
         """Report from time to time which clients are missing."""
@@ -480,7 +418,7 @@ class ClientGroup:
         return sorted(
             n
             for n in numbers
-            if self._pool is None or n in self._handles or self._find_peer(n) is not None
+            if not self._is_shared or n in self._handles or self._find_peer(n) is not None
         )
 
     def _find_silent(self, waited: Sequence[int], began: float) -> list[int]:
@@ -502,24 +440,8 @@ class ClientGroup:
         first: dict[str, Any] = {"heartbeat": min(_SAY_EVERY, self.config.timeout / 4)}
         if self._written is not None:
             first["folder"] = self._written.describe()
-        if self._pool is not None:
-            skip = dict.fromkeys(skip, 0)
-        first["state"] = self._find_state(peer)
+        first["state"] = None if peer.journal is None else peer.journal.newest.describe()
         return self._encode(peer.instance_id, skip=skip, **first)
-
-    def _find_state(self, peer: Peer) -> dict[str, Any] | None:
-        """Return the state with which a client begins: of its predecessor, or of an earlier run.
-
-        What a client of an earlier run has counted is not continued, as this run has not seen it.
-        """
-        if peer.journal is not None and peer.journal.state is not None:
-            state: dict[str, Any] = decode(peer.journal.state)
-            return state
-        past = None if self._pasts is None else self._pasts.former(peer.instance_id)
-        if past is None or not past.state:
-            return None
-        counts = {"rows": past.rows, "rejected": past.rejected, "orders": 0}
-        return {**counts, "shown": None, "requests": None, "state": past.state}
 
     def _encode(self, instance_id: int, **progress: Any) -> bytes:
         config = self.config

@@ -12,6 +12,7 @@ from physx_core.config import EnvironmentConfig
 from physx_core.errors import ConfigError, PhysxError, TooFewClientsError
 from physx_core.workers.launchers import describe_states
 from physx_core.workers.server.leases import Leases
+from physx_core.workers.server.peer import Peer
 
 _SAY_EVERY = 5.0
 _IDLE_LOSSES = 3  # in a row at the same place; then something is wrong there
@@ -24,8 +25,11 @@ class EpisodePool:
     Attributes:
         least: How many clients there must be.
         is_open: Whether others who know the token may start clients, besides the launcher.
+        is_ending: Whether no other client is needed.
         leases: The episodes that they simulate; None before the first one is ready.
     """
+
+    is_ending = False
 
     def __init__(self, config: EnvironmentConfig, clock: Clock, *, is_open: bool) -> None:
         """Begin without clients.
@@ -52,13 +56,23 @@ class EpisodePool:
                     f"{config.places} clients: raise max_clients."
                 )
 
-    def lose(self, number: int, error: PhysxError, *, ready: bool, launched: bool) -> bool:
-        """Give a lost client's episodes back, and log what follows.
+    def adopt(self, peer: Peer) -> None:
+        """Do nothing: a client begins without what earlier ones have left."""
+
+    def close(self) -> None:
+        """Do nothing: there is nothing to forget."""
+
+    def replaces(self, number: int, error: PhysxError | None) -> bool:
+        """Return False: no client goes on where another one ended."""
+        return False
+
+    def lose(self, number: int, error: PhysxError, peer: Peer | None, *, launched: bool) -> bool:
+        """Give the episodes of a client that is lost, or leaves, back, and log what follows.
 
         Args:
             number: Its place.
             error: How it was lost.
-            ready: Whether its environment was ready.
+            peer: Its connection; None: it has none.
             launched: Whether the launcher started it.
 
         Returns:
@@ -67,7 +81,10 @@ class EpisodePool:
         Raises:
             PhysxError: If another one would likely end in the same way.
         """
-        again = launched
+        if peer is not None and peer.has_left:
+            self._leave(number)
+            return False
+        again, ready = launched, peer is not None and bool(peer.fields)
         if launched and not ready and not self._config.is_elastic:
             raise error
         holds = self.leases is not None and number in self.leases.holders
@@ -84,7 +101,7 @@ class EpisodePool:
         _LOG.warning("%s. %s%s", text.rstrip("."), follows, details and "\n" + details)
         return again
 
-    def leave(self, number: int) -> None:
+    def _leave(self, number: int) -> None:
         """Give the episodes of a client that leaves to others."""
         if self.leases is not None:
             self.leases.release(number)

@@ -12,9 +12,9 @@ from physx_core.net.connection import Connection
 from physx_core.net.frames import FrameReader
 from physx_core.net.handshake import HANDSHAKE_LIMIT
 from physx_core.net.link import Link
-from physx_core.net.values import encode
-from physx_core.workers.row_codec import RejectedRows, RowQueue
-from physx_core.workers.server.journal import Journal
+from physx_core.workers.journal import Journal
+from physx_core.workers.pasts import Past
+from physx_core.workers.row_codec import ReceivedRows, RejectedRows
 from physx_core.workers.server.pace import Pace
 from physx_core.workers.server.validation import ClientState
 
@@ -72,7 +72,7 @@ class Peer(Connection):
         self.episode_fields: list[Field] = []
         self.is_independent = False
         self.row_fields: list[Field] = []
-        self.rows = RowQueue()
+        self.rows = ReceivedRows()
         self.received = self.granted = self.wanted = 0
         self.rejected = RejectedRows()
         self.rejected_limit = 0
@@ -118,11 +118,11 @@ class Peer(Connection):
         self.shown, self.journal = former.shown, former.journal
         self.episode = former.episode
         if self.journal is not None:
-            self._next_order = self.journal.first_order
-            self.resumed_requests = self.journal.resumed_requests
+            self._next_order = self.journal.newest.obeyed
+            self.resumed_requests = self.journal.newest.requests
 
     def keep_state(self, rows: int, state: ClientState) -> None:
-        """Keep a state for a client that takes its place.
+        """Keep a state for a client that takes its place, or a later run.
 
         Args:
             rows: How many rows came before it.
@@ -138,11 +138,12 @@ class Peer(Connection):
             raise ConnectionRefusedByPeerError("Its state is after rows that it has not sent.")
         if journal is None or journal.given_up:
             return
-        order, sent = journal.find_order(state["orders"]), self._next_order
-        if order is None or (sent is not None and order > sent):
+        newest, sent = journal.newest, self._next_order
+        sent = newest.next_order if sent is None else sent
+        if not newest.obeyed <= state["orders"] <= sent:
             raise ConnectionRefusedByPeerError("Its state is after orders that nobody gave.")
-        plain = {**state, "rows": rows, "requests": self.requests}
-        journal.keep_state(encode(plain), state["orders"], self.requests)
+        past, shown = Past(rows, state["state"], state["rejected"]), state["shown"]
+        journal.keep_state(past, obeyed=state["orders"], shown=shown, requests=self.requests)
 
     def hear(self, *, whole: bool) -> None:
         """Note a sign of life: a whole frame, or a substantial part of a long one.
@@ -153,14 +154,20 @@ class Peer(Connection):
         if whole or arrived - self._arrived >= _PIECE:
             self.heard, self._arrived = self._clock.monotonic(), arrived
 
-    def send(self, message: bytes) -> None:
+    def send(self, message: bytes, *, is_prediction: bool = False) -> None:
         """Send as much as the connection takes now; `flush` sends the rest.
 
         What a successor will need goes into the journal. A client that has just taken a place gets
         the orders from there, one after another.
+
+        Args:
+            message: The message.
+            is_prediction: Whether it answers a request for a prediction.
         """
         is_order = self.journal is not None and self.journal.record(
-            message, is_read=self._next_order is not None or self.requests < self.journal.answers
+            message,
+            is_prediction=is_prediction,
+            is_read=self._next_order is not None or self.requests < self.journal.answers,
         )
         if self._next_order is None or not is_order:
             self.send_once(message)

@@ -4,38 +4,33 @@ from __future__ import annotations
 
 import logging
 import selectors
-from collections.abc import Callable, Collection, Iterable, Mapping
-from types import MappingProxyType
+from collections.abc import Callable, Collection, Iterable
 
 from physx_core.components.services import Services
+from physx_core.config import EnvironmentConfig
 from physx_core.errors import (
     ConfigError,
     ConnectionRefusedByPeerError,
-    PhysxError,
     SampleError,
 )
 from physx_core.net.addresses import format_address
 from physx_core.net.frames import MAX_PAYLOAD, Frame, Kind, pack
-from physx_core.net.link import SOCKETS, Link, Transport
+from physx_core.net.link import Link, Transport
 from physx_core.net.listener import Listener
 from physx_core.net.liveness import is_loss
 from physx_core.net.pending import Handshakes
 from physx_core.net.remote_errors import decode_error, encode_error
 from physx_core.net.spin_wait import has_core_for_each
-from physx_core.workers.instance import NOTHING, Skip
 from physx_core.workers.parameter_sets import ParameterSets
-from physx_core.workers.pasts import Pasts
-from physx_core.workers.row_codec import unpack_rows
-from physx_core.workers.server.journal import Journal
+from physx_core.workers.server.episode_pool import EpisodePool
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.service_requests import ServiceRequests
+from physx_core.workers.server.stream_pool import StreamPool
 from physx_core.workers.server.validation import (
     check_environment_fields,
     check_row_fields,
-    check_rows,
     parse_fields,
     parse_parameters,
-    parse_state,
 )
 
 _HANDSHAKE_TIME = 5.0
@@ -53,57 +48,42 @@ class Server:
     Attributes:
         peers: Instance number to the connection of its client.
         token: Secret of the run.
+        pool: What clients do, and who takes the place of a lost one.
         dispatch: Handles the messages of clients, by their kind.
     """
 
     def __init__(
         self,
-        ip_address: str,
-        port: int,
-        instance_nb: int,
+        config: EnvironmentConfig,
         services: Services,
         setup: Callable[[Peer], bytes],
         token: str,
         sets: ParameterSets,
-        replaces: Callable[[int, PhysxError | None], bool],
-        journal_size: float,
-        skip: Skip = NOTHING,
-        reserved: Callable[[], Collection[int]] = tuple,
-        dispatch: Mapping[Kind, Callable[[Peer, Frame], None]] = MappingProxyType({}),
-        transport: Transport = SOCKETS,
-        pasts: Pasts | None = None,
+        pool: StreamPool | EpisodePool,
+        reserved: Callable[[], Collection[int]],
+        transport: Transport,
     ) -> None:
         """Store the arguments; `open` starts listening.
 
         Args:
-            ip_address: Address to listen at.
-            port: Port to listen at, 0 for any free one.
-            instance_nb: How many instances run.
+            config: Where to listen, and how many clients there may be.
             services: The services of the run, for the environments.
-            setup: Returns the payload that tells an instance's client what to run.
+            setup: Returns the payload that tells a client what to run.
             token: Secret of the run.
             sets: Chooses the instances' parameters.
-            replaces: Returns whether another client takes the place of one that failed with an
-                error, or left without one.
-            journal_size: Largest size in bytes of an instance's journal.
-            skip: What an earlier run already got from the instances.
-            reserved: Returns the instances that only clients that ask for them may run.
-            dispatch: Handles the messages about rows, by their kind, if clients do not just send
-                rows of streams.
+            pool: What clients do, and who takes the place of a lost one.
+            reserved: Returns the places that only clients that ask for them may take.
             transport: What connects the clients, and the clock that the server follows.
-            pasts: Keeps what a later run needs; None: nobody needs it.
         """
         self.peers: dict[int, Peer] = {}
         self.token = token
-        self._transport, self._clock = transport, transport.clock
-        self._ip_address, self._port, self._instance_nb = ip_address, port, instance_nb
+        self._clock = transport.clock
+        self._ip_address, self._port = config.ip_address, config.port
+        self._instance_nb = instance_nb = config.places
         self._spin_time = _SPIN_TIME if has_core_for_each(instance_nb) else 0.0
-        self._requests = ServiceRequests(services, sets, pasts)
-        self._services, self._pasts = services, pasts
-        self._setup, self._replaces, self._skip = setup, replaces, skip
-        self._journal_size = journal_size
-        self._reserved = reserved
-        self._ending = self._has_news = self._has_no_states = False
+        self._requests = ServiceRequests(services, sets)
+        self.pool, self._setup, self._reserved = pool, setup, reserved
+        self._ending = self._has_news = False
         self._listener = Listener[Peer](
             self._meet, self._give_up, encrypts=True, transport=transport
         )
@@ -114,14 +94,10 @@ class Server:
             Kind.PARAMETERS: _take_parameters,
             Kind.READY: self._take_ready,
             Kind.FIELDS: _take_fields,
-            Kind.WRONG: _take_wrong,
             Kind.ERROR: _take_error,
-            Kind.STATE: self._take_state,
             Kind.BYE: self._take_bye,
-            Kind.AGAIN: _take_sign_of_life,
             Kind.PING: _take_sign_of_life,
             **dict.fromkeys(_REQUESTS, self._requests.take),
-            **(dispatch or {Kind.ROWS: _take_rows}),
         }
 
     def open(self, host: str | None = None) -> None:
@@ -156,11 +132,6 @@ class Server:
         while self._answer_at_once(timeout, spin) and self._clock.monotonic() < until:
             spin = self._spin_time
         self._listener.timers.call_due()
-
-    def listen_to(self, peer: Peer, seconds: float) -> None:
-        """Handle what one client has sent, and nothing else; wait up to `seconds` for it."""
-        if self._transport.poll(peer.link).poll(1000 * seconds):
-            self._read(peer)
 
     def _answer_at_once(self, timeout: float, spin: float) -> bool:
         """Handle what has arrived; return whether it was only requests, all answered.
@@ -208,8 +179,7 @@ class Server:
         """Close all connections; calling it again does nothing."""
         for peer in self.peers.values():
             self._drop(peer)
-            if peer.journal is not None:
-                peer.journal.close()
+        self.pool.close()
         self._strangers.drop_all()
         self._listener.close()
 
@@ -246,7 +216,7 @@ class Server:
         peer = self.peers.get(number)
         if peer is None or not peer.is_awaited:
             return peer is None
-        return peer.vacant or not peer.is_lost or self._replaces(number, peer.failure)
+        return peer.vacant or not peer.is_lost or self.pool.replaces(number, peer.failure)
 
     def _meet(self, link: Link, name: str) -> None:
         peer = Peer(link, name, self._clock)
@@ -310,15 +280,8 @@ class Server:
             raise refusal
         peer.instance_id = wanted or free[0]
         peer.reader.limit = MAX_PAYLOAD
-        former = self.peers.get(peer.instance_id)
         self.peers[peer.instance_id] = peer
-        if former is not None:
-            peer.succeed(former)
-        else:
-            peer.received = self._skip.rows_of(peer.instance_id, self._instance_nb)
-            peer.rejected.count = self._skip.rejected_of(peer.instance_id)
-        if former is None and self._replaces(peer.instance_id, None):
-            peer.journal = Journal(peer.instance_id, self._journal_size)
+        self.pool.adopt(peer)
         peer.send(pack(Kind.SETUP, self._setup(peer)))
 
     def _give_up(self, peer: Peer) -> None:
@@ -342,22 +305,8 @@ class Server:
 
     def _take_ready(self, peer: Peer, frame: Frame) -> None:
         _take_ready(peer, frame)
-        if self._pasts is not None:
-            self._pasts.created(peer.instance_id, self._services)
-
-    def _take_state(self, peer: Peer, frame: Frame) -> None:
-        if frame.number:
-            state = parse_state(frame.payload)
-            peer.keep_state(frame.number, state)
-            self._requests.keep_state(peer, frame.number, state)
-        elif not self._has_no_states:
-            self._has_no_states = True
-            _LOG.warning(
-                "A client that takes the place of another one, also in a run that is resumed, will "
-                "repeat all rows since the last state, as instance %d gives none. %s",
-                peer.instance_id,
-                decode_error(frame.payload),
-            )
+        if peer.journal is not None:
+            peer.journal.end_creation()
 
 
 def _take_parameters(peer: Peer, frame: Frame) -> None:
@@ -376,8 +325,6 @@ def _take_ready(peer: Peer, frame: Frame) -> None:
     peer.is_independent = bool(frame.number)
     if peer.resumed_requests is not None:
         peer.requests = peer.resumed_requests
-    elif peer.journal is not None:
-        peer.journal.created = peer.requests
 
 
 def _take_fields(peer: Peer, frame: Frame) -> None:
@@ -390,26 +337,6 @@ def _take_fields(peer: Peer, frame: Frame) -> None:
             "The fields of its rows differ from those of its predecessor."
         )
     peer.row_fields, peer.has_told_fields = fields, True
-
-
-def _take_rows(peer: Peer, frame: Frame) -> None:
-    count = frame.number
-    if not peer.row_fields or not 0 < count <= peer.granted - peer.received:
-        raise ConnectionRefusedByPeerError(f"It sent {count} rows that nobody asked for.")
-    block = unpack_rows(frame.payload, peer.row_fields, count)
-    peer.last_step = check_rows(block, peer.row_fields, peer.instance_id, peer.last_step)
-    peer.rows.append(block, count)
-    peer.received += count
-    peer.pace.rows(count, goes_on=peer.received < peer.granted)
-
-
-def _take_wrong(peer: Peer, frame: Frame) -> None:
-    count = frame.number
-    if not peer.row_fields or not 0 < count <= peer.rejected_limit - peer.rejected.count:
-        raise ConnectionRefusedByPeerError(f"It sent {count} rejected rows that nobody asked for.")
-    block = unpack_rows(frame.payload, peer.row_fields, count)
-    check_rows(block, peer.row_fields, peer.instance_id, peer.last_step)
-    peer.rejected.append(block, count)
 
 
 def _take_sign_of_life(peer: Peer, frame: Frame) -> None:

@@ -9,15 +9,13 @@ import numpy as np
 
 from physx_core.components.services import Services
 from physx_core.errors import ConnectionRefusedByPeerError, PhysxError, UsageError
-from physx_core.net.frames import HEADER, Frame, Kind, pack
+from physx_core.net.frames import Frame, Kind, pack
 from physx_core.net.remote_errors import encode_error
 from physx_core.net.values import decode, pack_value
 from physx_core.typing import Batch, Sample
 from physx_core.workers.parameter_sets import ParameterSets
-from physx_core.workers.pasts import Past, Pasts
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.validation import (
-    ClientState,
     parse_choice,
     parse_events,
     parse_saved,
@@ -47,17 +45,15 @@ class ServiceRequests:
         batches: Whether requests for predictions are answered as one batch.
     """
 
-    def __init__(self, services: Services, sets: ParameterSets, pasts: Pasts | None) -> None:
+    def __init__(self, services: Services, sets: ParameterSets) -> None:
         """Store the services.
 
         Args:
             services: The services of the run.
             sets: Chooses the instances' parameters.
-            pasts: Keeps the answers to requests for predictions, and those of an earlier run; None:
-                nobody needs them.
         """
         self._services = services
-        self._sets, self._pasts = sets, pasts
+        self._sets = sets
         self._predict_batch: Callable[[Batch], Batch] | None = getattr(
             services, "predict_batch", None
         )
@@ -93,9 +89,10 @@ class ServiceRequests:
                 peer.pace.go_on()
                 return
         if frame.kind is Kind.PREDICT:
-            told = None if self._pasts is None else self._pasts.tell(peer.instance_id)
+            told = None if peer.journal is None else peer.journal.tell()
             if told is not None:
-                peer.send(pack(Kind.ANSWER if told[0] else Kind.REFUSAL, told[1], frame.number))
+                kind = Kind.ANSWER if told[0] else Kind.REFUSAL
+                peer.send(pack(kind, told[1], frame.number), is_prediction=True)
                 peer.pace.go_on()
                 return
             self._keep(peer, frame)
@@ -114,15 +111,6 @@ class ServiceRequests:
             peer.shown += 1
             self._services.show(peer.instance_id, frame.number, events)
 
-    def keep_state(self, peer: Peer, rows: int, state: ClientState) -> None:
-        """Keep a state for a later run, with what the run knows about the instance by now."""
-        if self._pasts is not None:
-            number = peer.instance_id
-            saved = self._services.load_parameters(number)
-            recorded, sets = self._sets.waiting(number)
-            past = Past(rows, state["state"], state["rejected"], recorded, sets, saved)
-            self._pasts.note(number, past)
-
     def _choose(self, peer: Peer, frame: Frame) -> None:
         if not peer.parameters:
             raise ConnectionRefusedByPeerError("It asked for parameters, but defined none.")
@@ -139,7 +127,8 @@ class ServiceRequests:
                     np.asarray(value)
             except ValueError:
                 refusal = UsageError(f'get_prediction() got "{name}", which is not an array.')
-                self._tell(peer, pack(Kind.REFUSAL, encode_error(refusal), frame.number))
+                message = pack(Kind.REFUSAL, encode_error(refusal), frame.number)
+                peer.send(message, is_prediction=True)
                 return
         if self._waiting:
             self.forget(peer)
@@ -175,7 +164,8 @@ class ServiceRequests:
             ]
         except PhysxError as error:
             for peer, number, _ in requests:
-                self._tell(peer, pack(Kind.REFUSAL, encode_error(error), number))
+                message = pack(Kind.REFUSAL, encode_error(error), number)
+                peer.send(message, is_prediction=True)
                 peer.pace.go_on()
             return
         except Exception as error:
@@ -183,16 +173,8 @@ class ServiceRequests:
             error.add_note(f"while handling the prediction for instance {numbers}")
             raise
         for (peer, _, _), message in zip(requests, messages, strict=True):
-            self._tell(peer, message)
+            peer.send(message, is_prediction=True)
             peer.pace.go_on()
-
-    def _tell(self, peer: Peer, message: bytes) -> None:
-        """Send the answer to a request for a prediction."""
-        if self._pasts is not None:
-            _, kind, _, _ = HEADER.unpack_from(message)
-            answer = kind == Kind.ANSWER, bytes(message[HEADER.size :])
-            self._pasts.answered(peer.instance_id, answer)
-        peer.send(message)
 
     def _predictions(self, requests: list[Request]) -> list[Sample]:
         if self._predict_batch is None or len(requests) == 1:
@@ -222,10 +204,7 @@ class ServiceRequests:
         except Exception as error:
             error.add_note(f"while handling {what} for instance {peer.instance_id}")
             raise
-        if what is _PREDICTION:
-            self._tell(peer, message)
-        else:
-            peer.send(message)
+        peer.send(message, is_prediction=what is _PREDICTION)
         peer.pace.go_on()
 
 

@@ -22,8 +22,7 @@ from physx_core.rows import concatenate
 from physx_core.sources.source import Source
 from physx_core.statistics import RunningStatistics
 from physx_core.typing import Batch
-from physx_core.workers.instance import Skip
-from physx_core.workers.pasts import Past
+from physx_core.workers.pasts import Past, Skip
 
 _CHUNK = 4096
 
