@@ -9,6 +9,11 @@ sequentially under the same limit; a small network trains on them at 0.5 or more
 with rows of 48 B, which are shuffled in blocks, and at 0.7 or more with rows of 48 kB, which are
 shuffled exactly; and the process grows by no more than the two windows of 16 MB in which rows are
 shuffled.
+
+What can be had without physx is printed beside it: a bare loop over the same files, which reads
+blocks of 64 kB in a random order, one window ahead in a thread, and takes the rows of a window in
+an order that it is given, or reads rows of 48 kB where they belong in a batch, announced to the
+system 8 MB ahead; and the training's steps alone, on a batch that is in memory.
 """
 
 from __future__ import annotations
@@ -18,7 +23,8 @@ import os
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -31,6 +37,7 @@ from physx_core.dataset.read.access import memory
 LIMIT = 384 * 2**20
 ROUNDS = 7
 GROWTH = 48
+HEADER, WINDOW = 4096, 256
 CASES = {
     "rows of 48 B": ({"x": (5,), "y": (1,)}, 4096, "blocks", 0.5),
     "rows of 48 kB": ({"x": (1000, 3), "y": (1000, 3)}, 32, "exact", 0.7),
@@ -48,9 +55,9 @@ def store(folder: Path, shapes: dict[str, tuple[int, ...]], size: int) -> None:
             dataset.append("training", rows)
 
 
-def files(folder: Path) -> list[Path]:
-    """Return the partition files."""
-    return sorted(folder.glob("*_training_*.h5"))
+def files(folder: Path, field: str = "") -> list[Path]:
+    """Return the partition files, of one field."""
+    return sorted(folder.glob(f"*_training_{field}*.h5"))
 
 
 def forget(folder: Path) -> None:
@@ -91,6 +98,91 @@ def shuffled(dataset: Dataset, batch_size: int, learn: Callable[..., None]) -> C
         return total
 
     return epoch
+
+
+def bare_blocks(folder: Path, row_nbytes: Sequence[int], batch_size: int) -> Callable[[], int]:
+    """Return a round of one epoch in blocks of 64 kB and windows of 256, without physx."""
+    block, rng = 2**16 // sum(row_nbytes), np.random.default_rng(0)
+    columns = [files(folder, field) for field in ("x", "y")]
+    places = [
+        (number, row)
+        for number, path in enumerate(columns[0])
+        for row in range(0, (path.stat().st_size - HEADER) // row_nbytes[0] - block, block)
+    ]
+    within = rng.permutation(WINDOW * block)
+
+    def read(chosen: Sequence[int]) -> list[np.ndarray]:
+        window = [np.empty((len(chosen) * block, n), np.uint8) for n in row_nbytes]
+        for slot, (number, row) in enumerate(places[each] for each in chosen):
+            for paths, values, nbytes in zip(columns, window, row_nbytes, strict=True):
+                descriptor = os.open(paths[number], os.O_RDONLY)
+                out = values[slot * block : (slot + 1) * block]
+                os.preadv(descriptor, [memoryview(out).cast("B")], HEADER + row * nbytes)
+                os.close(descriptor)
+        return window
+
+    def epoch() -> int:
+        forget(folder)
+        order = rng.permutation(len(places)).tolist()
+        pieces = [order[start : start + WINDOW] for start in range(0, len(order), WINDOW)]
+        outs, total = [np.empty((batch_size, n), np.uint8) for n in row_nbytes], 0
+        with ThreadPoolExecutor(1) as helper:
+            coming = helper.submit(read, pieces[0])
+            for following in [*pieces[1:], []]:
+                window, coming = coming.result(), helper.submit(read, following)
+                rows = within[within < len(window[0])] if len(window[0]) < len(within) else within
+                for start in range(0, len(rows) - batch_size + 1, batch_size):
+                    for values, out, n in zip(window, outs, row_nbytes, strict=True):
+                        kind = f"V{n}"
+                        index = rows[start : start + batch_size]
+                        np.take(values.view(kind), index, 0, out.view(kind), "clip")
+                    total += sum(out.nbytes for out in outs)
+        return total
+
+    return epoch
+
+
+def bare_rows(folder: Path, row_nbytes: Sequence[int], batch_size: int) -> Callable[[], int]:
+    """Return a round of one epoch of single rows in a random order, without physx."""
+    columns = [[os.open(path, os.O_RDONLY) for path in files(folder, f)] for f in ("x", "y")]
+    places = [
+        (number, HEADER + row)
+        for number, descriptor in enumerate(columns[0])
+        for row in range(0, os.fstat(descriptor).st_size - HEADER, row_nbytes[0])
+    ]
+    ahead = 2**23 // sum(row_nbytes)
+
+    def epoch() -> int:
+        forget(folder)
+        order, total = np.random.default_rng(0).permutation(len(places)).tolist(), 0
+        outs = [memoryview(bytearray(batch_size * n)) for n in row_nbytes]
+        for turn, chosen in enumerate(order):
+            if turn % ahead == 0:
+                for each in order[turn + ahead * (turn > 0) : turn + 2 * ahead]:
+                    number, at = places[each]
+                    for column, n in zip(columns, row_nbytes, strict=True):
+                        os.posix_fadvise(column[number], at, n, os.POSIX_FADV_WILLNEED)
+            (number, at), slot = places[chosen], turn % batch_size
+            for column, out, n in zip(columns, outs, row_nbytes, strict=True):
+                total += os.preadv(column[number], [out[slot * n : (slot + 1) * n]], at)
+        return total
+
+    return epoch
+
+
+def steps_alone(
+    shapes: Mapping[str, tuple[int, ...]], batch_size: int, learn: Callable[..., None]
+) -> Callable[[], int]:
+    """Return a round of a training's steps on one batch."""
+    batch = {name: np.random.default_rng(0).random((batch_size, *s)) for name, s in shapes.items()}
+    nbytes = sum(values.nbytes for values in batch.values())
+
+    def steps() -> int:
+        for _ in range(2 * LIMIT // nbytes):
+            learn(**batch)
+        return 2 * LIMIT // nbytes * nbytes
+
+    return steps
 
 
 def trainer(x_shape: tuple[int, ...], y_shape: tuple[int, ...]) -> Callable[..., None]:
@@ -136,8 +228,12 @@ def measure(root: Path, limited: bool) -> None:
 
                 return run
 
+            bare = bare_blocks if chosen == "blocks" else bare_rows
+            nbytes = [8 * int(np.prod(shape)) for shape in shapes.values()]
             candidates = {
                 "sequential read": sequential(folder),
+                "bare loop": bare(folder, nbytes, batch_size),
+                "steps alone": steps_alone(shapes, batch_size, step),
                 "batches": epoch(shuffled(dataset, batch_size, lambda **_: None)),
                 "training": epoch(shuffled(dataset, batch_size, step)),
             }

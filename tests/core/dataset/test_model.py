@@ -731,7 +731,8 @@ class Machine(RuleBasedStateMachine):
                     memory_of(free),
                     view.open(count, data=self.dataset, mode=mode, part=part) as batches,
                 ):
-                    found.append(np.concatenate([batch["n"].copy() for batch in batches]))
+                    rows = [batch["n"].copy() for batch in batches] or [np.zeros(0)]
+                    found.append(np.concatenate(rows))
                     place = [self.place(model, n) for n in found[-1].tolist()]
                     assert sorted(place) == batches.all_rows().tolist()
             except DatasetError as error:

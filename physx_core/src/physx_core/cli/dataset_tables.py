@@ -165,7 +165,9 @@ def _shape(shape: tuple[int, ...] | None, axes: tuple[str, ...]) -> str:
     """Return a shape as text, with the names of its axes."""
     if shape is None:
         return f"open: {', '.join(axes)}" if axes else "open"
-    return ", ".join(f"{n} {size}" for n, size in zip(axes, shape, strict=True)) or str(shape)
+    if not axes:
+        return str(shape)
+    return ", ".join(f"{name} {size}" for name, size in zip(axes, shape, strict=True))
 
 
 def _print_normalization(dataset: Dataset, mode: str) -> None:
