@@ -338,10 +338,11 @@ class Writer:
     def _counted(self, entry: Partition, listed: Sequence[Partition]) -> Partition:
         """Return a sealed partition with its rows in the mode's statistics if it has its own.
 
-        Those before it must be counted, perhaps as they are about to be `listed`.
+        Those before it must be counted, perhaps as they are about to be `listed`; partitions of
+        processes that write at the same time are counted as they come.
         """
         mode = self.store.manifest.modes[entry.mode]
-        place = mode.place(entry)
+        place = 0 if self.store.shared else mode.place(entry)
         before = mode.partitions[place - 1] if place else None
         counted = {(each.mode, each.key) for each in listed if each.counted}
         if before is not None and not (before.counted or (entry.mode, before.key) in counted):
