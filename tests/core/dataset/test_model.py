@@ -828,7 +828,8 @@ class Machine(RuleBasedStateMachine):
         sample = {name: block[0] for name, block in rows.items()}
         total = model.rows
         yield FieldShapeError, lambda: d.append(mode, {**rows, "n": np.zeros((count, 2), int)})
-        yield FieldShapeError, lambda: d.append(mode, {**rows, "n": np.zeros(count + 1, int)})
+        if len(rows) > 1:
+            yield FieldShapeError, lambda: d.append(mode, {**rows, "n": np.zeros(count + 1, int)})
         yield FieldTypeError, lambda: d.append(mode, {**rows, "n": rows["n"] + 0.5})
         yield UnknownFieldError, lambda: d.append(mode, {**rows, "unknown": rows["n"]})
         yield UnknownFieldError, lambda: d.append_sample(mode, {**sample, "unknown": 1})
