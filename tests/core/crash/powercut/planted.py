@@ -186,7 +186,11 @@ BUGS = (
         _instead(statistics_file, "write", _write_clearing_first),
     ),
     Bug("a new partition is not listed on the disk", _skip("sync", "append")),
-    Bug("the name of the list of new partitions is not synced", _skip("sync_folder", "append")),
+    Bug(
+        "the name of the list of new partitions is not synced",
+        _skip("sync_folder", "append"),
+        first=38,
+    ),
     Bug(
         "a durable append does not sync",
         _instead(OpenPartition, "append", _unsynced(OpenPartition.append)),
@@ -203,7 +207,7 @@ BUGS = (
         _instead(partition_format.Inspection, "certain", property(lambda self: True)),
     ),
     Bug("no marks are made", _instead(PartitionFile, "mark", _no_mark), first=17),
-    Bug("there is only one mark", _instead(PartitionFile, "mark", _mark_one_place), first=88),
+    Bug("there is only one mark", _instead(PartitionFile, "mark", _mark_one_place), first=184),
     Bug(
         "rows that follow lost ones are given out",
         _instead(recovery, "_discard_behind_gaps", lambda mode: None),
