@@ -219,7 +219,7 @@ BUGS = (
         "an update is not synced",
         _instead(syncing.Syncer, "note_path", lambda self, path: None),
     ),
-    Bug("a durable update does not sync", _skip("sync_file", "update")),
+    Bug("a durable update does not sync", _skip("sync_file", "note_path")),
     Bug(
         "rows with a digest are updated",
         _instead(OpenPartition, "settle", lambda self, names, last: None),
