@@ -236,7 +236,6 @@ BUGS = (
         first=62,
     ),
     Bug("merged files are listed before their names are synced", _merged_unsynced),
-    Bug("removed files may come back", _skip("sync_folder", "remove_files"), first=75),
     Bug("a checkpoint's files are not synced", _skip("sync_file", "_write"), checkpoints=True),
     Bug("a checkpoint's name is not synced", _skip("sync_folder", "_publish"), checkpoints=True),
     Bug(
