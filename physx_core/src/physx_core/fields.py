@@ -122,7 +122,11 @@ class Field:
     @property
     def statistics_shape(self) -> tuple[int, ...]:
         """Shape of its statistics: that of a value, but 1 for the axes they are pooled over."""
-        return tuple(1 if i in self.pooled else n for i, n in enumerate(self.shape or ()))
+        return self.pooled_shape(self.pooled)
+
+    def pooled_shape(self, axes: tuple[int, ...]) -> tuple[int, ...]:
+        """Return the shape of a value, but 1 for some axes."""
+        return tuple(1 if i in axes else n for i, n in enumerate(self.shape or ()))
 
     def is_resolution(self, shape: tuple[int, ...]) -> bool:
         """Return whether a shape differs from its own only in the axes that are `pooled`."""

@@ -15,6 +15,7 @@ from physx_core import (
 )
 from physx_core.dataset.read.access import memory
 from physx_core.errors import ConfigError, DatasetError
+from physx_core.views import sources
 
 WINDOW = {"past": ("x", [-1, 0]), "next": ("x", 1)}
 
@@ -84,6 +85,15 @@ def test_windows_are_learned_from_and_validated_with():
     assert len(held) == 32
     fields = checkpoint.read(training.checkpoint_path).fields
     assert fields["past"].shape == (2, 1)
+
+
+def test_trajectories_are_sought_once_for_all_parts(monkeypatch):
+    sought, find = [], sources.find_trajectories
+    monkeypatch.setattr(
+        sources, "find_trajectories", lambda rows: sought.append(rows) or find(rows)
+    )
+    training = train(View(sources={"a": 0.5, "b": 0.5}), ("x", "y"), epoch_nb=2)
+    assert len(sought) == 2 and training.validation_loss < 1e-6
 
 
 def test_a_training_that_ends_before_its_next_batch_keeps_its_last(tmp_path):

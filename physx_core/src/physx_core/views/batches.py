@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from copy import copy
 from dataclasses import replace
 from hashlib import blake2b
 from pathlib import Path
@@ -67,6 +66,7 @@ class Batches(Closeable):
         fields: Sequence[str] | None = None,
         dtype: DTypeLike | None = None,
         reuse: bool = False,
+        beside: Batches | None = None,
     ) -> None:
         """Open the data.
 
@@ -83,6 +83,8 @@ class Batches(Closeable):
             dtype: Type to convert floating-point fields to; None: no conversion.
             reuse: Whether every batch is in the same arrays, which is faster where a batch is
                 needed no longer than until the next.
+            beside: Batches of another part of the same rows, divided alike: their trajectories,
+                which may take a pass over the rows, are not sought again.
 
         Raises:
             ConfigError: If there is nothing to read, or the view does not fit the data.
@@ -98,7 +100,11 @@ class Batches(Closeable):
         self._mode = mode
         self._opened = contextlib.ExitStack()
         given = {None: 1.0} if data is not None else view.sources
-        self._sources = [self._open(name, data, snapshot) for name in given]
+        others = beside._sources if beside is not None else [None] * len(given)
+        self._sources: list[Source] = [
+            self._open(name, data, snapshot, other)
+            for name, other in zip(given, others, strict=True)
+        ]
         self.snapshot = {
             name or "": source.rows.snapshot
             for name, source in zip(given, self._sources, strict=True)
@@ -118,6 +124,7 @@ class Batches(Closeable):
         name: str | None,
         data: Dataset | str | Path | None,
         snapshot: Mapping[str, Sequence[int]] | None,
+        beside: Source | None,
     ) -> Source:
         dataset = data
         if not isinstance(dataset, Dataset):
@@ -128,7 +135,7 @@ class Batches(Closeable):
                 folder = dataset.directory
                 raise ConfigError(f"The snapshot has no rows of the source {name or folder}.")
             known = Snapshot(*snapshot[name or ""])
-        return Source(self.view, dataset, self._mode, self.part, known)
+        return Source(self.view, dataset, self._mode, self.part, known, beside)
 
     def _count(self, shares: Array) -> int:
         """Return the number of items of an epoch, and find out which source has which of them."""
@@ -170,7 +177,8 @@ class Batches(Closeable):
 
     def reading(self, fields: Sequence[str]) -> Batches:
         """Return the same batches, of other fields; they share the open files."""
-        other = copy(self)
+        other = object.__new__(type(self))  # `copy` would open the data again, as pickles do
+        other.__dict__ |= self.__dict__
         other._choose(fields, self._dtype, reuse=self._reuse)
         other._epoch, other._opened = None, contextlib.ExitStack()
         return other

@@ -41,7 +41,13 @@ class Source:
     """
 
     def __init__(
-        self, view: ViewOptions, dataset: Dataset, mode: str, part: Part, snapshot: Snapshot | None
+        self,
+        view: ViewOptions,
+        dataset: Dataset,
+        mode: str,
+        part: Part,
+        snapshot: Snapshot | None,
+        beside: Source | None = None,
     ) -> None:
         """Find the items.
 
@@ -51,6 +57,7 @@ class Source:
             mode: Mode of the rows.
             part: Which part of the trajectories.
             snapshot: The rows at some time; None: now.
+            beside: Another part of the same rows, whose trajectories have been found.
 
         Raises:
             ConfigError: If the view cannot be had of these rows.
@@ -60,13 +67,17 @@ class Source:
         self.rows = dataset.rows(mode, snapshot)
         self._view, self._drawn = view, (-1, np.zeros(0, np.intp))
         self._weights: Array | None = None
-        noun, found = self._find(part)
-        chosen = choose_part(view, part, self._chosen(found))
+        self._found: tuple[str, Trajectories] = (
+            self._find(part) if beside is None else beside._found
+        )
+        noun, found = self._found
+        named = self._chosen(found)
+        chosen = choose_part(view, part, named)
         taken, known = self.trajectories = len(chosen.rows), len(found.rows)
-        is_piece = part not in ("all", "training") and taken == known
-        self.division = f"{'a piece of each' if is_piece else taken} of {known} {_NOUNS[noun]}"
-        if is_piece and known == 1:
-            self.division = f"a piece of the only {noun}"
+        self.division = f"{taken} of {known} {_NOUNS[noun]}"
+        if part in ("validation", "test") and len(named.rows) < view.folds:
+            each = f"each of {taken} {_NOUNS[noun]}" if taken != 1 else f"the only {noun}"
+            self.division = f"a piece of {each}"
         self.items = Items(view, chosen)
         self.rows.loads = self.order == "exact"
 

@@ -60,8 +60,7 @@ class KeptCells(NamedTuple):
 def nothing(field: Field, pooled: tuple[int, ...] | None = None) -> KeptCells:
     """Return no cells of a field, whose statistics are pooled over some axes, or as kept."""
     axes = field.pooled if pooled is None else pooled
-    shape = (1 if axis in axes else size for axis, size in enumerate(field.shape or ()))
-    none = np.zeros((*shape, 0))
+    none = np.zeros((*field.pooled_shape(axes), 0))
     return KeptCells(np.zeros(0, np.uint64), Cells(np.zeros(0, np.int64), *(none,) * 4))
 
 

@@ -87,26 +87,14 @@ class StoredBatches:
                 f"train on. It has: {listed(dataset.modes)}."
                 f"{other_samples(dataset.directory, self.mode)}"
             )
-        replays = environment is not None and environment.load_samples
-        if environment is not None and config.view not in (_PLAIN, _ALL) and not replays:
-            raise ConfigError(
-                "DatasetConfig.view chooses among stored samples, but environments generate "
-                'these. Generate the samples first, or others in the mode "validation".'
-            )
-        for name in _NOT_REPLAYED if replays else ():
-            if getattr(config.view, name) != getattr(_PLAIN, name):
-                raise ConfigError(
-                    "Environments replay single rows of one dataset, each once: leave out "
-                    f"DatasetConfig.view.{name}."
-                )
+        generates = environment is not None and not environment.load_samples
+        if environment is not None:
+            _check_view(config.view, generates=generates)
         has_now = dataset.num_samples("validation") > 0
         had_mode = "validation" in self.snapshots if self.snapshots else has_now
         self._has_mode = had_mode and has_now  # else its samples were removed
         self._view = training_view(
-            config,
-            dataset.info,
-            has_validation=had_mode,
-            generates=environment is not None and not replays,
+            config, dataset.info, has_validation=had_mode, generates=generates
         )
 
     def _open(self, mode: str, view: View, size: int, part: Part = "training") -> Batches:
@@ -122,6 +110,7 @@ class StoredBatches:
             fields=self._names,
             dtype=self._data_type,
             reuse=True,
+            beside=None if part == "training" else self._training,
         )
         known = self.snapshots.get(mode)
         try:
@@ -258,3 +247,18 @@ class StoredBatches:
         if self._config.recompute_normalization and recompute:
             self.dataset.recompute_normalization(self.mode)
         return self.dataset.normalization_of(self.mode, self._config.normalize)
+
+
+def _check_view(view: View, *, generates: bool) -> None:
+    """Check that a view is one of what environments generate or replay."""
+    if generates and view not in (_PLAIN, _ALL):
+        raise ConfigError(
+            "DatasetConfig.view chooses among stored samples, but environments generate "
+            'these. Generate the samples first, or others in the mode "validation".'
+        )
+    for name in () if generates else _NOT_REPLAYED:
+        if getattr(view, name) != getattr(_PLAIN, name):
+            raise ConfigError(
+                "Environments replay single rows of one dataset, each once: leave out "
+                f"DatasetConfig.view.{name}."
+            )
