@@ -25,21 +25,19 @@ BATCH, VIEWS, WIDTH = 32, 8, 128
 
 
 def network(width: int) -> NetworkConfig:
-    kwargs = {"layers": [5, *[width] * 3, CELLS**2], "activation": "SiLU"}
-    kwargs["opt_fields"] = "temperature"
-    return NetworkConfig("torch/fc", kwargs, loss="MSELoss", optimizer="Adam", lr=1e-3)
+    how = {"layers": [5, *[width] * 3, CELLS**2], "activation": "SiLU", "opt_fields": "temperature"}
+    return NetworkConfig("torch/fc", how, loss="MSELoss", optimizer="Adam", lr=1e-3)
 
 
 def online(sampler, rows, seed, folder, given):
     """Train while simulating; return the session's parameters, and predictions."""
     environment = EnvironmentConfig(Heat, num_clients=2, seed=seed, sampler=sampler)
     buffer = {"capacity": rows // 2, "watermark": rows // 10, "views": VIEWS}
-    how = {"online": "physx/reservoir", "online_kwargs": buffer, "quiet": True}
-    training = Training(
+    with Training(
         network(WIDTH), None, environment, epoch_nb=1, batch_nb=VIEWS * rows // BATCH,
-        batch_size=BATCH, seed=seed, session_dir=str(folder), session_name="online", **how,
-    )  # fmt: skip
-    with training:
+        batch_size=BATCH, seed=seed, session_dir=str(folder), session_name="online", quiet=True,
+        online="physx/reservoir", online_kwargs=buffer,
+    ) as training:  # fmt: skip
         training.execute()
         (guess,) = training.learner.predict_in_training({"input": given}).values()
     with Dataset.open(training.session.path) as dataset:
