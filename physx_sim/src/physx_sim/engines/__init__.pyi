@@ -18,6 +18,8 @@ from .models.parts import Static as Static
 from .models.parts import layout_of as layout_of
 from .models.parts import read_parts as read_parts
 from .models.parts import static_poses as static_poses
+from .models.parts import without_armature as without_armature
+from .models.reading import read_robot as read_robot
 from .models.rigid_bodies import Joint as Joint
 from .models.rigid_bodies import RigidBody as RigidBody
 from .models.robot_files import EXAMPLE_DATA as EXAMPLE_DATA
@@ -26,9 +28,8 @@ from .models.robot_files import example_data_dir as example_data_dir
 from .models.robot_files import example_robot as example_robot
 from .models.robot_files import find_robot as find_robot
 from .models.robot_files import named_robots as named_robots
+from .models.robot_model import RobotModel as RobotModel
 from .models.shapes import CollisionShape as CollisionShape
-from .models.urdf import RobotModel as RobotModel
-from .models.urdf import read_robot as read_robot
 from .resistance import Resistance as Resistance
 from .rk4 import RK4_LACKS as RK4_LACKS
 from .rk4 import check_rk4 as check_rk4
