@@ -12,6 +12,7 @@ from .models.meshes import bounding_box as bounding_box
 from .models.meshes import bounding_capsule as bounding_capsule
 from .models.meshes import geometry_file as geometry_file
 from .models.meshes import read_vertices as read_vertices
+from .models.mjcf import is_mjcf as is_mjcf
 from .models.parts import MovableBody as MovableBody
 from .models.parts import Parts as Parts
 from .models.parts import Static as Static
@@ -30,6 +31,7 @@ from .models.robot_files import find_robot as find_robot
 from .models.robot_files import named_robots as named_robots
 from .models.robot_model import RobotModel as RobotModel
 from .models.shapes import CollisionShape as CollisionShape
+from .models.urdf_text import to_urdf as to_urdf
 from .resistance import Resistance as Resistance
 from .rk4 import RK4_LACKS as RK4_LACKS
 from .rk4 import check_rk4 as check_rk4
