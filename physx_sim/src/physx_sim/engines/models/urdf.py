@@ -3,22 +3,24 @@
 The engines' own readers of URDF disagree, so all engines get the numbers read here, and a file
 means the same in each of them:
 
-- `physx_sim.engines.models.shapes` reads the collision shapes. All meshes must exist.
+- `physx_sim.engines.models.shapes` reads the collision shapes, whose meshes must exist.
 - A link without mass gets 1e-9 kg and, unless it has moments of inertia, 1e-12 kg m².
-- Mimic joints are treated as ordinary joints.
+- Mimic joints are treated as ordinary joints, with a warning.
 - A position limit whose ends are equal or absent, or a velocity or effort limit that is 0 or
-  absent, counts as no limit: many files contain zeros for unknown limits.
+  absent, counts as no limit: many files contain zeros for unknown limits. So does, with a warning,
+  a lower limit above the upper one.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
+from physx_core.errors import listed
 from physx_sim import (
     JointSettings,
     Robot,
@@ -29,10 +31,10 @@ from physx_sim import (
 )
 from physx_sim.engines.models.inertias import MASSLESS, NEGLIGIBLE
 from physx_sim.engines.models.rigid_bodies import Inertial, Joint, Origin, RigidBody
-from physx_sim.engines.models.robot_files import check_meshes
+from physx_sim.engines.models.robot_files import missing_meshes
 from physx_sim.engines.models.robot_model import RobotModel, check_names
 from physx_sim.engines.models.shapes import shapes_of_robot
-from physx_sim.errors import ModelError
+from physx_sim.errors import MissingMeshesError, ModelError
 
 _MOVING = ("revolute", "continuous", "prismatic")
 _PLAIN = JointSettings()
@@ -51,7 +53,6 @@ def read_urdf(robot: Robot, path: Path, *, touching: bool) -> RobotModel:
         touching: Whether to read its collision shapes.
     """
     root = parse_urdf(path)
-    check_meshes(path, root, robot.package_dirs)
     tree = UrdfTree(root)
     if not robot.fixed_base and tree.links[0] == "world":
         raise ModelError("its root link is the world, which cannot float; use fixed_base=True")
@@ -61,12 +62,36 @@ def read_urdf(robot: Robot, path: Path, *, touching: bool) -> RobotModel:
             raise ModelError(f'joint "{name}" has the type "{kind}", which is not supported')
     if robot.root not in ("", tree.links[0]):
         raise ModelError(f'its root is "{tree.links[0]}", not "{robot.root}"')
-    moving = [joint.get("name", "") for joint in tree.joints if joint.get("type") in _MOVING]
-    check_names(robot, list(tree.links), moving)
+    moving = [joint for joint in tree.joints if joint.get("type") in _MOVING]
+    check_names(robot, list(tree.links), [joint.get("name", "") for joint in moving])
+    doubts = (*_odd_joints(moving), *_missing_meshes(robot, path, root))
     places = {name: place for place, name in enumerate(tree.links)}
     bodies = tuple(_body(robot, tree, name, places) for name in tree.links)
     shapes = shapes_of_robot(robot, path, tree) if touching else ()
-    return RobotModel(path, bodies, shapes)
+    return RobotModel(path, bodies, shapes, doubts)
+
+
+def _odd_joints(moving: Sequence[Element]) -> Iterator[str]:
+    """Yield what of the movable joints is not simulated as the file says."""
+    limits = [[_number(joint, "limit", end) for end in ("lower", "upper")] for joint in moving]
+    names = [joint.get("name", "") for joint in moving]
+    unlimited = [name for name, (low, high) in zip(names, limits, strict=True) if low > high]
+    if unlimited:
+        yield f"the lower limit is above the upper, so there is none: joints {listed(unlimited)}"
+    mimics = [joint.get("name", "") for joint in moving if joint.find("mimic") is not None]
+    if mimics:
+        yield f"joints that follow others (mimic) move freely: {listed(mimics)}. Command them, too"
+
+
+def _missing_meshes(robot: Robot, path: Path, root: Element) -> Iterator[str]:
+    """Yield which meshes do not exist, which is an error if they are needed for collisions."""
+    if robot.collisions != "none":
+        needed = missing_meshes(path, root.findall("link/collision"), robot.package_dirs)
+        if needed:
+            raise MissingMeshesError(str(path), needed)
+    missing = missing_meshes(path, [root], robot.package_dirs)
+    if missing:
+        yield f"{len(missing)} mesh file(s) do not exist, so they are not drawn: {listed(missing)}"
 
 
 def _body(robot: Robot, tree: UrdfTree, name: str, places: Mapping[str, int]) -> RigidBody:
@@ -85,8 +110,6 @@ def _body(robot: Robot, tree: UrdfTree, name: str, places: Mapping[str, int]) ->
 def _joint(joint: Element, all_settings: Mapping[str, JointSettings]) -> Joint:
     lower, upper = _number(joint, "limit", "lower"), _number(joint, "limit", "upper")
     name = joint.get("name", "")
-    if lower > upper:
-        raise ModelError(f'joint "{name}" has the lower limit {lower} above the upper {upper}')
     limited = joint.get("type") != "continuous" and lower < upper
     settings = all_settings.get(name, _PLAIN)
     return Joint(
