@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from urllib.parse import unquote, urlparse
 from xml.etree import ElementTree
@@ -219,11 +220,10 @@ def mesh_path(model: Path, name: str, package_dirs: Mapping[str, str | Path]) ->
     package, _, rest = name.removeprefix("package://").partition("/")
     if package in package_dirs:
         return Path(package_dirs[package]) / rest
-    around = model.parents
+    around = list(model.parents)
     near = [folder / rest for folder in around if folder.name == package]
-    beside = [folder / package / rest for folder in around]
-    renamed = [folder / rest for folder in around]
-    found = next((file for file in (*near, *beside, *renamed) if file.is_file()), None)
+    elsewhere = (folder / place for place in (f"{package}/{rest}", rest) for folder in around)
+    found = next((file for file in chain(near, elsewhere) if file.is_file()), None)
     return found or (near[0] if near else None)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import warnings
 from pathlib import Path
 
@@ -271,6 +272,12 @@ def test_what_is_left_out_is_named_once(tmp_path):
         assert part in text
 
 
+def test_without_mujoco_an_error_says_what_to_install(odd, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(ModelError, match=r"pip install .*physx.sim\[mjcf\]"):
+        read_robot(Robot(odd))
+
+
 @pytest.mark.parametrize(
     ("text", "options", "said"),
     [
@@ -281,13 +288,20 @@ def test_what_is_left_out_is_named_once(tmp_path):
         (ODD, {"root": "world", "fixed_base": False}, "is the world, which cannot float"),
         (ODD, {"root": "world", "feet": {"tap": 0.1}}, 'feet names "tap", which is not a link'),
         (
+            "<mujoco><worldbody>"
+            + 401 * '<body><geom size=".1"/></body>'
+            + "</worldbody></mujoco>",
+            {},
+            "401 bodies; a model may have 400",
+        ),
+        (
             '<mujoco><worldbody><body><joint name="b" type="ball"/><geom size="1"/></body>'
             "</worldbody></mujoco>",
             {},
             'joint "b" is a ball',
         ),
     ],
-    ids=["xml", "empty", "trees", "root", "floating", "feet", "ball"],
+    ids=["xml", "empty", "trees", "root", "floating", "feet", "bodies", "ball"],
 )
 def test_what_is_wrong_with_a_file_is_said(tmp_path, text, options, said):
     path = tmp_path / "wrong.xml"

@@ -31,6 +31,8 @@ WORLD = "world"
 """Root link of what is attached to the world."""
 _LARGEST = 2**24
 """Maximum size of a file, in bytes, without those that it includes."""
+_MOST = 400
+"""Maximum number of bodies, as of links in a URDF file."""
 _COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
 _ELEMENT = re.compile(rb"<([A-Za-z][\w:.-]*)")
 _NO_MASS = 0.0, np.zeros(3), np.zeros((3, 3))
@@ -116,6 +118,8 @@ class _File:
             self.model: Any = self.mujoco.MjModel.from_xml_path(str(path))
         except ValueError as error:
             raise ModelError(f"MuJoCo cannot read {path}: {error}") from error
+        if self.model.nbody > _MOST + 1:
+            raise ModelError(f"{path} has {self.model.nbody - 1} bodies; a model may have {_MOST}")
         model, free = self.model, int(self.mujoco.mjtJoint.mjJNT_FREE)
         roots = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
         self.floating = [b for b in roots if [*model.jnt_type[self.joints(b)]] == [free]]
