@@ -197,10 +197,11 @@ class DataGeneration(NewSessionPipeline):
         earlier: dict[int, int] = {}
         if streams is not None:
             missing = streams.missing(wanted, missing)
-            earlier, streams.earlier = streams.earlier, earlier
         if not missing:  # an earlier run has stored it
             self.batch = {}
             return
+        if streams is not None:
+            earlier, streams.earlier = streams.earlier, earlier
         source, dataset, mode = self.source, self.dataset, self._mode
         with record_beside_rows(source, dataset, mode, earlier):
             self.batch = source.batch(missing)
