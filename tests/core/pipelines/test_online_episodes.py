@@ -69,17 +69,19 @@ def test_episodes_may_fail():
     assert found[0] == found[1]
 
 
-def test_interrupted_training_simulates_what_has_no_record():
+@pytest.mark.parametrize("every", [0, 2])
+def test_interrupted_training_simulates_what_has_no_record(every):
     class Stopped(Training):
         def batch_end(self):
             if self.batch_id == 4:
                 raise KeyboardInterrupt
 
-    expected = result(train("whole", 2, training=RESERVOIR))
+    expected = result(train("whole", 2, training=RESERVOIR, state_every=every))
     Path("simulated.txt").unlink()
+    options = {"delay": 0.02, "state_every": every}
     with pytest.raises(KeyboardInterrupt):
-        train("stopped", 2, cls=Stopped, training=RESERVOIR, delay=0.02)
-    run = train("stopped", 3, training={**RESERVOIR, "resume": True}, delay=0.02)
+        train("stopped", 2, cls=Stopped, training=RESERVOIR, **options)
+    run = train("stopped", 3, training={**RESERVOIR, "resume": True}, **options)
     assert result(run) == expected
     begun, ended = simulated()
     assert sum(begun.values()) <= len(ended) + 2 * (2 + 3)
