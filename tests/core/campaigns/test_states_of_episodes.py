@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 import sizes
@@ -13,8 +14,12 @@ from simulated import Simulation, drawn
 
 from physx_core import DataGeneration, Dataset, DatasetConfig, EnvironmentConfig
 from physx_core.cli import main
+from physx_core.dataset import EpisodeStatus
+from physx_core.net import Kind, encode
+from physx_core.net.frames import HEADER, Frame
 from physx_core.plugins import resolve
 from physx_core.workers.episode_queue import EpisodeQueue
+from physx_core.workers.server.leases import Leases
 
 ENVS = Path(__file__).parents[1] / "programs" / "state_envs.py"
 VOYAGE = f"{ENVS}:Voyage"
@@ -83,6 +88,22 @@ def test_episodes_without_states_begin_anew_with_one_warning(simulation, said, n
     assert len(said("gives or takes no state")) == runs
 
 
+def test_what_an_episode_takes_is_the_sum_of_its_parts():
+    """A client gets several numbers at once only if they are short."""
+    sent, no_pace = [], SimpleNamespace(go_on=lambda: None)
+    client = {"instance_id": 1, "parameters": [], "row_fields": [], "episode_fields": []}
+    peer = SimpleNamespace(**client, send=sent.append, pace=no_pace, received=0)
+    leases = Leases(EpisodeQueue(100), lambda numbers: {})
+    leases.grant(peer, 1)
+    more, finished = int(EpisodeStatus.MORE), int(EpisodeStatus.FINISHED)
+    for part, (status, seconds) in enumerate([(more, 0.03), (more, 0.03), (finished, 0.001)]):
+        ended = [(0, 1, 0, part, status, seconds, "", {})]
+        frame = Frame(Kind.EPISODES, 0, bytearray(encode([ended, None])))
+        leases.dispatch[Kind.EPISODES](peer, frame)
+    leases.grant(peer, 1)
+    assert [HEADER.unpack_from(message)[-1] for message in sent] == [1, 1]
+
+
 # Resumed runs -----------------------------------------------------------------------------------
 
 
@@ -104,10 +125,10 @@ def generate(name, stop=0, **options):
     return kind.made
 
 
-def stored(name):
+def stored(name, mode="training"):
     with Dataset.open(f"sessions/{name}") as dataset:
         assert dataset.verify() == []
-        data = dataset["training"]
+        data = dataset[mode]
         return {field: data[field][:].tobytes() for field in data}
 
 
@@ -121,6 +142,15 @@ def test_a_resumed_run_goes_on_with_the_episode_that_was_begun(amount):
     assert made + rest <= NUMBERS * ROWS - ROWS - 45 + 2 * 30
     assert stored("run") == stored("whole")
     assert not list(Path("sessions/run/states").iterdir())
+
+
+def test_rejected_samples_before_a_state_are_stored_once():
+    options = {"env_kwargs": {"refuse": 6, "wait": 0.002}, "record_wrong_samples": True}
+    generate("whole", environment=options)
+    generate("run", ROWS + 45, environment=options)
+    generate("run", resume=True, environment=options)
+    assert stored("run", "wrong") == stored("whole", "wrong")
+    assert stored("run") == stored("whole")
 
 
 @pytest.mark.parametrize("damage", ["file", "rows", "none"])

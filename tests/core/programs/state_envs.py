@@ -159,10 +159,10 @@ class Voyage(Environment):
     independent_episodes = True
     made = stop = 0  # steps of this process; at which one it is interrupted, 0: none
 
-    def __init__(self, *, kills=(), pace=0.0, wait=0.0, life=0, rows=60, **kwargs):
+    def __init__(self, *, kills=(), pace=0.0, wait=0.0, life=0, rows=60, refuse=0, **kwargs):
         super().__init__(**kwargs)
         self.kills, self.pace, self.wait = list(kills), pace, wait
-        self.life, self.rows = life, rows
+        self.life, self.rows, self.refuse = life, rows, refuse
 
     def create(self):
         self.engine = Engine()
@@ -181,6 +181,9 @@ class Voyage(Environment):
         self.set_training_data(x=[self.engine.position, sum(self.seen)])
         if self.step_index == self.rows - 1:
             self.end_episode()
+
+    def check_sample(self):
+        return not self.refuse or self.step_index % self.refuse > 0
 
     def live(self):
         if simulation := current():

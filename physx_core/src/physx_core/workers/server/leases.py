@@ -247,6 +247,7 @@ class _Held:
         self._leases: list[tuple[Lease, range]] = []  # with numbers that have not ended
         self._parts: dict[int, int] = {}  # number of an episode that has begun to its next part
         self._pace: float | None = None  # seconds of an episode
+        self._spent = 0.0  # seconds of the parts of one that has not ended
 
     @property
     def left(self) -> list[range]:
@@ -275,8 +276,11 @@ class _Held:
     def note_pace(self, records: list[EpisodeRecord]) -> None:
         """Take note of what episodes have cost."""
         count = sum(each.count for each in records if each.status is not EpisodeStatus.MORE)
-        pace = sum(each.seconds for each in records) / max(1, count)
-        self._pace = 0.5 * (pace + (pace if self._pace is None else self._pace))
+        spent = self._spent + sum(each.seconds for each in records)
+        self._spent = 0.0 if count else spent
+        pace, before = spent / max(1, count), self._pace or 0.0
+        if count or pace > before:  # a part of an episode tells only that it is longer
+            self._pace = 0.5 * (pace + (before or pace))
 
     def add(self, lease: Lease, now: float) -> None:
         """Give it more numbers."""
