@@ -19,6 +19,7 @@ from physx_core.net import Kind, encode
 from physx_core.net.frames import HEADER, Frame
 from physx_core.plugins import resolve
 from physx_core.workers.episode_queue import EpisodeQueue
+from physx_core.workers.lease import Begun
 from physx_core.workers.server.leases import Leases
 
 ENVS = Path(__file__).parents[1] / "programs" / "state_envs.py"
@@ -86,6 +87,20 @@ def test_episodes_without_states_begin_anew_with_one_warning(simulation, said, n
     options = {"num_clients": 2, "retries": 100, "env_kwargs": {"kills": kills, "pace": 0.03}}
     assert simulate(4, kind, simulation=simulation, **options) == expected
     assert len(said("gives or takes no state")) == runs
+
+
+def test_an_episode_that_went_on_is_repeated_as_a_whole():
+    options = {"as_tcp_ip_client": False, "state_every": 4, "env_kwargs": {"wait": 0.01}}
+    config = EnvironmentConfig(VOYAGE, **options)
+    with leased(config, SEED, EpisodeQueue(1)) as source:
+        block = source.take()
+    begun = Begun(1, block.records[0].rows, *block.state[1:])
+    queue = EpisodeQueue(1, begun={0: begun})
+    with leased(config, SEED, queue) as source:
+        while not queue.is_done:
+            (record,) = source.take().records
+        assert record.part > 1
+        assert source.repeat(0, 1)["step"].tolist() == [*range(ROWS)]
 
 
 def test_what_an_episode_takes_is_the_sum_of_its_parts():

@@ -114,10 +114,13 @@ class LocalEpisodes(EpisodeSource):
 
     def take(self) -> EpisodeBlock:
         """Simulate the next episodes: see `EpisodeSource.take`."""
-        return self._settled(self._runner.run())
+        return self._settled(self._take_again(0))
 
     def _take_again(self, instance_id: int) -> EpisodeBlock:
-        return self._runner.run()
+        block = self._runner.run()
+        for record in block.records:
+            self._queue.follow(record)
+        return block
 
     def _lease(self) -> Lease | None:
         """Return the next numbers: at most twice as many as before, as sampling may be slow."""
