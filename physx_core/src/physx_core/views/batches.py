@@ -21,6 +21,7 @@ from physx_core.dataset.read.epochs import Epoch
 from physx_core.dataset.read.mode_statistics import compute_of
 from physx_core.dataset.read.shuffling import ItemOrder, key_of
 from physx_core.dataset.store.definitions import compare_fields
+from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.errors import ConfigError, DatasetError, UsageError
 from physx_core.fields import Field
 from physx_core.normalization import Measured, Normalization, Normalize, compute_normalization
@@ -395,7 +396,19 @@ class Batches(Closeable):
     def _statistics(self, of: Measured) -> RunningStatistics:
         total = RunningStatistics()
         for source in self._sources:
-            total.merge(compute_of(source.rows, of, source.items.ranges()))
+            total.merge(
+                self._statistics_of_increments(source, of)
+                if of.since
+                else compute_of(source.rows, of, source.items.ranges())
+            )
+        return total
+
+    def _statistics_of_increments(self, source: Source, of: Measured) -> RunningStatistics:
+        total, both = RunningStatistics(of.pooled), self.reading(of.names)
+        step = rows_per_block(sum(field.nbytes for field in both.fields.values()))
+        for start in range(0, source.count, step):
+            items = np.arange(start, min(start + step, source.count))
+            total.update(of.of(both._values(source, source.items.locate(items))))
         return total
 
     @property
