@@ -28,6 +28,7 @@ from physx_core.pipelines.learning.data_record import (
     describe_changes,
     record_data,
 )
+from physx_core.pipelines.learning.judging import NOT_JUDGED, Judgment, judge
 from physx_core.pipelines.learning.learner import Learner
 from physx_core.pipelines.learning.opening import DataOpening, join_group, open_dataset
 from physx_core.pipelines.learning.resuming import Start, can_resume, find_start
@@ -44,6 +45,7 @@ from physx_core.pipelines.storage import (
     reject_environments,
 )
 from physx_core.processes import Interrupt, deferred_interrupt, is_from_signal
+from physx_core.results import Result
 from physx_core.session import Session
 from physx_core.typing import Batch
 from physx_core.views.dataset_config import DatasetConfig
@@ -136,6 +138,10 @@ class Training(NewSessionPipeline):
     the loss after which to stop; None: never. The last network is kept in addition to "best"."""
     min_improvement: float = at_least(0, 0.0)
     """Smallest decrease below the best loss that counts as an improvement."""
+    rivals: str = field(default="all", metadata={"choices": ("all", "none")})
+    """Whether the network is judged at the end: "all" measures its errors on the samples that were
+    held back, and those of predictions that need no network, which get a tenth of the training's
+    time: the mean, no change, a linear map, and the nearest sample; "none" does not."""
     on_nan: str = field(default="stop", metadata={"choices": ("stop", "continue")})
     """What to do if a loss, gradient, or parameter is NaN or infinite: "stop" with an error and the
     previous checkpoint, or "continue" and ignore it."""
@@ -177,6 +183,7 @@ class Training(NewSessionPipeline):
     _told: Sequence[str] = field(init=False, repr=False, default=())
     _recorded: dict[str, float] | None = field(init=False, repr=False, default=None)
     _batches_read: int = field(init=False, repr=False, default=0)
+    _judgment: Judgment = field(init=False, repr=False, default=NOT_JUDGED)
 
     def __post_init__(self) -> None:
         """Store what was given in place of a configuration of the dataset as one."""
@@ -191,7 +198,7 @@ class Training(NewSessionPipeline):
         given = self.dataset_config
         return given if isinstance(given, DatasetConfig) else DatasetConfig()
 
-    def execute(self) -> None:
+    def execute(self) -> Result:
         """Train, and write a checkpoint to resume from however the training ends.
 
         Ctrl-C and SIGTERM end it after the current batch; a second signal ends it immediately,
@@ -232,6 +239,8 @@ class Training(NewSessionPipeline):
             self._check_condition(more, "epoch_condition")
             self.train_end()
             self._finish()
+            self._judge()
+        return self.result
 
     def train_begin(self) -> None:
         """Called before the first epoch, or before the epoch at which training resumes.
@@ -402,6 +411,21 @@ class Training(NewSessionPipeline):
             self.observers.note(self.stopped)
             self.session.note(self.stopped)
         self.save_checkpoint()
+
+    def _judge(self) -> None:
+        """Measure how good the network is, unless that is not wanted."""
+        if self._is_main and self.rivals != "none":
+            self._judgment = judge(self.learner, self.data.stored, self._duration, self._decided)
+
+    @property
+    def _decided(self) -> str:
+        """What the validation samples decided about the last network, in words."""
+        validates = self.validation_every > 0
+        scheduler = self.network_config.scheduler
+        name = scheduler if isinstance(scheduler, str) else getattr(scheduler, "__name__", "")
+        decided = ["when the training stopped"] if self.patience is not None and validates else []
+        decided += ["the learning rate"] if "Plateau" in name and validates else []
+        return " and ".join(decided)
 
     @property
     def stopped(self) -> str:
@@ -731,8 +755,6 @@ class Training(NewSessionPipeline):
             yield f"training loss {self.training_loss:.6g}"
         elif self.epoch_id >= self.epoch_nb:
             yield "nothing left to train: epoch_nb (--epoch-nb) is the total number of epochs"
-        if not math.isnan(self.validation_loss):
-            yield f"validation loss {self.validation_loss:.6g}"
         if not math.isinf(self.best.loss):
             yield f"smallest loss {self.best.loss:.6g}, after epoch {self.best.epoch}"
         if self.environment_config is not None:
@@ -741,6 +763,25 @@ class Training(NewSessionPipeline):
             yield from self.data.online.describe()
         if self.checkpoint_path is not None:
             yield f"checkpoint: {self.checkpoint_path}"
+
+    def _findings(self) -> dict[str, Any]:
+        judged, places = self._judgment, {"statistics": str(self.session.stats_dir)}
+        numbers = {
+            "loss/training": self.training_loss,
+            "loss/validation": self.validation_loss,
+            "loss/best": self.best.loss,
+            "predicted samples per s": judged.rate,
+        }
+        if self.checkpoint_path is not None:
+            places["checkpoint"] = str(self.checkpoint_path)
+        for name, dataset in self.data.stored.datasets.items():
+            places[f"dataset {name}".strip()] = str(dataset.directory)
+        return {
+            "numbers": {name: value for name, value in numbers.items() if math.isfinite(value)},
+            "parts": judged.parts,
+            "why": judged.why,
+            "places": places,
+        }
 
     def _next(self, error: BaseException | None) -> Iterable[str]:
         path = shlex.quote(str(self.session.path))
