@@ -26,7 +26,7 @@ from physx_core.views.batches import PAD, Batches
 
 MEAN, CLASS, LINEAR = "mean", "most frequent class", "linear map"
 UNCHANGED, NEAREST = "nothing changes", "nearest neighbor"
-_COMPARED = 20_000
+_COMPARED = 5_000
 """Number of samples on which rivals are compared; of more, batches at equal distances are."""
 _ALIKE = 0.5
 """Mean squared difference of consecutive rows, as a share of that of any two: suspicious below."""
@@ -190,9 +190,7 @@ class Judge:
             alike = steps < _ALIKE * spread
             why = _TRAJECTORY if alike else "nothing is known of episodes: blocks of rows count"
         fields = {
-            name: self._field(
-                name, part, whole[name], sums, unsaid=why if why == _TRAJECTORY else ""
-            )
+            name: self._field(name, part, whole[name], sums, is_said=why != _TRAJECTORY)
             for name in self._targets
             if name not in missing
         }
@@ -227,7 +225,6 @@ class Judge:
             if name == NEAREST and not part.is_apart:
                 continue
             try:
-                self._check(0)
                 common = rival.prepare(batch)
             except NotRunError as error:
                 self._drop(name, error)

@@ -26,7 +26,7 @@ class Judgment:
     why: str = ""
 
 
-NOT_JUDGED = Judgment(why='it was not measured (rivals="none")')
+NOT_JUDGED = Judgment(why='rivals is "none"')
 
 
 def judge(learner: Learner, stored: StoredBatches, seconds: float, used: str) -> Judgment:
