@@ -12,6 +12,8 @@ from physx_core.fields import Field
 from physx_core.results.result import Interval
 from physx_core.typing import Array, Index
 
+ERRORS = ("rmse", "relative_l2", "max", "accuracy", "balanced_accuracy")
+"""Names of errors; of the accuracies, larger values are better."""
 FEWEST = 8
 """Number of episodes below which nothing is said about chance."""
 _DRAWS = 2000
@@ -86,6 +88,11 @@ class Target:
         if len(shape) == len(own) + 1 and shape[:-1] == own:
             return np.asarray(predicted.argmax(axis=-1))
         return None
+
+
+def as_loss(name: str, value: float) -> float:
+    """Return an error, or of an accuracy what is missing to 1, and the other way round."""
+    return 1.0 - value if name.endswith("accuracy") else value
 
 
 class Errors:

@@ -49,7 +49,7 @@ class RivalResult:
 
     Attributes:
         errors: Its errors, as in `FieldResult.errors`; empty if it was not computed.
-        verdict: "wins" or "loses", of the network, if the errors differ by 1 % at least, and neither
+        verdict: "wins" or "loses", of the network, if the errors differ by 1 % at least and neither
             episodes drawn at random (a paired bootstrap) nor random signs of their differences
             leave more than 1 % to chance; else "even"; "unknown" if nothing can be said.
         ratio: The network's error divided by the rival's; NaN if the rival makes none.
