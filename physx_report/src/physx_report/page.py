@@ -1,0 +1,79 @@
+"""Page: one HTML file that opens from a disk and prints; it has no script."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from physx_core import files
+from physx_core.errors import PhysxError, SessionError
+from physx_report.blocks import Block, Figure, Table, Text
+from physx_report.run import Run
+from physx_report.section import all_sections
+
+NAME = "report.html"
+"""Name of the page in the session's folder."""
+
+
+def write_report(
+    session: str | Path, path: str | Path | None = None, *, trust: bool = False
+) -> Path:
+    """Write what a session has found to an HTML page; equal sessions give equal bytes.
+
+    Args:
+        session: The session's folder.
+        path: The page, which is replaced; None: ``report.html`` in the session's folder.
+        trust: Whether to import whatever code the session's files name.
+
+    Returns:
+        The page.
+
+    Raises:
+        SessionError: If the session has no result, or the page cannot be written.
+        PluginError: If a plugin's section fails.
+    """
+    with Run(session, trust=trust) as run:
+        place = run.path / NAME if path is None else Path(path)
+        sections = [(each.title, list(each.blocks(run))) for each in all_sections()]
+        kinds = ", ".join(kind.replace("_", " ") for kind in run.results)
+        text = _template().render(
+            title=f"{run.path.name}: {kinds}",
+            sections=[(title, _plain(blocks)) for title, blocks in sections if blocks],
+        )
+    try:
+        files.replace(place, text.encode())
+    except OSError as error:
+        raise SessionError(f"{place} cannot be written: {error}.") from error
+    return place
+
+
+def _plain(blocks: Iterable[Block]) -> list[tuple[str, Any]]:
+    """Return blocks as the template takes them, with the name of each kind."""
+    found: list[tuple[str, Any]] = []
+    for block in blocks:
+        match block:
+            case Text():
+                found.append(("text", block))
+            case Table():
+                found.append(("table", block))
+            case Figure():
+                content = base64.b64encode(block.svg.encode()).decode()
+                found.append(("figure", (content, block.caption)))
+            case _:
+                raise PhysxError(f"A section of a report has {block!r}, which is no block.")
+    return found
+
+
+@cache
+def _template() -> Any:
+    loader = PackageLoader("physx_report", "templates")
+    made = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True,
+    )  # fmt: skip
+    return made.get_template("page.html")
