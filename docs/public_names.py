@@ -38,6 +38,7 @@ FACES = {
     "physx_testing": ("",),
     "physx_formats": ("", "errors"),
     "physx_dart": ("",),
+    "physx_mujoco": ("",),
     "physx_torch": ("",),
     "physx_rerun": ("",),
     "physx_gym": (
