@@ -5,9 +5,11 @@ from __future__ import annotations
 import io
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from typing import Any
 
 import matplotlib as mpl
 import numpy as np
+from cycler import cycler
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Canvas
 
@@ -16,8 +18,8 @@ from physx_report.blocks import Figure
 
 TRUTH, PREDICTION, MUTED = "#222222", "#d1495b", "#7a869a"
 _CYCLE = ("#30638e", "#d1495b", "#2a9d8f", "#edae49", "#6d597a", "#7a869a")
-_STYLE = {
-    "axes.prop_cycle": mpl.cycler(color=_CYCLE),
+_STYLE: Any = {
+    "axes.prop_cycle": cycler(color=_CYCLE),
     "axes.spines.right": False,
     "axes.spines.top": False,
     "font.size": 9,

@@ -13,8 +13,9 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 from physx_core import files
 from physx_core.errors import PhysxError, SessionError
 from physx_report.blocks import Block, Figure, Table, Text
+from physx_report.errors import ReportError
 from physx_report.run import Run
-from physx_report.section import all_sections
+from physx_report.section import Section, all_sections
 
 NAME = "report.html"
 """Name of the page in the session's folder."""
@@ -35,11 +36,12 @@ def write_report(
 
     Raises:
         SessionError: If the session has no result, or the page cannot be written.
-        PluginError: If a plugin's section fails.
+        ReportError: If a section fails.
+        PluginError: If a plugin is broken.
     """
     with Run(session, trust=trust) as run:
         place = run.path / NAME if path is None else Path(path)
-        sections = [(each.title, list(each.blocks(run))) for each in all_sections()]
+        sections = [(each.title, _blocks(each, run)) for each in all_sections()]
         kinds = ", ".join(kind.replace("_", " ") for kind in run.results)
         text = _template().render(
             title=f"{run.path.name}: {kinds}",
@@ -50,6 +52,16 @@ def write_report(
     except OSError as error:
         raise SessionError(f"{place} cannot be written: {error}.") from error
     return place
+
+
+def _blocks(section: Section, run: Run) -> list[Block]:
+    try:
+        return list(section.blocks(run))
+    except PhysxError:
+        raise
+    except Exception as error:  # a plugin may raise anything
+        what = f"{type(error).__name__}: {error}"
+        raise ReportError(f'The section "{section.title}" of the report failed: {what}') from error
 
 
 def _plain(blocks: Iterable[Block]) -> list[tuple[str, Any]]:
@@ -65,7 +77,7 @@ def _plain(blocks: Iterable[Block]) -> list[tuple[str, Any]]:
                 content = base64.b64encode(block.svg.encode()).decode()
                 found.append(("figure", (content, block.caption)))
             case _:
-                raise PhysxError(f"A section of a report has {block!r}, which is no block.")
+                raise ReportError(f"A section of a report has {block!r}, which is no block.")
     return found
 
 

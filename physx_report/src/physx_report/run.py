@@ -7,8 +7,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from physx_core import Dataset, Result, read_scalars
-from physx_core.closeable import Closeable
+from physx_core import Closeable, Dataset, Result, read_scalars
 from physx_core.config import read_toml
 from physx_core.errors import DatasetError, SessionError
 from physx_core.pipelines import Unseen, open_unseen

@@ -14,8 +14,11 @@ from physx_report import write_report
 
 @dataclass
 class Report:
-    """Write what a run found to one HTML page: how good its network is and compared with what,
-    where it is good and bad, what was simulated, how it was made, and how to repeat it."""
+    """Write what a run found to one HTML page.
+
+    It says how good the network is and compared with what, where it is good and where it is bad,
+    what was simulated, and how to repeat the run.
+    """
 
     session: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="SESSION")]
     """The session's folder."""

@@ -24,8 +24,8 @@ def _blocks(run: Run) -> Iterator[Block]:
             file = shlex.quote(str(Path(run.path) / "config.toml"))
             again = f"physx {_COMMANDS[kind]} --config {file} --session-name again"
             yield Text([again], "code")
-    file = run.path / "info.txt"
-    lines = file.read_text(errors="replace").splitlines() if file.is_file() else []
+    info = run.path / "info.txt"
+    lines = info.read_text(errors="replace").splitlines() if info.is_file() else []
     versions = [line for line in lines if "physx-core " in line and ", " in line]
     if versions:
         yield Text([f"Versions: {versions[-1]}."])

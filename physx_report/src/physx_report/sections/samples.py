@@ -25,7 +25,14 @@ def _blocks(run: Run) -> Iterator[Block]:
     yield Text(list(result.summary), "verdict")
     modes = [mode for mode in dataset.modes if mode != EPISODES and dataset.num_samples(mode)]
     rows = [
-        [mode, name, str(field.shape), field.dtype, field.unit, f"{dataset.num_samples(mode):,}"]
+        [
+            mode,
+            name,
+            str(field.shape),
+            str(field.dtype),
+            field.unit,
+            f"{dataset.num_samples(mode):,}",
+        ]
         for mode in modes
         for name, field in dataset.fields(mode).items()
     ]

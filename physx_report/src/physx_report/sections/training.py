@@ -9,14 +9,20 @@ from physx_report.blocks import Block, Table
 from physx_report.run import Run
 from physx_report.section import Section
 
+_SHOWN = {"epoch": ("loss/training", "loss/validation"), "batch": ("loss/batch",)}
+
 
 def _blocks(run: Run) -> Iterator[Block]:
     result = run.training
     if result is None:
         return
     losses = {
-        "epoch": {n: s for (of, n), s in run.scalars.items() if of == "epoch" and "loss" in n},
-        "batch": {n: s for (of, n), s in run.scalars.items() if n == "loss/batch"},
+        timeline: {
+            name.removeprefix("loss/"): steps
+            for (of, name), steps in run.scalars.items()
+            if of == timeline and name in shown
+        }
+        for timeline, shown in _SHOWN.items()
     }
     for timeline, series in losses.items():
         if any(len(steps) > 1 for steps in series.values()):

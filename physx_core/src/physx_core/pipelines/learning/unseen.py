@@ -12,6 +12,8 @@ from physx_core.pipelines.learning.data_record import open_data, training_view
 from physx_core.pipelines.learning.learner import Learner, load_learner
 from physx_core.typing import Batch
 from physx_core.views.batches import Batches
+from physx_core.views.folds import Part
+from physx_core.views.view import View
 
 _BATCH = 256
 
@@ -64,7 +66,8 @@ def open_unseen(session: str | Path, *, trust: bool = False) -> Iterator[Unseen]
         view = training_view(config, info, has_validation=has_mode)
         view = replace(view, order="stored", weights=None, drop_last=False)
         alone = replace(view, sources={}, hold_back=False)
-        wanted = {"validation": (alone, "validation", "training")} if has_mode else {}
+        wanted: dict[str, tuple[View, str, Part]] = {}
+        wanted |= {"validation": (alone, "validation", "training")} if has_mode else {}
         if view.hold_back:
             wanted["validation"] = view, config.mode, "validation"
         if view.test_fold is not None:
@@ -72,9 +75,15 @@ def open_unseen(session: str | Path, *, trust: bool = False) -> Iterator[Unseen]
         parts = {
             name: opened.enter_context(
                 Batches(
-                    chosen, _BATCH, data=own, mode=mode, part=part, snapshot=taken.get(mode),
-                    fields=list(names), dtype=learner.config.data_type,
-                )  # fmt: skip
+                    chosen,
+                    _BATCH,
+                    data=own,
+                    mode=mode,
+                    part=part,
+                    snapshot=taken.get(mode),
+                    fields=list(names),
+                    dtype=learner.config.data_type,
+                )
             )
             for name, (chosen, mode, part) in wanted.items()
         }
