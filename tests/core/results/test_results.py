@@ -20,8 +20,9 @@ from physx_core import (
     Result,
     Training,
     View,
+    read_scalars,
 )
-from physx_core.errors import SessionError
+from physx_core.errors import ConfigError, SessionError
 from physx_core.results import read_results
 from physx_core.toy import Linear
 
@@ -337,3 +338,66 @@ def test_a_damaged_file_of_results_is_named():
         (Path("sessions/run/results.json")).write_bytes(content)
         with pytest.raises(SessionError, match=r"results\.json"):
             read_results("sessions/run")
+
+
+# Monitor ----------------------------------------------------------------------------------------
+
+
+class Drifting(Planted):
+    """Gets better for two epochs, while its loss stays the same, and then worse."""
+
+    epoch = 0
+
+    def predict(self, data):
+        return {"y": data["x"] @ MAP + abs(Drifting.epoch - 2)}
+
+
+def drifting(**options):
+    class Counting(Training):
+        def epoch_begin(self):
+            Drifting.epoch = self.epoch_id
+
+    return Counting(
+        NetworkConfig(Drifting), "data", epoch_nb=6, batch_nb=1, batch_size=50, quiet=True,
+        **options,
+    )  # fmt: skip
+
+
+def test_an_error_in_physical_units_decides_which_network_is_the_best_and_when_to_stop():
+    store(*noisy(noise=0))
+    training = drifting(monitor="error/y/rmse", patience=2)
+    found = training.execute()
+    assert training.best.epoch == 3 and training.epoch_id == 5
+    assert found["error/y/rmse/best"] == pytest.approx(0, abs=1e-5)
+    curve = read_scalars(training.session.path)["epoch", "error/y/rmse"]
+    assert list(curve.values()) == pytest.approx([2, 1, 0, 1, 2], abs=1e-5)
+    assert found.parts["validation"].used == "when the training stopped"
+    assert "smallest error/y/rmse" in str(found)
+
+
+@pytest.mark.parametrize(
+    ("options", "reason"),
+    [
+        ({"monitor": "error/z/rmse"}, "Did you mean"),
+        ({"monitor": "error/y/accuracy"}, "errors of this field are"),
+        ({"monitor": "error/y/rmse", "validation_every": 0}, "nothing is validated"),
+    ],
+)
+def test_what_cannot_be_monitored_is_refused(options, reason):
+    store(*noisy())
+    with pytest.raises(ConfigError, match=reason):
+        drifting(**options).execute()
+
+
+def test_of_an_accuracy_the_largest_decides():
+    x = RNG.normal(size=(1000, 3))
+    store(x, x[:, :2] > 0)
+    training = drifting(monitor="error/y/accuracy")
+    training.network_config = NetworkConfig(
+        type("Chosen", (Drifting,), {"predict": lambda self, data: {
+            "y": (data["x"][:, :2] > abs(Drifting.epoch - 2)).astype(float)}})
+    )  # fmt: skip
+    found = training.execute()
+    assert training.best.epoch == 3
+    assert found["error/y/accuracy/best"] == 1.0
+    assert "largest error/y/accuracy 1, after epoch 3" in str(found)

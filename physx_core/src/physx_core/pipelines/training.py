@@ -19,7 +19,7 @@ from physx_core.components.buffer import Buffer
 from physx_core.components.group import Group
 from physx_core.config import EnvironmentConfig, NetworkConfig, at_least, options, to_plain
 from physx_core.dataset import Dataset
-from physx_core.errors import ConfigError, DivergedError, PhysxError
+from physx_core.errors import ConfigError, DivergedError, PhysxError, listed
 from physx_core.observers import REPORT_SECONDS, statistics_observers
 from physx_core.pipelines.learning.bound_options import bound_options, check_bound
 from physx_core.pipelines.learning.components import create
@@ -28,7 +28,13 @@ from physx_core.pipelines.learning.data_record import (
     describe_changes,
     record_data,
 )
-from physx_core.pipelines.learning.judging import NOT_JUDGED, Judgment, judge
+from physx_core.pipelines.learning.judging import (
+    NOT_JUDGED,
+    Judgment,
+    check_monitor,
+    judge,
+    make_judge,
+)
 from physx_core.pipelines.learning.learner import Learner
 from physx_core.pipelines.learning.opening import DataOpening, join_group, open_dataset
 from physx_core.pipelines.learning.resuming import Start, can_resume, find_start
@@ -46,6 +52,8 @@ from physx_core.pipelines.storage import (
 )
 from physx_core.processes import Interrupt, deferred_interrupt, is_from_signal
 from physx_core.results import Result
+from physx_core.results.errors import as_loss
+from physx_core.results.judge import Judge
 from physx_core.session import Session
 from physx_core.typing import Batch
 from physx_core.views.dataset_config import DatasetConfig
@@ -133,6 +141,11 @@ class Training(NewSessionPipeline):
     validation_batch_size: int | None = at_least(1, None)
     """Number of validation samples predicted at once, in each process; None: `batch_size`. It
     changes the memory and the time that a validation takes, but not its losses."""
+    monitor: str | None = None
+    """What decides which network is the "best", when `patience` ends, and what a scheduler such as
+    "ReduceLROnPlateau" gets: an error on the validation samples in physical units, for example
+    "error/FIELD/relative_l2", all of which are then recorded; see `FieldResult.errors`. None: the
+    validation loss, or if nothing is validated the training loss."""
     patience: int | None = at_least(1, None)
     """Number of consecutive validations (epochs, if nothing is validated) without improvement of
     the loss after which to stop; None: never. The last network is kept in addition to "best"."""
@@ -183,6 +196,7 @@ class Training(NewSessionPipeline):
     _told: Sequence[str] = field(init=False, repr=False, default=())
     _recorded: dict[str, float] | None = field(init=False, repr=False, default=None)
     _batches_read: int = field(init=False, repr=False, default=0)
+    _errors: Judge | None = field(init=False, repr=False, default=None)
     _judgment: Judgment = field(init=False, repr=False, default=NOT_JUDGED)
 
     def __post_init__(self) -> None:
@@ -399,7 +413,20 @@ class Training(NewSessionPipeline):
             self.observers.predictions(*compared, self.epoch_id, "epoch")
         if self.on_nan == "stop" and not math.isfinite(self.validation_loss):
             raise self._diverged(f"the validation loss is {self.validation_loss}", 0)
-        return self.validation_loss
+        return self.validation_loss if self.monitor is None else self._monitor(values)
+
+    def _monitor(self, values: dict[str, float]) -> float:
+        """Measure the errors on the validation samples; return the one that decides."""
+        stored, monitor = self.data.stored, str(self.monitor)
+        self._errors = self._errors or make_judge(self.learner, stored)
+        found = self._errors.measure(stored.validation)
+        values |= {f"error/{name}": value for name, value in found.items()}
+        if monitor not in values:
+            raise ConfigError(
+                f"Training.monitor is {monitor!r}, but the errors of this field are: "
+                f"{listed(name for name in values if name.startswith('error/'))}."
+            )
+        return as_loss(monitor, values[monitor])
 
     def train_end(self) -> None:
         """Called after the last epoch; before the last checkpoint is written."""
@@ -415,7 +442,9 @@ class Training(NewSessionPipeline):
     def _judge(self) -> None:
         """Measure how good the network is, unless that is not wanted."""
         if self._is_main and self.rivals != "none":
-            self._judgment = judge(self.learner, self.data.stored, self._duration, self._decided)
+            self._judgment = judge(
+                *(self.learner, self.data.stored, self._duration, self._decided), self._errors
+            )
 
     @property
     def _decided(self) -> str:
@@ -432,7 +461,7 @@ class Training(NewSessionPipeline):
         """Why the training ends before its last epoch; empty if it does not."""
         if self.patience is None or self.epoch_id >= self.epoch_nb:
             return ""
-        return self.best.reason_to_stop(self.patience)
+        return self.best.reason_to_stop(self.patience, self.monitor)
 
     def validate(self) -> dict[str, float]:
         """Return the mean loss and other statistics over the validation samples."""
@@ -627,6 +656,10 @@ class Training(NewSessionPipeline):
         )
         self.data = opening.open(resources, dataset)
         self._prepare_learner(start)
+        self._errors = None
+        if self.monitor is not None:
+            validates = self.validation_every > 0 and self.data.stored.has_validation
+            check_monitor(self.monitor, self.learner, validates=validates)
         if start.checkpoint is not None and start.environment is None and self._is_main:
             self._tell_changed_data(start.config.mode)
         resources.push(self._close)
@@ -756,7 +789,7 @@ class Training(NewSessionPipeline):
         elif self.epoch_id >= self.epoch_nb:
             yield "nothing left to train: epoch_nb (--epoch-nb) is the total number of epochs"
         if not math.isinf(self.best.loss):
-            yield f"smallest loss {self.best.loss:.6g}, after epoch {self.best.epoch}"
+            yield self.best.describe(self.monitor)
         if self.environment_config is not None:
             yield describe_samples(self.data.dataset.directory)
         if self.data.online is not None:
@@ -769,7 +802,7 @@ class Training(NewSessionPipeline):
         numbers = {
             "loss/training": self.training_loss,
             "loss/validation": self.validation_loss,
-            "loss/best": self.best.loss,
+            f"{self.monitor or 'loss'}/best": as_loss(self.monitor or "", self.best.loss),
             "predicted samples per s": judged.rate,
         }
         if self.checkpoint_path is not None:

@@ -26,7 +26,7 @@ from physx_core.views.batches import PAD, Batches
 
 MEAN, CLASS, LINEAR = "mean", "most frequent class", "linear map"
 UNCHANGED, NEAREST = "nothing changes", "nearest neighbor"
-_COMPARED = 20_000
+_COMPARED = 5_000
 """Number of samples on which rivals are compared; of more, batches at equal distances are."""
 _ALIKE = 0.5
 """Mean squared difference of consecutive rows, as a share of that of any two: suspicious below."""
@@ -40,7 +40,8 @@ _NEIGHBORS = (
 )
 _NOUNS = {"episode": "episodes", "trajectory": "trajectories", "block": "blocks of rows"}
 _LEAST_SECONDS = 2.0
-_SHARE = 0.1
+_SHARE = 0.08
+"""Of the training's time; what else is measured takes the rest of a tenth."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,32 +91,22 @@ class Judge:
             validation; NaN before the first.
     """
 
-    def __init__(
-        self,
-        network: Predictor,
-        training: Batches,
-        seconds: float,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        """Learn from the samples that the network learned from.
+    def __init__(self, network: Predictor, training: Batches) -> None:
+        """Read some of the samples that the network learns from.
 
         Args:
             network: The network.
             training: Batches of these samples.
-            seconds: Duration of the training in s: its rivals get a tenth of it, and at least 2 s.
-            clock: Returns the time in s.
         """
-        self._network, self._clock = network, clock
-        self._training = training.reading(network.names)
-        self._seconds = max(_LEAST_SECONDS, seconds * _SHARE)
-        self._deadline = clock() + self._seconds
-        self._sample = TrainingSample(self._training, network.given)
+        self._network = network
+        with training.reading(network.names) as self._training:
+            self._sample = TrainingSample(self._training, network.given)
         fields, batch = self._training.fields, self._sample.batch
         self._targets = {
             name: Target.of(fields[name], batch[name], network.loss) for name in network.pairs
         }
+        self._rivals: dict[str, Rival] = {}
         self._why: dict[tuple[str, str], str] = {}
-        self._rivals = self._learn()
         self._predicted, self._predicting = 0, 0.0
 
     @property
@@ -125,15 +116,18 @@ class Judge:
 
     def _check(self, seconds: float) -> None:
         if self._clock() + seconds > self._deadline:
-            raise TooSlowError(
-                f"it takes longer than {self._seconds:.3g} s, a tenth of the training's time "
-                "(at least 2 s)"
-            )
+            raise TooSlowError(f"it takes longer than the {self._seconds:.3g} s that rivals have")
 
-    def _learn(self) -> dict[str, Rival]:
-        """Return the rivals that can be computed; keep why others cannot."""
+    def learn(self, seconds: float, clock: Callable[[], float] = time.monotonic) -> None:
+        """Let the rivals learn that can be computed, and keep why others cannot.
+
+        Args:
+            seconds: Duration of the training in s: the rivals get 8 % of it, and at least 2 s.
+            clock: Returns the time in s.
+        """
+        self._seconds, self._clock = max(_LEAST_SECONDS, seconds * _SHARE), clock
+        self._deadline = clock() + self._seconds
         sources: dict[str, tuple[str, int | None]] = {}
-        found: dict[str, Rival] = {}
         for name in self._targets:
             try:
                 sources[name] = same_quantity(name, self._network.given, self._training)
@@ -145,25 +139,41 @@ class Judge:
             NEAREST: lambda: Nearest(self._sample, self._targets, self._check),
         }
         if sources:
-            found[UNCHANGED] = Unchanged(sources)
+            self._rivals[UNCHANGED] = Unchanged(sources)
         for rival, make in makers.items():
             try:
                 self._check(0)
-                found[rival] = make()
+                self._rivals[rival] = make()
             except NotRunError as error:
                 self._drop(rival, error)
-        return found
 
     def _drop(self, rival: str, error: NotRunError) -> None:
         self._why |= {(rival, name): str(error) for name in self._targets}
 
+    def measure(self, batches: Batches) -> dict[str, float]:
+        """Return the network's errors, as ``FIELD/NAME``: see `FieldResult.errors`."""
+        sums = {name: Errors(of, batches.num_groups) for name, of in self._targets.items()}
+        missing: dict[str, str] = {}
+        with batches.reading(self._network.names) as reading:
+            for number in range(len(reading)):
+                batch = reading[number]
+                self._add(sums, self._predict(batch, missing), batch, reading.groups(number))
+        return {
+            f"{name}/{key}": value
+            for name, of in sums.items() if name not in missing
+            for key, value in of.errors()[0].items()
+        }  # fmt: skip
+
     def judge(self, part: Judged) -> PartResult:
-        """Measure all errors on a part of the data.
+        """Measure all errors on a part of the data; the rivals must have learned.
 
         Args:
             part: The samples.
         """
-        batches = part.batches.reading(self._network.names)
+        with part.batches.reading(self._network.names) as batches:
+            return self._judge(part, batches)
+
+    def _judge(self, part: Judged, batches: Batches) -> PartResult:
         groups, every = batches.num_groups, max(1, -(-batches.num_items // _COMPARED))
         whole = {name: Errors(target, groups) for name, target in self._targets.items()}
         sums = {
@@ -190,9 +200,7 @@ class Judge:
             alike = steps < _ALIKE * spread
             why = _TRAJECTORY if alike else "nothing is known of episodes: blocks of rows count"
         fields = {
-            name: self._field(
-                name, part, whole[name], sums, unsaid=why if why == _TRAJECTORY else ""
-            )
+            name: self._field(name, part, whole[name], sums, is_said=why != _TRAJECTORY)
             for name in self._targets
             if name not in missing
         }
@@ -207,9 +215,9 @@ class Judge:
 
     def _predict(self, batch: Batch, missing: dict[str, str]) -> Batch:
         """Return the network's predictions by true field; keep why there are none of some."""
-        begin = self._clock()
+        begin = time.monotonic()
         answer, found = self._network.predict(batch), {}
-        self._predicting += self._clock() - begin
+        self._predicting += time.monotonic() - begin
         self._predicted += len(next(iter(batch.values())))
         for name, predicted in self._network.pairs.items():
             guess = self._targets[name].decode(answer[predicted])
@@ -227,7 +235,6 @@ class Judge:
             if name == NEAREST and not part.is_apart:
                 continue
             try:
-                self._check(0)
                 common = rival.prepare(batch)
             except NotRunError as error:
                 self._drop(name, error)

@@ -49,8 +49,9 @@ class RivalResult:
 
     Attributes:
         errors: Its errors, as in `FieldResult.errors`; empty if it was not computed.
-        verdict: "wins" or "loses", of the network, if an interval over episodes excludes chance and
-            the errors differ by 1 % at least; else "even"; "unknown" if nothing can be said.
+        verdict: "wins" or "loses", of the network, if the errors differ by 1 % at least and neither
+            episodes drawn at random (a paired bootstrap) nor random signs of their differences
+            leave more than 1 % to chance; else "even"; "unknown" if nothing can be said.
         ratio: The network's error divided by the rival's; NaN if the rival makes none.
         interval: 99 % interval of that ratio over episodes; None if there are too few.
         why: Why it was not computed, or nothing can be said; else empty.
@@ -188,7 +189,7 @@ class Result:
         for name, part in self.parts.items():
             found += _part_lines(name, part)
         if self.why:
-            found.append(f"how good the network is, is not known: {self.why}")
+            found.append(f"not judged: {self.why}")
         return found
 
     def __str__(self) -> str:
@@ -213,7 +214,7 @@ class Result:
             notes = [*_missing(part), *([part.why] if part.why else [])]
             found += [f"<p>{escape(line)}</p>" for line in notes]
         if self.why:
-            found.append(f"<p>Not judged: {escape(self.why)}</p>")
+            found.append(f"<p>not judged: {escape(self.why)}</p>")
         return "\n".join(found)
 
 

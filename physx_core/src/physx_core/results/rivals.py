@@ -16,8 +16,11 @@ Check = Callable[[float], None]
 """Raises `TooSlowError` if there is less time left than so many s."""
 
 _FEWEST_ROWS = 32
-_WIDEST = 2000
+_WIDEST = 1500
 """Largest number of unknowns of the linear map; of more inputs, it is found from as many rows."""
+_OUTPUTS = 64
+"""Largest number of outputs that choose the penalty."""
+_SECONDS_PER_FLOP = 6e-11
 _PENALTIES = 10.0 ** np.arange(-9, 4, 2)
 _PROJECTED = 128
 _NEIGHBORS = 10_000
@@ -85,26 +88,53 @@ class Linear(Rival):
 
     def __init__(self, sample: TrainingSample, targets: Mapping[str, Target], check: Check) -> None:
         super().__init__(sample, targets, check)
-        x = sample.inputs
+        x, (fit, back) = sample.inputs, sample.split()
         if len(x) < _FEWEST_ROWS:
             raise NotRunError(f"{len(x)} samples in memory are too few")
-        some = np.arange(len(x))
         if x.shape[1] > _WIDEST < len(x):
             some = np.linspace(0, len(x) - 1, _WIDEST).astype(int)
-        fit, back = (np.intersect1d(part, some) for part in sample.split())
-        solve = _Solver(x[fit], check)
-        whole = _Solver(x[some], check)
-        self._maps = {}
-        for name, target in targets.items():
-            y = _numbers(target, sample.batch[name])
-            mean = y[some].mean(axis=0)
-            errors = solve.errors(y[fit] - mean, x[back], y[back] - mean)
-            penalty = _PENALTIES[int(np.argmin(errors))]
-            self._maps[name] = whole.map(y[some] - mean, penalty), mean
+            fit, back = np.intersect1d(fit, some), np.intersect1d(back, some)
+        x = x[np.concatenate([fit, back])]
+        y = {name: _numbers(target, sample.batch[name][np.concatenate([fit, back])])
+             for name, target in targets.items()}  # fmt: skip
+        size, width = min(x.shape), sum(each.shape[1] for each in y.values())
+        each = 2 / 3 * size**3
+        flops = (2 * x.size * size + (len(_PENALTIES) + 1) * each) * len(y) + 2 * size**2 * width
+        check(_SECONDS_PER_FLOP * flops)
+        self._known = x if x.shape[1] > len(x) else None
+        self._maps = {name: self._fit(x, values, len(fit)) for name, values in y.items()}
+
+    def _fit(self, x: Array, y: Array, fit: int) -> tuple[Array, Array]:
+        """Return the weights of what `prepare` returns, and the mean.
+
+        Args:
+            x: Inputs, shape (rows, columns).
+            y: Outputs, shape (rows, outputs).
+            fit: Number of rows to learn from, before those that choose the penalty.
+        """
+        mean = y[:fit].mean(axis=0)
+        few = np.unique(np.linspace(0, y.shape[1] - 1, _OUTPUTS).astype(int))
+        wanted = (y - mean)[:, few]
+        if self._known is None:
+            gram, right, left = x[:fit].T @ x[:fit], x[:fit].T @ wanted[:fit], x[fit:]
+        else:
+            gram = x @ x.T
+            left, right = gram[fit:, :fit], wanted[:fit]
+            whole, gram = gram, gram[:fit, :fit]
+        errors = [
+            float(np.square(left @ _solve(gram, right, p * fit) - wanted[fit:]).sum())
+            for p in _PENALTIES
+        ]
+        penalty, mean = _PENALTIES[int(np.argmin(errors))] * len(x), y.mean(axis=0)
+        if self._known is not None:
+            return _solve(whole, y - mean, penalty), mean
+        whole = gram + x[fit:].T @ x[fit:]
+        return _solve(whole, x.T @ (y - mean), penalty), mean
 
     def prepare(self, batch: Batch) -> Array:
-        """Return the inputs."""
-        return self._sample.read(batch)
+        """Return the inputs, or in dual form their products with those of the samples."""
+        inputs = self._sample.read(batch)
+        return inputs if self._known is None else inputs @ self._known.T
 
     def predict(self, name: str, batch: Batch, common: Array) -> Array:
         """Return what the map predicts."""
@@ -112,39 +142,9 @@ class Linear(Rival):
         return _from_numbers(self._targets[name], common @ weights + mean, batch[name].shape)
 
 
-class _Solver:
-    """Ridge regressions of the same inputs, with all penalties, from one decomposition."""
-
-    def __init__(self, x: Array, check: Check) -> None:
-        self._x, self._is_dual, self._check = x, x.shape[1] > len(x), check
-        size = min(x.shape)
-        check(1e-10 * x.size * size + 4e-10 * size**3)  # s, on a slow core
-        values, self._vectors = np.linalg.eigh(x @ x.T if self._is_dual else x.T @ x)
-        self._values = values.clip(min=0.0)
-
-    def _projected(self, y: Array) -> Array:
-        right = y if self._is_dual else self._x.T @ y
-        found: Array = self._vectors.T @ right
-        return found
-
-    def _filter(self, penalty: float) -> Array:
-        found: Array = 1.0 / (self._values + penalty * max(1, len(self._x)))
-        return found[:, None]
-
-    def errors(self, y: Array, x: Array, wanted: Array) -> list[float]:
-        """Return the squared error with each penalty for other samples."""
-        left, right = (x @ self._x.T if self._is_dual else x) @ self._vectors, self._projected(y)
-        found = []
-        for penalty in _PENALTIES:
-            self._check(1e-10 * left.size * right.shape[1])
-            error = left @ (right * self._filter(penalty)) - wanted
-            found.append(float(np.square(error).sum()))
-        return found
-
-    def map(self, y: Array, penalty: float) -> Array:
-        """Return the weights, shape (columns of x, columns of y)."""
-        found: Array = self._vectors @ (self._projected(y) * self._filter(penalty))
-        return self._x.T @ found if self._is_dual else found
+def _solve(gram: Array, right: Array, penalty: float) -> Array:
+    found: Array = np.linalg.solve(gram + penalty * np.eye(len(gram)), right)
+    return found
 
 
 class Nearest(Rival):
@@ -159,8 +159,9 @@ class Nearest(Rival):
             order = rng.permutation(width)
             begins = np.linspace(0, width, _PROJECTED, endpoint=False).astype(int)
             self._bins = order, rng.choice((-1.0, 1.0), width), begins
-        self._known = self._project(sample.inputs)[:_NEIGHBORS]
-        self._norms = np.square(self._known).sum(axis=1)
+        known = self._project(sample.inputs)[:_NEIGHBORS]
+        norms = np.square(known).sum(axis=1, keepdims=True)
+        self._known = np.hstack([-2 * known, norms]).T.copy()
 
     def _project(self, inputs: Array) -> Array:
         if self._bins is not None:
@@ -171,9 +172,10 @@ class Nearest(Rival):
     def prepare(self, batch: Batch) -> Array:
         """Return which sample is nearest to each row."""
         inputs, found = self._project(self._sample.read(batch)), []
-        for first in range(0, len(inputs), 256):
+        inputs = np.hstack([inputs, np.ones((len(inputs), 1), np.float32)])
+        for first in range(0, len(inputs), 64):
             self._check(0)
-            found.append((self._norms - 2 * inputs[first : first + 256] @ self._known.T).argmin(1))
+            found.append((inputs[first : first + 64] @ self._known).argmin(axis=1))
         return np.concatenate(found)
 
     def predict(self, name: str, batch: Batch, common: Array) -> Array:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from physx_core.errors import PhysxError
+from physx_core.errors import ConfigError, PhysxError, listed, nearest
 from physx_core.pipelines.learning.batches.stored import StoredBatches
 from physx_core.pipelines.learning.learner import Learner
 from physx_core.results import PartResult
+from physx_core.results.errors import ERRORS
 from physx_core.results.judge import Judge, Predictor
 
 
@@ -26,17 +27,15 @@ class Judgment:
     why: str = ""
 
 
-NOT_JUDGED = Judgment(why='it was not measured (rivals="none")')
+NOT_JUDGED = Judgment(why='rivals is "none"')
 
 
-def judge(learner: Learner, stored: StoredBatches, seconds: float, used: str) -> Judgment:
-    """Judge a network on the samples that were held back; no error of it ends the run.
+def make_judge(learner: Learner, stored: StoredBatches) -> Judge:
+    """Return what measures a network's errors.
 
     Args:
-        learner: The network.
+        learner: The network, which may go on learning.
         stored: The samples.
-        seconds: Duration of the training in s.
-        used: What the samples for validation decided about the network, in words.
     """
     network, loss = learner.network, learner.config.loss
     predictor = Predictor(
@@ -45,7 +44,22 @@ def judge(learner: Learner, stored: StoredBatches, seconds: float, used: str) ->
         dict(zip(network.opt_fields, network.pred_fields, strict=False)),
         loss if isinstance(loss, str) else getattr(loss, "__name__", ""),
     )
-    if not predictor.pairs:
+    return Judge(predictor, stored.training)
+
+
+def judge(
+    learner: Learner, stored: StoredBatches, seconds: float, used: str, known: Judge | None = None
+) -> Judgment:
+    """Judge a network on the samples that were held back; no error of it ends the run.
+
+    Args:
+        learner: The network.
+        stored: The samples.
+        seconds: Duration of the training in s.
+        used: What the samples for validation decided about the network, in words.
+        known: What measured its errors before, if anything.
+    """
+    if not (learner.network.opt_fields and learner.network.pred_fields):
         return Judgment(why="its fields have no true values (opt_fields)")
     try:
         unseen = stored.unseen(used)
@@ -54,8 +68,29 @@ def judge(learner: Learner, stored: StoredBatches, seconds: float, used: str) ->
                 why='no samples were held back: generate some of the mode "validation", or hold '
                 "back a part of stored ones (View.hold_back)"
             )
-        judge = Judge(predictor, stored.training, seconds)
+        judge = known or make_judge(learner, stored)
+        judge.learn(seconds)
         return Judgment({name: judge.judge(part) for name, part in unseen.items()}, judge.rate)
     except Exception as error:  # the network is stored already: a run must not fail for its result
         reason = str(error) if isinstance(error, PhysxError) else repr(error)
         return Judgment(why=f"measuring it failed: {reason}")
+
+
+def check_monitor(monitor: str, learner: Learner, *, validates: bool) -> None:
+    """Check that a training has the error that `Training.monitor` names.
+
+    Raises:
+        ConfigError: If it has not.
+    """
+    pairs = zip(learner.network.opt_fields, learner.network.pred_fields, strict=False)
+    known = [f"error/{name}/{error}" for name, _ in pairs for error in ERRORS]
+    if monitor not in known:
+        raise ConfigError(
+            f"Training.monitor is {monitor!r}, which is no error of this network."
+            f"{nearest(monitor, known)} It has: {listed(known)}."
+        )
+    if not validates:
+        raise ConfigError(
+            f"Training.monitor is {monitor!r}, an error on validation samples, but nothing is "
+            "validated: set validation_every, and hold samples back (View.hold_back)."
+        )

@@ -199,6 +199,11 @@ class StoredBatches:
         return found
 
     @property
+    def validation(self) -> Batches:
+        """The validation batches, in the order of writing."""
+        return self._validation
+
+    @property
     def training(self) -> Batches:
         """The batches of one epoch after another."""
         return self._training
