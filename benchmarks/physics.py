@@ -1,4 +1,4 @@
-"""Contacts and free motion of both engines against theory, and the time of a step with each solver.
+"""Contacts and free motion of all engines against theory, and the time of a step with each solver.
 
     python benchmarks/physics.py             # the figures of docs/contacts.md
     python benchmarks/physics.py --check     # exits with 1 if a default misses a target
@@ -25,12 +25,14 @@ import physx_gym  # noqa: F401 - registers the environments
 from physx_core import plugins
 from physx_sim import Box, Ground, Robot, Simulation, World, Wrench
 
-SOLVERS = {"dart": ("nsgs", "fbf", "dantzig"), "pinocchio": ("pgs",)}
+SOLVERS = {"dart": ("nsgs", "fbf", "dantzig"), "pinocchio": ("pgs",), "mujoco": ("newton",)}
 GRAVITY = 9.81
 PAIRS = [(engine, solver) for engine, solvers in SOLVERS.items() for solver in solvers]
 ANGLES = (0, 15, 30, 45)
 FRICTION = 0.3
 """Friction of the feet of the pushed A1."""
+WORST = {"dart": 0.01, "pinocchio": 0.01, "mujoco": 0.02}
+"""Largest error of friction. MuJoCo's soft contacts creep before they slip."""
 STAND = np.tile([0.0, 0.8, -1.6], 4)
 
 _ROD = (
@@ -231,7 +233,7 @@ def times() -> None:
 
 
 def environments() -> float:
-    """Print the steps per second of Ant-v0 on both engines; return the ratio."""
+    """Print the steps per second of Ant-v0 on each engine; return Pinocchio's over DART's."""
     candidates = {engine: _episodes(engine) for engine in SOLVERS}
     measured = rates(candidates, 5, time.process_time)
     report("physx/Ant-v0, random actions", "steps", measured, "dart", 0.0)
@@ -273,7 +275,7 @@ def main() -> None:
     print()
     for engine, solvers in SOLVERS.items():
         worst = max(errors[engine, solvers[0]].values())
-        met.append(claim(f"{engine}: largest error of friction", worst, at_most=0.01))
+        met.append(claim(f"{engine}: largest error of friction", worst, at_most=WORST[engine]))
         met.append(
             claim(
                 f"{engine}: A-frame at 50°, µ = 0.62 stands",

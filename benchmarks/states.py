@@ -5,6 +5,7 @@
 
 killed: a stream of 10 s whose process is killed every 3 s ends within 1.5 times as long. Without
 states it never ends.
+episode: the same for an independent episode.
 age: after a kill, a stream that is ten times older goes on after at most 1.2 times as long.
 resumed: the same after ``kill -9`` of the whole run and ``--resume``.
 journal: for 3 000 rows that each ask for 5 predictions of 32 kB, 480 MB in all, the journal holds
@@ -70,6 +71,16 @@ class Walk(Environment):
         self.set_training_data(position=self.position)
 
 
+class Trip(Walk):
+    """An independent episode."""
+
+    episode_steps = round(WORK / STEP)
+
+    def reset_parameters(self) -> None:
+        """Return to the origin."""
+        self.position = np.zeros(100)
+
+
 class Services:
     """Predictions of 32 kB."""
 
@@ -130,6 +141,24 @@ def check_killed() -> bool:
         killed = seconds_of_rows(rows)
     print(f"A stream alone {alone:.1f} s, killed every {INTERVAL:g} s {killed:.1f} s")
     return claim("killed, times as long", killed / alone, at_most=1.5)
+
+
+def seconds_of_episode(name: str) -> float:
+    """Return the time that a run with one episode takes."""
+    file, paused = Path(__file__).resolve(), {"pause": STEP}
+    config = EnvironmentConfig(f"{file}:Trip", env_kwargs=paused, retries=1000, state_every=EVERY)
+    began = time.monotonic()
+    DataGeneration(config, session_name=name, episodes=1, quiet=True).execute()
+    return time.monotonic() - began
+
+
+def check_episode() -> bool:
+    """Kill the client of an episode again and again until it has ended."""
+    alone = seconds_of_episode("alone")
+    with killing(INTERVAL):
+        killed = seconds_of_episode("killed")
+    print(f"An episode alone {alone:.1f} s, killed every {INTERVAL:g} s {killed:.1f} s")
+    return claim("episode killed, times as long", killed / alone, at_most=1.5)
 
 
 def seconds_to_continue(age: int) -> float:
@@ -229,6 +258,7 @@ def check_states() -> bool:
 
 CHECKS: dict[str, Callable[[], bool]] = {
     "killed": check_killed,
+    "episode": check_episode,
     "age": check_age,
     "resumed": check_resumed,
     "journal": check_journal,

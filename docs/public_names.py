@@ -38,6 +38,7 @@ FACES = {
     "physx_testing": ("",),
     "physx_formats": ("", "errors"),
     "physx_dart": ("",),
+    "physx_mujoco": ("",),
     "physx_torch": ("",),
     "physx_rerun": ("",),
     "physx_gym": (
@@ -47,6 +48,7 @@ FACES = {
     ),
     "physx_remote": ("", "errors"),
     "physx_cluster": ("", "sweep", "errors"),
+    "physx_report": ("", "drawing", "errors"),
 }
 MODULES = [f"{root}.{name}".rstrip(".") for root, names in FACES.items() for name in names]
 

@@ -48,7 +48,7 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 APART = "pytest.mark.processes"  # in a file whose tests start processes
 STARTS = ("subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.system")
 RUNNING = {"quick": False}  # what kind of test
-DAYS = 8
+DAYS = 12
 """After so many days each case was in a sample."""
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import signal
 import subprocess
@@ -156,6 +157,17 @@ def clients(services, nothing_stays_behind):
         return ClientSource(settings, services, SEED, run_ahead=run_ahead, total=total)
 
     return make
+
+
+@pytest.fixture
+def said(caplog):
+    """Return a function: what physx said that matches a pattern."""
+
+    def find(pattern=""):
+        texts = [record.getMessage() for record in caplog.records if record.name == "physx"]
+        return [text for text in texts if re.search(pattern, text)]
+
+    return find
 
 
 @pytest.fixture

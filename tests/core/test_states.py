@@ -215,6 +215,7 @@ def parts_of(value: Any) -> list[Any]:
     return [part for pair in vars(value).items() for part in pair]
 
 
+@pytest.mark.slow
 @settings(max_examples=200, deadline=None)
 @given(RECIPES, RECIPES)
 def test_random_graphs(recipe, added):

@@ -140,6 +140,7 @@ def test_files_of_the_first_version_are_read(tmp_path, folder):
         assert dataset.fields("training")["force"].role == "additional"
 
 
+@pytest.mark.slow
 def test_rows_that_are_no_samples_are_named(tmp_path, folder):
     cases = {
         "missing": ([X[0], None, X[2]], "Row 1 .* has no value"),

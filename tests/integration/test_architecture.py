@@ -8,6 +8,7 @@ PACKAGES = (
     "testing",
     "formats",
     "dart",
+    "mujoco",
     "torch",
     "rerun",
     "gym",

@@ -119,7 +119,7 @@ RECORDS = {
     *("Layout", "Part", "State", "AppliedWrench", "MotorState", "SensorState", "RobotInfo"),
     *("UrdfShape", "Episode", "StepperState", "Result", "Trial", "Normalization"),
     *("CollisionShape", "Joint", "MovableBody", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
-    *("Kind", "Format", "Table"),
+    *("Kind", "Format", "Table", "Section"),
 }
 ABSTRACT = {"Pipeline", "Sensor"}
 
@@ -197,6 +197,7 @@ CASES.remove((physx_core.DataGeneration, "episodes"))  # instead of batches
 CASES += [(physx_core.Parameter, option) for option in ("low", "high", "mean", "deviation")]
 
 
+@pytest.mark.slow  # imports all packages
 def test_every_public_description_is_covered_with_a_number_in_each_option() -> None:
     assert declared().keys() <= GIVEN.keys(), "add options for the new description to GIVEN"
     for cls, option in CASES:

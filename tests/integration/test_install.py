@@ -14,8 +14,9 @@ import pytest
 pytestmark = [pytest.mark.slow, pytest.mark.processes]
 
 PACKAGES = (
-    *("physx_core", "physx_testing", "physx_sim", "physx_formats", "physx_dart", "physx_torch"),
-    *("physx_rerun", "physx_gym", "physx_remote", "physx_cluster"),
+    *("physx_core", "physx_testing", "physx_sim", "physx_formats", "physx_dart", "physx_mujoco"),
+    *("physx_torch", "physx_rerun", "physx_gym", "physx_remote", "physx_cluster"),
+    "physx_report",
 )
 PHYSX = ("-m", "physx_core")
 GENERATE = "--batch-nb 2 --batch-size 10"
@@ -58,6 +59,16 @@ try:
     resolve("backend", "dart")
 except PluginNotFoundError as error:
     print(error)
+"""
+LOWER = """
+from physx_core.plugins import resolve
+from physx_sim import JointSettings, Robot, World
+
+crane = Robot("crane.urdf", joints={"lift": JointSettings("velocity")})
+with resolve("backend", "mujoco").build(World([crane])) as simulation:
+    simulation.set_commands([0.5])
+    simulation.step(1000)
+    print(f"{simulation.positions()[0]:.1f} m")
 """
 ASK = """
 import socket, sys
@@ -196,6 +207,15 @@ def test_sim_reads_a_robot_and_has_no_engine(python, add, run, tmp_path):
     assert 'No plugin "dart" is installed' in done and "pip install" in done
 
 
+@pytest.mark.faults
+def test_mujoco_simulates_without_the_other_engines(python, add, run, tmp_path):
+    add("physx_mujoco")
+    assert not {"dartpy", "pin"} & installed(python)
+    (tmp_path / "crane.urdf").write_text(CRANE)
+    (tmp_path / "program.py").write_text(LOWER)
+    assert "0.5 m" in run("program.py", python=python).stdout
+
+
 def test_formats_exports_and_imports(python, add, run, tmp_path):
     add("physx_formats")
     generate(run, python)
@@ -208,6 +228,13 @@ def test_testing_writes_a_plugin_and_checks_a_component(python, add, run, tmp_pa
     run(*PHYSX, "new", "environment", "mine", python=python)
     assert (tmp_path / "physx-mine/pyproject.toml").exists()
     assert "toy/spring" in run(*PHYSX, "check", "toy/spring", python=python).stdout
+
+
+@pytest.mark.faults
+def test_report_writes_a_page(python, add, run):
+    add("physx_report")
+    generate(run, python)
+    assert "report.html" in run(*PHYSX, "report", "sessions/data_generation", python=python).stdout
 
 
 @pytest.mark.faults

@@ -43,6 +43,7 @@ def test_modules_do_not_import_in_circles(package):
         pytest.fail(" imports ".join(reversed(error.args[1])))
 
 
+@pytest.mark.slow  # imports all packages
 def test_what_can_be_closed_is_a_context_manager():
     pytest.importorskip("torch")
     found = {

@@ -232,9 +232,9 @@ class EnvironmentConfig:
     Then an episode has failed, and a stream ends the run. None: once for an episode, never for a
     stream."""
     state_every: int = at_least(0, 0)
-    """Number of rows after which each stream gives a state, from which the next client goes on;
-    0: there are none, and it repeats all rows. Where an engine keeps memory of its last step, rows
-    depend on this number in the last bits."""
+    """Number of rows after which each stream, or an independent episode, gives a state, from which
+    the next client goes on; 0: there are none, and it repeats all rows. Where an engine keeps
+    memory of its last step, rows depend on this number in the last bits."""
     journal_size: float = at_least(1e-6, 1.0)
     """Largest size in GB of the journal of a stream that may go on elsewhere, in the folder for
     temporary files: all predictions and stored samples that its client was given, since the last

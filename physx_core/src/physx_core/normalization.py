@@ -11,18 +11,22 @@ import numpy as np
 from physx_core.errors import ConfigError, DatasetError, listed, nearest
 from physx_core.fields import CHANNEL, Field
 from physx_core.statistics import RunningStatistics, check_statistic
-from physx_core.typing import Array
+from physx_core.typing import Array, Batch
 
 METHODS = (
     *("none", "component", "channel", "field"),
     *("log-component", "log-channel", "log-field"),
+    "increment",
 )
 """How a field may be normalized: not at all; or with one mean and deviation for each component,
-each entry of its axis ``"channel"``, or all of the field; ``log-``: its natural logarithm is."""
+each entry of its axis ``"channel"``, or all of the field; ``log-``: its natural logarithm is;
+``increment``: its change since the field that is the same quantity, or ``increment:FIELD``, is, as
+by default."""
 
 Normalize = bool | Mapping[str, str]
 """Whether fields are normalized, or the method of some of them by name."""
 
+_INCREMENT = "increment"
 _STATISTICS = ("mean", "std", "minimum", "maximum")
 
 
@@ -39,6 +43,7 @@ class Normalization:
         minimum: Smallest value, float64, in the field's unit; None if unknown.
         maximum: Largest value, like `minimum`.
         log: Whether all of them, without unit, are those of the natural logarithm of the field.
+        since: The field that they are those of the change since; "": they are of the field itself.
     """
 
     mean: Array
@@ -46,12 +51,14 @@ class Normalization:
     minimum: Array | None = None
     maximum: Array | None = None
     log: bool = False
+    since: str = ""
 
     def arrays(self) -> dict[str, Array]:
         """Return the known statistics by name, for a file or another process."""
         known = ((name, getattr(self, name)) for name in _STATISTICS)
         found = {name: values for name, values in known if values is not None}
-        return found | {"log": np.array(1.0)} if self.log else found
+        found |= {"log": np.array(1.0)} if self.log else {}
+        return found | ({"since": _letters(self.since)} if self.since else {})
 
     @classmethod
     def from_arrays(cls, arrays: Mapping[str, Array], shape: tuple[int, ...]) -> Normalization:
@@ -64,37 +71,50 @@ class Normalization:
         Raises:
             ValueError: If they are not the finite statistics of such a field.
         """
-        if not {"mean", "std"} <= arrays.keys() <= {*_STATISTICS, "log"}:
+        if not {"mean", "std"} <= arrays.keys() <= {*_STATISTICS, "log", "since"}:
             raise ValueError(f"the statistics {sorted(arrays)} are not those of a normalization")
         own = arrays["mean"].shape
         if np.broadcast_shapes(own, shape) != shape:
             raise ValueError(f"statistics of shape {own} are not those of values of shape {shape}")
-        known = {name: check_statistic(name, arrays[name], own) for name in arrays if name != "log"}
-        return cls(**known, log="log" in arrays)
+        known = {n: check_statistic(n, arrays[n], own) for n in _STATISTICS if n in arrays}
+        since = bytes(arrays.get("since", np.empty(0)).astype(np.uint8)).decode()
+        return cls(**known, log="log" in arrays, since=since)
 
 
 class Measured(NamedTuple):
     """What statistics are of.
 
     Attributes:
-        field: Name of the stored field.
+        field: Name of the stored field; of increments, of the field of batches.
         pooled: Axes of its values that they are pooled over.
         log: Whether they are those of its natural logarithm.
+        since: The field of batches that they are those of the change since; "": of none.
     """
 
     field: str
     pooled: tuple[int, ...]
-    log: bool
+    log: bool = False
+    since: str = ""
 
-    def of(self, rows: Array) -> Array:
+    @property
+    def names(self) -> list[str]:
+        """The fields that they are computed from."""
+        return [self.field, self.since] if self.since else [self.field]
+
+    def of(self, batch: Batch) -> Array:
         """Return what they are computed from.
 
         Args:
-            rows: Rows of the field.
+            batch: Rows of the fields.
 
         Raises:
             DatasetError: If the logarithm of a value does not exist.
         """
+        rows = batch[self.field]
+        if self.since:
+            before = batch[self.since]
+            before = before if before.ndim == rows.ndim else before[:, -1]
+            return np.subtract(rows, before, dtype=np.float64)
         if not self.log:
             return rows
         wrong = rows[rows <= 0]
@@ -107,10 +127,11 @@ class Measured(NamedTuple):
 
 
 class _Choice(NamedTuple):
-    """How one field is normalized."""
+    """How one field is normalized; `of` is the stored field whose quantity it is."""
 
     name: str
     by: str
+    of: Field
     measured: Measured
 
 
@@ -152,16 +173,16 @@ def compute_normalization(
         DatasetError: If a value has no logarithm.
     """
     found = {}
-    for name, by, of in _choices(normalize, fields, stored):
-        known = statistics(of)
+    for name, by, of, what in _choices(normalize, fields, stored):
+        known = statistics(what)
         if known is None or not known.count:
             continue
         known = known.pool() if by == "field" else known
         mean, std = known.mean, known.std
         resolution = 4 * np.finfo(np.float64).eps * np.abs(mean)
         arrays = mean, np.where(std > resolution, std, 1.0), known.minimum, known.maximum
-        mean, std, least, most = (_fitted(a, by, fields[name], stored[of.field]) for a in arrays)
-        found[name] = Normalization(mean, std, least, most, of.log)
+        mean, std, least, most = (_fitted(a, by, fields[name], of) for a in arrays)
+        found[name] = Normalization(mean, std, least, most, what.log, what.since)
     return found
 
 
@@ -172,7 +193,7 @@ def check_methods(where: str, normalize: Normalize) -> None:
         ConfigError: If there is no such method.
     """
     for name, method in normalize.items() if isinstance(normalize, Mapping) else ():
-        if method not in METHODS:
+        if method not in METHODS and not method.startswith(_INCREMENT + ":"):
             raise ConfigError(
                 f"{where}: {name} is {method!r} but must be one of {listed(METHODS)}."
             )
@@ -198,10 +219,13 @@ def _choices(
     for name, field in fields.items() if normalize is not False else ():
         if field.has_statistics:
             names = _quantities(field, stored)
-            given = next((table[each] for each in names if each in table), "")
+            given = [(each, table[each]) for each in names if each in table]
+            own = [by for each, by in given if each == name or not by.startswith(_INCREMENT)]
             of = stored[names[-1]]
-            method = given or _default(of)
-            if method != "none":
+            method = own[0] if own else _default(of)
+            if method.startswith(_INCREMENT):
+                yield _increment(name, method, of, fields, stored)
+            elif method != "none":
                 yield _choice(name, method, of)
 
 
@@ -212,6 +236,38 @@ def _quantities(field: Field, stored: Mapping[str, Field]) -> list[str]:
         names.append(other)
         other = stored[other].like
     return names
+
+
+def _increment(
+    name: str, method: str, of: Field, fields: Mapping[str, Field], stored: Mapping[str, Field]
+) -> _Choice:
+    """Return how a field is normalized by its change since another one."""
+    kept = {n for n, each in fields.items() if n != name and each.has_statistics}
+    same = [n for n in fields if n in kept and _quantities(fields[n], stored)[-1] == of.name]
+    since = method.removeprefix(_INCREMENT).removeprefix(":")
+    if not since and len(same) != 1:
+        what = f"{listed(same)} are" if same else "no other field is"
+        raise ConfigError(
+            f'normalize: {name} is "{_INCREMENT}", but {what} the same quantity '
+            f'(Field(..., like=...), or a window): name the field, as "{_INCREMENT}:past".'
+        )
+    since = since or same[0]
+    if since not in kept:
+        raise ConfigError(
+            f'normalize: {name} is "{method}", but there is no field "{since}" of numbers to '
+            f"subtract.{nearest(since, kept)} Fields: {listed(sorted(kept))}."
+        )
+    shape, before = fields[name].shape or (), fields[since].shape or ()
+    if shape != (of.shape or ()) or shape not in (before, before[1:]):
+        raise ConfigError(
+            f'normalize: the change of "{name}", of shape {shape}, since "{since}", of shape '
+            f'{before}, is not that of one step of "{of.name}", of shape {of.shape}.'
+        )
+    return _Choice(name, _default(of), of, Measured(name, of.pooled, since=since))
+
+
+def _letters(name: str) -> Array:
+    return np.frombuffer(name.encode(), np.uint8)
 
 
 def _default(of: Field) -> str:
@@ -228,7 +284,7 @@ def _choice(name: str, method: str, of: Field) -> _Choice:
             f'"{CHANNEL}": name its axes in Field(..., axes=...), or normalize it by "field".'
         )
     pooled = () if by == "component" else of.pooled
-    return _Choice(name, by, Measured(of.name, pooled, method.startswith("log-")))
+    return _Choice(name, by, of, Measured(of.name, pooled, method.startswith("log-")))
 
 
 def _fitted(values: Array, by: str, field: Field, of: Field) -> Array:

@@ -126,6 +126,7 @@ training.epoch_nb = {THOUSAND}
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("text", "told"),
     [

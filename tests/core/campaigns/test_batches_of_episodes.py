@@ -187,7 +187,7 @@ def test_replaced_production_of_batches_gets_a_stream():
 def test_interrupted_batches_are_resumed_without_repeating_what_has_ended(how):
     kwargs = {"least": 1, "sleep": 0.03, "log": "log"}
     command = [sys.executable, "-m", "physx_core", "generate", TROUBLED]
-    command += ["--batch-nb", "1", "--batch-size", "90", "--session-name", "run"]
+    command += ["--batch-nb", "1", "--batch-size", "200", "--session-name", "run"]
     command += ["--environment.num-clients", "2", "--environment.seed", str(SEED)]
     command += ["--no-prove-independence"]  # each number is to be simulated once
     given = [f"{name}={value!r}" for name, value in kwargs.items()]
@@ -205,7 +205,7 @@ def test_interrupted_batches_are_resumed_without_repeating_what_has_ended(how):
     subprocess.run(
         [*command[:4], "sessions/run", "--resume"], check=True, stderr=subprocess.DEVNULL
     )
-    assert stored()[0] == expected(90, least=1)
+    assert stored()[0] == expected(200, least=1)
     numbers = Path("log").read_text().split()
     again = len(numbers) - len(set(numbers))
     assert again <= 2 + sum(status == EpisodeStatus.CUT for status in stored()[1].values())

@@ -7,8 +7,9 @@ import sizes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from physx_core.dataset import EpisodeRecord
+from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.workers.episode_queue import EpisodeQueue
+from physx_core.workers.lease import Begun, EpisodeState
 
 
 class Model:
@@ -85,6 +86,36 @@ def test_numbers_come_in_order_and_those_that_came_back_first(total, recorded, r
         assert queue.is_done == (model.finished == total)
         assert queue.waiting >= len(model.back) + len(model.fresh)
         assert len(held) + len(model.back) + len(model.fresh) + model.finished + lost == total
+
+
+@given(st.sets(st.integers(0, 12)), st.sets(st.integers(0, 15)))
+@settings(max_examples=sizes.size(100, 20))
+def test_begun_episodes_come_in_order_and_alone(recorded, begun):
+    queue = EpisodeQueue(12, recorded, begun={n: Begun(1, 5, 4, b"s") for n in begun - recorded})
+    taken = []
+    while numbers := queue.take_range(3):
+        assert len(numbers) == 1 or not begun.intersection(numbers)
+        assert [n for n in numbers if queue.begun(n)] == [n for n in numbers if n in begun]
+        taken += numbers
+    assert taken == [number for number in range(12) if number not in recorded]
+
+
+def test_queue_follows_the_parts_of_an_episode():
+    queue = EpisodeQueue(2)
+
+    def follow(part, rows, made=0, status=EpisodeStatus.MORE):
+        state = EpisodeState(1, made, b"state") if made else None
+        queue.follow(EpisodeRecord(episode=1, rows=rows, part=part, status=status), state)
+        return queue.begun(1)
+
+    assert follow(0, 7) is None
+    assert follow(1, 3, made=8) == Begun(2, 10, 8, b"state")
+    assert follow(2, 5) == Begun(3, 15, 8, b"state")
+    assert follow(0, 4) is None  # begun anew
+    with pytest.raises(ValueError, match="after rows"):
+        follow(1, 4, made=9)
+    follow(0, 4, made=4)
+    assert follow(1, 1, status=EpisodeStatus.FINISHED) is None
 
 
 def test_numbers_beyond_the_total_are_no_episodes_of_it():

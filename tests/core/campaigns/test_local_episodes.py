@@ -45,6 +45,7 @@ TROUBLES = st.dictionaries(
 )
 
 
+@pytest.mark.slow
 @given(st.integers(0, 15), st.sets(st.integers(0, 20), max_size=8), TROUBLES, st.booleans())
 @settings(max_examples=sizes.size(80, 15))
 def test_each_number_has_its_rows_or_has_failed(total, recorded, troubles, has_parameters):

@@ -199,6 +199,7 @@ def test_rows_whose_records_are_lost_are_not_removed(folder):
             dataset.compact()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("step", range(0, 90, 3))
 def test_a_process_that_dies_while_compacting_leaves_all_rows(folder, monkeypatch, step):
     """After each operation on files, a copy of the folder is what a killed process leaves."""

@@ -92,6 +92,7 @@ def test_a_fold_of_long_episodes_reads_no_rows(folder, rows_read, cells):
         assert_array_equal(found.maximum, x.max(axis=0))
 
 
+@pytest.mark.slow
 def test_changed_rows_records_and_files_are_noticed(folder):
     with Dataset.create(folder) as dataset:
         store(dataset, *range(1, 10))
@@ -134,6 +135,7 @@ def test_changed_rows_records_and_files_are_noticed(folder):
     check()
 
 
+@pytest.mark.slow
 def test_what_is_extended_in_memory_has_the_same_bits(folder):
     random = np.random.default_rng(1)
     with Dataset.create(folder) as dataset:
@@ -145,6 +147,7 @@ def test_what_is_extended_in_memory_has_the_same_bits(folder):
             assert found == [array.tobytes() for array in fresh.arrays().values()]
 
 
+@pytest.mark.slow
 def test_the_order_is_extended_as_if_it_were_read_anew(folder):
     """Also where records of ranges, parts, failures and replacements overlap."""
     random = np.random.default_rng(2)

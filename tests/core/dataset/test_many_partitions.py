@@ -46,6 +46,7 @@ def rows(killed, folder):
     return np.arange(len(read(folder)))
 
 
+@pytest.mark.slow
 def test_the_manifest_is_seldom_written_anew(folder):
     written, counts = set(), []
     with Dataset.create(folder, max_file_size=SIZE) as dataset:
@@ -74,6 +75,7 @@ def test_a_refreshed_reader_sees_new_partitions(folder):
                 assert_array_equal(reader["training"]["n"][:], np.arange(start + 5))
 
 
+@pytest.mark.slow
 def test_a_torn_line_loses_no_rows(killed, rows, tmp_path):
     content, total = (killed / "changes.jsonl").read_bytes(), len(rows)
     for end in [*range(0, len(content), 37), len(content) - 1]:

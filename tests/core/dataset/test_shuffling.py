@@ -59,6 +59,7 @@ def test_a_lazy_permutation_has_every_number_once(count, key):
     assert_array_equal(np.sort(scatter(np.arange(count), count, key)), np.arange(count))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("draw", [permutation, lambda n, key: scatter(np.arange(n), n, key)])
 def test_all_orders_are_equally_likely(draw):
     count, draws = 4, 6000

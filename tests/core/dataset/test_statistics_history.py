@@ -153,6 +153,7 @@ def same(one, other):
             assert array.tobytes() == other[name].arrays()[part].tobytes(), (name, part)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("number", range(trials(10, 4)))
 def test_statistics_after_any_history_are_those_of_the_rows_read_anew(number):
     run_state_machine_as_test(seed(number)(Machine), settings=FEW)

@@ -69,40 +69,54 @@ def test_episodes_may_fail():
     assert found[0] == found[1]
 
 
-def test_interrupted_training_simulates_what_has_no_record():
+@pytest.mark.parametrize("every", [0, 2])
+def test_interrupted_training_simulates_what_has_no_record(every):
     class Stopped(Training):
         def batch_end(self):
             if self.batch_id == 4:
                 raise KeyboardInterrupt
 
-    expected = result(train("whole", 2, training=RESERVOIR))
+    expected = result(train("whole", 2, training=RESERVOIR, state_every=every))
     Path("simulated.txt").unlink()
+    options = {"delay": 0.02, "state_every": every}
     with pytest.raises(KeyboardInterrupt):
-        train("stopped", 2, cls=Stopped, training=RESERVOIR, delay=0.02)
-    run = train("stopped", 3, training={**RESERVOIR, "resume": True}, delay=0.02)
+        train("stopped", 2, cls=Stopped, training=RESERVOIR, **options)
+    run = train("stopped", 3, training={**RESERVOIR, "resume": True}, **options)
     assert result(run) == expected
     begun, ended = simulated()
     assert sum(begun.values()) <= len(ended) + 2 * (2 + 3)
+
+
+def killed(run_killed, tmp_path, moments, environment, buffer, clients):
+    """Return the results of a training, and of one that is killed at shares of its duration."""
+    program = str(PROGRAM)
+    folders = [tmp_path / name for name in ("whole", "killed")]
+    for folder in folders:
+        folder.mkdir()
+    _, duration = run_killed(program, folders[0], [], environment, buffer, "2")
+    times = [duration * moment for moment in moments]
+    run_killed(program, folders[1], times, environment, buffer, clients)
+    return [(folder / "result.txt").read_text() for folder in folders]
 
 
 @pytest.mark.faults
 @pytest.mark.parametrize("buffer", ["stream", "reservoir"])
 @pytest.mark.parametrize("clients", ["1", "2", "3"])
 def test_training_killed_at_random_moments(tmp_path, buffer, clients, run_killed, monkeypatch):
-    random, program = np.random.default_rng(seed()), str(PROGRAM)
-    folders = [tmp_path / name for name in ("whole", "killed")]
-    for folder in folders:
-        folder.mkdir()
-    _, duration = run_killed(program, folders[0], [], buffer, "2")
-    moments = (duration * random.uniform(0.3, 0.9, trials(10, 3))).tolist()
-    run_killed(program, folders[1], moments, buffer, clients)
-    found = []
-    for folder in folders:
-        monkeypatch.chdir(folder)
-        found.append(Path("result.txt").read_text())
+    moments = np.random.default_rng(seed()).uniform(0.3, 0.9, trials(10, 3))
+    found = killed(run_killed, tmp_path, moments, "lesson", buffer, clients)
     assert found[0] == found[1]
+    monkeypatch.chdir(tmp_path / "killed")
     begun, ended = simulated()
     assert sum(begun.values()) <= len(ended) + (len(moments) + 1) * int(clients) * 8
+
+
+@pytest.mark.faults
+@pytest.mark.parametrize("clients", ["1", "2", "3"])
+def test_heat_training_killed_at_random_moments(tmp_path, clients, run_killed):
+    moments = np.random.default_rng(seed()).uniform(0.2, 0.9, trials(30, 3))
+    found = killed(run_killed, tmp_path, moments, "heat", "reservoir", clients)
+    assert found[0] == found[1]
 
 
 def test_independent_episode_cannot_ask_the_network_that_learns():

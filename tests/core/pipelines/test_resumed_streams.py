@@ -88,6 +88,27 @@ def test_a_resumed_generation_has_the_same_rows(run, every, places, nothing_stay
     assert stored("stopped") == stored("whole")
 
 
+@pytest.mark.parametrize("batches", [1, 3])
+def test_rejected_samples_keep_their_order_if_a_kill_comes_between_them_and_their_rows(
+    run, batches, monkeypatch
+):
+    environment = run.streams(LOCAL, state_every=5)
+    run.generation("whole", environment).execute()
+    store, left = Dataset.append, [batches]
+
+    def append(dataset, mode, rows, **options):
+        left[0] -= mode == "wrong"
+        if not left[0]:
+            raise KeyboardInterrupt
+        store(dataset, mode, rows, **options)
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(Dataset, "append", append)
+        run.generation("stopped", environment).execute()
+    run.generation("stopped", environment, resume=True).execute()
+    assert stored("stopped") == stored("whole")
+
+
 def test_nothing_before_a_state_is_simulated_again(run, made, at_once):
     environment = run.streams(LOCAL, state_every=5, env_kwargs={"refuse": 0})
     interrupted(run.generation("stopped", environment), 11)

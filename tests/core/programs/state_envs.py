@@ -6,6 +6,7 @@ import os
 import signal
 import sys
 import threading
+import time
 from pathlib import Path
 
 import numpy as np
@@ -150,3 +151,68 @@ class Mortal(Environment):
         Mortal.made += 1
         self.position = self.position + self.rng.normal(size=3)
         self.set_training_data(position=self.position)
+
+
+class Voyage(Environment):
+    """Long independent episodes, at whose steps a client is killed or a run is interrupted."""
+
+    independent_episodes = True
+    made = stop = 0  # steps of this process; at which one it is interrupted, 0: none
+
+    def __init__(self, *, kills=(), pace=0.0, wait=0.0, life=0, rows=60, refuse=0, **kwargs):
+        super().__init__(**kwargs)
+        self.kills, self.pace, self.wait = list(kills), pace, wait
+        self.life, self.rows, self.refuse = life, rows, refuse
+
+    def create(self):
+        self.engine = Engine()
+
+    def init_database(self):
+        self.define_training_fields(Field("x", (2,)))
+
+    def reset_parameters(self):
+        self.engine.position, self.engine.warm = 0.0, 0.0
+        self.seen = []
+
+    def step(self):
+        self.live()
+        self.engine.advance(self.rng.normal())
+        self.seen = [*self.seen[-3:], self.engine.position]
+        self.set_training_data(x=[self.engine.position, sum(self.seen)])
+        if self.step_index == self.rows - 1:
+            self.end_episode()
+
+    def check_sample(self):
+        return not self.refuse or self.step_index % self.refuse > 0
+
+    def live(self):
+        if simulation := current():
+            simulation.steps = getattr(simulation, "steps", 0) + 1
+            simulation.sleep(self.pace)
+            killed, place = vars(simulation).setdefault("killed", set()), self.step_index
+            if place in self.kills and (self.episode_index, place) not in killed:
+                killed.add((self.episode_index, place))
+                simulation.running.kill()
+                simulation.sleep(0)
+        time.sleep(self.wait)
+        Voyage.made += 1
+        if self.life and Voyage.made > self.life:
+            os.kill(os.getpid(), signal.SIGKILL)
+        if Voyage.made == Voyage.stop:
+            raise KeyboardInterrupt
+
+
+class OpaqueVoyage(Voyage):
+    """Its state cannot be captured."""
+
+    def create(self):
+        super().create()
+        self.lock = threading.Lock()
+
+
+class OwnVoyage(Voyage):
+    """Its state is refused by whoever did not give it."""
+
+    def create(self):
+        super().create()
+        self.mark = object.__hash__(self)

@@ -89,6 +89,7 @@ def test_rows_of_an_episode_follow_from_its_number(**case):
     check_chapters(lambda **options: open_local(None, "Chapters", **options), **case)
 
 
+@pytest.mark.slow
 @given(**CHAPTERS)
 @settings(max_examples=sizes.size(20, 5), phases=[Phase.explicit, Phase.generate])
 def test_clients_make_the_same_rows(**case):

@@ -126,6 +126,7 @@ WINDOWS = st.dictionaries(
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(trials(7200, 600))
 @settings(database=None, deadline=None, max_examples=trials(10_000, 25))
 @given(
     lengths=st.lists(st.integers(1, 9), min_size=1, max_size=14), window=WINDOWS,
@@ -312,7 +313,9 @@ def test_mistakes_in_a_view_are_named(options, message):
 # Sources and weights ----------------------------------------------------------------------------
 
 
-@settings(database=None, deadline=None, max_examples=30)
+@pytest.mark.slow
+@pytest.mark.timeout(trials(7200, 600))
+@settings(database=None, deadline=None, max_examples=trials(10_000, 25))
 @given(
     shares=st.lists(st.integers(1, 9), min_size=2, max_size=4), seed=st.integers(0, 9),
     epoch=st.sampled_from(["first", "all"]), size=st.integers(1, 40),
@@ -346,22 +349,42 @@ def test_each_batch_has_its_share_of_each_source(shares, seed, epoch, size):
         assert abs(total - ends) <= 2 + 0.05 * ends
 
 
-def test_weighted_items_come_in_proportion(tmp_path):
-    lengths = [4] * 9 + [40]
-    store(tmp_path, episodes(lengths))
-    with View(weights="episode", hold_back=False).open(8, data=tmp_path) as batches:
-        found = Counter(int(e) for b in batches for e in b["x"][:, 0])
-        assert max(found.values()) - min(found.values()) <= 4 and sum(found.values()) == 76
-        again = Counter(int(e) for b in batches for e in b["x"][:, 0])
-        assert found == again
-    with View(weights="class:label", hold_back=False).open(8, data=tmp_path) as batches:
-        found = Counter(int(n) for b in batches for n in b["label"])
-        assert max(found.values()) - min(found.values()) <= 2
-    with View(weights="field:step", hold_back=False).open(8, data=tmp_path) as batches:
-        steps = np.concatenate([b["step"] for b in batches])
-        assert 0 not in steps
-        total = sum(n * (n - 1) / 2 for n in lengths)
-        assert abs((steps == 39).sum() - 76 * 39 / total) <= 1
+@pytest.mark.slow
+@pytest.mark.timeout(trials(7200, 600))
+@settings(database=None, deadline=None, max_examples=trials(10_000, 25))
+@given(
+    lengths=st.lists(st.integers(1, 9), min_size=1, max_size=14), window=WINDOWS,
+    kind=st.sampled_from(["episode", "class:label", "field:step"]),
+    folds=st.integers(2, 6), held=st.booleans(), size=st.integers(1, 7), seed=st.integers(0, 99),
+)  # fmt: skip
+def test_weighted_items_come_in_proportion(lengths, window, kind, folds, held, size, seed):
+    trajectories, held = episodes(lengths), held and len(lengths) >= folds
+    view = View(window=window, weights=kind, folds=folds, hold_back=held, fold_seed=seed)
+    numbers = np.arange(len(lengths))
+    kept = folds_of(np.zeros(len(lengths), int), numbers, folds, seed).tolist() if held else []
+    model = Model(view, trajectories, kept or [-1] * len(lengths))
+    items = [(int(x[at][0]), int(x[at][1])) for x, at in model.items]
+    same = Counter(episode if kind == "episode" else episode % 3 for episode, _ in items)
+    weights = [
+        step if kind == "field:step" else 1 / same[episode if kind == "episode" else episode % 3]
+        for episode, step in items
+    ]  # fmt: skip
+    with TemporaryDirectory() as name:
+        store(Path(name), trajectories)
+        if not sum(weights):
+            with pytest.raises((DatasetError, ConfigError)):
+                view.open(size, seed, data=name)[0]
+            return
+        with view.open(size, seed, data=name) as batches:
+            found: Counter = Counter()
+            for number in range(len(batches)):
+                (rows,) = batches.rows(number)
+                found.update(rows.tolist())
+    begins = np.cumsum([0, *lengths])
+    for (episode, step), weight in zip(items, weights, strict=True):
+        times = found.pop(int(begins[episode]) + step, 0)
+        assert abs(times - len(items) * weight / sum(weights)) < 1 + 1e-9
+    assert not found
 
 
 # Purity -----------------------------------------------------------------------------------------

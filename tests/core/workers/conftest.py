@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import re
 import subprocess
 import sys
 import time
@@ -49,17 +48,6 @@ def join(port, token, nothing_stays_behind):
             return process
 
         yield start
-
-
-@pytest.fixture
-def said(caplog):
-    """Return a function: what physx said that matches a pattern."""
-
-    def find(pattern=""):
-        texts = [record.getMessage() for record in caplog.records if record.name == "physx"]
-        return [text for text in texts if re.search(pattern, text)]
-
-    return find
 
 
 class Rows:

@@ -68,6 +68,7 @@ def expected(lengths, size, batch_nb, run_ahead):
     return found
 
 
+@pytest.mark.slow
 @given(
     st.data(),
     st.lists(st.integers(0, 4), min_size=1, max_size=25),

@@ -295,7 +295,7 @@ def test_malformed_fields_of_episodes_are_refused(case):
     leases, peer = leases_of_one(row_fields=[], episode_fields=MESH)
     values, text = ENDED.get(case, (VALUES, "the fields"))
     status = EpisodeStatus.FAILED if case.startswith("failed") else EpisodeStatus.FINISHED
-    payload = encode([(0, 1, 0, 0, int(status), 0.5, "", values)])
+    payload = encode([[(0, 1, 0, 0, int(status), 0.5, "", values)], None])
     frame = Frame(Kind.EPISODES, 0, bytearray(payload))
     if case == "good":
         leases.dispatch[Kind.EPISODES](peer, frame)

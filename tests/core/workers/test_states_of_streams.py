@@ -68,6 +68,7 @@ def states(simulated, services, said):
 PLACES = [f"{what} {row}" for row in range(20) for what in ("step", "prediction", "apply")]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [1, 3, 7])
 @pytest.mark.parametrize(
     "options",
@@ -86,6 +87,7 @@ def test_rows_do_not_depend_on_kills_at_every_row(states, every, options):
     assert len([*Path().glob("*-1")]) > 30
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("place", ["create", *PLACES[:48:5], *PLACES[1:48:7], *PLACES[2:48:7]])
 def test_rows_do_not_depend_on_a_kill(states, place):
     options = {"record_wrong_samples": True}
@@ -94,6 +96,7 @@ def test_rows_do_not_depend_on_a_kill(states, place):
     assert run(states(4, env_kwargs=kwargs, retries=1, **options)) == expected
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [1, 4])
 def test_stored_rows_do_not_depend_on_kills(states, every):
     expected = run(states(every), stored=True)
@@ -130,6 +133,7 @@ def test_drawings_and_saved_parameters_are_not_repeated(states, services):
     assert seen[0] == seen[1]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("every", [0, 5])
 def test_only_rows_after_the_state_are_repeated(states, simulation, every):
     kwargs = {"asks": False, "refuse": 0, "kills": [f"step {row}" for row in range(1, 200)]}

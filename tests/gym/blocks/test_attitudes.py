@@ -61,6 +61,7 @@ def test_fast_rotations_are_exact_too():
     assert angle(from_rotation_vector_rows(DT * rate), np.array(state[:4])) < 1e-7
 
 
+@pytest.mark.slow
 def test_finds_up_and_bias_from_acceleration():
     truth = quaternions(1, seed=3)[0]
     seen = 9.81 * rotate_back_rows(truth, UP)

@@ -92,6 +92,7 @@ def test_roll_pitch_yaw_over_200_steps(backend):
     assert tilt > 5e-3
 
 
+@pytest.mark.slow
 def test_rates_alone_are_followed_through_hard_sways_and_impacts():
     worst, tilt = errors(walker(filtered={"kp": 0.0, "ki": 0.0}), 2.0)
     assert worst < 5e-3

@@ -336,6 +336,7 @@ def test_snapshots_of_other_blocks():
         pd.restore({"target_state": np.zeros((3, 2))})
 
 
+@pytest.mark.slow
 def test_environments_are_freed():
     env = pipeline()
     env.reset(seed=0)

@@ -95,6 +95,7 @@ def test_seed_and_number_of_the_episode_determine_everything(make, backend):
         np.testing.assert_equal([first, *plays(twin, given)], observations)
 
 
+@pytest.mark.slow
 def test_snapshots_and_copies_keep_what_was_drawn(make, backend):
     env = make(backend=backend)
     given = actions(env, 10)

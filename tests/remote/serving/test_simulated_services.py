@@ -43,6 +43,7 @@ def link(simulation, **options):
     return RequestLink(("127.0.0.1", PORT), transport=simulation, **options)
 
 
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(drawn, st.lists(st.lists(st.binary(max_size=300), max_size=4), min_size=1, max_size=4))
 def test_each_client_gets_its_answers_in_any_order_of_events(choose, told):
@@ -62,6 +63,7 @@ def test_each_client_gets_its_answers_in_any_order_of_events(choose, told):
         service.close()
 
 
+@pytest.mark.slow
 @settings(max_examples=30)
 @given(drawn)
 def test_a_request_that_takes_long_keeps_the_others_waiting(choose):
@@ -99,6 +101,7 @@ def test_a_service_is_waited_for():
         service.close()
 
 
+@pytest.mark.slow
 def test_a_silent_client_is_left_after_its_time_where_another_waits(caplog):
     with Simulation() as simulation:
         service = serve(simulation, Communication(patience=3600.0, transport=simulation))

@@ -107,6 +107,7 @@ def is_seen(layout, points):
     return bool((ahead > 0).all() and in_width.all() and in_height.all())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("reference", ENVIRONMENTS)
 def test_every_environment_is_in_its_picture(reference, tmp_path):
     DataGeneration(

@@ -100,6 +100,7 @@ def test_motions_agree_through_limits_and_friction(pair):
         np.testing.assert_allclose(one.positions(), other.positions(), atol=1e-8)
 
 
+@pytest.mark.slow
 def test_joints_pushed_into_their_limits_agree(dart, pinocchio, example):
     world = World([Robot(example("panda_description/urdf/panda.urdf"))])
     with dart.build(world) as one, pinocchio.build(world) as other:
@@ -136,6 +137,7 @@ def test_tumbling_quadrupeds_agree_for_a_second(dart, pinocchio, example):
         np.testing.assert_allclose(one.positions()[:7], other.positions()[:7], atol=1e-8)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["arm", "double-pendulum"])
 def test_environments_agree_over_a_thousand_steps(name, drive):
     one, other = (

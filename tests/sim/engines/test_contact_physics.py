@@ -32,6 +32,7 @@ def tilted(ratio, friction, direction=(1.0, 0.0)):
     return (*along, -9.81 * np.cos(angle)), angle
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("engine", ENGINES, ids=str)
 def test_a_box_on_an_incline_holds_below_the_friction_angle_and_slides_above(engine):
     gravity, _ = tilted(0.98, 0.5)

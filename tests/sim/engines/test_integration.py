@@ -68,6 +68,7 @@ def test_rk4_keeps_the_energy_of_a_double_pendulum(backend):
         assert simulation.time == 10.0
 
 
+@pytest.mark.slow
 def test_rk4_follows_the_solution_of_the_pendulum(backend, bar):
     """The reference is the same equation, solved with steps ten times smaller."""
     with backend.build(World([bar()], integrator="rk4")) as simulation:
@@ -111,6 +112,7 @@ def test_rk4_of_a_spring_with_a_rotor_follows_its_solution(pinocchio, write_urdf
             np.testing.assert_allclose(state, exact, atol=1e-7)
 
 
+@pytest.mark.slow
 def test_rk4_follows_the_solution_under_constant_forces(backend, write_urdf):
     """Two masses on springs; a controller sets their forces every 10 ms."""
     joints = {"first": JointSettings(stiffness=40), "second": JointSettings(stiffness=25)}

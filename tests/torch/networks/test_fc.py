@@ -27,6 +27,7 @@ def test_layers_and_activations():
     assert network.nb_parameters() == weights + (256 + 128 + 9) + (256 + 128)
 
 
+@pytest.mark.slow
 def test_one_layer_is_linear():
     network = FC([3, 2])
     x = torch.rand(4, 3)

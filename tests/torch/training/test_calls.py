@@ -61,6 +61,7 @@ def test_a_training_batch_makes_at_most_40_calls(network, normalize):
             assert number < 2 or len(counter.calls) <= 40, counter.calls
 
 
+@pytest.mark.slow
 def test_a_prediction_step_makes_at_most_45_calls(network):
     data = DatasetConfig(existing_dir="data")
     Training(network, data, epoch_nb=1, batch_size=10, quiet=True).execute()

@@ -71,6 +71,7 @@ def test_a_network_of_each_component_names_the_shape_that_it_takes():
         learner.predict({"u": rows(7)["u"]})
 
 
+@pytest.mark.slow
 def test_positive_fields_are_learned_from_their_logarithms():
     learner = train({"u": "log-channel", "v": "log-channel"})
     known = learner.transformation.normalization

@@ -164,6 +164,7 @@ def test_a_step_that_the_scaler_of_float16_leaves_out_is_no_divergence():
     assert not is_equal(network, before) and np.isfinite(losses).all()
 
 
+@pytest.mark.slow
 def test_gradients_that_no_scale_makes_finite_are():
     network, optimization = made(root_of_zero, mixed_precision="float16")
     for _ in range(60):

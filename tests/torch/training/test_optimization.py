@@ -50,6 +50,7 @@ def rate(optimization):
 # Learning ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_normalized_regression_is_learned():
     network, optimization = made([2, 16, 16, 1], lr=1e-2)
     batch = regression()

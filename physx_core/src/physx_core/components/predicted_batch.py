@@ -32,7 +32,7 @@ class PredictedBatch:
         inputs: The network's `net_fields` as it gets them.
         output: The network's `pred_fields` as it returns them.
         prediction: The network's `pred_fields` as the loss compares them.
-        targets: The network's `opt_fields` as the loss compares them.
+        targets: The network's `opt_fields` as the loss compares them; of increments, the changes.
     """
 
     network: Network
@@ -55,13 +55,15 @@ class PredictedBatch:
         read, targets = pick(data, network.net_fields), pick(data, network.opt_fields)
         inputs = transformation.transform_before_prediction(read)
         output = network.predict(inputs)
+        if transformation.increments:
+            targets = transformation.increments.of(targets, read)
         compared = transformation.transform_before_loss(output, targets)
         return cls(network, transformation, data, inputs, output, *compared)
 
     @property
     def physical_prediction(self) -> Tensors:
         """The network's `pred_fields` in physical units; computed anew each time."""
-        return self.transformation.transform_before_apply(self.output)
+        return _to_physical(self.transformation, self.output, self.data)
 
     @property
     def physical_targets(self) -> Tensors:
@@ -102,4 +104,10 @@ def predict(network: Network, transformation: Transformation, data: Tensors) -> 
         data: The network's `net_fields`.
     """
     output = network.predict(transformation.transform_before_prediction(data))
-    return transformation.transform_before_apply(output)
+    return _to_physical(transformation, output, data)
+
+
+def _to_physical(transformation: Transformation, output: Tensors, inputs: Tensors) -> Tensors:
+    prediction = transformation.transform_before_apply(output)
+    increments = transformation.increments
+    return increments.add(prediction, inputs) if increments else prediction

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 
+from physx_core.components.increments import Increments
 from physx_core.components.network import Network
 from physx_core.normalization import Normalization
 from physx_core.typing import Tensors
@@ -12,10 +13,15 @@ from physx_core.typing import Tensors
 class Transformation:
     """The identity; plugins derive their own.
 
+    Of targets that are increments, it gets and returns the changes.
+
     Attributes:
         normalization: Mean and standard deviation by field; empty if nothing is normalized. They
             are stored in checkpoints.
+        increments: The targets that are increments; None: there are none.
     """
+
+    increments: Increments | None = None
 
     def __init__(self) -> None:
         self.normalization: dict[str, Normalization] = {}
@@ -23,8 +29,13 @@ class Transformation:
     def set_normalization(
         self, normalization: Mapping[str, Normalization], network: Network
     ) -> None:
-        """Set the coefficients; called before the first batch and whenever they change."""
+        """Set the coefficients; called before the first batch and whenever they change.
+
+        Raises:
+            ConfigError: If a target is the increment of what the network does not read.
+        """
         self.normalization = dict(normalization)
+        self.increments = Increments(network, normalization) or None
 
     def transform_before_prediction(self, data: Tensors) -> Tensors:
         """Return the network's inputs, from data in physical units.

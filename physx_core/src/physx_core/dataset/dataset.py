@@ -404,6 +404,21 @@ class Dataset(EpisodeReading, Closeable):
             self._check_ordinary(mode)
         appender.append(mode, rows, checked=checked)
 
+    def unfinished_episodes(self, mode: str, campaign: int) -> dict[int, tuple[int, int]]:
+        """Return the episodes of which parts are stored, but not the last one.
+
+        Args:
+            mode: Name of a mode.
+            campaign: Number of the campaign in it.
+
+        Returns:
+            For the number of each the number of its next part, and how many rows it has.
+
+        Raises:
+            UsageError: If the dataset is not open for writing, or closed.
+        """
+        return self._for_writing().writer.recorder.unfinished(mode, campaign)
+
     def append_episodes(
         self,
         mode: str,

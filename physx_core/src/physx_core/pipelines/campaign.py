@@ -23,7 +23,7 @@ CAMPAIGNS = "campaigns"
 """Entry in a dataset's info: what its campaigns simulated, in order."""
 _SAME = (
     *("environment", "env_kwargs", "independent_episodes", "episode_steps"),
-    *("simulations_per_step", "sampler", "sampler_kwargs", "seed"),
+    *("simulations_per_step", "sampler", "sampler_kwargs", "state_every", "seed"),
 )
 """Entries of a description on which the rows of an episode depend."""
 

@@ -15,6 +15,8 @@ from physx_core.pipelines.independence import IndependenceProof
 from physx_core.sources.episode_source import EpisodeSource
 from physx_core.sources.source import Source
 from physx_core.workers.episode_queue import EpisodeQueue
+from physx_core.workers.episode_runner import EpisodeBlock
+from physx_core.workers.pasts import Past, PastFiles
 from physx_core.workers.row_queue import RowQueue
 
 
@@ -36,6 +38,7 @@ class CampaignWriter:
         max_failed: int,
         *,
         keeps_rejected: bool,
+        states: PastFiles | None,
     ) -> None:
         """Prepare; `open` gives it what simulates.
 
@@ -45,10 +48,11 @@ class CampaignWriter:
             queue: The numbers that are missing.
             max_failed: How many episodes of this run may fail.
             keeps_rejected: Whether to store the samples that `check_sample` rejects.
+            states: Keeps the states of episodes that have not ended; None: there are none.
         """
         self.campaign, self.queue, self.failed = campaign, queue, 0
         self._dataset, self._max_failed = dataset, max_failed
-        self._keeps_rejected = keeps_rejected
+        self._keeps_rejected, self._states = keeps_rejected, states
         self._delegation: Delegation | None = None
         self._unsure: list[EpisodeRecord] = []  # failed, but perhaps not needed
         self._source: Source | None = None
@@ -118,8 +122,19 @@ class CampaignWriter:
             checked=True,
             first_row=block.first_row,
         )
+        if self._states is not None:
+            self._keep_state(self._states, block)
         self._count_failed(record for record in records if record.status is EpisodeStatus.FAILED)
         return self.queue.finished - before
+
+    def _keep_state(self, states: PastFiles, block: EpisodeBlock) -> None:
+        """Keep the state that comes with rows, which are stored, and no state of what has ended."""
+        for record in block.records:
+            if record.status is not EpisodeStatus.MORE:
+                states.forget(range(record.episode, record.episode + record.count))
+        if block.state is not None:
+            number, made, state = block.state
+            states.keep({number: Past(made, state)})
 
     def _count_failed(self, failed: Iterable[EpisodeRecord]) -> None:
         """Count the failed episodes that are known to be needed.

@@ -35,6 +35,7 @@ from physx_core.pipelines.storage import (
     reject_streams_of_writers,
     store_sets,
 )
+from physx_core.pipelines.stored_episodes import find_begun
 from physx_core.pipelines.stored_streams import StoredStreams
 from physx_core.results import Result
 from physx_core.session import Session
@@ -42,7 +43,7 @@ from physx_core.sources.source import Source
 from physx_core.typing import Batch
 from physx_core.views.dataset_config import DatasetConfig
 from physx_core.workers.episode_queue import EpisodeQueue
-from physx_core.workers.pasts import NOTHING
+from physx_core.workers.pasts import NOTHING, PastFiles
 from physx_core.workers.row_queue import RowQueue
 
 
@@ -102,6 +103,7 @@ class DataGeneration(NewSessionPipeline):
     _first_row: int = field(init=False, repr=False, default=0)
     _former_rows: int = field(init=False, repr=False, default=0)
     _streams: StoredStreams | None = field(init=False, repr=False, default=None)
+    _states: PastFiles | None = field(init=False, repr=False, default=None)
     _is_described: bool = field(init=False, repr=False, default=False)
 
     def __post_init__(self) -> None:
@@ -199,10 +201,11 @@ class DataGeneration(NewSessionPipeline):
         earlier: dict[int, int] = {}
         if streams is not None:
             missing = streams.missing(wanted, missing)
-            earlier, streams.earlier = streams.earlier, earlier
         if not missing:  # an earlier run has stored it
             self.batch = {}
             return
+        if streams is not None:
+            earlier, streams.earlier = streams.earlier, earlier
         source, dataset, mode = self.source, self.dataset, self._mode
         with record_beside_rows(source, dataset, mode, earlier):
             self.batch = source.batch(missing)
@@ -277,10 +280,10 @@ class DataGeneration(NewSessionPipeline):
             self.session = Session.existing(self.session_dir, self.session_name)
         else:
             self.session = self._create_session()
-        self._writer = self._streams = None
+        self._writer = self._streams = self._states = None
         self._first_row = self.batch_id = self._former_rows = 0
         self._is_described = False
-        resources.callback(self._close_streams)
+        resources.callback(self._close_states)
         self.dataset = resources.enter_context(open_own(self.session, dataset_config))
         campaign = former = None
         campaigns = Campaign.count(self.dataset, self._mode)
@@ -366,9 +369,10 @@ class DataGeneration(NewSessionPipeline):
         campaign = Campaign.begin(self.dataset, self._mode, config, self._seed, seed, parameters)
         self._writer = self._make_writer(campaign)
 
-    def _close_streams(self) -> None:
-        if self._streams is not None:
-            self._streams.close()
+    def _close_states(self) -> None:
+        for kept in (self._streams, self._states):
+            if kept is not None:
+                kept.close()
 
     def _larger_number(self) -> dict[str, int]:
         """Return how much to record if the campaign was to have more than this run asks for."""
@@ -390,15 +394,20 @@ class DataGeneration(NewSessionPipeline):
 
     def _make_writer(self, campaign: Campaign) -> CampaignWriter:
         ended = campaign.ended(self.dataset, failed=not self.retry_failed)
+        config = self.environment_config
+        self._states, begun = find_begun(self.session, self.dataset, campaign, config)
         queue: EpisodeQueue
-        retries = self.environment_config.retries
         if self.episodes is None:
-            queue = RowQueue(self._amount()[0], ended, retries)
+            queue = RowQueue(self._amount()[0], ended, config.retries, begun)
         else:
-            queue = EpisodeQueue(self.episodes, ended.all_numbers, retries)
-        keeps_rejected = self.environment_config.record_wrong_samples
+            queue = EpisodeQueue(self.episodes, ended.all_numbers, config.retries, begun)
         return CampaignWriter(
-            self.dataset, campaign, queue, self.max_failed, keeps_rejected=keeps_rejected
+            self.dataset,
+            campaign,
+            queue,
+            self.max_failed,
+            keeps_rejected=config.record_wrong_samples,
+            states=self._states,
         )
 
     def _simulates_episodes(self) -> bool:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from functools import partial
 
 import numpy as np
 
@@ -13,7 +14,7 @@ from physx_core.typing import Batch
 from physx_core.workers.episode_queue import EpisodeQueue
 from physx_core.workers.episode_runner import EpisodeBlock, EpisodeRunner
 from physx_core.workers.instance import Instance
-from physx_core.workers.lease import Lease, most_numbers
+from physx_core.workers.lease import Lease, most_numbers, say_without_states
 from physx_core.workers.parameter_sets import ParameterSets
 
 
@@ -90,16 +91,20 @@ class EpisodeSource(ABC):
 class LocalEpisodes(EpisodeSource):
     """Simulates the numbers one after another in this process, with one environment."""
 
-    def __init__(self, instance: Instance, sets: ParameterSets, queue: EpisodeQueue) -> None:
+    def __init__(
+        self, instance: Instance, sets: ParameterSets, queue: EpisodeQueue, state_every: int
+    ) -> None:
         """Prepare the simulation.
 
         Args:
             instance: Simulates the episodes; open.
             sets: Chooses the parameters of each number.
             queue: The numbers to simulate.
+            state_every: Number of rows after which an episode gives a state; 0: never.
         """
         super().__init__(sets, queue)
-        self._runner = EpisodeRunner(instance, self._lease)
+        refuse = partial(say_without_states, instance.instance_id)
+        self._runner = EpisodeRunner(instance, self._lease, refuse, state_every=state_every)
         self._leased = 0
 
     @property
@@ -109,13 +114,18 @@ class LocalEpisodes(EpisodeSource):
 
     def take(self) -> EpisodeBlock:
         """Simulate the next episodes: see `EpisodeSource.take`."""
-        return self._settled(self._runner.run())
+        return self._settled(self._take_again(0))
 
     def _take_again(self, instance_id: int) -> EpisodeBlock:
-        return self._runner.run()
+        block = self._runner.run()
+        for record in block.records:
+            self._queue.follow(record)
+        return block
 
     def _lease(self) -> Lease | None:
         """Return the next numbers: at most twice as many as before, as sampling may be slow."""
         numbers = self._queue.take_range(min(1 + self._leased, most_numbers(self._sets.parameters)))
         self._leased += len(numbers)
-        return Lease(numbers, self._sets.values_of(numbers)) if numbers else None
+        if not numbers:
+            return None
+        return Lease(numbers, self._sets.values_of(numbers), self._queue.begun(numbers[0]))

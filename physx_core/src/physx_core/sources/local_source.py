@@ -131,7 +131,8 @@ class LocalSource(Source):
         """Simulate independent episodes: see `Source.lease`."""
         from physx_core.sources.episode_source import LocalEpisodes  # streams need no records
 
-        return LocalEpisodes(self._instances[0], self.sets, queue)
+        every = self._config.state_every
+        return LocalEpisodes(self._instances[0], self.sets, queue, every)
 
     def _open(self, instance: Instance) -> None:
         draw, with_states = self._config.visualizer is not None, self._config.state_every > 0

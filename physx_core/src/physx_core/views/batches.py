@@ -21,16 +21,19 @@ from physx_core.dataset.read.epochs import Epoch
 from physx_core.dataset.read.mode_statistics import compute_of
 from physx_core.dataset.read.shuffling import ItemOrder, key_of
 from physx_core.dataset.store.definitions import compare_fields
+from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.errors import ConfigError, DatasetError, UsageError
 from physx_core.fields import Field
 from physx_core.normalization import Measured, Normalization, Normalize, compute_normalization
 from physx_core.statistics import RunningStatistics
 from physx_core.typing import Array, Batch, Index
 from physx_core.views.folds import Part
+from physx_core.views.items import Located
 from physx_core.views.options import ViewOptions, Window
 from physx_core.views.sources import Source, window_of
 
 _SHARES = 1000
+_AHEAD = 4096
 PAD = "_is_pad"
 """What is added to the name of a window for that of the field that marks its repeated values."""
 
@@ -119,6 +122,7 @@ class Batches(Closeable):
         self._epoch: tuple[int, Epoch] | None = None
         self._process = os.getpid()
         self._passes: dict[tuple[int, int, int], tuple[ItemOrder, int]] = {}
+        self._ahead = 0, 0, 0, Located(np.zeros(0, np.intp), None)
 
     def _open(
         self,
@@ -239,12 +243,13 @@ class Batches(Closeable):
             self._begin(epoch).fill(start, batch)
             return batch
         if len(self._sources) == 1:
-            return self._values(self._sources[0], self._items(0, epoch, 0, start, stop))
+            return self._values(self._sources[0], self._next(epoch, start, stop))
         batch = self._arrays.take(stop - start)
         for source, (slots, items) in zip(
             self._sources, self._drawn(epoch, start, stop), strict=True
         ):
-            for name, values in self._values(source, items).items() if len(slots) else ():
+            where = source.items.locate(items)
+            for name, values in self._values(source, where).items() if len(slots) else ():
                 batch[name][slots] = values
         return batch
 
@@ -318,7 +323,7 @@ class Batches(Closeable):
     def take(self, items: Index) -> Batch:
         """Return some of the items of a single source as a batch, whatever their order."""
         self._only.rows.check()
-        return self._values(self._only, items)
+        return self._values(self._only, self._only.items.locate(items))
 
     @property
     def _only(self) -> Source:
@@ -370,6 +375,17 @@ class Batches(Closeable):
         order, key = self._pass(source, epoch, repeat)
         return self._sources[source].drawn(order.items(start, stop), key)
 
+    def _next(self, epoch: int, start: int, stop: int) -> Located:
+        """Return the items of a batch of a single source; of those after it, several at once."""
+        known, first, last, found = self._ahead
+        if known != epoch or start < first or stop > last:
+            follows = known == epoch and start == last
+            last = min(start + _AHEAD, self.num_items) if follows else stop
+            last, first = max(last, stop), start
+            found = self._sources[0].items.locate(self._items(0, epoch, 0, first, last))
+            self._ahead = epoch, first, last, found
+        return found.part(start - first, stop - first)
+
     def _drawn(self, epoch: int, start: int, stop: int) -> list[tuple[Index, Index]]:
         """Return for each source which places of a batch it fills, and with which items."""
         slots = np.arange(start, stop)
@@ -388,15 +404,15 @@ class Batches(Closeable):
             found.append((mine, items))
         return found
 
-    def _values(self, source: Source, items: Index) -> Batch:
+    def _values(self, source: Source, where: Located) -> Batch:
         """Return what a batch contains of some items of a source."""
         found: Batch = {}
         for name, window in self._windows.items():
-            values = source.gather(window.field, items, window.at)
+            values = source.gather(window.field, where, window.at)
             values = values[:, 0] if window.is_single else values
             found[name] = values.astype(self._kinds[name], copy=False)
             if name + PAD in self.fields:
-                padded = source.items.are_padded(items, window.at)
+                padded = source.items.are_padded(where.items, window.at)
                 found[name + PAD] = padded[:, 0] if window.is_single else padded
         return found
 
@@ -428,7 +444,19 @@ class Batches(Closeable):
     def _statistics(self, of: Measured) -> RunningStatistics:
         total = RunningStatistics()
         for source in self._sources:
-            total.merge(compute_of(source.rows, of, source.items.ranges()))
+            total.merge(
+                self._statistics_of_increments(source, of)
+                if of.since
+                else compute_of(source.rows, of, source.items.ranges())
+            )
+        return total
+
+    def _statistics_of_increments(self, source: Source, of: Measured) -> RunningStatistics:
+        total, both = RunningStatistics(of.pooled), self.reading(of.names)
+        step = rows_per_block(sum(field.nbytes for field in both.fields.values()))
+        for start in range(0, source.count, step):
+            items = np.arange(start, min(start + step, source.count))
+            total.update(of.of(both._values(source, source.items.locate(items))))
         return total
 
     @property

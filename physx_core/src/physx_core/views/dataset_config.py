@@ -35,9 +35,11 @@ class DatasetConfig:
     """Normalize fields to mean 0 and standard deviation 1 for networks. A table says how, by field:
     "component", each component for itself; "channel", each entry of the axis "channel", all others
     together; "field", all components together; with "log-" in front, the natural logarithm of
-    positive values; "none", not at all. A field that it does not name, and with True every field,
-    is normalized like the one that it is `like`, by that one's statistics; else by "channel", or
-    by "field" without channels, if it has two or more named axes; else by "component"."""
+    positive values; "increment", its change since the field of the network's inputs that is the
+    same quantity, or since FIELD with "increment:FIELD"; "none", not at all. A field that it does
+    not name, and with True every field, is normalized like the one that it is `like`, by that one's
+    statistics; else by "channel", or by "field" without channels, if it has two or more named axes;
+    else by "component"."""
     recompute_normalization: bool = False
     """Recompute mean and standard deviation from the stored rows instead of using the stored
     values."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 
@@ -12,6 +13,23 @@ from physx_core.typing import Index
 from physx_core.views.options import ViewOptions
 
 _STEPS = 4
+
+
+class Located(NamedTuple):
+    """Some items, and where they are.
+
+    Attributes:
+        items: Their numbers, shape (items,).
+        rows: Their reference rows, if the rows of a window follow one another there as its offsets
+            do; None: they may not.
+    """
+
+    items: Index
+    rows: Index | None
+
+    def part(self, start: int, stop: int) -> Located:
+        """Return some of them."""
+        return Located(self.items[start:stop], None if self.rows is None else self.rows[start:stop])
 
 
 class Items:
@@ -56,7 +74,7 @@ class Items:
 
     def rows(self, items: Index, offsets: Sequence[int] = (0,)) -> Index:
         """Return the row numbers of items at some offsets, shape (items, offsets)."""
-        start, size, place = self._locate(items)
+        start, size, place = self._places(items)
         places = place[:, None] + np.asarray(offsets, np.intp)
         if self._pads:
             places = np.clip(places, 0, size[:, None] - 1)
@@ -64,19 +82,17 @@ class Items:
         found = self._found.places
         return places if found is None else found[places]
 
-    def first_rows(self, items: Index, offsets: Sequence[int]) -> Index | None:
-        """Return the first row of each window; None if its rows do not follow one another."""
-        is_run = list(offsets) == list(range(offsets[0], offsets[0] + len(offsets)))
-        if self._pads or self._found.places is not None or not is_run:
-            return None
-        found = self._first.take(self.trajectories(items))
-        found += items if self._stride == 1 else items * self._stride
-        found += offsets[0]
-        return found
+    def locate(self, items: Index) -> Located:
+        """Return items with their reference rows."""
+        if self._pads or self._found.places is not None:
+            return Located(items, None)
+        rows = self._first.take(self.trajectories(items))
+        rows += items if self._stride == 1 else items * self._stride
+        return Located(items, rows)
 
     def are_padded(self, items: Index, offsets: Sequence[int]) -> Flags:
         """Return whether the values of items at some offsets are repeated, as `rows`."""
-        _, size, place = self._locate(items)
+        _, size, place = self._places(items)
         places = place[:, None] + np.asarray(offsets, np.intp)
         return (places < 0) | (places >= size[:, None])
 
@@ -107,7 +123,7 @@ class Items:
         begins = np.flatnonzero(np.diff(rows, prepend=-2) != 1)
         return rows[begins], np.diff(begins, append=len(rows))
 
-    def _locate(self, items: Index) -> tuple[Index, Index, Index]:
+    def _places(self, items: Index) -> tuple[Index, Index, Index]:
         """Return start and rows of each item's trajectory, and the place of its reference row."""
         which = self.trajectories(items)
         inside = items - (self._ends[which] - self.trajectory[which])

@@ -21,7 +21,7 @@ from physx_core.errors import ConfigError, DatasetError
 from physx_core.plugins.references import import_component
 from physx_core.typing import Array, Index
 from physx_core.views.folds import Part, choose_part
-from physx_core.views.items import Items
+from physx_core.views.items import Items, Located
 from physx_core.views.options import ViewOptions, Window
 
 _BLOCK, _SAME_SIZE = 16, 4096
@@ -222,16 +222,16 @@ class Source:
                 which = self.items.trajectories(every)
                 self._weights = 1.0 / self.items.trajectory[which]
             else:
-                values = self.gather(name, every, (0,))[:, 0]
+                values = self.gather(name, self.items.locate(every), (0,))[:, 0]
                 self._weights = _weights_of(kind, name, values)
         return self._weights
 
-    def gather(self, name: str, items: Index, offsets: Sequence[int]) -> Array:
+    def gather(self, name: str, where: Located, offsets: Sequence[int]) -> Array:
         """Return a stored field of items at some offsets, shape (items, offsets, *field shape)."""
-        first = self.items.first_rows(items, offsets)
-        if first is not None:
-            return self.rows.windows(name, first, len(offsets))
-        rows = self.items.rows(items, offsets)
+        first, count = offsets[0], len(offsets)
+        if where.rows is not None and tuple(offsets) == tuple(range(first, first + count)):
+            return self.rows.windows(name, where.rows + first, count)
+        rows = self.items.rows(where.items, offsets)
         found = self.rows.gather(name, rows.ravel())
         return found.reshape(*rows.shape, *found.shape[1:])
 

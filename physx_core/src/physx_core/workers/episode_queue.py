@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import heapq
 from collections import Counter
-from collections.abc import Collection
+from collections.abc import Collection, Mapping
 
 import numpy as np
 
 from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.typing import Index
+from physx_core.workers.lease import Begun, EpisodeState
 
 
 class EpisodeQueue:
@@ -22,7 +23,11 @@ class EpisodeQueue:
     """
 
     def __init__(
-        self, total: int, recorded: Collection[int] | Index = (), retries: int | None = None
+        self,
+        total: int,
+        recorded: Collection[int] | Index = (),
+        retries: int | None = None,
+        begun: Mapping[int, Begun] | None = None,
     ) -> None:
         """Start with all numbers that are not recorded.
 
@@ -30,13 +35,15 @@ class EpisodeQueue:
             total: Number of episodes.
             recorded: Numbers that an earlier run has recorded; those from `total` on are ignored.
             retries: How often a number is given out again after it was lost; None: once.
+            begun: What an earlier run has stored of episodes that are not recorded.
         """
         self.total = self.end = total
         known = recorded if isinstance(recorded, np.ndarray) else np.array([*recorded], np.int64)
         numbers = np.sort(known, kind="stable")
         numbers = numbers[(numbers < total) & (np.diff(numbers, prepend=-1) > 0)]
         self.finished = len(numbers)
-        self._begins, self._ends = _gaps(numbers, total)
+        self._begun = {number: each for number, each in (begun or {}).items() if number < total}
+        self._begins, self._ends = _gaps(numbers, total, self._begun)
         self._losses, self._retries = Counter[int](), 1 if retries is None else retries
         self._returned: list[int] = []
         self._gap, self._next = 0, 0
@@ -78,6 +85,33 @@ class EpisodeQueue:
         if record.status is not EpisodeStatus.MORE:
             self.finished += record.count
 
+    def follow(self, record: EpisodeRecord, state: EpisodeState | None = None) -> None:
+        """Note what there is of a number that has not ended, for whoever goes on with it.
+
+        Args:
+            record: What has come from its client.
+            state: Its newest state; None: as before.
+
+        Raises:
+            ValueError: If the state is of another one, or after rows that have not come.
+        """
+        before = self._begun.pop(record.episode, None) if self._begun else None
+        if record.status is not EpisodeStatus.MORE:
+            return
+        if before is None or not record.part:
+            before = Begun(0, 0)
+        begun = before._replace(part=record.part + 1, rows=before.rows + record.rows)
+        if state is not None:
+            if state.episode != record.episode or not 0 < state.made <= begun.rows:
+                raise ValueError("a state of another episode, or after rows that it has not sent")
+            begun = begun._replace(made=state.made, state=state.state)
+        self._begun[record.episode] = begun
+
+    def begun(self, number: int) -> Begun | None:
+        """Return from where a number goes on; None: it begins."""
+        found = self._begun.get(number)
+        return found if found is not None and found.state else None
+
     @property
     def waiting(self) -> int:
         """How many numbers wait, at most."""
@@ -96,8 +130,18 @@ class EpisodeQueue:
         return True
 
 
-def _gaps(numbers: Index, total: int) -> tuple[Index, Index]:
-    """Return the begins and ends of the ranges of numbers below `total` that are missing."""
+def _gaps(numbers: Index, total: int, alone: Collection[int]) -> tuple[Index, Index]:
+    """Return the begins and ends of the ranges of numbers below `total` that are missing.
+
+    Args:
+        numbers: The numbers that are there, in order.
+        total: See above.
+        alone: Missing ones that are ranges of their own.
+    """
     begins, ends = np.append(0, numbers + 1), np.append(numbers, total)
     missing = begins < ends
-    return begins[missing], ends[missing]
+    begins, ends = begins[missing], ends[missing]
+    single = np.array(sorted(alone), np.int64)
+    more_begins = np.union1d(single, np.setdiff1d(single + 1, ends))
+    more_ends = np.union1d(single + 1, np.setdiff1d(single, begins))
+    return np.union1d(begins, more_begins), np.union1d(ends, more_ends)

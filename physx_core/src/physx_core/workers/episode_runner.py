@@ -19,13 +19,15 @@ from physx_core.errors import (
     PhysxError,
     ProgramError,
     SampleError,
+    StateError,
     WrongSamplesError,
 )
 from physx_core.fields import Field
+from physx_core.net.values import decode, encode
 from physx_core.rows import ROW_FIELDS, RowBuffer, infer_shapes
 from physx_core.typing import Batch
 from physx_core.workers.instance import MOST_REJECTED, Instance
-from physx_core.workers.lease import AIM, Lease
+from physx_core.workers.lease import AIM, Begun, EpisodeState, Lease
 
 OF_EPISODES = (EnvironmentFailedError, ProgramError, NotFiniteError, WrongSamplesError)
 """Errors that end an episode."""
@@ -45,6 +47,7 @@ class EpisodeBlock(NamedTuple):
         rejected: The samples that `check_sample` rejected in the episodes that have ended, if they
             are recorded; ``step`` counts all of an episode's.
         first_row: Address of the rows if a client has written them itself, so that there are none.
+        state: The newest state of the last episode, which goes on; None: there is no new one.
     """
 
     rows: Batch
@@ -52,6 +55,7 @@ class EpisodeBlock(NamedTuple):
     instance_id: int = 1
     rejected: Batch = {}  # noqa: RUF012 - never changed
     first_row: int | None = None
+    state: EpisodeState | None = None
 
 
 @dataclass(slots=True)
@@ -91,22 +95,32 @@ class EpisodeRunner:
     """
 
     def __init__(
-        self, instance: Instance, take: Callable[[], Lease | None], clock: Clock = SYSTEM_CLOCK
+        self,
+        instance: Instance,
+        take: Callable[[], Lease | None],
+        refuse: Callable[[StateError], None],
+        *,
+        state_every: int = 0,
+        clock: Clock = SYSTEM_CLOCK,
     ) -> None:
         """Store what simulates.
 
         Args:
             instance: Simulates the episodes; open.
             take: Returns the next numbers; None: there are none now.
+            refuse: Called once if an episode cannot give a state, or go on from one.
+            state_every: Number of rows after which an episode gives a state; 0: never.
             clock: Tells what an episode costs.
         """
         self.fields: list[Field] = [*instance.fields, *ROW_FIELDS]
         self.is_busy = False
         self._instance, self._take, self._now = instance, take, clock.monotonic
+        self._refuse, self._has_refused, self._state_every = refuse, False, state_every
+        self._state: EpisodeState | None = None
         self._lease = Lease(range(0), {})
         self._episodes = self._lease.episodes()
         self._number: int | None = None  # of the episode that is being simulated
-        self._part = self._step = 0
+        self._part = self._step = self._stored = 0  # rows that an earlier client has stored
         self._buffer: RowBuffer | None = None
         self._parts: list[_Part] = []
         self._joined: _Part | None = None  # the last part, if an episode of one row can be added
@@ -120,7 +134,8 @@ class EpisodeRunner:
     def run(self) -> EpisodeBlock:
         """Simulate until rows fill a block, episodes took 20 ms, or no number is left.
 
-        A part of a long episode is returned after 10 s, so that it is on the disk.
+        A part of a long episode is returned after 10 s, so that it is on the disk, and with each
+        state.
 
         Raises:
             PhysxError: If the environment fails in a way that concerns all episodes.
@@ -141,9 +156,7 @@ class EpisodeRunner:
                 self._fail(error)
             if self._number is None and self._began >= until:
                 break
-            if self._is_full:
-                break
-            if self._number is not None and self._now() - self._began >= _PART_TIME:
+            if self._is_full or self._is_due:
                 break
         if self._number is not None:
             self._end(_MORE)
@@ -158,15 +171,48 @@ class EpisodeRunner:
         has_many = len(self._parts) >= self._most_parts or rejected >= MOST_REJECTED
         return self._number is None and has_many
 
+    @property
+    def _is_due(self) -> bool:
+        """Whether the rows of an episode that goes on are to be stored now."""
+        if self._number is None or self._step <= self._stored:
+            return False
+        return self._now() - self._began >= (AIM if self._state else _PART_TIME)
+
     def _begin(self) -> bool:
         """Begin the next number; return whether there is one."""
         following = next(self._episodes, None) or self._take_more()
         if following is None:
             return False
         self._number, values = following
-        self._part = self._step = 0
+        self._part = self._step = self._stored = 0
+        self._state = None
         self._instance.begin(self._number, values)
+        if self._lease.begun is not None:
+            self._go_on(self._lease.begun)
         return True
+
+    def _go_on(self, begun: Begun) -> None:
+        """Go on with an episode from its state; if that is impossible, it has begun anew."""
+        try:
+            self._instance.set_state(decode(begun.state))
+        except StateError as error:
+            self._say_refusal(error)
+        else:
+            self._part, self._stored, self._step, _ = begun
+
+    def _take_state(self) -> None:
+        """Take the state of an episode, always after the same rows: see `Instance.get_state`."""
+        try:
+            state = encode(self._instance.get_state(), "the state")
+        except StateError as error:
+            self._say_refusal(error)
+        else:
+            self._state = EpisodeState(self._number or 0, self._step, state)
+
+    def _say_refusal(self, error: StateError) -> None:
+        if not self._has_refused:
+            self._has_refused = True
+            self._refuse(error)
 
     def _take_more(self) -> tuple[int, Mapping[str, Any]] | None:
         """Take numbers and return the first one with its parameters; None if there are none."""
@@ -181,13 +227,16 @@ class EpisodeRunner:
         """Simulate the next row of the episode, which may be its last."""
         sample = self._instance.step()
         if sample:
-            buffer = self._buffer or self._make_buffer(sample)
-            buffer.put(sample, 0, self._number or 0, self._step)
+            if self._step >= self._stored:
+                buffer = self._buffer or self._make_buffer(sample)
+                buffer.put(sample, 0, self._number or 0, self._step)
             self._step += 1
         if not sample or self._instance.has_ended:
             fields = self._instance.take_episode_data() if self._episode_fields else None
             self._end(_FINISHED, fields=fields)
             self._number = None
+        elif self._state_every and self._step % self._state_every == 0:
+            self._take_state()
 
     def _make_single_rows(self, until: float) -> None:
         """Simulate episodes of one row while there are numbers, space, and time."""
@@ -283,7 +332,8 @@ class EpisodeRunner:
                 self._leave_out(self._buffer, self._buffer.count, count, str(error))
         parts, self._parts, self._first, self._joined = self._parts, [], 0, None
         records, who = [_record(part) for part in parts], self._instance.instance_id
-        return EpisodeBlock(rows, records, who, self._take_rejected())
+        state, self._state = None if self._number is None else self._state, None
+        return EpisodeBlock(rows, records, who, self._take_rejected(), state=state)
 
     def _take_rejected(self) -> Batch:
         """Return the rejected samples of all episodes but the one that goes on."""

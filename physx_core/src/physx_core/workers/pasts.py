@@ -226,9 +226,24 @@ class PastFiles(Closeable):
         """
         found: dict[int, Past] = {}
         for number, past in self._read_all():
+            self._written.setdefault(number, (0, -math.inf))
             if is_valid(number, past) and past.rows > found.get(number, Past()).rows:
                 found[number] = past
         return found
+
+    def forget(self, numbers: range) -> None:
+        """Remove what is kept of some numbers, which need it no more.
+
+        Raises:
+            DatasetError: If the disk fails.
+        """
+        for number in [each for each in self._written if each in numbers]:
+            del self._written[number]
+            for known in (self._waiting, self._aging, self._turns):
+                known.pop(number, None)
+            with files.storing(f"The state of number {number}"):
+                for path in self._folder.glob(f"{number}.*bin"):
+                    files.remove(path)
 
     def clear(self) -> None:
         """Remove the pasts of an earlier generation."""

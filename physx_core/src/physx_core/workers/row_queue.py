@@ -5,7 +5,7 @@ from __future__ import annotations
 import warnings
 from bisect import bisect_right
 from collections import Counter
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -14,6 +14,7 @@ from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.errors import UsageError
 from physx_core.typing import Index
 from physx_core.workers.episode_queue import EpisodeQueue
+from physx_core.workers.lease import Begun
 
 _NO_END = 2**47
 _SOME_EMPTY, _MOST_EMPTY = 1000, 10_000
@@ -57,21 +58,29 @@ class RowQueue(EpisodeQueue):
 
     choose: Callable[[RowQueue, int], int] | None = None
 
-    def __init__(self, goal: int, recorded: Ended = NONE_ENDED, retries: int | None = None) -> None:
+    def __init__(
+        self,
+        goal: int,
+        recorded: Ended = NONE_ENDED,
+        retries: int | None = None,
+        begun: Mapping[int, Begun] | None = None,
+    ) -> None:
         """Start with the numbers that are not recorded.
 
         Args:
             goal: How many rows are wanted.
             recorded: Episodes that an earlier run has recorded.
             retries: How often a number is given out again after it was lost; None: once.
+            begun: What it has stored of others.
         """
-        super().__init__(_NO_END, recorded.all_numbers, retries)
+        super().__init__(_NO_END, recorded.all_numbers, retries, begun)
         first, numbers, rows = recorded
         ends = np.cumsum(numbers)
         before = int((first == ends - numbers).sum())  # entries before the first missing number
         later = zip(*(column[before:].tolist() for column in recorded), strict=True)
         self.goal, self._taken, self._all_rows = goal, 0, int(rows.sum())
-        self._parts: Counter[int] = Counter()  # number to its rows so far
+        rows_so_far = {number: each.rows for number, each in self._begun.items()}
+        self._parts = Counter[int](rows_so_far)  # by number
         self._ended = {first: (count, rows) for first, count, rows in later}  # after the missing
         self._last = int((first + numbers).max(initial=0)) - 1  # the last one that has ended
         # Numbers up to the first missing one, and the rows before them:

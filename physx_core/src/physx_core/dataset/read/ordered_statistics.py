@@ -76,7 +76,7 @@ def compute_of_rows(
     """
     field = known.fields[of.field]
     cells = _divide(known, field, starts, counts)
-    if known.order is None or of.log or of.pooled != field.pooled:
+    if known.order is None or of.log or of.since or of.pooled != field.pooled:
         return _read(known, of, cells).merged()
     return _Keeper(known, of).find(cells).merged()
 
@@ -194,7 +194,7 @@ def _read(known: ModeRows, of: Measured, cells: _Division) -> Cells:
         last = max(first + 1, int(ends.searchsorted(read + step, "right")))
         rows = np.concatenate([cells.rows(cell) for cell in range(first, last)])
         blocks = (rows[begin : begin + step] for begin in range(0, len(rows), step))
-        values = (of.of(known.gather(of.field, block)) for block in blocks)
+        values = (of.of({n: known.gather(n, block) for n in of.names}) for block in blocks)
         if len(rows) <= step:
             found.append(Cells.of(next(values), cells.size[first:last], of.pooled))
         else:

@@ -62,7 +62,7 @@ class Recorder:
         self._writer, self._reader = writer, reader
         self._streams: dict[str, tuple[int, int]] = {}  # campaign and first row of open ones
         self._campaigns: dict[str, int] = {}  # the last one
-        self._parts: dict[tuple[str, int, int], int] = {}  # the next one of unfinished episodes
+        self._unfinished: dict[tuple[str, int, int], tuple[int, int]] = {}  # next part, and rows
 
     def load(self) -> None:
         """Look at the records that there are; unfinished episodes that lack rows begin anew.
@@ -72,7 +72,7 @@ class Recorder:
         """
         if not has_table(self.manifest):
             return
-        for known in (self.recorded, self._streams, self._campaigns, self._parts):
+        for known in (self.recorded, self._streams, self._campaigns, self._unfinished):
             known.clear()
         for mode in RECORDED:
             records = self._reader.orders.records(mode)
@@ -92,7 +92,7 @@ class Recorder:
         for campaign, episode, _, first, rows, part, status in zip(*columns, strict=True):
             self._note(mode, campaign, episode, first, rows, part, status)
             if status == EpisodeStatus.MORE and not addresses.has_all(first, rows):
-                self._parts.pop((mode, campaign, episode), None)
+                self._unfinished.pop((mode, campaign, episode), None)
 
     def append(
         self,
@@ -148,7 +148,7 @@ class Recorder:
         Raises:
             UsageError: If not.
         """
-        parts = dict(self._parts)
+        parts = {key: part for key, (part, _) in self._unfinished.items()}
         for each in episodes:
             key = mode, each.campaign, each.episode
             if each.part and parts.get(key) != each.part:
@@ -157,6 +157,11 @@ class Recorder:
                     f"is {parts.get(key, 0)}."
                 )
             parts[key] = each.part + 1 if each.status is EpisodeStatus.MORE else 0
+
+    def unfinished(self, mode: str, campaign: int) -> dict[int, tuple[int, int]]:
+        """Return the next part of each episode that has not ended, and how many rows it has."""
+        known = self._unfinished.items()
+        return {n: each for (name, of, n), each in known if (name, of) == (mode, campaign)}
 
     def begin_stream(self, mode: str) -> None:
         """Let the next rows of a mode with records count without records of their own.
@@ -226,9 +231,9 @@ class Recorder:
                 self.recorded.discard(mode)
             return
         key = mode, campaign, episode
-        before = self._parts.pop(key, 0)
+        before, known = self._unfinished.pop(key, (0, 0))
         if status == EpisodeStatus.MORE and part in (0, before):
-            self._parts[key] = part + 1
+            self._unfinished[key] = part + 1, rows + (known if part else 0)
 
     def _note_end(self, mode: str, campaign: int, end: int) -> None:
         """Take note of a campaign, and of the address after recorded rows."""

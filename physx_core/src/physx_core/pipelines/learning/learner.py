@@ -129,10 +129,19 @@ class Learner:
         self.normalize(normalization)
 
     def normalize(self, normalization: Mapping[str, Normalization]) -> None:
-        """Pass the normalization of the network's fields to the transformation."""
+        """Pass the normalization of the network's fields to the transformation.
+
+        Raises:
+            ConfigError: If a target is the increment of what the network does not read.
+        """
         used = {*self.network.net_fields, *self.network.opt_fields}
         mine = {name: item for name, item in normalization.items() if name in used}
         self.transformation.set_normalization(mine, self.network)
+        if any(item.since for item in mine.values()) and not self.transformation.increments:
+            raise ConfigError(
+                f"{type(self.transformation).__name__}.set_normalization() must call that of its "
+                "base class, where targets are increments."
+            )
 
     @property
     def batch_fields(self) -> list[str]:

@@ -40,6 +40,7 @@ from physx_core.pipelines.storage import (
     reject_episode_fields,
     restore_parameters,
 )
+from physx_core.pipelines.stored_episodes import find_begun
 from physx_core.plugins.networks import resolve_network
 from physx_core.session import Session
 from physx_core.sources.source import Source
@@ -200,7 +201,7 @@ class DataOpening:
         if buffer.capacity:
             drawn = DrawnRows(self.session, buffer.batch_size, self.progress.blocks)
             resources.callback(drawn.close)
-        writer = self._open_campaign(dataset, environment, source, generation)
+        writer = self._open_campaign(resources, dataset, environment, source, generation)
         blocks = Blocks(
             source,
             dataset,
@@ -218,6 +219,7 @@ class DataOpening:
 
     def _open_campaign(
         self,
+        resources: contextlib.ExitStack,
         dataset: Dataset,
         environment: EnvironmentConfig,
         source: Source,
@@ -238,13 +240,17 @@ class DataOpening:
         else:
             reject_episode_fields(source)
             return None
-        queue = RowQueue(self.buffer.total, campaign.ended(dataset), environment.retries)
+        states, begun = find_begun(self.session, dataset, campaign, environment)
+        if states is not None:
+            resources.callback(states.close)
+        queue = RowQueue(self.buffer.total, campaign.ended(dataset), environment.retries, begun)
         writer = CampaignWriter(
             dataset,
             campaign,
             queue,
             self.max_failed,
             keeps_rejected=environment.record_wrong_samples,
+            states=states,
         )
         source.sets.follow(queue, self.buffer.needed, self.buffer.batch_nb, self.run_ahead)
         writer.open(source)

@@ -151,7 +151,7 @@ class _Client:
         self._link, self._instance, self._folder = link, instance, folder
         self._producer = Producer(link, instance, **skip)
         self._services = RemoteServices(link, self._producer, shown)
-        self._has_states = skip["state_every"] > 0
+        self._state_every = skip["state_every"]
         self._leased: EpisodeProducer | None = None
         self._row_files: RowFiles | None = None
 
@@ -162,7 +162,7 @@ class _Client:
             draw: Whether there is a visualizer.
             state: What an earlier client sent, to go on from; None: begin.
         """
-        services, with_states = self._services, self._has_states
+        services, with_states = self._services, self._state_every > 0
         try:
             if self._folder is not None:
                 from physx_core.workers.client.row_files import RowFiles
@@ -197,7 +197,9 @@ class _Client:
             # Importing datasets takes a quarter of a client's start time; streams need none.
             from physx_core.workers.client.episode_producer import EpisodeProducer
 
-            self._leased = EpisodeProducer(self._link, self._instance, self._row_files)
+            self._leased = EpisodeProducer(
+                self._link, self._instance, self._row_files, self._state_every
+            )
         (self._leased or self._producer).run()
 
     def close(self) -> None:

@@ -15,13 +15,20 @@ from physx_core.dataset import EpisodeRecord, EpisodeStatus
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
 from physx_core.fields import Field
 from physx_core.net.frames import Frame, Kind, pack
+from physx_core.net.remote_errors import decode_error
 from physx_core.net.values import decode, encode
 from physx_core.rows import concatenate
 from physx_core.typing import Batch, Index
 from physx_core.workers.episode_queue import EpisodeQueue
 from physx_core.workers.episode_runner import EpisodeBlock
 from physx_core.workers.instance import MOST_REJECTED
-from physx_core.workers.lease import AIM, Lease, most_numbers
+from physx_core.workers.lease import (
+    AIM,
+    EpisodeState,
+    Lease,
+    most_numbers,
+    say_without_states,
+)
 from physx_core.workers.row_codec import unpack_rows
 from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.validation import check_values
@@ -63,9 +70,11 @@ class Leases:
             **rows,
             Kind.WRONG: self._take_rejected,
             Kind.EPISODES: self._take_episodes,
+            Kind.STATE: self._take_refusal,
         }
         self._queue, self._choose = queue, choose
         self._held: dict[int, _Held] = {}  # by instance
+        self._has_no_states = False
         self._suspects: set[int] = set()  # numbers, one of which ended a client; leased alone
 
     @property
@@ -100,8 +109,10 @@ class Leases:
 
     def _lease(self, peer: Peer, numbers: range) -> None:
         values = self._choose(numbers) if peer.parameters else {}
-        self._held[peer.instance_id].add(Lease(numbers, values), self._clock.monotonic())
-        peer.send(pack(Kind.LEASE, encode([numbers[0], values]), len(numbers)))
+        lease = Lease(numbers, values, self._queue.begun(numbers[0]))
+        self._held[peer.instance_id].add(lease, self._clock.monotonic())
+        begun = None if lease.begun is None else tuple(lease.begun)
+        peer.send(pack(Kind.LEASE, encode([numbers[0], values, begun]), len(numbers)))
         peer.pace.go_on()
 
     def lose(self, instance_id: int) -> int | None:
@@ -176,11 +187,13 @@ class Leases:
         first_row, held.first_row = held.first_row, None
         rejected, held.rejected = concatenate(held.rejected), []
         try:
-            records = [_parse(plain, peer.episode_fields) for plain in decode(frame.payload)]
+            plain, state = decode(frame.payload)
+            records = [_parse(each, peer.episode_fields) for each in plain]
         except (AttributeError, TypeError, ValueError, ConfigError) as error:
             raise ConnectionRefusedByPeerError(f"It sent impossible episodes: {error}.") from error
         before = held.count
         records = [held.settled(record) for record in records]
+        state = None if state is None else _parse_state(state)
         if held.count < before:
             held.since = self._clock.monotonic()
         count = sum(record.rows for record in records)
@@ -194,7 +207,26 @@ class Leases:
             self._written.take(peer, first_row, count)
         peer.received += count
         held.note_pace(records)
-        self.blocks.append(EpisodeBlock(rows, records, peer.instance_id, rejected, first_row))
+        self._follow(records, state)
+        self.blocks.append(
+            EpisodeBlock(rows, records, peer.instance_id, rejected, first_row, state)
+        )
+
+    def _follow(self, records: list[EpisodeRecord], state: EpisodeState | None) -> None:
+        """Note what there is of episodes; the state is of the last one."""
+        last = len(records) - 1
+        try:
+            for place, record in enumerate(records):
+                self._queue.follow(record, state if place == last else None)
+        except ValueError as error:
+            raise ConnectionRefusedByPeerError(f"It sent {error}.") from error
+
+    def _take_refusal(self, peer: Peer, frame: Frame) -> None:
+        if frame.number:
+            raise ConnectionRefusedByPeerError("It sent a state of no episode.")
+        if not self._has_no_states:
+            self._has_no_states = True
+            say_without_states(peer.instance_id, decode_error(frame.payload))
 
 
 class _Held:
@@ -215,6 +247,7 @@ class _Held:
         self._leases: list[tuple[Lease, range]] = []  # with numbers that have not ended
         self._parts: dict[int, int] = {}  # number of an episode that has begun to its next part
         self._pace: float | None = None  # seconds of an episode
+        self._spent = 0.0  # seconds of the parts of one that has not ended
 
     @property
     def left(self) -> list[range]:
@@ -243,12 +276,17 @@ class _Held:
     def note_pace(self, records: list[EpisodeRecord]) -> None:
         """Take note of what episodes have cost."""
         count = sum(each.count for each in records if each.status is not EpisodeStatus.MORE)
-        pace = sum(each.seconds for each in records) / max(1, count)
-        self._pace = 0.5 * (pace + (pace if self._pace is None else self._pace))
+        spent = self._spent + sum(each.seconds for each in records)
+        self._spent = 0.0 if count else spent
+        pace, before = spent / max(1, count), self._pace or 0.0
+        if count or pace > before:  # a part of an episode tells only that it is longer
+            self._pace = 0.5 * (pace + (before or pace))
 
     def add(self, lease: Lease, now: float) -> None:
         """Give it more numbers."""
         self.since = self.since if self._leases else now
+        if lease.begun is not None:
+            self._parts[lease.numbers[0]] = lease.begun.part
         self._leases.append((lease, lease.numbers))
 
     def settled(self, record: EpisodeRecord) -> EpisodeRecord:
@@ -266,12 +304,12 @@ class _Held:
             )
         lease, left = self._leases[place]
         part = self._parts.get(first, 0)
-        if record.rows and record.part != part:
+        if record.rows and record.part not in (0, part):  # it may begin anew
             raise ConnectionRefusedByPeerError(
                 f"It sent part {record.part} of episode {first} instead of {part}."
             )
         if record.status is EpisodeStatus.MORE:
-            self._parts[first] = part + 1
+            self._parts[first] = record.part + 1
         else:
             self._parts.pop(first, None)
             rest = range(left.start, first), range(ended.stop, left.stop)
@@ -320,6 +358,14 @@ def _check_fields(records: list[EpisodeRecord], peer: Peer) -> None:
         if each.fields:
             block = {name: value[None] for name, value in each.fields.items()}
             check_values({**block, "step": np.array([-1])}, peer.episode_fields, peer.instance_id)
+
+
+def _parse_state(plain: Any) -> EpisodeState:
+    """Return the state of an episode that a client sent."""
+    kinds = [type(part) for part in plain] if isinstance(plain, tuple) else []
+    if kinds != [int, int, bytes]:
+        raise ConnectionRefusedByPeerError("It sent a state that is none.")
+    return EpisodeState(*plain)
 
 
 def _parse(plain: Any, fields: list[Field]) -> EpisodeRecord:

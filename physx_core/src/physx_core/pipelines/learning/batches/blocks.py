@@ -219,7 +219,7 @@ class Blocks:
     def _add(self, rows: Batch) -> None:
         for of in measured(self._normalize, self._dataset.fields(self._mode)):
             statistics = self._statistics.setdefault(of, RunningStatistics(of.pooled))
-            statistics.update(of.of(rows[of.field]))
+            statistics.update(of.of(rows))
 
 
 def _part(rows: Batch, part: slice) -> Batch:

@@ -42,10 +42,12 @@ class MujocoAlgorithms(Algorithms):
         self._stretched = np.concatenate(ends).astype(np.intp)
 
     def body_poses(self, q: Vector, bodies: Sequence[int]) -> Vector:
+        """Return the poses of bodies, given as indices into `Layout.names`, shape (bodies, 7)."""
         self._place(q)
         return np.array([self._pose(body) for body in bodies]).reshape(-1, 7)
 
     def motions(self, q: Vector, v: Vector, a: Vector, bodies: Sequence[int]) -> Vector:
+        """Return the motions of bodies in the world frame, shape (bodies, 19)."""
         self._move(q, v, a)
         found, six = np.zeros((len(bodies), 19)), np.zeros(6)
         model, data, kind = self._model, self._data, mujoco.mjtObj.mjOBJ_XBODY
@@ -59,6 +61,7 @@ class MujocoAlgorithms(Algorithms):
         return found
 
     def forward_dynamics(self, q: Vector, v: Vector, tau: Vector) -> Vector:
+        """Return the accelerations, shape (nv,), caused by torques (nv,) and resistance."""
         self._move(q, v)
         bias, resisted = np.zeros(self.nv), tau - self._resistance.torques(q[self._stretched], v)
         mujoco.mj_rne(self._model, self._data, 0, bias)
@@ -72,6 +75,7 @@ class MujocoAlgorithms(Algorithms):
         return a
 
     def inverse_dynamics(self, q: Vector, v: Vector, acceleration: Vector) -> Vector:
+        """Return the torques, shape (nv,), that produce accelerations (nv,) against resistance."""
         model, data, tau = self._model, self._data, np.zeros(self.nv)
         self._move(q, v, acceleration)
         mujoco.mj_rne(model, data, 1, tau)
@@ -80,10 +84,12 @@ class MujocoAlgorithms(Algorithms):
         return found
 
     def mass_matrix(self, q: Vector) -> Vector:
+        """Return the mass matrix, shape (nv, nv)."""
         self._place(q)
         return self._turned(q, self._turned(q, self._mass()).T.copy())
 
     def jacobian(self, body: int, q: Vector, point: Vector) -> Vector:
+        """Return the Jacobian, shape (6, nv), of a point on a body, given by its index."""
         found, data = np.zeros((6, self.nv)), self._data
         if body < len(self._bodies):
             self._place(q)
@@ -95,6 +101,7 @@ class MujocoAlgorithms(Algorithms):
     def joint_wrenches(
         self, q: Vector, v: Vector, a: Vector, outer: Mapping[int, Sequence[float]]
     ) -> Vector:
+        """Return the joint reactions in a state, shape (joints, 6)."""
         model, data = self._model, self._data
         self._place(q)
         data.xfrc_applied[:] = 0.0

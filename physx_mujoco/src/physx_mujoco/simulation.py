@@ -94,9 +94,15 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
             raise FeatureNotSupportedError(self.engine, "restitution", features)
 
     def make_algorithms(self) -> Algorithms:
+        """Return MuJoCo's algorithms."""
         return MujocoAlgorithms(self.parts, self._world)
 
     def advance(self, n: int) -> None:
+        """Simulate n physics steps.
+
+        Raises:
+            SimulationError: If MuJoCo cannot hold or solve the contacts of this world.
+        """
         try:
             self._run(n)
         except mujoco.FatalError as error:
@@ -116,9 +122,11 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
                 self._drives.step()
 
     def clear_warm_start(self) -> None:
+        """Make the state alone determine what follows."""
         self._running.data.qacc_warmstart[:] = 0.0
 
     def read_contacts(self) -> Records:
+        """Return the contacts of the last physics step."""
         model, data = self._running.model, self._running.data
         found, force = np.zeros(data.ncon, CONTACT), np.zeros(6)
         for number, (row, contact) in enumerate(zip(found, data.contact, strict=True)):
@@ -132,6 +140,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         return found
 
     def close(self) -> None:
+        """Free the world; further calls do nothing."""
         if not self._closed:
             super().close()
             del self._running, self._drives, self._world

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from hypothesis.stateful import RuleBasedStateMachine, initialize, invariant, precondition, rule
 from sizes import size
 
+from physx_core import plugins
 from physx_core.errors import UnknownOptionError
 from physx_core.rotations import to_matrix
 from physx_sim import (
@@ -350,8 +351,6 @@ class Snapshots(RuleBasedStateMachine):
 
     @initialize(mode=st.sampled_from(["force", "servo", "position"]))
     def build(self, mode):
-        from physx_mujoco.simulation import MujocoBackend
-
         names = [joint.name for joint in read_robot(Robot("ant")).joints]
         settings = JointSettings(mode, friction=0.1, stiffness=1.0)
         robot = Robot(
@@ -362,7 +361,7 @@ class Snapshots(RuleBasedStateMachine):
         )
         ball = Sphere(name="ball", radius=0.1, mass=0.5, position=(0.1, 0, 1.0))
         world = World([robot], objects=[ball], ground=Ground())
-        self.one, self.other = (MujocoBackend().build(world) for _ in range(2))
+        self.one, self.other = (plugins.resolve("backend", "mujoco").build(world) for _ in range(2))
         self.done, self.state = [], None
         self.take()
 

@@ -47,21 +47,25 @@ class MujocoRobot(RobotEngine):
         self._torques = running.data.qfrc_applied[part.velocities][self.base :]
 
     def hold(self, commands: Vector) -> None:
+        """Hold commands, shape (joints,), already clipped to their limits."""
         self._torques[:] = commands
 
     def positions(self) -> Vector:
+        """Return the current positions, shape (nq,), as a new vector."""
         q: Vector = self._q.copy()
         if self.base:
             q[:7] = outwards(q[:7])
         return q
 
     def velocities(self) -> Vector:
+        """Return the current velocities, shape (nv,), as a new vector."""
         v: Vector = self._v.copy()
         if self.base:
             v[:3] = rotate_back(self.positions()[3:7].tolist(), *v[:3].tolist())
         return v
 
     def accelerations(self) -> Vector:
+        """Return the velocity change in the last step divided by the period, shape (nv,)."""
         period = self._running.model.opt.timestep
         a: Vector = (self._v - self._before) / period
         if self.base:
@@ -70,6 +74,7 @@ class MujocoRobot(RobotEngine):
         return a
 
     def write(self, positions: Vector, velocities: Vector) -> None:
+        """Set the state."""
         q, v = positions.copy(), velocities.copy()
         if self.base:
             q[:7] = q[:7][INWARDS]
@@ -77,18 +82,23 @@ class MujocoRobot(RobotEngine):
         self.set_native(q, v)
 
     def native(self) -> tuple[Vector, Vector]:
+        """Return a copy of MuJoCo's positions and velocities."""
         return self._q.copy(), self._v.copy()
 
     def set_native(self, positions: Vector, velocities: Vector) -> None:
+        """Set a state returned by `native`."""
         self._q[:], self._v[:] = positions, velocities
 
     def speed(self) -> float:
+        """Return the norm of the velocities; NaN or inf if the state is not finite."""
         return float(np.sqrt(self._v.dot(self._v)))
 
     def can_move(self, link: int) -> bool:
+        """Return whether a link, given by its index in the model, can move."""
         return bool(self._running.model.body_weldid[self._bodies[link]])
 
     def push(self, link: int, force: Vector, torque: Vector, point: Vector, local: bool) -> None:
+        """Apply a wrench until `release`."""
         data, body = self._running.data, self._bodies[link]
         mujoco.mj_kinematics(self._running.model, data)
         turn = data.xmat[body].reshape(3, 3)
@@ -98,4 +108,5 @@ class MujocoRobot(RobotEngine):
         data.xfrc_applied[body] += np.concatenate([force, torque + np.cross(arm, force)])
 
     def release(self) -> None:
+        """Remove all wrenches."""
         self._running.data.xfrc_applied[self._bodies] = 0.0

@@ -7,9 +7,7 @@ from physx_core import plugins
 
 @pytest.fixture
 def backend():
-    from physx_mujoco.simulation import MujocoBackend
-
-    return MujocoBackend()
+    return plugins.resolve("backend", "mujoco")
 
 
 @pytest.fixture

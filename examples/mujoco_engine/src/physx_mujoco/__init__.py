@@ -1,1 +1,0 @@
-"""physx plugin `mujoco`: simulations with MuJoCo."""

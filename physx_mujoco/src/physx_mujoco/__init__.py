@@ -1,0 +1,10 @@
+"""physx plugin `mujoco`: simulations of robots and objects with MuJoCo.
+
+The public names are imported on first use, so discovering the plugin does not import an engine.
+"""
+
+from __future__ import annotations
+
+import lazy_loader
+
+__getattr__, __dir__, __all__ = lazy_loader.attach_stub(__name__, __file__)
