@@ -51,7 +51,7 @@ class Pipeline(ABC):
     ``*_end`` before it closes what ends. The *steps*, ``*_condition``, ``*_count`` and those named
     after what they do, do the work described in their docstrings; a replacement that leaves out
     what the run needs is an error. A loop of one's own over the steps of an open pipeline stores
-    what `execute` does.
+    what `execute` does, but for its result.
 
     When it starts, a run prints to stderr where it writes; when it ends, what it stored and the
     next commands. A run that fails before it has stored anything removes the session created for
