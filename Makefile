@@ -14,7 +14,7 @@ DIST := --dist loadgroup --no-loadscope-reorder
 ROOM = $(wildcard tests/$(P) tests/*/$(P) tests/*/*/$(P))
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check
 COMPILE := $(BIN)/python -m compileall -q -j 0 .venv/lib >/dev/null 2>&1 || true  # pip uses one core
-PACKAGES := -e ./physx_core -e ./physx_testing -e "./physx_sim[robots,meshes]" -e ./physx_formats -e "./physx_dart[robots]" -e ./physx_mujoco -e "./physx_torch[export]" -e ./physx_rerun -e ./physx_gym -e ./physx_remote -e ./physx_cluster
+PACKAGES := -e ./physx_core -e ./physx_testing -e "./physx_sim[robots,meshes,mjcf]" -e ./physx_formats -e "./physx_dart[robots]" -e ./physx_mujoco -e "./physx_torch[export]" -e ./physx_rerun -e ./physx_gym -e ./physx_remote -e ./physx_cluster -e ./physx_report
 PROJECTS := $(wildcard physx_*/pyproject.toml) constraints.txt
 
 .PHONY: demo test quick lint docs bench clean
@@ -49,6 +49,7 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/faults.py
 	$(BIN)/python benchmarks/dataset.py
 	$(BIN)/python benchmarks/views.py
+	$(BIN)/python benchmarks/judged.py
 	$(BIN)/python benchmarks/larger_than_memory.py
 	$(BIN)/python benchmarks/online.py
 	$(BIN)/python benchmarks/states.py

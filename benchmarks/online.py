@@ -68,7 +68,7 @@ def learner_alone(folder: str) -> float:
 def client_alone(folder: str, cost: float, batches: int = BATCHES) -> float:
     """Return batches per second of one client."""
     config = environment(cost)
-    options = {key: value for key, value in common(folder).items() if key != "seed"}
+    options = {key: value for key, value in common(folder).items() if key not in ("seed", "rivals")}
     return batches_per_second(DataGeneration(config, batch_nb=batches, **options))
 
 
@@ -93,7 +93,7 @@ def environment(cost: float) -> EnvironmentConfig:
 
 def common(folder: str) -> dict[str, Any]:
     """Return options of all pipelines."""
-    return {"batch_size": BATCH, "session_dir": folder, "quiet": True, "seed": 0}
+    return {"batch_size": BATCH, "session_dir": folder, "quiet": True, "seed": 0, "rivals": "none"}
 
 
 def batches_per_second(pipeline: Pipeline) -> float:

@@ -48,6 +48,7 @@ FACES = {
     ),
     "physx_remote": ("", "errors"),
     "physx_cluster": ("", "sweep", "errors"),
+    "physx_report": ("", "drawing", "errors"),
 }
 MODULES = [f"{root}.{name}".rstrip(".") for root, names in FACES.items() for name in names]
 

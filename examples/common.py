@@ -74,6 +74,7 @@ def trained(
         session_dir=str(session / "networks"),
         epoch_nb=epochs,
         validation_every=0,
+        rivals="none",
         seed=seed,
         quiet=True,
         **{"batch_size": 32, **options},

@@ -56,7 +56,9 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     physx_sim.Ground: {"normal": (0.1, 0.2, 0.7)},
     physx_sim.Stairs: {},
     physx_sim.HeightField: {"heights": [[0.0, 1.0], [0.5, 0.25]], "origin": (1.0, 0.5)},
-    physx_sim.JointSettings: {"damping": 0.5, "friction": 0.25},
+    physx_sim.JointSettings: {
+        **{"damping": 0.5, "friction": 0.25, "stiffness": 2.0, "rest": 0.5, "armature": 0.125}
+    },
     physx_sim.Robot: {
         "urdf": "arm.urdf",
         "feet": {"foot": 0.25},
@@ -119,7 +121,7 @@ RECORDS = {
     *("Layout", "Part", "State", "AppliedWrench", "MotorState", "SensorState", "RobotInfo"),
     *("UrdfShape", "Episode", "StepperState", "Result", "Trial", "Normalization"),
     *("CollisionShape", "Joint", "MovableBody", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
-    *("Kind", "Format", "Table"),
+    *("Kind", "Format", "Table", "Section"),
 }
 ABSTRACT = {"Pipeline", "Sensor"}
 

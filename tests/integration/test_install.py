@@ -16,6 +16,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.processes]
 PACKAGES = (
     *("physx_core", "physx_testing", "physx_sim", "physx_formats", "physx_dart", "physx_mujoco"),
     *("physx_torch", "physx_rerun", "physx_gym", "physx_remote", "physx_cluster"),
+    "physx_report",
 )
 PHYSX = ("-m", "physx_core")
 GENERATE = "--batch-nb 2 --batch-size 10"
@@ -227,6 +228,13 @@ def test_testing_writes_a_plugin_and_checks_a_component(python, add, run, tmp_pa
     run(*PHYSX, "new", "environment", "mine", python=python)
     assert (tmp_path / "physx-mine/pyproject.toml").exists()
     assert "toy/spring" in run(*PHYSX, "check", "toy/spring", python=python).stdout
+
+
+@pytest.mark.faults
+def test_report_writes_a_page(python, add, run):
+    add("physx_report")
+    generate(run, python)
+    assert "report.html" in run(*PHYSX, "report", "sessions/data_generation", python=python).stdout
 
 
 @pytest.mark.faults

@@ -67,6 +67,7 @@ class ModelBuilder:
         self._spec.compiler.degree = False
         self._hard = {"solref": (_STEPS * parts.world.period, _DAMPING), "solimp": _IMPEDANCE}
         self._moments: list[Vector] = []
+        self._masses: list[float] = []
         self._owners: list[int] = []
         shapes = [shape for movable in parts.movables for shape in movable.model.shapes]
         frictions = {float(x.friction) for x in (*shapes, *(each.what for each in parts.statics))}
@@ -89,7 +90,7 @@ class ModelBuilder:
         owners = np.array(
             [self._owners[int(model.geom(i).name)] for i in range(model.ngeom)], np.intp
         )
-        model.body_inertia[bodies] = self._moments
+        model.body_mass[bodies], model.body_inertia[bodies] = self._masses, self._moments
         mujoco.mj_setConst(model, mujoco.MjData(model))
         first = 0
         for movable in self._parts.movables:
@@ -125,22 +126,23 @@ class ModelBuilder:
             self._add_shape(added[link], shape, first + link, **masks)
 
     def _add_body(self, parent: Any, body: RigidBody, position: Vector, turn: Vector) -> Any:
-        """Add a link with its mass; its moments of inertia, valid or not, are set later."""
+        """Add a link; its mass, which may be 0, and its moments of inertia are set later."""
         new = parent.add_body(name=str(len(self._moments)), pos=position, quat=_quaternion(turn))
         moments, axes = np.linalg.eigh(body.inertia)
         axes[:, 2] *= np.linalg.det(axes)  # a rotation, not a reflection
-        new.explicitinertial, new.mass, new.inertia = True, body.mass, (1.0, 1.0, 1.0)
+        new.explicitinertial, new.mass, new.inertia = True, 1.0, (1.0, 1.0, 1.0)
         new.ipos, new.iquat = body.center, _quaternion(axes)
+        self._masses.append(body.mass)
         self._moments.append(moments)
         return new
 
     def _add_joint(self, new: Any, joint: Joint, axis: Vector) -> None:
-        extra, kind = joint.settings, mujoco.mjtJoint
-        added = new.add_joint(axis=axis, frictionloss=joint.friction, armature=extra.armature)
+        kind = mujoco.mjtJoint
+        added = new.add_joint(axis=axis, frictionloss=joint.friction, armature=joint.armature)
         added.type = kind.mjJNT_SLIDE if joint.unit == "m" else kind.mjJNT_HINGE
-        added.damping, added.springref = (joint.damping, 0.0, 0.0), extra.rest
-        added.stiffness = (extra.stiffness, 0.0, 0.0)
-        if np.isfinite(joint.upper) and extra.mode != "velocity":
+        added.damping, added.springref = (joint.damping, 0.0, 0.0), joint.rest
+        added.stiffness = (joint.stiffness, 0.0, 0.0)
+        if np.isfinite(joint.upper) and joint.mode != "velocity":
             added.limited = mujoco.mjtLimited.mjLIMITED_TRUE
             added.range = joint.lower, joint.upper
         for option, value in self._hard.items():

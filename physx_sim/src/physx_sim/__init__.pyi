@@ -18,6 +18,7 @@ from .description.robot import Robot as Robot
 from .description.world import World as World
 from .description.wrench import Wrench as Wrench
 from .devices import steps_of as steps_of
+from .engines.models.mjcf import mjcf_robots as mjcf_robots
 from .features import FEATURES as FEATURES
 from .layout import CONTACT as CONTACT
 from .layout import RAY_HIT as RAY_HIT

@@ -12,7 +12,7 @@ class ModelError(PhysxError):
 
 
 class MissingMeshesError(ModelError):
-    """A robot description names mesh files that do not exist.
+    """A robot description names mesh files of collision shapes that do not exist.
 
     Attributes:
         missing: All missing files, as named in the description.
@@ -23,7 +23,9 @@ class MissingMeshesError(ModelError):
         lines = "".join(f"\n  {name}" for name in self.missing)
         super().__init__(
             f"{model} names {len(self.missing)} mesh file(s) that do not exist:{lines}\n"
-            "Give the folder of each package in Robot(package_dirs={name: folder})."
+            "They were looked for in the packages among the folders around this file, beside them, "
+            "and in these folders. Give the folder of each package in "
+            'Robot(package_dirs={name: folder}), or do without shapes: Robot(collisions="none").'
         )
 
 

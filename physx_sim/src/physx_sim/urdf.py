@@ -7,6 +7,7 @@ import math
 import os
 from collections.abc import Mapping
 from dataclasses import dataclass
+from itertools import chain
 from pathlib import Path
 from urllib.parse import unquote, urlparse
 from xml.etree import ElementTree
@@ -138,7 +139,7 @@ def parse_urdf(path: Path) -> Element:
             f"{path} has a DOCTYPE, which URDF files do not need and which can hide an XML bomb."
         )
     try:
-        root = ElementTree.fromstring(text)  # without a DOCTYPE there are no entities
+        root = ElementTree.fromstring(text.lstrip())  # without a DOCTYPE there are no entities
     except ElementTree.ParseError as error:
         raise ModelError(f"{path} is not valid XML: {error}.") from error
     if root.tag != "robot":
@@ -208,8 +209,9 @@ def mesh_path(model: Path, name: str, package_dirs: Mapping[str, str | Path]) ->
     Args:
         model: Path of the URDF file; relative names are relative to its folder.
         name: The name as given in the URDF: ``package://...``, ``file://...`` or a path.
-        package_dirs: Folder of each package. Other packages are searched for in the folders around
-            the URDF file.
+        package_dirs: Folder of each package. Other packages are searched for among the folders
+            around the URDF file and beside these; at last, the file is, whatever its package is
+            called there.
     """
     if name.startswith("file://"):
         return Path(unquote(urlparse(name).path))
@@ -218,8 +220,11 @@ def mesh_path(model: Path, name: str, package_dirs: Mapping[str, str | Path]) ->
     package, _, rest = name.removeprefix("package://").partition("/")
     if package in package_dirs:
         return Path(package_dirs[package]) / rest
-    near = next((folder for folder in model.parents if folder.name == package), None)
-    return None if near is None else near / rest
+    around = list(model.parents)
+    near = [folder / rest for folder in around if folder.name == package]
+    elsewhere = (folder / place for place in (f"{package}/{rest}", rest) for folder in around)
+    found = next((file for file in chain(near, elsewhere) if file.is_file()), None)
+    return found or (near[0] if near else None)
 
 
 def _elements_by_name(root: Element, tag: str) -> dict[str, Element]:

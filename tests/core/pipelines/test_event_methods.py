@@ -30,6 +30,8 @@ SPRING = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, seed=1)
 NETWORK = NetworkConfig("toy/linear", network_kwargs={"net_fields": ["state", "force"]})
 DATA = DatasetConfig(existing_dir="sessions/run")
 
+TIMED = ("info.txt", "results.json")
+
 
 def noting(make, names):
     """A subclass that notes each event in `calls` and does what the pipeline does."""
@@ -166,7 +168,7 @@ def events_of(make):
 
 
 def stored(place):
-    """The content of all files below a folder, except notes and file headers, which tell times."""
+    """The content of all files below a folder, except those that tell times, and file headers."""
     found = {}
     for path in Path(place).rglob("*"):
         name = str(path.relative_to(place))
@@ -177,7 +179,7 @@ def stored(place):
                     for mode in dataset.modes
                     for field, values in dataset[mode].items()
                 }
-        if path.is_file() and path.suffix != ".h5" and path.name != "info.txt":
+        if path.is_file() and path.suffix != ".h5" and path.name not in TIMED:
             found[name] = path.read_bytes().replace(str(place).encode(), b"PLACE")
         if path.name == "dataset.json":  # own steps say nothing of how to go on with the streams
             plain = json.loads(found[name])

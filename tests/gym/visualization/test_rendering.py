@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from pathlib import Path
 from typing import ClassVar
 
 import gymnasium
@@ -15,6 +16,7 @@ from PIL import Image
 from physx_core import plugins
 from physx_core.components import Factory, Visualizer
 from physx_core.errors import ConfigError, PluginNotFoundError, UnknownOptionError, VisualizerError
+from physx_core.rotations import from_axis_angle, to_matrix
 from physx_gym import RobotEnv, Simulator, replay
 from physx_gym.errors import LogError
 from physx_gym.visualization.drawing import WorldDrawing
@@ -29,7 +31,9 @@ from physx_sim import (
     Robot,
     Sphere,
     Stairs,
+    UrdfTree,
     World,
+    parse_urdf,
 )
 
 pytestmark = pytest.mark.processes
@@ -249,6 +253,37 @@ def test_objects_of_all_kinds_are_drawn_where_they_are(tmp_path):
     assert (found["can"]["radius"], found["can"]["length"]) == (0.1, 1.0)
     assert found["robot"]["bodies"] == ["rail", "cart", "pole"]
     assert found["robot"]["urdf"].endswith("cartpole.urdf")
+
+
+def test_a_robot_from_mjcf_is_drawn_by_its_collision_shapes(tmp_path):
+    pytest.importorskip("mujoco")
+    (tmp_path / "a.obj").write_text(CUBE)
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        '<mujoco><asset><mesh name="m" file="a.obj"/></asset><worldbody><body name="arm" '
+        'pos="0 0 1">'
+        '<joint name="j" pos="0 0 0.5"/><geom type="box" size=".1 .2 .3" pos="1 2 3" '
+        'euler="10 20 30"/><geom type="mesh" mesh="m" pos="4 5 6"/></body></worldbody></mujoco>'
+    )
+    engine, factory = plugins.resolve("backend", "mujoco"), Factory()
+    world = World([Robot(path, collisions="none")])
+    with engine.build(world) as simulation:
+        drawing = WorldDrawing(factory, world, engine, simulation.layout, "world")
+        drawing.add(simulation.body_poses())
+        events = [one for several in factory.take_events() for one in several.each()]
+        (robot,) = [event.values for event in events if event.name == "robot"]
+        tree = UrdfTree(parse_urdf(Path(robot["urdf"])))
+        drawing.close()
+    assert robot["bodies"] == tree.links == ["world", "arm.j", "arm"]
+    box, mesh = tree.shapes("arm", "visual")
+    assert (box.kind, box.size) == ("box", (0.2, 0.4, 0.6))
+    np.testing.assert_allclose(box.pose[:3, 3], (1, 2, 3))
+    turn = to_matrix(from_axis_angle((1, 0, 0), np.radians(10)))
+    for axis, angle in (((0, 1, 0), 20), ((0, 0, 1), 30)):
+        turn = turn @ to_matrix(from_axis_angle(axis, np.radians(angle)))
+    np.testing.assert_allclose(box.pose[:3, :3], turn, atol=1e-12)
+    assert mesh.mesh == str(tmp_path / "a.obj")
+    np.testing.assert_allclose(mesh.pose[:3, 3], (4, 5, 6), atol=1e-9)
 
 
 @pytest.mark.parametrize(

@@ -16,8 +16,6 @@ from hypothesis import strategies as st
 from sizes import size
 
 from physx_core import PhysxError, plugins
-from physx_dart.dart.loading import load_skeleton
-from physx_dart.pinocchio.models import load_model, load_stepping_model
 from physx_sim import JointSettings, Robot, World
 from physx_sim.engines import (
     LoadedBody,
@@ -178,66 +176,64 @@ def test_all_readers_read_the_same_number_or_physx_refuses_it(write_urdf, where,
 
 # Loading --------------------------------------------------------------------------------------
 
-LOADERS = {
-    "dart": load_skeleton,
-    "pinocchio": lambda movable: load_model(movable, (0.0, 0.0, -9.81), armature=np.zeros(2)),
-    "pinocchio, stepping": lambda movable: load_stepping_model(
-        movable, (0.0, 0.0, -9.81), armature=np.zeros(2 if movable.fixed_base else 8)
-    ),
-}
-LOST = {
-    "upper: mass": ('mass value="1.0"', 'mass value="0.5"'),
-    "tool: mass": ('mass value="0.25"', 'mass value="0.0"'),
-    "upper: inertia": ('ixx="0.02"', 'ixx="0.0201"'),
-    "upper: center of mass": ('xyz="0.1 0.0 0.2"', 'xyz="0.1 0.0 0.21"'),
-    "lower: position": ('xyz="0.0 0.0 0.4"', 'xyz="0.0 0.0 0.5"'),
-    "lower: rotation": ('rpy="0.1 0.2 0.3"', 'rpy="0.1 0.2 0.0"'),
-    "tool: rotation": ('rpy="0.0 0.0 0.5"', 'rpy="0.0 0.0 0.6"'),
-    "elbow: axis": ('axis xyz="1.0 0.0 0.0"', 'axis xyz="0.0 1.0 0.0"'),
-}
-"""Text for the engines and what they might take it for."""
+
+@pytest.fixture
+def movable(write_urdf):
+    robot = Robot(write_urdf(arm()), "left", position=(1.0, 2.0, 3.0))
+    return read_parts(World([robot])).movables[0]
 
 
-@pytest.mark.parametrize("loader", LOADERS)
-@pytest.mark.parametrize("lost", LOST)
-@pytest.mark.parametrize("fixed_base", [True, False])
-def test_a_number_that_an_engine_reads_differently_is_an_error_that_names_it(
-    write_urdf, loader, lost, fixed_base
-):
-    robot = Robot(write_urdf(arm()), "left", fixed_base=fixed_base, position=(1.0, 2.0, 3.0))
-    movable = read_parts(World([robot])).movables[0]
-    LOADERS[loader](movable)
-    (owner, quantity), (text, other) = lost.split(": "), LOST[lost]
-    assert movable.model.text.count(text) == 1
-    model = dataclasses.replace(movable.model, text=movable.model.text.replace(text, other))
-    with pytest.raises(ModelError, match=rf"{quantity} \S.* instead of ") as caught:
-        LOADERS[loader](dataclasses.replace(movable, model=model))
-    message = str(caught.value)
-    assert owner in message and '"left"' in message and str(robot.urdf) in message
-
-
-def test_a_limit_that_an_engine_does_not_keep_is_an_error():
-    movable = read_parts(World([Robot("cartpole")])).movables[0]
+def held(movable):
+    """Return what an engine holds that loads everything."""
     bodies = movable.model.bodies
     poses = np.array([body.pose for body in bodies])
+    poses[0, :3, 3] = movable.position
     axes = np.array([body.axis for body in bodies if body.joint is not None])
-    held = [LoadedBody((i,), body.mass, body.center, body.inertia) for i, body in enumerate(bodies)]
+    found = [
+        LoadedBody((i,), body.mass, body.center.copy(), body.inertia.copy())
+        for i, body in enumerate(bodies)
+    ]
     upper = np.array([joint.upper for joint in movable.model.joints])
-    check_loaded("mine", movable, LoadedRobot(poses, axes, held, {"upper": upper}))
-    name = movable.model.joints[0].name
-    with pytest.raises(ModelError, match=rf'mine gives joint "{name}" the upper 0.0 instead of'):
-        check_loaded(
-            "mine", movable, LoadedRobot(poses, axes, held, {"upper": np.zeros(len(upper))})
-        )
+    return LoadedRobot(poses, axes, found, {"upper": upper})
 
 
-def test_what_an_engine_does_not_understand_is_not_lost(write_urdf):
-    """The engines' own reader drops the inertia of a link with a number that it does not take."""
-    movable = read_parts(World([Robot(write_urdf(arm()))])).movables[0]
-    text = movable.model.text.replace('mass value="1.0"', 'mass value="1.0 "')
-    for load in LOADERS.values():
-        with pytest.raises(ModelError, match=r'"upper" the mass .* instead of 1\.0'):
-            load(dataclasses.replace(movable, model=dataclasses.replace(movable.model, text=text)))
+def lighter(loaded, place, **other):
+    """Return what an engine holds, but for the inertia of one body."""
+    bodies = list(loaded.bodies)
+    bodies[place] = dataclasses.replace(bodies[place], **other)
+    return dataclasses.replace(loaded, bodies=bodies)
+
+
+LOST = {
+    'link "lower" the position': lambda x: dataclasses.replace(x, poses=x.poses + moved(2)),
+    'link "tool" the rotation': lambda x: dataclasses.replace(x, poses=x.poses + turned(3)),
+    'joint "shoulder" the axis': lambda x: dataclasses.replace(x, axes=x.axes[:, [1, 2, 0]]),
+    'joint "shoulder" the upper': lambda x: dataclasses.replace(x, limits={"upper": np.zeros(2)}),
+    'link "upper" the mass': lambda x: lighter(x, 1, mass=0.5),
+    'link "upper" the center of mass': lambda x: lighter(x, 1, center=np.full(3, 0.1)),
+    'link "upper" the inertia': lambda x: lighter(x, 1, inertia=0.99 * x.bodies[1].inertia),
+}
+"""What an engine may have lost, by what the error names."""
+
+
+def moved(link):
+    found = np.zeros((4, 4, 4))
+    found[link, 0, 3] = 0.1
+    return found
+
+
+def turned(link):
+    found = np.zeros((4, 4, 4))
+    found[link, 0, 1] = 0.1
+    return found
+
+
+@pytest.mark.parametrize("lost", LOST)
+def test_a_number_that_an_engine_does_not_keep_is_an_error_that_names_it(movable, lost):
+    check_loaded("mine", movable, held(movable))
+    with pytest.raises(ModelError, match=rf"mine gives {lost} \S.* instead of ") as caught:
+        check_loaded("mine", movable, LOST[lost](held(movable)))
+    assert '"left"' in str(caught.value) and str(movable.model.path) in str(caught.value)
 
 
 # The third reader -----------------------------------------------------------------------------

@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import importlib.metadata
 
+import numpy as np
 import pytest
 
 from physx_core.errors import ConfigError
-from physx_sim import Robot, World
-from physx_sim.engines import example_robot
+from physx_sim import Robot, World, mesh_path
+from physx_sim.engines import example_robot, read_robot
 from physx_sim.errors import MissingMeshesError, ModelError
 
 LINK = '<link name="{}"/>'
@@ -36,7 +37,6 @@ def chain(kind="continuous", extra=""):
         (robot(LINK.format("a"), JOINT.format("j", "fixed", "a", "x", "")), 'child "x".*links: a'),
         (chain("ball"), 'type "ball"'),
         (chain("floating"), 'type "floating"'),
-        (chain("revolute", '<limit lower="1" upper="0" effort="1" velocity="1"/>'), "lower limit"),
         (chain("revolute", '<limit lower="0" upper="x" effort="1" velocity="1"/>'), 'upper="x"'),
         (chain("revolute", '<limit effort="-1" velocity="1"/>'), 'effort="-1"'),
         (chain("continuous", '<axis xyz="0 0 0"/>'), 'axis "0 0 0"'),
@@ -108,15 +108,49 @@ SHAPES = """
 """
 
 
-def test_all_missing_meshes_are_named_in_one_error(backend, write_urdf, tmp_path):
-    path = write_urdf(SHAPES)
-    world = World([Robot(path, fixed_base=False, package_dirs={"shapes": tmp_path})])
+def test_all_missing_collision_meshes_are_named_in_one_error(backend, write_urdf):
     with pytest.raises(MissingMeshesError) as caught:
-        backend.build(world)
-    names = ["package://shapes/one.dae", "two.stl"]
-    names += ["package://nobody/three.obj", "file:///four%20.obj"]
+        backend.build(World([Robot(write_urdf(SHAPES), fixed_base=False)]))
+    names = ["package://nobody/three.obj", "file:///four%20.obj"]
     assert caught.value.missing == names
     assert all(name in str(caught.value) for name in names)
+
+
+def test_a_mesh_that_is_only_drawn_may_be_missing(write_urdf):
+    robot = Robot(write_urdf(SHAPES), fixed_base=False, collisions="none")
+    text = " ".join(read_robot(robot).warnings)
+    assert "4 mesh file(s) do not exist" in text and "two.stl" in text
+
+
+@pytest.mark.parametrize(
+    "place", ["nobody", "models/nobody", "models/arm/nobody", "", "models", "models/arm/urdf"]
+)
+def test_a_mesh_is_found_where_a_person_finds_it(tmp_path, place):
+    """In a package around or beside the file, or in one whose folder has another name."""
+    path, mesh = tmp_path / "models/arm/urdf/arm.urdf", tmp_path / place / "three.obj"
+    for file in (path, mesh):
+        file.parent.mkdir(parents=True, exist_ok=True)
+        file.write_text("")
+    assert mesh_path(path, "package://nobody/three.obj", {}) == mesh
+    assert mesh_path(path, "package://nobody/four.obj", {}) is None
+
+
+def test_habits_of_files_are_accepted_with_a_warning(backend, write_urdf):
+    limits = '<limit lower="1" upper="0" effort="1" velocity="1"/>'
+    mimic = '<mimic joint="a" multiplier="-1"/>'
+    text = robot(
+        *(LINK.format(name) for name in ("base", "left", "right")),
+        JOINT.format("a", "revolute", "base", "left", limits),
+        JOINT.format("b", "continuous", "base", "right", mimic),
+    )
+    path = write_urdf(f'\n <?xml version="1.0"?>{text}')
+    said = " ".join(read_robot(Robot(path)).warnings)
+    assert "so there is none: joints a" in said and "(mimic) move freely: b" in said
+    with (
+        pytest.warns(UserWarning, match="above the upper|mimic"),
+        backend.build(World([Robot(path, type(backend).__name__)])) as simulation,
+    ):
+        assert np.isinf(simulation.layout.lower).all()
 
 
 def test_meshes_are_found_in_packages_and_beside_the_file(backend, write_urdf, tmp_path):

@@ -126,7 +126,12 @@ class TrialTraining(Training):
             )
         return {epoch: found[epoch] for epoch in sorted(found) if epoch <= self.epoch_id}
 
-    def result(self) -> Result:
+    @property
+    def _decided(self) -> str:
+        """What the validation samples decide: the trials are compared by them."""
+        return " and ".join(filter(None, [super()._decided, "which trial is the best"]))
+
+    def outcome(self) -> Result:
         """Return the trial's result."""
         numbers = self.numbers()
         state = PRUNED if self.is_pruned else COMPLETE
@@ -211,7 +216,7 @@ def _run_training(
     with contextlib.ExitStack() as opened:
         opened.push(training)
         training.execute()
-        return training.result()
+        return training.outcome()
 
 
 def _build(kind: str, tables: Tables, make: type[P], folder: Path, **given: Any) -> P:

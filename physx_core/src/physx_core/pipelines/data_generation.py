@@ -37,6 +37,7 @@ from physx_core.pipelines.storage import (
 )
 from physx_core.pipelines.stored_episodes import find_begun
 from physx_core.pipelines.stored_streams import StoredStreams
+from physx_core.results import Result
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
@@ -118,7 +119,7 @@ class DataGeneration(NewSessionPipeline):
                 "independent episodes."
             )
 
-    def execute(self) -> None:
+    def execute(self) -> Result:
         """Generate all batches, or simulate all episodes.
 
         Raises:
@@ -135,6 +136,7 @@ class DataGeneration(NewSessionPipeline):
             if self._writer is not None and self.prove_independence:
                 self._writer.prove_independence()
             self.data_generation_end()
+        return self.result
 
     def _amount(self) -> tuple[int, str]:
         """Return how much there is to generate, and its unit."""

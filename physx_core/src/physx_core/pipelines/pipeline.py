@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
@@ -30,6 +30,8 @@ from physx_core.processes import (
     passes_through,
     raised_at_sigterm,
 )
+from physx_core.results import Result
+from physx_core.results.stored import store_result
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.workers.pasts import NOTHING, Skip
@@ -49,7 +51,7 @@ class Pipeline(ABC):
     ``*_end`` before it closes what ends. The *steps*, ``*_condition``, ``*_count`` and those named
     after what they do, do the work described in their docstrings; a replacement that leaves out
     what the run needs is an error. A loop of one's own over the steps of an open pipeline stores
-    what `execute` does.
+    what `execute` does, but for its result.
 
     When it starts, a run prints to stderr where it writes; when it ends, what it stored and the
     next commands. A run that fails before it has stored anything removes the session created for
@@ -58,6 +60,7 @@ class Pipeline(ABC):
     Attributes:
         session: The run's folder; known once the pipeline is open.
         observers: Progress bar, statistics, and viewers.
+        result: What the run found; known once `execute` has finished.
         kind: Name of the pipeline's table in configuration files.
     """
 
@@ -71,9 +74,11 @@ class Pipeline(ABC):
     kind: ClassVar[str]
     session: Session = field(init=False, repr=False)
     observers: Observers = field(init=False, repr=False)
+    result: Result = field(init=False, repr=False)
     _resources: contextlib.ExitStack | None = field(init=False, repr=False, default=None)
     _is_main = True  # whether this process writes the session; others only help with training
     _began = 0.0
+    _has_finished = False
 
     if not TYPE_CHECKING:  # type checkers would accept every misspelled attribute
 
@@ -85,8 +90,8 @@ class Pipeline(ABC):
             raise AttributeError(what, name=name, obj=self)
 
     @abstractmethod
-    def execute(self) -> None:
-        """Run the pipeline from start to end."""
+    def execute(self) -> Result:
+        """Run the pipeline from start to end, and return what it found."""
 
     @abstractmethod
     def _open(self, resources: contextlib.ExitStack) -> None:
@@ -107,6 +112,10 @@ class Pipeline(ABC):
             error: What ended the run; None: it finished.
         """
         return ()
+
+    def _findings(self) -> dict[str, Any]:
+        """Return what `Result` says of the finished run besides the lines of `_results`."""
+        return {}
 
     def _next(self, error: BaseException | None) -> Iterable[str]:
         """Return commands that continue from here.
@@ -135,7 +144,7 @@ class Pipeline(ABC):
         self.session = None  # type: ignore[assignment]
         try:
             with contextlib.ExitStack() as resources:
-                self._began = time.monotonic()
+                self._began, self._has_finished = time.monotonic(), False
                 resources.enter_context(raised_at_sigterm())
                 self._open(resources)
                 self._begin()
@@ -183,7 +192,21 @@ class Pipeline(ABC):
             self._say(f"session: {self.session.path} was removed: the run stored nothing in it")
             return
         commands = (f"next: {command}" for command in self._next(error))
-        self._say(*self._results(error), *outputs, *commands)
+        if error is None and self._has_finished:
+            self._conclude()
+            lines: Iterable[str] = self.result.lines
+        else:
+            lines = self._results(error)
+        self._say(*lines, *outputs, *commands)
+
+    def _conclude(self) -> None:
+        """Make the result of the finished run, and store it in the session."""
+        path, found = str(self.session.path), self._findings()
+        places = {"session": path, **found.pop("places", {})}
+        summary = tuple(self._results(None))
+        self.result = Result(self.kind, path, self._duration, summary, places=places, **found)
+        if self._is_main:
+            store_result(self.session.path, self.result)
 
     def _say(self, *lines: str) -> None:
         """Print lines to stderr, in the process that writes the session."""
@@ -239,12 +262,16 @@ class Pipeline(ABC):
     def _running(self) -> Iterator[None]:
         """Open the pipeline for the duration of a run, unless the user has opened it."""
         with contextlib.ExitStack() as opened:
-            if self._resources is None:
+            closes = self._resources is None
+            if closes:
                 opened.enter_context(self)
             else:
                 self._begin()
             yield
             self.observers.end()
+            self._has_finished = True
+            if not closes:
+                self._conclude()
 
     def _observe(
         self,

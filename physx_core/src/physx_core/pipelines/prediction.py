@@ -31,6 +31,7 @@ from physx_core.pipelines.storage import (
 )
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.processes import deferred_interrupt
+from physx_core.results import Result
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
@@ -92,7 +93,7 @@ class Prediction(Pipeline):
     _stored: StoredRows | None = field(init=False, repr=False, default=None)
     _is_asked: bool = field(init=False, repr=False, default=False)
 
-    def execute(self) -> None:
+    def execute(self) -> Result:
         """Run all steps. Ctrl-C and SIGTERM end the run cleanly after the current step.
 
         Raises:
@@ -118,6 +119,7 @@ class Prediction(Pipeline):
             unfinished = self.step_nb >= 0 and self.prediction_condition()
             if interrupt.number == signal.SIGTERM or (interrupt and unfinished):
                 interrupt.end()
+        return self.result
 
     def prediction_begin(self) -> None:
         """Called before the first step."""

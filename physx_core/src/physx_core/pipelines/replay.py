@@ -16,6 +16,7 @@ from physx_core.pipelines.storage import reject_client_writers
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.plugins.references import check_recorded, find, is_recorded_as
 from physx_core.processes import deferred_interrupt
+from physx_core.results import Result
 from physx_core.sources.source import Source
 from physx_core.typing import Batch
 from physx_core.views.dataset_config import DatasetConfig
@@ -64,7 +65,7 @@ class Replay(NewSessionPipeline):
     step_id: int = field(init=False, repr=False, default=0)
     _stored: StoredRows = field(init=False, repr=False)
 
-    def execute(self) -> None:
+    def execute(self) -> Result:
         """Replay the samples. Ctrl-C and SIGTERM end the run cleanly after the current step.
 
         Raises:
@@ -87,6 +88,7 @@ class Replay(NewSessionPipeline):
             self.replay_end()
             if interrupt.number == signal.SIGTERM:
                 interrupt.end()
+        return self.result
 
     def replay_begin(self) -> None:
         """Called before the first step."""

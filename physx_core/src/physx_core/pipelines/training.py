@@ -19,7 +19,7 @@ from physx_core.components.buffer import Buffer
 from physx_core.components.group import Group
 from physx_core.config import EnvironmentConfig, NetworkConfig, at_least, options, to_plain
 from physx_core.dataset import Dataset
-from physx_core.errors import ConfigError, DivergedError, PhysxError
+from physx_core.errors import ConfigError, DivergedError, PhysxError, listed
 from physx_core.observers import REPORT_SECONDS, statistics_observers
 from physx_core.pipelines.learning.bound_options import bound_options, check_bound
 from physx_core.pipelines.learning.components import create
@@ -27,6 +27,13 @@ from physx_core.pipelines.learning.data_record import (
     describe_batch,
     describe_changes,
     record_data,
+)
+from physx_core.pipelines.learning.judging import (
+    NOT_JUDGED,
+    Judgment,
+    check_monitor,
+    judge,
+    make_judge,
 )
 from physx_core.pipelines.learning.learner import Learner
 from physx_core.pipelines.learning.opening import DataOpening, join_group, open_dataset
@@ -44,6 +51,9 @@ from physx_core.pipelines.storage import (
     reject_environments,
 )
 from physx_core.processes import Interrupt, deferred_interrupt, is_from_signal
+from physx_core.results import Result
+from physx_core.results.errors import as_loss
+from physx_core.results.judge import Judge
 from physx_core.session import Session
 from physx_core.typing import Batch
 from physx_core.views.dataset_config import DatasetConfig
@@ -131,11 +141,20 @@ class Training(NewSessionPipeline):
     validation_batch_size: int | None = at_least(1, None)
     """Number of validation samples predicted at once, in each process; None: `batch_size`. It
     changes the memory and the time that a validation takes, but not its losses."""
+    monitor: str | None = None
+    """What decides which network is the "best", when `patience` ends, and what a scheduler such as
+    "ReduceLROnPlateau" gets: an error on the validation samples in physical units, for example
+    "error/FIELD/relative_l2", all of which are then recorded; see `FieldResult.errors`. None: the
+    validation loss, or if nothing is validated the training loss."""
     patience: int | None = at_least(1, None)
     """Number of consecutive validations (epochs, if nothing is validated) without improvement of
     the loss after which to stop; None: never. The last network is kept in addition to "best"."""
     min_improvement: float = at_least(0, 0.0)
     """Smallest decrease below the best loss that counts as an improvement."""
+    rivals: str = field(default="all", metadata={"choices": ("all", "none")})
+    """Whether the network is judged at the end: "all" measures its errors on the samples that were
+    held back, and those of predictions that need no network, which get a tenth of the training's
+    time: the mean, no change, a linear map, and the nearest sample; "none" does not."""
     on_nan: str = field(default="stop", metadata={"choices": ("stop", "continue")})
     """What to do if a loss, gradient, or parameter is NaN or infinite: "stop" with an error and the
     previous checkpoint, or "continue" and ignore it."""
@@ -177,6 +196,8 @@ class Training(NewSessionPipeline):
     _told: Sequence[str] = field(init=False, repr=False, default=())
     _recorded: dict[str, float] | None = field(init=False, repr=False, default=None)
     _batches_read: int = field(init=False, repr=False, default=0)
+    _errors: Judge | None = field(init=False, repr=False, default=None)
+    _judgment: Judgment = field(init=False, repr=False, default=NOT_JUDGED)
 
     def __post_init__(self) -> None:
         """Store what was given in place of a configuration of the dataset as one."""
@@ -191,7 +212,7 @@ class Training(NewSessionPipeline):
         given = self.dataset_config
         return given if isinstance(given, DatasetConfig) else DatasetConfig()
 
-    def execute(self) -> None:
+    def execute(self) -> Result:
         """Train, and write a checkpoint to resume from however the training ends.
 
         Ctrl-C and SIGTERM end it after the current batch; a second signal ends it immediately,
@@ -232,6 +253,8 @@ class Training(NewSessionPipeline):
             self._check_condition(more, "epoch_condition")
             self.train_end()
             self._finish()
+            self._judge()
+        return self.result
 
     def train_begin(self) -> None:
         """Called before the first epoch, or before the epoch at which training resumes.
@@ -390,7 +413,20 @@ class Training(NewSessionPipeline):
             self.observers.predictions(*compared, self.epoch_id, "epoch")
         if self.on_nan == "stop" and not math.isfinite(self.validation_loss):
             raise self._diverged(f"the validation loss is {self.validation_loss}", 0)
-        return self.validation_loss
+        return self.validation_loss if self.monitor is None else self._monitor(values)
+
+    def _monitor(self, values: dict[str, float]) -> float:
+        """Measure the errors on the validation samples; return the one that decides."""
+        stored, monitor = self.data.stored, str(self.monitor)
+        self._errors = self._errors or make_judge(self.learner, stored)
+        found = self._errors.measure(stored.validation)
+        values |= {f"error/{name}": value for name, value in found.items()}
+        if monitor not in values:
+            raise ConfigError(
+                f"Training.monitor is {monitor!r}, but the errors of this field are: "
+                f"{listed(name for name in values if name.startswith('error/'))}."
+            )
+        return as_loss(monitor, values[monitor])
 
     def train_end(self) -> None:
         """Called after the last epoch; before the last checkpoint is written."""
@@ -403,12 +439,29 @@ class Training(NewSessionPipeline):
             self.session.note(self.stopped)
         self.save_checkpoint()
 
+    def _judge(self) -> None:
+        """Measure how good the network is, unless that is not wanted."""
+        if self._is_main and self.rivals != "none":
+            self._judgment = judge(
+                *(self.learner, self.data.stored, self._duration, self._decided), self._errors
+            )
+
+    @property
+    def _decided(self) -> str:
+        """What the validation samples decided about the last network, in words."""
+        validates = self.validation_every > 0
+        scheduler = self.network_config.scheduler
+        name = scheduler if isinstance(scheduler, str) else getattr(scheduler, "__name__", "")
+        decided = ["when the training stopped"] if self.patience is not None and validates else []
+        decided += ["the learning rate"] if "Plateau" in name and validates else []
+        return " and ".join(decided)
+
     @property
     def stopped(self) -> str:
         """Why the training ends before its last epoch; empty if it does not."""
         if self.patience is None or self.epoch_id >= self.epoch_nb:
             return ""
-        return self.best.reason_to_stop(self.patience)
+        return self.best.reason_to_stop(self.patience, self.monitor)
 
     def validate(self) -> dict[str, float]:
         """Return the mean loss and other statistics over the validation samples."""
@@ -603,6 +656,10 @@ class Training(NewSessionPipeline):
         )
         self.data = opening.open(resources, dataset)
         self._prepare_learner(start)
+        self._errors = None
+        if self.monitor is not None:
+            validates = self.validation_every > 0 and self.data.stored.has_validation
+            check_monitor(self.monitor, self.learner, validates=validates)
         if start.checkpoint is not None and start.environment is None and self._is_main:
             self._tell_changed_data(start.config.mode)
         resources.push(self._close)
@@ -731,16 +788,33 @@ class Training(NewSessionPipeline):
             yield f"training loss {self.training_loss:.6g}"
         elif self.epoch_id >= self.epoch_nb:
             yield "nothing left to train: epoch_nb (--epoch-nb) is the total number of epochs"
-        if not math.isnan(self.validation_loss):
-            yield f"validation loss {self.validation_loss:.6g}"
         if not math.isinf(self.best.loss):
-            yield f"smallest loss {self.best.loss:.6g}, after epoch {self.best.epoch}"
+            yield self.best.describe(self.monitor)
         if self.environment_config is not None:
             yield describe_samples(self.data.dataset.directory)
         if self.data.online is not None:
             yield from self.data.online.describe()
         if self.checkpoint_path is not None:
             yield f"checkpoint: {self.checkpoint_path}"
+
+    def _findings(self) -> dict[str, Any]:
+        judged, places = self._judgment, {"statistics": str(self.session.stats_dir)}
+        numbers = {
+            "loss/training": self.training_loss,
+            "loss/validation": self.validation_loss,
+            f"{self.monitor or 'loss'}/best": as_loss(self.monitor or "", self.best.loss),
+            "predicted samples per s": judged.rate,
+        }
+        if self.checkpoint_path is not None:
+            places["checkpoint"] = str(self.checkpoint_path)
+        for name, dataset in self.data.stored.datasets.items():
+            places[f"dataset {name}".strip()] = str(dataset.directory)
+        return {
+            "numbers": {name: value for name, value in numbers.items() if math.isfinite(value)},
+            "parts": judged.parts,
+            "why": judged.why,
+            "places": places,
+        }
 
     def _next(self, error: BaseException | None) -> Iterable[str]:
         path = shlex.quote(str(self.session.path))

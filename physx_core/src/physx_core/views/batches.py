@@ -29,12 +29,13 @@ from physx_core.statistics import RunningStatistics
 from physx_core.typing import Array, Batch, Index
 from physx_core.views.folds import Part
 from physx_core.views.items import Located
-from physx_core.views.options import ViewOptions
+from physx_core.views.options import ViewOptions, Window
 from physx_core.views.sources import Source, window_of
 
 _SHARES = 1000
 _AHEAD = 4096
-_PAD = "_is_pad"
+PAD = "_is_pad"
+"""What is added to the name of a window for that of the field that marks its repeated values."""
 
 
 class Batches(Closeable):
@@ -216,7 +217,7 @@ class Batches(Closeable):
         shape = (*of_window, *(stored.shape or ()))
         found = {name: replace(stored, name=name, shape=shape, axes=axes, like=like)}
         if self.view.edges == "pad" and name in self.view.windows:
-            found[name + _PAD] = Field(name + _PAD, of_window, "bool", role="additional")
+            found[name + PAD] = Field(name + PAD, of_window, "bool", role="additional")
         return found
 
     # Batches --------------------------------------------------------------------------------
@@ -271,6 +272,53 @@ class Batches(Closeable):
             source.items.rows(items)[:, 0]
             for source, (_, items) in zip(self._sources, drawn, strict=True)
         ]
+
+    def groups(self, number: int) -> Index:
+        """Return the trajectory of each of a batch's items, as a number, shape (items,).
+
+        It numbers the trajectories, or blocks of rows, of all sources and parts, from 0.
+        """
+        epoch, start, stop = self._place(number)
+        found, before = np.empty(stop - start, np.intp), 0
+        drawn = self._drawn(epoch, start, stop)
+        for source, (slots, items) in zip(self._sources, drawn, strict=True):
+            found[slots] = before + source.groups_of(items)
+            before += len(source.groups.found.rows)
+        return found
+
+    @property
+    def group_nouns(self) -> list[str]:
+        """What `groups` are, by source: "episode", "trajectory" or "block"."""
+        return [source.groups.noun for source in self._sources]
+
+    @property
+    def num_groups(self) -> int:
+        """Number of trajectories, or blocks of rows, of all sources and parts."""
+        return sum(len(source.groups.found.rows) for source in self._sources)
+
+    def describe_group(self, group: int) -> dict[str, Any]:
+        """Return what is known of one of `groups`: its number, rows and parameters."""
+        for (name, dataset), source in zip(self.datasets.items(), self._sources, strict=True):
+            count = len(source.groups.found.rows)
+            if group < count:
+                place = {"source": name or str(dataset.directory)} if name else {}
+                return place | source.describe_group(group)
+            group -= count
+        raise IndexError(f"There is no group {group}.")
+
+    def window(self, name: str) -> Window:
+        """Return the window of a field; of a stored one, its value at offset 0."""
+        return window_of(self.view, name)
+
+    def quantity(self, name: str) -> str:
+        """Return the stored field whose quantity a field is: see `Field.like`."""
+        stored = self.window(name).field
+        return self._sources[0].rows.fields[stored].like or stored
+
+    @property
+    def is_whole(self) -> bool:
+        """Whether the parts of the view differ in trajectories, not only in pieces of them."""
+        return all(source.is_whole for source in self._sources)
 
     def take(self, items: Index) -> Batch:
         """Return some of the items of a single source as a batch, whatever their order."""
@@ -363,9 +411,9 @@ class Batches(Closeable):
             values = source.gather(window.field, where, window.at)
             values = values[:, 0] if window.is_single else values
             found[name] = values.astype(self._kinds[name], copy=False)
-            if name + _PAD in self.fields:
+            if name + PAD in self.fields:
                 padded = source.items.are_padded(where.items, window.at)
-                found[name + _PAD] = padded[:, 0] if window.is_single else padded
+                found[name + PAD] = padded[:, 0] if window.is_single else padded
         return found
 
     # What it is ---------------------------------------------------------------------------------

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ from physx_core.views.options import ViewOptions, Window
 _BLOCK, _SAME_SIZE = 16, 4096
 """Rows held back together where nothing is known of episodes, and after how many they double."""
 _NOUNS = {"episode": "episodes", "trajectory": "trajectories", "block": "blocks of rows"}
+_SHOWN = 8
+"""Largest number of values of a parameter that is shown."""
 _STATUS = {"finished": EpisodeStatus.FINISHED, "cut": EpisodeStatus.CUT}
 
 
@@ -38,6 +41,7 @@ class Source:
         items: The items of the part.
         trajectories: How many trajectories the part has, and how many there are.
         division: The same in words.
+        is_whole: Whether the parts differ in trajectories, not only in pieces or blocks of them.
     """
 
     def __init__(
@@ -78,6 +82,7 @@ class Source:
         if part in ("validation", "test") and len(named.rows) < view.folds:
             each = f"each of {taken} {_NOUNS[noun]}" if taken != 1 else f"the only {noun}"
             self.division = f"a piece of {each}"
+        self.is_whole = noun != "block" and len(named.rows) >= view.folds
         self.items = Items(view, chosen)
         self.rows.loads = self.order == "exact"
 
@@ -88,13 +93,48 @@ class Source:
         chooses = view.windows or view.stride > 1 or view.episodes or view.where or view.weights
         if not (divides or chooses):
             return "block", _blocks(np.zeros(min(1, rows.count), np.intp), rows.count)
+        return self._seek(needed=bool(chooses))
+
+    def _seek(self, *, needed: bool) -> tuple[str, Trajectories]:
+        """Return the trajectories; if nothing is known of any, blocks of rows, unless `needed`."""
+        rows = self.rows
         try:
             found = find_trajectories(rows)
         except DatasetError:
-            if chooses:
+            if needed:
                 raise
             return "block", _growing_blocks(rows.count)
         return "trajectory" if (found.campaign < 0).any() else "episode", found
+
+    @cached_property
+    def groups(self) -> Groups:
+        """The trajectories that its rows belong to, sought now if they did not matter before."""
+        noun, found = self._found
+        if noun == "block" and len(found.rows) < 2:
+            noun, found = self._seek(needed=False)
+        return Groups(noun, found, self.rows.count)
+
+    def groups_of(self, items: Index) -> Index:
+        """Return the place in `groups` of the trajectory of each item, shape (items,)."""
+        return self.groups.find(self.items.rows(items)[:, 0])
+
+    def describe_group(self, place: int) -> dict[str, Any]:
+        """Return number, rows and parameters of a trajectory of `groups`."""
+        found = self.groups.found
+        first = found.first_rows[place : place + 1]
+        known: dict[str, Any] = {
+            "number": int(found.episode[place]),
+            "first_row": int(first[0]),
+            "rows": int(found.rows[place]),
+        }
+        if found.campaign[place] >= 0 and self.rows.order is not None:
+            known["campaign"] = int(found.campaign[place])
+            values = {name: self.rows.episode_values(name, first)[0]
+                      for name in self.rows.episode_names}  # fmt: skip
+            known["parameters"] = {
+                name: value.tolist() for name, value in values.items() if value.size <= _SHOWN
+            }
+        return known
 
     def _chosen(self, found: Trajectories) -> Trajectories:
         """Return the trajectories that the view names."""
@@ -194,6 +234,36 @@ class Source:
         rows = self.items.rows(where.items, offsets)
         found = self.rows.gather(name, rows.ravel())
         return found.reshape(*rows.shape, *found.shape[1:])
+
+
+class Groups:
+    """The trajectories, or blocks of rows, that all rows of a source are divided into.
+
+    Attributes:
+        noun: "episode", "trajectory", or "block" if nothing is known of trajectories.
+        found: The trajectories.
+    """
+
+    def __init__(self, noun: str, found: Trajectories, count: int) -> None:
+        """Sort them by their first places.
+
+        Args:
+            noun: What they are.
+            found: The trajectories.
+            count: Number of rows.
+        """
+        self.noun, self.found = noun, found
+        self._order = np.argsort(found.start, kind="stable")
+        self._starts = found.start[self._order]
+        self._places: Index | None = None
+        if found.places is not None:
+            self._places = np.empty(count, np.intp)
+            self._places[found.places[:count]] = np.arange(count)
+
+    def find(self, rows: Index) -> Index:
+        """Return the place in `found` of the trajectory of each row, shape (rows,)."""
+        places = rows if self._places is None else self._places[rows]
+        return self._order[self._starts.searchsorted(places, "right") - 1]
 
 
 def window_of(view: ViewOptions, name: str) -> Window:

@@ -22,15 +22,13 @@ from physx_sim.engines import (
     LoadedBody,
     LoadedRobot,
     MovableBody,
+    RigidBody,
     Static,
     check_loaded,
     geometry_file,
 )
 from physx_sim.errors import ModelError
 
-WORLD = "world"
-ROOT = "physx root"
-"""Substitute name in DART for a root link named `world`, which DART would drop."""
 GROUND_SIZE = (1000.0, 1000.0, 10.0)
 """Size of the box that represents an infinite plane, in m. For a box on a plane, DART finds a
 single contact point; for a box on a box, all corners."""
@@ -65,50 +63,64 @@ def load_skeleton(movable: MovableBody, *, free: bool = False) -> dynamics.Skele
         free: Whether its joints have neither limits nor resistance, and take torques.
 
     Raises:
-        ModelError: If DART cannot load it, or holds something else than physx read.
+        ModelError: If DART holds something else than physx read.
     """
-    model, text = movable.model, movable.model.text
-    if model.links[0] == WORLD:
-        text = text.replace(f'link="{WORLD}"', f'link="{ROOT}"')
-        text = text.replace(f'<link name="{WORLD}">', f'<link name="{ROOT}">')
-    skeleton = _parse(text, movable.fixed_base, str(model.path))
-    if movable.fixed_base:
-        place = _transform(movable.position, to_matrix(movable.orientation))
-        skeleton.getRootJoint().setTransformFromParentBodyNode(place)
-    skeleton.setName(movable.name)
-    joints = [skeleton.getJoint(joint.name) for joint in model.joints]
+    model = movable.model
+    skeleton = dynamics.Skeleton(movable.name)
+    nodes: list[Any] = []
+    with _silence():  # DART warns of links without mass
+        for link in model.bodies:
+            nodes.append(_add_link(skeleton, link, nodes, movable))
+    moving = [
+        node.getParentJoint()
+        for link, node in zip(model.bodies, nodes, strict=True)
+        if link.joint is not None
+    ]
     limits: dict[str, Vector] = {}
     if not free:
-        for joint, native in zip(model.joints, joints, strict=True):
+        for joint, native in zip(model.joints, moving, strict=True):
             _configure(joint, native)
         for name, read in _LIMITS.items():
-            limits[name] = np.array([read(native) for native in joints], np.float64)
-    check_loaded("dart", movable, _loaded(skeleton, movable, limits))
+            limits[name] = np.array([read(native) for native in moving], np.float64)
+    axes = np.array([joint.getAxis() for joint in moving]).reshape(-1, 3)
+    poses = [node.getParentJoint().getTransformFromParentBodyNode().matrix() for node in nodes]
+    found = [LoadedBody((place,), *_inertia(node)) for place, node in enumerate(nodes)]
+    check_loaded("dart", movable, LoadedRobot(np.array(poses), axes, found, limits))
     return skeleton
 
 
-def _loaded(
-    skeleton: dynamics.Skeleton, movable: MovableBody, limits: Mapping[str, Vector]
-) -> LoadedRobot:
-    """Return what DART holds of a robot or object."""
-    bodies, poses = [], []
-    for place, link in enumerate(movable.model.links):
-        body = skeleton.getBodyNode(link_name(link))
-        if body is None:
-            raise ModelError(f'DART finds no link "{link}" in {movable.model.path}.')
-        joint, inertia = body.getParentJoint(), body.getInertia()
-        child = joint.getTransformFromChildBodyNode().inverse()
-        poses.append(joint.getTransformFromParentBodyNode().multiply(child).matrix())
-        found = inertia.getLocalCOM(), inertia.getMoment()
-        bodies.append(LoadedBody((place,), inertia.getMass(), *found))
-    joints = [skeleton.getJoint(joint.name) for joint in movable.model.joints]
-    axes = np.array([joint.getAxis() for joint in joints]).reshape(-1, 3)
-    return LoadedRobot(np.array(poses), axes, bodies, limits)
+def _add_link(
+    skeleton: dynamics.Skeleton, link: RigidBody, nodes: Sequence[Any], movable: MovableBody
+) -> Any:
+    """Add a link and the joint that leads to it; return its body."""
+    parent, place = (nodes[link.parent], link.pose) if nodes else (None, None)
+    if link.joint is not None:
+        revolute = link.joint.unit == "rad"
+        joint, body = (
+            skeleton.createRevoluteJointAndBodyNodePair(parent)
+            if revolute
+            else skeleton.createPrismaticJointAndBodyNodePair(parent)
+        )
+        joint.setAxis(link.axis)
+    elif nodes or movable.fixed_base:
+        joint, body = skeleton.createWeldJointAndBodyNodePair(parent)
+        if not nodes:
+            place = _transform(movable.position, to_matrix(movable.orientation))
+    else:
+        joint, body = skeleton.createFreeJointAndBodyNodePair()
+    if place is not None:
+        joint.setTransformFromParentBodyNode(place)
+    body.setInertia(dynamics.Inertia(link.mass, link.center, link.inertia))
+    return body
+
+
+def _inertia(node: Any) -> tuple[float, Vector, Vector]:
+    held = node.getInertia()
+    return held.getMass(), held.getLocalCOM(), held.getMoment()
 
 
 def _configure(joint: Joint, native: Any) -> None:
     """Set the limits, resistance, and actuator of a joint in DART."""
-    settings = joint.settings
     native.setPositionLowerLimit(0, joint.lower)
     native.setPositionUpperLimit(0, joint.upper)
     native.setVelocityLowerLimit(0, -joint.max_velocity)
@@ -118,22 +130,16 @@ def _configure(joint: Joint, native: Any) -> None:
     native.setLimitEnforcement(True)
     native.setDampingCoefficient(0, joint.damping)
     native.setCoulombFriction(0, joint.friction)
-    native.setSpringStiffness(0, settings.stiffness)
-    native.setRestPosition(0, settings.rest)
-    native.setActuatorType(_ACTUATORS[settings.mode])
+    native.setSpringStiffness(0, joint.stiffness)
+    native.setRestPosition(0, joint.rest)
+    native.setActuatorType(_ACTUATORS[joint.mode])
 
 
-def link_name(link: str) -> str:
-    """Return a link's name in DART."""
-    return ROOT if link == WORLD else link
-
-
-def attach_shapes(skeleton: dynamics.Skeleton, shapes: Sequence[CollisionShape]) -> None:
-    """Attach collision shapes to a skeleton's bodies."""
-    for shape in shapes:
-        body = skeleton.getBodyNode(link_name(shape.body))
-        if body is None:  # an object has a single body
-            body = skeleton.getBodyNode(0)
+def attach_shapes(skeleton: dynamics.Skeleton, movable: MovableBody) -> None:
+    """Attach the collision shapes of a robot or object to its bodies."""
+    links = {name: place for place, name in enumerate(movable.model.links)}
+    for shape in movable.model.shapes:
+        body = skeleton.getBodyNode(links.get(shape.body, 0))  # an object has a single body
         _attach(body, _dart_shape(shape), shape, _transform(shape.position, shape.rotation))
 
 
@@ -208,10 +214,11 @@ def _dart_shape(shape: CollisionShape) -> Any:
 
 def _load_mesh(path: Path) -> Any:
     text = _MESH.format(str(path).replace("&", "&amp;").replace("<", "&lt;").replace('"', "&quot;"))
-    skeleton = _parse(text, True, str(path))
-    for node in skeleton.getBodyNode(0).getShapeNodes():
+    with _silence() as messages:
+        skeleton = utils.DartLoader().parseSkeletonString(text, "")
+    for node in () if skeleton is None else skeleton.getBodyNode(0).getShapeNodes():
         return node.getShape()
-    raise ModelError(f"DART finds no mesh in {path}.")
+    raise ModelError(f"DART finds no mesh in {path}.{''.join(messages)}")
 
 
 def _height_shape(field: HeightField) -> Any:
@@ -238,21 +245,8 @@ def _transform(position: Sequence[float] | Vector, rotation: Vector) -> Vector:
     return transform
 
 
-def _parse(text: str, fixed_base: bool, origin: str) -> dynamics.Skeleton:
-    options = utils.DartLoaderOptions()
-    kind = utils.DartLoaderRootJointType
-    options.mDefaultRootJointType = kind.FIXED if fixed_base else kind.FLOATING
-    loader = utils.DartLoader()
-    loader.setOptions(options)
-    with _capture_messages() as messages:
-        skeleton = loader.parseSkeletonString(text, "")
-    if skeleton is None:
-        raise ModelError(f"DART cannot load {origin}.{''.join(messages)}")
-    return skeleton
-
-
 @contextmanager
-def _capture_messages() -> Iterator[list[str]]:
+def _silence() -> Iterator[list[str]]:
     """Collect what native code in this process writes to standard error."""
     messages: list[str] = []
     sys.stderr.flush()

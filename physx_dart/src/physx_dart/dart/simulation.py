@@ -29,6 +29,7 @@ from physx_sim.engines import (
     RobotSimulation,
     check_rk4,
     read_parts,
+    without_armature,
 )
 from physx_sim.errors import FeatureNotSupportedError, SimulationError
 
@@ -84,7 +85,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
         ):
             if name is not None and name not in known:
                 raise UnknownOptionError(f"World.{option} for dart", [name], known)
-        parts = read_parts(world)
+        parts = without_armature(read_parts(world), self.engine)
         touching = any(movable.model.shapes for movable in parts.movables)
         solver = world.solver or ("nsgs" if touching else "dantzig")
         detector = world.detector or ("dart" if solver == "dantzig" else "bullet")
@@ -119,7 +120,8 @@ class DartSimulation(RobotSimulation[DartRobot]):
         features = frozenset(FEATURES) - self.lacks
         if parts.world.integrator == "rk4":
             check_rk4(parts, self.engine, features)
-        if any(joint.settings.armature for each in parts.movables for joint in each.model.joints):
+        settings = [each for robot in parts.world.robots for each in robot.joints.values()]
+        if any(each.armature for each in settings):
             raise FeatureNotSupportedError(self.engine, "armature", features)
         shapes = [shape for each in parts.movables for shape in each.model.shapes]
         shapes += [each.what for each in parts.statics if isinstance(each.what, CollisionShape)]
@@ -131,7 +133,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
         movable = parts.movables[place]
         robot = DartRobot(movable, parts.world.gravity)
         if parts.world.contacts != "none":
-            attach_shapes(robot.skeleton, movable.model.shapes)
+            attach_shapes(robot.skeleton, movable)
         if movable.self_collisions and movable.moves and parts.world.contacts == "all":
             robot.skeleton.enableSelfCollisionCheck()
         self._world.addSkeleton(robot.skeleton)

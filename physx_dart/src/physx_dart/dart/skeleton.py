@@ -16,7 +16,7 @@ from physx_core.rotations import (
     to_rotation_vector,
 )
 from physx_core.typing import Vector
-from physx_dart.dart.loading import link_name, load_skeleton
+from physx_dart.dart.loading import load_skeleton
 from physx_sim.engines import MovableBody, RobotEngine, base_accelerations, rk4_step
 
 
@@ -33,11 +33,7 @@ class DartRobot(RobotEngine):
         self.skeleton = load_skeleton(movable)
         self._gravity = gravity
         self._made_shadow: Any = None
-        joints = [self.skeleton.getJoint(joint.name) for joint in self.model.joints]
-        places = [joint.getIndexInSkeleton(0) for joint in joints]
-        self._native = np.array([*range(self.base), *places], dtype=np.intp)
-        self._sorted = bool((self._native == np.arange(self.nv)).all())
-        self.bodies = [self.skeleton.getBodyNode(link_name(link)) for link in self.model.links]
+        self.bodies = list(self.skeleton.getBodyNodes())
         self._held, self._commands = np.zeros(self.nv), np.zeros(self.nv - self.base)
         self._pushes: list[tuple[int, Vector, Vector, Vector, bool]] = []
         self._change: Vector | None = None
@@ -46,11 +42,8 @@ class DartRobot(RobotEngine):
     def hold(self, commands: Vector) -> None:
         """Hold commands, shape (joints,), already clipped to their limits."""
         self._commands = commands
-        if self.base or not self._sorted:
-            if self._sorted:
-                self._held[self.base :] = commands
-            else:
-                self._held[self._native[self.base :]] = commands
+        if self.base:
+            self._held[self.base :] = commands
             commands = self._held
         if self.nv > self.base:
             self.skeleton.setCommands(commands)
@@ -69,7 +62,7 @@ class DartRobot(RobotEngine):
 
     def positions(self) -> Vector:
         """Return the current positions, shape (nq,), as a new vector."""
-        q = self._q if self._sorted else self._q[self._native]
+        q = self._q
         if not self.base:
             return q.copy()
         found = np.empty(self.nq)
@@ -79,15 +72,14 @@ class DartRobot(RobotEngine):
     def velocities(self) -> Vector:
         """Return the current velocities, shape (nv,), as a new vector."""
         if self._twist is None:
-            v = self._v if self._sorted else self._v[self._native]
-            self._twist = self._in_base(v.copy()) if self.base else v
+            self._twist = self._in_base(self._v.copy()) if self.base else self._v
         return self._twist.copy()
 
     def accelerations(self) -> Vector:
         """Return the accelerations of the last step, shape (nv,)."""
         if self._change is not None:
             return self._change.copy()
-        a = self._to_layout(self.skeleton.getAccelerations())
+        a = self.skeleton.getAccelerations()
         if not self.base:
             return a
         x, y, z, *linear = a[:6].tolist()
@@ -202,14 +194,13 @@ class DartRobot(RobotEngine):
         rotation = self._place(self._shadow, positions, velocities)
         self._shadow.clearExternalForces()
         for link, force, torque, point, local in self._pushes if pushed else ():
-            body = self._shadow.getBodyNode(link_name(self.model.links[link]))
-            _push(body, force, torque, point, local)
+            _push(self._shadow.getBodyNode(link), force, torque, point, local)
         forces = torques - self.resistance.torques(positions, velocities)
         if rotation is not None:
             forces = np.concatenate([rotation @ forces[3:6], rotation @ forces[:3], forces[6:]])
-        self._shadow.setForces(self._to_native(forces))
+        self._shadow.setForces(forces)
         self._shadow.computeForwardDynamics()
-        a = self._to_layout(self._shadow.getAccelerations())
+        a = self._shadow.getAccelerations()
         if rotation is not None:
             linear = a[3:6] @ rotation - np.cross(velocities[3:6], velocities[:3])
             a = np.concatenate([linear, a[:3] @ rotation, a[6:]])
@@ -222,9 +213,9 @@ class DartRobot(RobotEngine):
         if rotation is not None:
             linear = rotation @ (a[:3] + np.cross(velocities[3:6], velocities[:3]))
             a = np.concatenate([rotation @ a[3:6], linear, a[6:]])
-        self._shadow.setAccelerations(self._to_native(a))
+        self._shadow.setAccelerations(a)
         self._shadow.computeInverseDynamics(False, False, False)
-        forces = self._to_layout(self._shadow.getForces())
+        forces = self._shadow.getForces()
         if rotation is not None:
             forces = np.concatenate([forces[3:6] @ rotation, forces[:3] @ rotation, forces[6:]])
         return forces + self.resistance.torques(positions, velocities)
@@ -239,19 +230,9 @@ class DartRobot(RobotEngine):
             positions = np.concatenate([vector, positions[:3], positions[7:]])
             twist = velocities
             velocities = np.concatenate([rotation @ twist[3:6], rotation @ twist[:3], twist[6:]])
-        skeleton.setPositions(self._to_native(positions))
-        skeleton.setVelocities(self._to_native(velocities))
+        skeleton.setPositions(positions)
+        skeleton.setVelocities(velocities)
         return rotation
-
-    def _to_layout(self, native: Vector) -> Vector:
-        return native if self._sorted else native[self._native]
-
-    def _to_native(self, vector: Vector) -> Vector:
-        if self._sorted:
-            return vector
-        native = np.empty(self.nv)
-        native[self._native] = vector
-        return native
 
 
 def _push(body: Any, force: Vector, torque: Vector, point: Vector, local: bool) -> None:

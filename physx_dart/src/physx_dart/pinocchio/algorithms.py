@@ -41,7 +41,7 @@ class MovableAlgorithms:
         """Return the algorithms of a robot or object."""
         resistance = Resistance.of(movable)
         model = load_model(movable, gravity, armature=resistance.armature)
-        return cls(model, resistance, frames_of(model, movable))
+        return cls(model, resistance, frames_of(movable))
 
     def write_motion(self, frame: int, out: Vector) -> None:
         """Write pose, velocity, and acceleration of a frame, after `pinocchio.forwardKinematics`.

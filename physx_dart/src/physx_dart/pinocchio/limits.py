@@ -41,7 +41,7 @@ class JointConstraints:
     def __init__(self, joints: Sequence[Joint], period: float, base: int) -> None:
         """Store the bounds of all joints, the period in s, and the base's degrees of freedom."""
         self.base = base
-        modes = np.array([joint.settings.mode for joint in joints], dtype=object)
+        modes = np.array([joint.mode for joint in joints], dtype=object)
         lower = np.array([joint.lower for joint in joints])
         upper = np.array([joint.upper for joint in joints])
         fastest = np.array([joint.max_velocity for joint in joints])

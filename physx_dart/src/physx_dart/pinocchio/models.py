@@ -12,19 +12,12 @@ from physx_core.typing import Vector
 from physx_sim.engines import LoadedBody, LoadedRobot, MovableBody, check_loaded
 from physx_sim.errors import ModelError
 
-_TRANSLATION, _ROTATION = "physx translation", "physx rotation"
-_LINK = "physx link "
 _MOST_VELOCITIES = 192
 
 
 def load_model(movable: MovableBody, gravity: tuple[float, ...], *, armature: Vector) -> Any:
     """Return the model of a robot or object in the convention of `physx_core`."""
-    if movable.fixed_base:
-        model = _parse(movable)
-        _weld(model, movable)
-    else:
-        model = _parse(movable, pinocchio.JointModelFreeFlyer())
-    return _finish(model, movable, gravity, armature, 1 if movable.fixed_base else 2)
+    return _load(movable, gravity, armature, pinocchio.JointModelFreeFlyer())
 
 
 def load_stepping_model(
@@ -36,27 +29,13 @@ def load_stepping_model(
     the world frame, not its own, so that semi-implicit Euler conserves the linear momentum of a
     tumbling body, as in DART; in the base's own frame it would not.
     """
-    if movable.fixed_base:
-        return load_model(movable, gravity, armature=armature)
-    nowhere = pinocchio.SE3.Identity()
-    base = pinocchio.Model()
-    first = base.addJoint(0, pinocchio.JointModelTranslation(), nowhere, _TRANSLATION)
-    second = base.addJoint(first, pinocchio.JointModelSpherical(), nowhere, _ROTATION)
-    frame = pinocchio.Frame(_ROTATION, second, 0, nowhere, pinocchio.FrameType.BODY)
-    place = base.addFrame(frame)
-    robot = _parse(movable)
-    links = [frame for frame in robot.frames if frame.type == pinocchio.FrameType.BODY]
-    for frame in links:  # appendModel confuses a link and a joint with the same name
-        frame.name = f"{_LINK}{frame.name}"
-    model = pinocchio.appendModel(base, robot, place, nowhere)
-    for frame in model.frames:
-        frame.name = frame.name.removeprefix(_LINK)
-    return _finish(model, movable, gravity, armature, 3)
+    base = pinocchio.JointModelTranslation(), pinocchio.JointModelSpherical()
+    return _load(movable, gravity, armature, *base)
 
 
-def frames_of(model: Any, movable: MovableBody) -> list[int]:
-    """Return the frame of each link of a model."""
-    return [model.getFrameId(link, pinocchio.FrameType.BODY) for link in movable.model.links]
+def frames_of(movable: MovableBody) -> list[int]:
+    """Return the frame of each link in a model; frame 0 is the world."""
+    return list(range(1, len(movable.model.links) + 1))
 
 
 def twists_of(found: Vector) -> Vector:
@@ -64,48 +43,56 @@ def twists_of(found: Vector) -> Vector:
     return found.reshape(6, -1)
 
 
-def _parse(movable: MovableBody, *root: Any) -> Any:
-    try:
-        model = pinocchio.buildModelFromXML(movable.model.text, *root)
-    except (ValueError, RuntimeError) as error:
-        raise ModelError(f"Pinocchio cannot load {movable.model.path}: {error}") from error
-    if model.nv > _MOST_VELOCITIES:
-        raise ModelError(
-            f"{movable.model.path} has {model.nv} degrees of freedom. Pinocchio's memory grows "
-            f"with their cube, so at most {_MOST_VELOCITIES} are allowed; use the engine dart."
-        )
-    return model
-
-
-def _weld(model: Any, movable: MovableBody) -> None:
-    """Place the root of a fixed-base robot."""
-    rotation = to_matrix(movable.orientation)
-    base = pinocchio.SE3(rotation, np.array(movable.position))
-    for joint in range(1, model.njoints):
-        if model.parents[joint] == 0:
-            model.jointPlacements[joint] = base * model.jointPlacements[joint]
-    for place, frame in enumerate(model.frames):
-        if frame.parentJoint == 0 and place > 0:
-            model.frames[place].placement = base * frame.placement
-
-
-def _finish(
-    model: Any, movable: MovableBody, gravity: tuple[float, ...], armature: Vector, first: int
-) -> Any:
+def _load(movable: MovableBody, gravity: tuple[float, ...], armature: Vector, *base: Any) -> Any:
+    _check_size(movable)
+    model, nowhere = pinocchio.Model(), pinocchio.SE3.Identity()
+    places: list[tuple[int, Any]] = []  # of each link: its joint, and where it is on it
+    for link in movable.model.bodies:
+        if link.parent >= 0:
+            joint, place = places[link.parent]
+            place = place * pinocchio.SE3(link.pose)
+        elif movable.fixed_base:
+            turn = to_matrix(movable.orientation)
+            joint, place = 0, pinocchio.SE3(turn, np.array(movable.position))
+        else:
+            joint, place = 0, nowhere
+            for number, kind in enumerate(base):
+                joint = model.addJoint(joint, kind, nowhere, f"physx base {number}")
+        if link.joint is not None:
+            kind = _joint_model(link.joint.unit, link.axis)
+            joint, place = model.addJoint(joint, kind, place, link.joint.name), nowhere
+        inertia = pinocchio.Inertia.Zero()  # its constructor refuses what only a whole body needs
+        inertia.mass, inertia.lever, inertia.inertia = link.mass, link.center, link.inertia
+        model.appendBodyToJoint(joint, inertia, place)
+        model.addFrame(pinocchio.Frame(link.name, joint, place, pinocchio.FrameType.BODY))
+        places.append((joint, place))
     model.gravity.linear = np.array(gravity, np.float64)
     model.armature = np.asarray(armature, np.float64)
-    moving = list(model.names)[first:]
-    if moving != [joint.name for joint in movable.model.joints]:
-        path = movable.model.path
-        raise ModelError(f"Pinocchio reads the joints of {path} in a different order: {moving}.")
     check_loaded("pinocchio", movable, _loaded(model, movable))
     return model
+
+
+def _check_size(movable: MovableBody) -> None:
+    velocities = len(movable.model.joints) + (0 if movable.fixed_base else 6)
+    if velocities > _MOST_VELOCITIES:
+        raise ModelError(
+            f"{movable.model.path} has {velocities} degrees of freedom. Pinocchio's memory grows "
+            f"with their cube, so at most {_MOST_VELOCITIES} are allowed; use the engine dart."
+        )
+
+
+def _joint_model(unit: str, axis: Vector) -> Any:
+    """Return a joint about or along an axis; those of a coordinate axis are faster."""
+    kind = "Revolute" if unit == "rad" else "Prismatic"
+    if axis.max() == 1.0 and np.count_nonzero(axis) == 1:
+        return getattr(pinocchio, f"JointModel{kind[0]}{'XYZ'[int(np.argmax(axis))]}")()
+    return getattr(pinocchio, f"JointModel{kind}Unaligned")(axis)
 
 
 def _loaded(model: Any, movable: MovableBody) -> LoadedRobot:
     """Return what Pinocchio holds of a robot or object, whose limits it does not use."""
     bodies = movable.model.bodies
-    frames = [model.frames[frame] for frame in frames_of(model, movable)]
+    frames = [model.frames[frame] for frame in frames_of(movable)]
     poses, axes = [], []
     for frame, body in zip(frames, bodies, strict=True):
         joint, place = frame.parentJoint, frame.placement

@@ -55,7 +55,7 @@ class PinocchioRobot(RobotEngine):
         self._model = self.model_in_motion.copy()
         self._model.armature = np.asarray(resists.armature, np.float64)
         self._data = self._model.createData()
-        self.frames = frames_of(self.model_in_motion, movable)
+        self.frames = frames_of(movable)
         self._pushes = pinocchio.StdVec_Force()
         self._pushes.extend(pinocchio.Force.Zero() for _ in range(self.model_in_motion.njoints))
         self._more: tuple[Any, ...] = ()  # the wrenches, if there are any
@@ -71,7 +71,7 @@ class PinocchioRobot(RobotEngine):
         self._acted_on = bool(self._contacts) or self._joints.acts
         self._solver = solver
         self._rk4 = world.integrator == "rk4"
-        modes = [joint.settings.mode for joint in self.model.joints]
+        modes = [joint.mode for joint in self.model.joints]
         forces = np.array([mode == "force" for mode in modes], np.float64)
         self._forces = None if forces.all() else forces
         self._positions, self._velocities = np.zeros(self.nq), np.zeros(self.nv)

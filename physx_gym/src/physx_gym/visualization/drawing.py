@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from physx_sim import (
     World,
     WorldObject,
 )
+from physx_sim.engines import is_mjcf, read_robot, to_urdf
 
 _GROUND, _MOVING, _RESTING = "#6d7885", "#ff7f0e", "#a3acb6"
 _THICKNESS, _REACH = 0.01, 100.0  # of a drawn plane, and half its width, in m
@@ -36,7 +38,10 @@ _ROBOT = """<robot name="mesh"><link name="mesh"><visual><geometry>
 
 
 class WorldDrawing:
-    """Draws a world with a factory: robots by their visual shapes, objects, and the ground."""
+    """Draws a world with a factory: robots by their visual shapes, objects, and the ground.
+
+    Robots from MJCF files are drawn by their collision shapes.
+    """
 
     def __init__(
         self,
@@ -110,14 +115,17 @@ class WorldDrawing:
         bodies = self._layout.bodies[self._layout.parts[robot.name].bodies]
         names = [body.removeprefix(f"{robot.name}/") for body in bodies]
         packages = {name: str(folder) for name, folder in robot.package_dirs.items()}
-        urdf = str(self._model(robot.urdf))
+        urdf = str(self._model(robot))
         self._factory.add_robot(
             robot.name, urdf, names, package_dirs=packages, poses=poses, **self._look
         )
 
-    def _model(self, urdf: str | Path) -> Path:
-        """Return the file of a robot, which may be given by its name in the backend."""
-        path = Path(urdf)
+    def _model(self, robot: Robot) -> Path:
+        """Return the URDF file of a robot, which may be given by its name in the backend."""
+        urdf, path = robot.urdf, Path(robot.urdf)
+        if is_mjcf(path):
+            shown = dataclasses.replace(robot, collisions="shapes", feet={})
+            return self._write(to_urdf(read_robot(shown, touching=True)))
         if isinstance(urdf, Path) or urdf.lower().endswith(".urdf") or path.is_file():
             return path
         return self._backend.robot_path(urdf) or path
@@ -142,11 +150,15 @@ class WorldDrawing:
 
     def _as_robot(self, each: Mesh) -> Path:
         """Return a URDF file of a mesh, as viewers load mesh files in this form."""
+        path = quoteattr(str(Path(each.path).absolute()))
+        return self._write(_ROBOT.format(path, scale=each.scale))
+
+    def _write(self, text: str) -> Path:
+        """Return a temporary URDF file."""
         if self._folder is None:
             self._folder = TemporaryFolder("drawing-")
         folder = self._folder.path
         file = folder / f"{len(list(folder.iterdir()))}.urdf"
-        text = _ROBOT.format(quoteattr(str(Path(each.path).absolute())), scale=each.scale)
         file.write_text(text, encoding="utf-8")
         return file
 

@@ -1,4 +1,4 @@
-"""Robots: a URDF file plus the options that a world adds to it."""
+"""Robots: a URDF or MJCF file plus the options that a world adds to it."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from physx_core import checks
 from physx_core.errors import ConfigError, UnknownOptionError
 
 Mode = Literal["force", "servo", "velocity", "position"]
+_RESISTANCE = ("damping", "friction", "stiffness", "rest", "armature")
 Collisions = Literal["shapes", "boxes", "capsules", "none"]
 
 
 @dataclass(frozen=True)
 class JointSettings:
-    """Drive and resistance of a joint. None: as in the URDF file.
+    """Drive and resistance of a joint. None: as in the robot's file, 0 if it does not say.
 
     Attributes:
         mode: Meaning of a command to the joint. ``"force"``: a torque, in N m or N.
@@ -40,29 +41,37 @@ class JointSettings:
     gain: float = 20.0
     damping: float | None = None
     friction: float | None = None
-    stiffness: float = 0.0
-    rest: float = 0.0
-    armature: float = 0.0
+    stiffness: float | None = None
+    rest: float | None = None
+    armature: float | None = None
 
     def __post_init__(self) -> None:
         if self.mode not in get_args(Mode):
             raise UnknownOptionError("JointSettings.mode", [str(self.mode)], get_args(Mode))
         checks.store_declared("JointSettings.", self)
         checks.positive("JointSettings.gain", self.gain)
-        checks.finite("JointSettings.rest", self.rest)
+        if self.rest is not None:
+            checks.finite("JointSettings.rest", self.rest)
         for option in ("damping", "friction", "stiffness", "armature"):
             value = getattr(self, option)
             if value is not None:
                 checks.not_negative(f"JointSettings.{option}", value)
 
+    def resistance(self, **file: float) -> dict[str, float]:
+        """Return damping, friction, stiffness, rest and armature, completed from a file's."""
+        given = {name: getattr(self, name) for name in _RESISTANCE}
+        return {name: file.get(name, 0.0) if x is None else x for name, x in given.items()}
+
 
 @dataclass(frozen=True)
 class Robot:
-    """A robot from a URDF file; links and joints named in its options must exist in that file.
+    """A robot from a file; links and joints named in its options must exist in that file.
 
     Attributes:
-        urdf: Path of the URDF file.
+        urdf: Path of its URDF or MJCF file, or the name of a robot: see ``physx robots``.
         name: Name of the robot in the world.
+        root: In an MJCF file with several trees, the body that is the root link, or ``"world"`` for
+            all that is attached to the world: see `mjcf_robots`.
         fixed_base: Whether the root link is welded to the world; otherwise it floats freely. A
             welded robot without a movable joint is scenery: static, like a static object.
         package_dirs: Folder of each package in mesh names of the form ``package://<name>/...``.
@@ -77,9 +86,9 @@ class Robot:
             and the sphere's radius, in m.
         friction: Coefficient of friction of all links; a contact uses the smaller of the two.
         restitution: Coefficient of restitution of all links; a contact uses the product of the two.
-        joints: Settings of joints, by their name in the URDF file.
+        joints: Settings of joints, by their name in the file.
         mass_factors: Scale factors for the mass and moments of inertia of links, by their name in
-            the URDF file; 1 for all others.
+            the file; 1 for all others.
 
     Raises:
         UnknownOptionError: If there is no such choice of `collisions`.
@@ -99,6 +108,7 @@ class Robot:
     restitution: float = 0.0
     joints: Mapping[str, JointSettings] = field(default_factory=dict)
     mass_factors: Mapping[str, float] = field(default_factory=dict)
+    root: str = ""
 
     def __post_init__(self) -> None:
         checks.name("robot", self.name)

@@ -12,12 +12,15 @@ from .models.meshes import bounding_box as bounding_box
 from .models.meshes import bounding_capsule as bounding_capsule
 from .models.meshes import geometry_file as geometry_file
 from .models.meshes import read_vertices as read_vertices
+from .models.mjcf import is_mjcf as is_mjcf
 from .models.parts import MovableBody as MovableBody
 from .models.parts import Parts as Parts
 from .models.parts import Static as Static
 from .models.parts import layout_of as layout_of
 from .models.parts import read_parts as read_parts
 from .models.parts import static_poses as static_poses
+from .models.parts import without_armature as without_armature
+from .models.reading import read_robot as read_robot
 from .models.rigid_bodies import Joint as Joint
 from .models.rigid_bodies import RigidBody as RigidBody
 from .models.robot_files import EXAMPLE_DATA as EXAMPLE_DATA
@@ -26,9 +29,9 @@ from .models.robot_files import example_data_dir as example_data_dir
 from .models.robot_files import example_robot as example_robot
 from .models.robot_files import find_robot as find_robot
 from .models.robot_files import named_robots as named_robots
+from .models.robot_model import RobotModel as RobotModel
 from .models.shapes import CollisionShape as CollisionShape
-from .models.urdf import RobotModel as RobotModel
-from .models.urdf import read_robot as read_robot
+from .models.urdf_text import to_urdf as to_urdf
 from .resistance import Resistance as Resistance
 from .rk4 import RK4_LACKS as RK4_LACKS
 from .rk4 import check_rk4 as check_rk4

@@ -39,8 +39,13 @@ class Resistance:
         base = 0 if movable.fixed_base else 6
         table = np.zeros((5, base + len(movable.model.joints)))
         for column, joint in zip(table.T[base:], movable.model.joints, strict=True):
-            extra = joint.settings
-            column[:] = joint.damping, joint.friction, extra.stiffness, extra.rest, extra.armature
+            column[:] = (
+                joint.damping,
+                joint.friction,
+                joint.stiffness,
+                joint.rest,
+                joint.armature,
+            )
         return cls(table)
 
     def torques(self, positions: Vector, velocities: Vector) -> Vector | float:

@@ -39,7 +39,7 @@ def check_rk4(parts: Parts, engine: str, features: Collection[str]) -> None:
         for name, asked in (
             ("limits", np.isfinite(limits).any()),
             ("joint_friction", joint.friction > 0),
-            ("actuators", joint.settings.mode != "force"),
+            ("actuators", joint.mode != "force"),
         ):
             if asked:
                 what = f'{name} in rk4, of the joint "{joint.name}"'

@@ -102,7 +102,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._tame = tame**2 if tame > 0 else -1.0
         self._positioned = np.flatnonzero(modes == "position")
         joints = [joint for movable in self.parts.movables for joint in movable.model.joints]
-        gains = np.array([min(joint.settings.gain, 1 / self.period) for joint in joints])
+        gains = np.array([min(joint.gain, 1 / self.period) for joint in joints])
         self._gains = gains[self._positioned]
         places = np.array(list(layout.position_index.values()), np.intp)
         self._positioned_q = places[self._positioned]

@@ -97,6 +97,8 @@ class Motor:
 def with_rotors(world: World, motors: Sequence[Motor]) -> World:
     """Return the world with the rotors of rigid-gear motors added to its joints' armature.
 
+    A file's own armature is that of its motor, so it is replaced.
+
     Engines without the feature ``armature`` cannot build it.
 
     Raises:
@@ -108,7 +110,7 @@ def with_rotors(world: World, motors: Sequence[Motor]) -> World:
             place, joint = _robot_of(world, motor.joint)
             joints = dict(robots[place].joints)
             settings = joints.get(joint, JointSettings())
-            armature = settings.armature + motor.armature
+            armature = (settings.armature or 0.0) + motor.armature
             joints[joint] = dataclasses.replace(settings, armature=armature)
             robots[place] = dataclasses.replace(robots[place], joints=joints)
     return dataclasses.replace(world, robots=robots)
@@ -117,7 +119,7 @@ def with_rotors(world: World, motors: Sequence[Motor]) -> World:
 def armature_in(world: World, joint: str) -> float:
     """Return a joint's armature in a world, given the joint's name in the layout."""
     place, name = _robot_of(world, joint)
-    return world.robots[place].joints.get(name, JointSettings()).armature
+    return world.robots[place].joints.get(name, JointSettings()).armature or 0.0
 
 
 def _robot_of(world: World, joint: str) -> tuple[int, str]:

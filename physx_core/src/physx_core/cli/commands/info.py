@@ -21,6 +21,7 @@ from physx_core.pipelines.learning.data_record import (
     describe_record,
     open_data,
 )
+from physx_core.results import read_results
 
 
 @dataclass
@@ -93,6 +94,10 @@ def _show_session(place: Path, options: Info) -> None:
     except DatasetNotFoundError:
         if not checkpoints:
             raise
+    for kind, result in read_results(place).items():
+        show(f"result of the last {kind}, {result.seconds:.3g} s")
+        for line in result.lines:
+            show(f"  {line}")
     problems = 0
     for path in checkpoints:
         try:

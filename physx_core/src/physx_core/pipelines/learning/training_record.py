@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 from numpy.lib.stride_tricks import sliding_window_view
 
+from physx_core.results.errors import as_loss
+
 RECENT = 50
 """Window of the running mean and variance, in batches or epochs."""
 
@@ -146,11 +148,21 @@ class BestEpoch:
         self.loss, self.epoch = loss, epoch
         return True
 
-    def reason_to_stop(self, patience: int) -> str:
+    def describe(self, name: str | None) -> str:
+        """Return the best value in words.
+
+        Args:
+            name: What decides; None: the loss.
+        """
+        value = as_loss(name or "", self.loss)
+        least = "largest" if (name or "").endswith("accuracy") else "smallest"
+        return f"{least} {name or 'loss'} {value:.6g}, after epoch {self.epoch}"
+
+    def reason_to_stop(self, patience: int, name: str | None) -> str:
         """Return why to stop after `patience` epochs without improvement; empty: continue."""
         if self.waited < patience:
             return ""
         return (
-            f"The training stopped early: the loss did not improve {self.waited} times in a row "
-            f"(patience={patience}). The smallest was {self.loss:.6g}, after epoch {self.epoch}."
+            f"The training stopped early: the {name or 'loss'} did not improve {self.waited} times "
+            f"in a row (patience={patience}); {self.describe(name)}."
         )

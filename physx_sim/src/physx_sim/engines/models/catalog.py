@@ -8,8 +8,8 @@ from xml.etree.ElementTree import Element
 
 from physx_core.errors import PhysxError
 from physx_sim import Robot, RobotInfo, parse_urdf
+from physx_sim.engines.models.reading import read_robot
 from physx_sim.engines.models.robot_files import mesh_path, named_robots
-from physx_sim.engines.models.urdf import read_robot
 
 _NO_DIRS: Mapping[str, str | Path] = {}
 

@@ -110,7 +110,8 @@ def _weightless(bodies: Sequence[RigidBody], fixed_base: bool) -> str:
         body.joint.name
         for link, body in enumerate(bodies)
         if body.joint is not None
-        and body.joint.settings.mode != "velocity"
+        and body.joint.mode != "velocity"
+        and not body.joint.armature
         and (masses[link] == 0 if body.joint.unit == "m" else moved[link] <= rounding[link])
     ]
     if not names:

@@ -5,11 +5,12 @@ from __future__ import annotations
 import functools
 import warnings
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
+from physx_core.errors import listed
 from physx_sim import (
     Ground,
     HeightField,
@@ -20,9 +21,10 @@ from physx_sim import (
     World,
     WorldObject,
 )
+from physx_sim.engines.models.reading import read_robot
 from physx_sim.engines.models.rigid_bodies import Inertial, Joint
+from physx_sim.engines.models.robot_model import RobotModel, model_of_body
 from physx_sim.engines.models.shapes import CollisionShape, moments, shape_of_object
-from physx_sim.engines.models.urdf import RobotModel, model_of_body, read_robot
 from physx_sim.errors import ModelError
 
 
@@ -99,7 +101,7 @@ def read_parts(world: World) -> Parts:
     for movable in movables:
         for text in movable.model.warnings:
             where = f'Robot "{movable.name}", {movable.model.path}'
-            _warn(f"{where}: {text}.", movable.model.text)
+            _warn(f"{where}: {text}.")
     statics = [] if world.ground is None else [Static("ground", world.ground)]
     for thing in world.objects:
         if thing.static:
@@ -119,8 +121,8 @@ def _robot(robot: Robot, touching: bool) -> MovableBody:
 
 
 @functools.cache
-def _warn(text: str, content: str) -> None:
-    """Warn once of each content: simulations of the same file are built many times."""
+def _warn(text: str) -> None:
+    """Warn once: simulations of the same file are built many times."""
     warnings.warn(text, stacklevel=5)
 
 
@@ -149,6 +151,28 @@ def _object(thing: WorldObject) -> MovableBody:
     inertial = Inertial(float(thing.mass), (xx, yy, zz, 0.0, 0.0, 0.0))
     model = model_of_body("body", Path(thing.name), inertial, shape)
     return MovableBody(thing.name, model, False, thing.position, thing.orientation, is_object=True)
+
+
+def without_armature(parts: Parts, engine: str) -> Parts:
+    """Return parts without the inertia of rotors, for an engine that has none; warn once."""
+    movables = list(parts.movables)
+    for place, movable in enumerate(movables):
+        model = movable.model
+        if any(joint.armature for joint in model.joints):
+            where = f'Robot "{movable.name}", {model.path}'
+            names = [joint.name for joint in model.joints if joint.armature]
+            _warn(
+                f"{where}: the engine {engine} leaves out the armature of the joints "
+                f"{listed(names)}. Other engines move them more slowly."
+            )
+            bodies = tuple(
+                body
+                if body.joint is None
+                else replace(body, joint=replace(body.joint, armature=0.0))
+                for body in model.bodies
+            )
+            movables[place] = replace(movable, model=replace(model, bodies=bodies))
+    return replace(parts, movables=tuple(movables))
 
 
 def static_poses(parts: Parts) -> np.ndarray:
@@ -199,7 +223,7 @@ def layout_of(parts: Parts) -> Layout:
         max_torque=_column(joints, "max_torque"),
         parts=places,
         statics=statics,
-        modes=tuple(joint.settings.mode for joint in joints),
+        modes=tuple(joint.mode for joint in joints),
         units=tuple(joint.unit for joint in joints),
     )
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from physx_core.rotations import from_roll_pitch_yaw, to_matrix
 from physx_core.typing import Vector
-from physx_sim import JointSettings
+from physx_sim.description.robot import Mode
 
 
 @dataclass(frozen=True)
@@ -23,10 +23,14 @@ class Joint:
         upper: Upper position limit, in rad or m; inf: none.
         max_velocity: Limit of the velocity, in rad/s or m/s.
         max_torque: Limit of the torque, in N m or N.
+        mode: Meaning of its commands, as in `JointSettings`.
+        gain: Of a servo that tracks positions, as in `JointSettings`.
+        unit: Unit of its position, rad or m.
         damping: Viscous damping, in N m s/rad or N s/m.
         friction: Coulomb friction, in N m or N.
-        settings: The world's settings for it.
-        unit: Unit of its position, rad or m.
+        stiffness: Stiffness of a spring between the links, in N m/rad or N/m.
+        rest: Rest position of the spring, in rad or m.
+        armature: Inertia of the motor's rotor as seen from the joint, in kg m² or kg.
     """
 
     name: str
@@ -34,10 +38,14 @@ class Joint:
     upper: float
     max_velocity: float
     max_torque: float
+    mode: Mode
+    gain: float
+    unit: str
     damping: float
     friction: float
-    settings: JointSettings
-    unit: str
+    stiffness: float
+    rest: float
+    armature: float
 
 
 @dataclass(frozen=True, eq=False)

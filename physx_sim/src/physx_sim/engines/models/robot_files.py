@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 import importlib.metadata
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 from physx_core.errors import nearest
 from physx_core.origin import install_hint
-from physx_sim.errors import MissingMeshesError, ModelError
+from physx_sim.errors import ModelError
 from physx_sim.urdf import mesh_path as find_mesh
 
 EXAMPLE_DATA = "example-robot-data"
@@ -105,21 +105,19 @@ def example_robot(name: str) -> Path:
     return path
 
 
-def check_meshes(model: Path, root: Element, package_dirs: Mapping[str, str | Path]) -> None:
-    """Check that all mesh files of a robot exist, both visual and collision meshes.
+def missing_meshes(
+    model: Path, elements: Sequence[Element], package_dirs: Mapping[str, str | Path]
+) -> list[str]:
+    """Return the mesh files of elements that do not exist, as named in the file.
 
     Args:
         model: Path of the robot's URDF file.
-        root: Its root element.
+        elements: Elements that contain meshes.
         package_dirs: Folder of each package.
     """
-    missing = []
-    for name in dict.fromkeys(mesh.get("filename", "") for mesh in root.iter("mesh")):
-        path = mesh_path(model, name, package_dirs)
-        if path is None or not path.is_file():
-            missing.append(name)
-    if missing:
-        raise MissingMeshesError(str(model), missing)
+    meshes = (mesh.get("filename", "") for each in elements for mesh in each.iter("mesh"))
+    paths = {name: mesh_path(model, name, package_dirs) for name in dict.fromkeys(meshes)}
+    return [name for name, path in paths.items() if path is None or not path.is_file()]
 
 
 def mesh_path(model: Path, name: str, package_dirs: Mapping[str, str | Path]) -> Path | None:

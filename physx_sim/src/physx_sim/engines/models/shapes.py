@@ -8,7 +8,6 @@ from pathlib import Path
 
 import numpy as np
 
-from physx_core.errors import listed, nearest
 from physx_core.typing import Vector
 from physx_sim import Box, Capsule, Cylinder, Mesh, Robot, Sphere, UrdfTree, WorldObject
 from physx_sim.engines.models.meshes import bounding_box, bounding_capsule, read_vertices
@@ -50,18 +49,11 @@ def shapes_of_robot(robot: Robot, path: Path, tree: UrdfTree) -> tuple[Collision
         path: Its URDF file.
         tree: Its links.
     """
-    unknown = [name for name in robot.feet if name not in tree.links]
-    if unknown:
-        raise ModelError(
-            f'feet name "{unknown[0]}", which is not a link.{nearest(unknown[0], tree.links)} '
-            f"Links: {listed(tree.links)}"
-        )
     shapes: list[CollisionShape] = []
     material = robot.friction, robot.restitution
     for name in tree.elements:
         if name in robot.feet:
-            size, zero = (float(robot.feet[name]),), np.zeros(3)
-            shapes.append(CollisionShape("sphere", size, zero, np.eye(3), name, *material))
+            shapes.append(shape_of_foot(robot, name))
         elif robot.collisions != "none":
             for each in tree.shapes(name, "collision"):
                 if each.kind != "mesh" and not min(each.size) > 0:
@@ -69,8 +61,14 @@ def shapes_of_robot(robot: Robot, path: Path, tree: UrdfTree) -> tuple[Collision
                 pose = each.pose[:3, 3].copy(), each.pose[:3, :3].copy()
                 mesh = mesh_path(path, each.mesh, robot.package_dirs) if each.mesh else None
                 shape = CollisionShape(each.kind, each.size, *pose, name, *material, mesh)
-                shapes.append(_simplify(shape, robot.collisions))
+                shapes.append(simplified(shape, robot.collisions))
     return tuple(shapes)
+
+
+def shape_of_foot(robot: Robot, link: str) -> CollisionShape:
+    """Return the sphere that a robot has in the place of a link's own shapes."""
+    size, material = (float(robot.feet[link]),), (robot.friction, robot.restitution)
+    return CollisionShape("sphere", size, np.zeros(3), np.eye(3), link, *material)
 
 
 def shape_of_object(thing: WorldObject) -> CollisionShape:
@@ -133,7 +131,7 @@ def _round_moments(shape: CollisionShape, mass: float) -> tuple[float, float, fl
     return across, across, cylinder * r**2 / 2 + sphere * 0.4 * r**2
 
 
-def _simplify(shape: CollisionShape, collisions: str) -> CollisionShape:
+def simplified(shape: CollisionShape, collisions: str) -> CollisionShape:
     """Return the bounding box or capsule of a mesh if requested, else the shape itself."""
     if shape.mesh is None:
         return shape

@@ -15,6 +15,7 @@ from physx_core.fields import Field
 from physx_core.normalization import Normalization
 from physx_core.pipelines.learning.data_record import training_view
 from physx_core.pipelines.storage import other_samples
+from physx_core.results.judge import Judged
 from physx_core.typing import Batch, Index
 from physx_core.views.batches import Batches
 from physx_core.views.dataset_config import DatasetConfig
@@ -178,6 +179,34 @@ class StoredBatches:
         count = self._validation.num_items
         chosen = np.linspace(0, count - 1, min(count, _SHOWN)).astype(np.intp)
         return self._validation.reading(names).take(chosen)
+
+    def unseen(self, used: str) -> dict[str, Judged]:
+        """Return the parts of the samples that the network does not learn from, by name.
+
+        Args:
+            used: What those for validation decided about the network, in words.
+        """
+        found = {}
+        if self.has_validation:
+            held = self._validation
+            is_apart = "block" not in held.group_nouns and (self._has_mode or held.is_whole)
+            division = "" if self._has_mode else " and ".join(held.division)
+            found["validation"] = Judged(held, is_apart, division, used)
+        if self._view.test_fold is not None:
+            view = replace(self._view, order="stored", weights=None, drop_last=False)
+            test = self._open(self.mode, view, self._validation_batch_size, "test")
+            found["test"] = Judged(test, test.is_whole, " and ".join(test.division))
+        return found
+
+    @property
+    def validation(self) -> Batches:
+        """The validation batches, in the order of writing."""
+        return self._validation
+
+    @property
+    def training(self) -> Batches:
+        """The batches of one epoch after another."""
+        return self._training
 
     @property
     def datasets(self) -> dict[str, Dataset]:

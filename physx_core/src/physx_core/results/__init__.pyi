@@ -1,0 +1,8 @@
+"""Results: what a run found, and how good its network is, compared with predictions without one."""
+
+from .result import EpisodeError as EpisodeError
+from .result import FieldResult as FieldResult
+from .result import PartResult as PartResult
+from .result import Result as Result
+from .result import RivalResult as RivalResult
+from .stored import read_results as read_results

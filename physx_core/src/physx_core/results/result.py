@@ -1,0 +1,321 @@
+"""Result: what a run found; a plain value that is printed, stored, and shown in notebooks."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from html import escape
+from typing import Any, Literal, TypeAlias
+
+Verdict: TypeAlias = Literal["wins", "loses", "even", "unknown"]
+Interval: TypeAlias = tuple[float, float]
+
+_SHOWN_PARAMETERS = 4
+_WIDEST = 10
+"""Largest number of classes whose confusion is shown."""
+_WORDS = {"wins": "better", "loses": "WORSE", "even": "no clear difference"}
+
+
+@dataclass(frozen=True)
+class EpisodeError:
+    """How far off the network is in one episode.
+
+    Attributes:
+        error: Root mean square error in the field's unit, or the share of wrong values of a class.
+        about: What is known of the episode: ``number``, ``first_row``, ``rows``, and of an
+            independent one ``campaign`` and ``parameters``.
+    """
+
+    error: float
+    about: Mapping[str, Any]
+
+    @property
+    def text(self) -> str:
+        """The episode in words."""
+        known = self.about
+        given = list(known.get("parameters", {}).items())
+        shown = [f"{name} {_plain(value)}" for name, value in given[:_SHOWN_PARAMETERS]]
+        more = ["..."] if len(given) > len(shown) else []
+        words = [f"{known.get('number', '?')}", f"({', '.join(shown + more)})" if shown else ""]
+        return " ".join(word for word in words if word)
+
+
+@dataclass(frozen=True)
+class RivalResult:
+    """A prediction that needs no network, compared with the network on the same samples.
+
+    Attributes:
+        errors: Its errors, as in `FieldResult.errors`; empty if it was not computed.
+        verdict: "wins" or "loses", of the network, if the errors differ by 1 % at least and neither
+            episodes drawn at random (a paired bootstrap) nor random signs of their differences
+            leave more than 1 % to chance; else "even"; "unknown" if nothing can be said.
+        ratio: The network's error divided by the rival's; NaN if the rival makes none.
+        interval: 99 % interval of that ratio over episodes; None if there are too few.
+        why: Why it was not computed, or nothing can be said; else empty.
+    """
+
+    errors: Mapping[str, float] = field(default_factory=dict)
+    verdict: Verdict = "unknown"
+    ratio: float = math.nan
+    interval: Interval | None = None
+    why: str = ""
+
+
+@dataclass(frozen=True)
+class FieldResult:
+    """How good the predictions of one field are.
+
+    Attributes:
+        kind: "real" numbers, or "classes".
+        unit: The field's unit; errors of real numbers have it. Those of components of several
+            units, which it lists with commas, are in standard deviations of each component.
+        errors: Errors by name. Real numbers have ``rmse``, the root mean square error of all
+            values; ``max``, the largest absolute one; and ``relative_l2``, the norm of the error
+            divided by that of the truth, both of a whole episode, averaged over episodes. Classes
+            have ``accuracy`` and ``balanced_accuracy``, the mean over the true classes.
+        interval: 95 % interval of ``rmse`` or ``accuracy`` over episodes; None: too few of them.
+        by_component: ``rmse`` of each component with its unit, of fields with few of them.
+        confusion: Number of values by true class, then by predicted class; of classes.
+        classes: The classes in the order of `confusion`.
+        near_zero: Number of episodes left out of ``relative_l2``, as the truth is nearly zero.
+        episodes: The "best", "median" and "worst" episode.
+        rivals: The rivals by name.
+    """
+
+    kind: Literal["real", "classes"]
+    unit: str = ""
+    errors: Mapping[str, float] = field(default_factory=dict)
+    interval: Interval | None = None
+    by_component: Sequence[tuple[float, str]] = ()
+    confusion: Sequence[Sequence[int]] = ()
+    classes: Sequence[int] = ()
+    near_zero: int = 0
+    episodes: Mapping[str, EpisodeError] = field(default_factory=dict)
+    rivals: Mapping[str, RivalResult] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class PartResult:
+    """How good a network is on samples that it has not learned from.
+
+    Attributes:
+        samples: Number of samples.
+        episodes: Number of episodes, or of what else they are divided into.
+        division: Where they come from, in words.
+        used: What these samples decided about the network, in words; empty: nothing.
+        fields: The predicted fields by name.
+        compared: Number of samples on which rivals are compared, whole batches from all places.
+        why: What speaks against comparing on these samples; empty: nothing.
+        missing: Why other predicted fields are not judged, by name.
+    """
+
+    samples: int
+    episodes: int
+    division: str
+    used: str = ""
+    fields: Mapping[str, FieldResult] = field(default_factory=dict)
+    compared: int = 0
+    why: str = ""
+    missing: Mapping[str, str] = field(default_factory=dict)
+
+
+@dataclass(frozen=True)
+class Result:
+    """What a run found, and where it is.
+
+    ``print(result)`` shows what the run prints at its end, ``result["error/x/rmse"]`` is a number.
+
+    Attributes:
+        kind: The pipeline: "training", "data_generation", "prediction" or "replay".
+        session: Folder of the session.
+        seconds: Duration in s.
+        summary: What was done, in lines.
+        numbers: Losses and rates by name, with units in the names: see `values`.
+        parts: The network's errors on the parts "validation" and "test", as far as they exist.
+        why: Why the network was not judged; empty if it was.
+        places: Where things are, by what they are.
+    """
+
+    kind: str
+    session: str
+    seconds: float
+    summary: Sequence[str] = ()
+    numbers: Mapping[str, float] = field(default_factory=dict)
+    parts: Mapping[str, PartResult] = field(default_factory=dict)
+    why: str = ""
+    places: Mapping[str, str] = field(default_factory=dict)
+
+    @property
+    def values(self) -> dict[str, float]:
+        """All numbers by name: `numbers`, and errors as ``error/FIELD/NAME``, ``test/FIELD/NAME``.
+
+        The errors of a rival are ``error/FIELD/RIVAL/NAME``.
+        """
+        found = dict(self.numbers)
+        for part, judged in self.parts.items():
+            start = "error" if part == "validation" else part
+            for name, of in judged.fields.items():
+                found |= {f"{start}/{name}/{key}": value for key, value in of.errors.items()}
+                for rival, other in of.rivals.items():
+                    found |= {
+                        f"{start}/{name}/{rival}/{key}": value
+                        for key, value in other.errors.items()
+                    }
+        return found
+
+    def __getitem__(self, name: str) -> float:
+        """Return one of `values`."""
+        known = self.values
+        if name not in known:
+            raise KeyError(f"{name!r}; the result has: {', '.join(known) or 'no numbers'}")
+        return known[name]
+
+    def to_plain(self) -> dict[str, Any]:
+        """Return all of it as plain data; numbers that do not exist are None."""
+        plain: dict[str, Any] = _finite(dataclasses.asdict(self))
+        return plain
+
+    def to_json(self) -> str:
+        """Return all of it as JSON; numbers that do not exist are null."""
+        return json.dumps(self.to_plain(), indent=1, allow_nan=False)
+
+    @property
+    def lines(self) -> list[str]:
+        """The text, line by line."""
+        found = list(self.summary)
+        for name, part in self.parts.items():
+            found += _part_lines(name, part)
+        if self.why:
+            found.append(f"not judged: {self.why}")
+        return found
+
+    def __str__(self) -> str:
+        return "\n".join(self.lines)
+
+    def _repr_html_(self) -> str:
+        """Return the text with tables, for notebooks."""
+        found = [f"<p>{'<br>'.join(escape(line) for line in self.summary)}</p>"]
+        for name, part in self.parts.items():
+            found.append(f"<h4>{escape(_heading(name, part))}</h4>")
+            for label, of in part.fields.items():
+                rows = [("network", _shown(of.errors, of.unit), ""), *_rival_rows(of)]
+                cells = (
+                    "<tr>" + "".join(f"<td>{escape(cell)}</td>" for cell in row) + "</tr>"
+                    for row in rows
+                )
+                found.append(
+                    f"<table><caption>{escape(label)}</caption><tr><th></th><th>errors</th>"
+                    f"<th>the network is</th></tr>{''.join(cells)}</table>"
+                )
+                found += [f"<p>{escape(line)}</p>" for line in _details(of)]
+            notes = [*_missing(part), *([part.why] if part.why else [])]
+            found += [f"<p>{escape(line)}</p>" for line in notes]
+        if self.why:
+            found.append(f"<p>not judged: {escape(self.why)}</p>")
+        return "\n".join(found)
+
+
+def _heading(name: str, part: PartResult) -> str:
+    told = f"decided {part.used}" if part.used else "decided nothing about the network"
+    return f"{name}: {part.samples:,} samples of {part.division}, which {told}"
+
+
+def _part_lines(name: str, part: PartResult) -> Iterator[str]:
+    yield _heading(name, part)
+    for label, of in part.fields.items():
+        between = f", 95 % interval {_between(of.interval)}" if of.interval else ""
+        yield f"  {label}: {_shown(of.errors, of.unit)}{between}"
+        rows = list(_rival_rows(of))
+        width = max([len(rival) for rival, _, _ in rows], default=0)
+        for rival, errors, told in rows:
+            yield "    " + f"{rival:{width}}  {errors:24}  {told}".rstrip()
+        yield from (f"    {line}" for line in _details(of))
+    yield from (f"  {line}" for line in _missing(part))
+    if part.why:
+        yield f"  {part.why}"
+
+
+def _missing(part: PartResult) -> Iterator[str]:
+    yield from (f"{name} is not judged: {why}" for name, why in part.missing.items())
+
+
+def _rival_rows(of: FieldResult) -> Iterator[tuple[str, str, str]]:
+    """Yield name, errors and verdict of each rival."""
+    for name, rival in of.rivals.items():
+        if not rival.errors:
+            yield name, "not run", rival.why
+            continue
+        key = "rmse" if of.kind == "real" else "accuracy"
+        errors = _shown({key: rival.errors[key]}, of.unit)
+        if rival.verdict == "unknown":
+            yield name, errors, rival.why
+            continue
+        ratio = "" if math.isnan(rival.ratio) else f", {_number(rival.ratio)} times the error"
+        between = f" ({_between(rival.interval)})" if ratio and rival.interval else ""
+        yield name, errors, f"{_WORDS[rival.verdict]}{ratio}{between}"
+
+
+def _details(of: FieldResult) -> Iterator[str]:
+    if of.by_component:
+        each = ", ".join(f"{_number(value)} {unit}".strip() for value, unit in of.by_component)
+        yield f"rmse by component: {each}"
+    if of.near_zero:
+        yield f"{of.near_zero} episodes have no relative error, as the truth is nearly zero"
+    if of.episodes:
+        unit = _one_unit(of.unit) if of.kind == "real" else ""
+        form = _number if of.kind == "real" else _percent
+        each = ", ".join(
+            f"{name} {episode.text}: {form(episode.error)} {unit}".rstrip()
+            for name, episode in of.episodes.items()
+        )
+        yield f"episodes: {each}"
+    if of.confusion and len(of.classes) <= _WIDEST:
+        yield "true class: values by predicted class"
+        for label, row in zip(of.classes, of.confusion, strict=True):
+            yield f"  {label}: {', '.join(f'{count:,}' for count in row)}"
+
+
+def _shown(errors: Mapping[str, float], unit: str) -> str:
+    own = _one_unit(unit)
+    words = []
+    for name, value in errors.items():
+        if name in ("accuracy", "balanced_accuracy", "relative_l2"):
+            words.append(f"{name} {_percent(value)}")
+        else:
+            words.append(f"{name} {_number(value)} {own}".rstrip())
+    return ", ".join(words)
+
+
+def _one_unit(unit: str) -> str:
+    """Return a unit; of components of several units, that in which their errors are added up."""
+    return unit if "," not in unit else "std"
+
+
+def _number(value: float) -> str:
+    return f"{value:.3g}"
+
+
+def _percent(value: float) -> str:
+    return f"{value * 100:.3g} %"
+
+
+def _between(interval: Interval | None) -> str:
+    return "" if interval is None else f"{_number(interval[0])} to {_number(interval[1])}"
+
+
+def _plain(value: Any) -> str:
+    return f"{value:.4g}" if isinstance(value, float) else str(value)
+
+
+def _finite(value: Any) -> Any:
+    """Return plain data in which numbers that are not finite are None."""
+    if isinstance(value, Mapping):
+        return {str(name): _finite(each) for name, each in value.items()}
+    if isinstance(value, (list, tuple)):
+        return [_finite(each) for each in value]
+    if isinstance(value, float) and not math.isfinite(value):
+        return None
+    return value

@@ -1,0 +1,83 @@
+"""Results as a session keeps them: one of each pipeline, in a file that people can read too."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import math
+import types
+import typing
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+from physx_core import files
+from physx_core.errors import SessionError
+from physx_core.parsing import parse_json
+from physx_core.results.result import Result
+
+FILE = "results.json"
+_LARGEST = 2**24
+
+
+def store_result(session: Path, result: Result) -> None:
+    """Write a result to a session, in place of that of the last run of the same pipeline.
+
+    Raises:
+        SessionError: If the session cannot be written to.
+    """
+    try:
+        known = {name: each.to_plain() for name, each in read_results(session).items()}
+    except SessionError:  # damaged, or of another version: the new one matters more
+        known = {}
+    try:
+        text = json.dumps({**known, result.kind: result.to_plain()}, indent=1, allow_nan=False)
+        files.replace(session / FILE, f"{text}\n".encode())
+    except OSError as error:
+        raise SessionError(f"{session / FILE} cannot be written: {error}.") from error
+
+
+def read_results(session: str | Path) -> dict[str, Result]:
+    """Return the results of a session by the kind of pipeline; empty if there are none.
+
+    Args:
+        session: The session's folder.
+
+    Raises:
+        SessionError: If the file is damaged.
+    """
+    path = Path(session) / FILE
+    if not path.exists():
+        return {}
+    try:
+        plain = parse_json(files.read_content(path, _LARGEST))
+        return {name: _typed(Result, each) for name, each in plain.items()}
+    except (OSError, ValueError, TypeError, AttributeError, LookupError) as error:
+        raise SessionError(f"{path} is damaged: {error}. Remove it.") from error
+
+
+def _typed(hint: Any, value: Any) -> Any:
+    """Return plain data as a value of a type, of those that results are made of."""
+    kinds = typing.get_args(hint)
+    match typing.get_origin(hint) or hint:
+        case typing.Any:
+            return value
+        case made if dataclasses.is_dataclass(made):
+            hints = typing.get_type_hints(made)
+            return made(**{name: _typed(hints[name], each) for name, each in value.items()})  # type: ignore[operator]
+        case made if made in (typing.Union, types.UnionType):
+            [kind] = [kind for kind in kinds if kind is not type(None)]
+            return None if value is None else _typed(kind, value)
+        case made if isinstance(made, type) and issubclass(made, Mapping):
+            return {str(name): _typed(kinds[1], each) for name, each in value.items()}
+        case made if isinstance(made, type) and issubclass(made, Sequence) and kinds:
+            each_kind = kinds if made is tuple else kinds[:1] * len(value)
+            return tuple(_typed(k, each) for k, each in zip(each_kind, value, strict=True))
+        case typing.Literal:
+            if value not in kinds:
+                raise ValueError(f"{value!r} is none of {kinds}")
+        case made if made is float:
+            return math.nan if value is None else float(value)
+        case made if isinstance(made, type) and not isinstance(value, made):
+            raise TypeError(f"{value!r} is not {made.__name__}")
+    return value

@@ -1,0 +1,91 @@
+"""Page: one HTML file that opens from a disk and prints; it has no script."""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+from jinja2 import Environment, PackageLoader, StrictUndefined
+
+from physx_core import files
+from physx_core.errors import PhysxError, SessionError
+from physx_report.blocks import Block, Figure, Table, Text
+from physx_report.errors import ReportError
+from physx_report.run import Run
+from physx_report.section import Section, all_sections
+
+NAME = "report.html"
+"""Name of the page in the session's folder."""
+
+
+def write_report(
+    session: str | Path, path: str | Path | None = None, *, trust: bool = False
+) -> Path:
+    """Write what a session has found to an HTML page; equal sessions give equal bytes.
+
+    Args:
+        session: The session's folder.
+        path: The page, which is replaced; None: ``report.html`` in the session's folder.
+        trust: Whether to import whatever code the session's files name.
+
+    Returns:
+        The page.
+
+    Raises:
+        SessionError: If the session has no result, or the page cannot be written.
+        ReportError: If a section fails.
+        PluginError: If a plugin is broken.
+    """
+    with Run(session, trust=trust) as run:
+        place = run.path / NAME if path is None else Path(path)
+        sections = [(each.title, _blocks(each, run)) for each in all_sections()]
+        kinds = ", ".join(kind.replace("_", " ") for kind in run.results)
+        text = _template().render(
+            title=f"{run.path.name}: {kinds}",
+            sections=[(title, _plain(blocks)) for title, blocks in sections if blocks],
+        )
+    try:
+        files.replace(place, text.encode())
+    except OSError as error:
+        raise SessionError(f"{place} cannot be written: {error}.") from error
+    return place
+
+
+def _blocks(section: Section, run: Run) -> list[Block]:
+    try:
+        return list(section.blocks(run))
+    except PhysxError:
+        raise
+    except Exception as error:  # a plugin may raise anything
+        what = f"{type(error).__name__}: {error}"
+        raise ReportError(f'The section "{section.title}" of the report failed: {what}') from error
+
+
+def _plain(blocks: Iterable[Block]) -> list[tuple[str, Any]]:
+    """Return blocks as the template takes them, with the name of each kind."""
+    found: list[tuple[str, Any]] = []
+    for block in blocks:
+        match block:
+            case Text():
+                found.append(("text", block))
+            case Table():
+                found.append(("table", block))
+            case Figure():
+                content = base64.b64encode(block.svg.encode()).decode()
+                found.append(("figure", (content, block.caption)))
+            case _:
+                raise ReportError(f"A section of a report has {block!r}, which is no block.")
+    return found
+
+
+@cache
+def _template() -> Any:
+    loader = PackageLoader("physx_report", "templates")
+    made = Environment(
+        loader=loader, autoescape=True, undefined=StrictUndefined, trim_blocks=True,
+        lstrip_blocks=True,
+    )  # fmt: skip
+    return made.get_template("page.html")

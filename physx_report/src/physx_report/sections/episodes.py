@@ -1,0 +1,142 @@
+"""Where a network is good and where it is bad: by step, by parameter, and in pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import numpy as np
+
+from physx_core import Batches
+from physx_core.errors import PhysxError
+from physx_core.pipelines import Unseen
+from physx_core.results import EpisodeError, PartResult
+from physx_core.typing import Array
+from physx_report import drawing, wording
+from physx_report.blocks import Block, Text
+from physx_report.run import Run
+from physx_report.section import Section
+
+_MOST_BATCHES = 64
+_ROWS = 400
+"""Largest number of rows of an episode that are drawn."""
+_ORDER = ("best", "median", "worst")
+
+
+def _blocks(run: Run) -> Iterator[Block]:
+    try:
+        unseen = run.unseen
+    except PhysxError as error:
+        yield Text([f"The network cannot be run on its samples any more: {error}"])
+        return
+    if unseen is None or run.training is None:
+        return
+    for name, part in run.training.parts.items():
+        if name in unseen.parts:
+            yield from _errors(unseen, name)
+            yield from _pictures(unseen, name, part)
+
+
+def _errors(unseen: Unseen, part: str) -> Iterator[Block]:
+    """Draw errors against the step, and against the parameters of episodes."""
+    batches = unseen.parts[part]
+    count = min(len(batches), _MOST_BATCHES)
+    chosen = np.unique(np.linspace(0, len(batches) - 1, count).astype(int)).tolist()
+    groups = np.concatenate([batches.groups(number) for number in chosen])
+    squares: dict[str, list[Array]] = {}
+    for number in chosen:
+        predicted, true = unseen.compare(batches[number])
+        for name, values in predicted.items():
+            if values.dtype.kind == "f":
+                error = (values - true[name]).astype(np.float64).reshape(len(values), -1)
+                squares.setdefault(name, []).append((error**2).mean(axis=1))
+    known, first, place = np.unique(groups, return_index=True, return_inverse=True)
+    about = [batches.describe_group(int(group)) for group in known]
+    step = np.concatenate([batches.rows(number)[0] for number in chosen])
+    step = step - np.array([one["first_row"] for one in about])[place]
+    for name, parts in squares.items():
+        square, unit = np.concatenate(parts), batches.fields[name].unit
+        label = f"{name}: error{f' / {unit}' if unit and ',' not in unit else ''}"
+        yield from _by_step(label, step, square, part)
+        by_episode = np.sqrt(np.bincount(place, square) / np.bincount(place))
+        yield from _by_parameter(label, about, by_episode, part)
+    del first
+
+
+def _by_step(label: str, step: Array, square: Array, part: str) -> Iterator[Block]:
+    if len(np.unique(step)) < 3 or step.min() < 0:
+        return
+    edges = np.unique(np.linspace(0, step.max() + 1, 41).astype(int))
+    where = np.digitize(step, edges) - 1
+    filled = [k for k in range(len(edges) - 1) if (where == k).any()]
+    root = np.sqrt(square)
+    quantiles = np.array([np.quantile(root[where == k], (0.1, 0.5, 0.9)) for k in filled])
+    x = edges[filled]
+    with drawing.figure(f"Error by step of the episode ({part})") as (found, (axes,)):
+        axes.fill_between(x, quantiles[:, 0], quantiles[:, 2], color=drawing.MUTED, alpha=0.3, lw=0)
+        axes.plot(x, quantiles[:, 1], color=drawing.PREDICTION)
+        axes.set_xlabel("step (line: median; area: 80 % of the samples)")
+        axes.set_ylabel(label)
+        axes.set_ylim(bottom=0)
+    yield from found
+
+
+def _by_parameter(
+    label: str, about: list[dict[str, Any]], errors: Array, part: str
+) -> Iterator[Block]:
+    parameters = [one.get("parameters", {}) for one in about]
+    names = [n for n in (parameters[0] if parameters else {}) if np.ndim(parameters[0][n]) == 0]
+    names = [n for n in names if all(isinstance(p.get(n), float) for p in parameters)][:4]
+    if not names or len(errors) < 3:
+        return
+    caption = f"Error of each episode by parameter ({part})"
+    with drawing.figure(caption, 1, len(names)) as (found, axes):
+        for place, name in zip(axes, names, strict=True):
+            place.plot([p[name] for p in parameters], errors, ".", color=drawing.PREDICTION, ms=5)
+            place.set_xlabel(name)
+            place.set_ylim(bottom=0)
+        axes[0].set_ylabel(label)
+    yield from found
+
+
+def _pictures(unseen: Unseen, part: str, judged: PartResult) -> Iterator[Block]:
+    """Draw the best, the median, and the worst episode of each field."""
+    batches = unseen.parts[part]
+    for name, of in judged.fields.items():
+        for which in _ORDER:
+            if which in of.episodes:
+                yield from _picture(unseen, batches, name, which, of.episodes[which], of.unit)
+
+
+def _picture(
+    unseen: Unseen, batches: Batches, name: str, which: str, episode: EpisodeError, unit: str
+) -> Iterator[Block]:
+    items = _items(batches, episode.about)
+    if items is None or not len(items):
+        return
+    predicted, true = unseen.compare(batches.take(items))
+    if name not in predicted:
+        return
+    values, guess = true[name].astype(float), predicted[name].astype(float)
+    error = wording.measured("rmse", episode.error, unit)
+    caption = f"{which.capitalize()} episode of {name}: {episode.text}; error {error}"
+    label = f"{name}{f' / {unit}' if unit and ',' not in unit else ''}"
+    with drawing.figure(caption, 1, drawing.count_axes(values)) as (found, axes):
+        drawing.compare(axes, values, guess, label, "step")
+    yield from found
+
+
+def _items(batches: Batches, about: Mapping[str, Any]) -> Array | None:
+    """Return the items of an episode, as they are numbered in the order of writing."""
+    if len(batches.datasets) > 1:
+        return None
+    first, rows = about["first_row"], about["rows"]
+    found = []
+    for number in range(len(batches)):
+        (places,) = batches.rows(number)
+        inside = np.flatnonzero((places >= first) & (places < first + rows))
+        found.append(number * batches.batch_size + inside)
+    return np.concatenate(found)[:_ROWS]
+
+
+SECTION = Section("Where it is good and where it is bad", _blocks, 20)

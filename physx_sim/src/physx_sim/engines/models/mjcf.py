@@ -1,0 +1,412 @@
+"""Robot models from MJCF files.
+
+MuJoCo compiles the file, and what physx simulates is read from the result: defaults, classes,
+inertias from shapes and the like are then what MuJoCo makes of them. A body with several joints
+becomes a chain of links, of which all but the last have no mass and are named after their joint;
+one whose last joint is not at its origin is fixed to such a link. What no engine is told, such as
+tendons, is named in the model's warnings.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physx_core.errors import listed, nearest
+from physx_core.files import read_content
+from physx_core.origin import install_hint
+from physx_core.rotations import from_axis_angle, to_matrix
+from physx_core.typing import Vector
+from physx_sim import JointSettings, Robot
+from physx_sim.engines.models.rigid_bodies import Joint, RigidBody
+from physx_sim.engines.models.robot_model import RobotModel, check_names
+from physx_sim.engines.models.shapes import CollisionShape, shape_of_foot, simplified
+from physx_sim.errors import ModelError
+
+WORLD = "world"
+"""Root link of what is attached to the world."""
+_LARGEST = 2**24
+"""Maximum size of a file, in bytes, without those that it includes."""
+_MOST = 400
+"""Maximum number of bodies, as of links in a URDF file."""
+_COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
+_ELEMENT = re.compile(rb"<([A-Za-z][\w:.-]*)")
+_NO_MASS = 0.0, np.zeros(3), np.zeros((3, 3))
+
+
+def is_mjcf(path: Path) -> bool:
+    """Return whether a file's root element is ``mujoco``; a missing file is none."""
+    try:
+        text = read_content(path.resolve(), _LARGEST)
+    except OSError:
+        return False
+    first = _ELEMENT.search(_COMMENT.sub(b"", text))
+    return first is not None and first[1] == b"mujoco"
+
+
+def mjcf_robots(path: str | Path, **options: Any) -> tuple[Robot, ...]:
+    """Return the robots of an MJCF file, where they are in the file.
+
+    Args:
+        path: The file.
+        options: Options of all robots, as in `Robot`.
+
+    Returns:
+        A robot that consists of everything attached to the world, named ``world``, if any of it can
+        move or touch; then one for each body with a free joint, named after the body.
+
+    Raises:
+        ModelError: If MuJoCo cannot compile the file, or the package mujoco is not installed.
+    """
+    file = _File(Path(path).absolute())
+    found = []
+    if file.attached or file.solid(0):
+        found.append(Robot(path, WORLD, **{"root": WORLD, **options}))
+    for body in file.floating:
+        pose = {"position": file.model.body_pos[body].tolist()}
+        w, x, y, z = file.model.body_quat[body].tolist()
+        pose["orientation"] = [x, y, z, w]
+        name = file.body_name(body)
+        found.append(Robot(path, name, **{"root": name, "fixed_base": False, **pose, **options}))
+    return tuple(found)
+
+
+def read_mjcf(robot: Robot, path: Path, *, touching: bool) -> RobotModel:
+    """Read a robot's MJCF file.
+
+    Args:
+        robot: The robot's description.
+        path: Its file.
+        touching: Whether to read its collision shapes.
+    """
+    file = _File(path)
+    root = file.root(robot)
+    links = _Links(file, robot, root)
+    names = [body.name for body in links.found]
+    if len(set(names)) < len(names):
+        raise ModelError(f"its links need different names, but are called {listed(names)}")
+    joints = [body.joint.name for body in links.found if body.joint is not None]
+    check_names(robot, names, joints)
+    shapes = _Shapes(file, robot, list(links.places))
+    left_out = [*_left_out(robot, file, links), *shapes.left_out]
+    if robot.fixed_base and root in file.floating:
+        left_out.append("the free joint of its root body (fixed_base=False lets it float)")
+    warnings = (f"physx leaves out {'; '.join(left_out)}",) if left_out else ()
+    return RobotModel(path, tuple(links.found), tuple(shapes.found if touching else ()), warnings)
+
+
+class _File:
+    """A compiled file.
+
+    Attributes:
+        mujoco: The package.
+        model: MuJoCo's model.
+        floating: Bodies with a free joint.
+        attached: Other bodies whose parent is the world.
+    """
+
+    def __init__(self, path: Path) -> None:
+        self.path, self.mujoco = path, _mujoco()
+        log = self.mujoco.MjLogConfig.get()
+        log.logto_file = log.logto_console = False
+        log.set()
+        try:
+            self.model: Any = self.mujoco.MjModel.from_xml_path(str(path))
+        except ValueError as error:
+            raise ModelError(f"MuJoCo cannot read {path}: {error}") from error
+        if self.model.nbody > _MOST + 1:
+            raise ModelError(f"{path} has {self.model.nbody - 1} bodies; a model may have {_MOST}")
+        model, free = self.model, int(self.mujoco.mjtJoint.mjJNT_FREE)
+        roots = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
+        self.floating = [b for b in roots if [*model.jnt_type[self.joints(b)]] == [free]]
+        self.attached = [body for body in roots if body not in self.floating]
+
+    def joints(self, body: int) -> range:
+        """Return the joints of a body."""
+        first = int(self.model.body_jntadr[body])
+        return range(first, first + int(self.model.body_jntnum[body]))
+
+    def geoms(self, body: int) -> range:
+        """Return the geoms of a body."""
+        first = int(self.model.body_geomadr[body])
+        return range(first, first + int(self.model.body_geomnum[body]))
+
+    def solid(self, body: int) -> list[int]:
+        """Return the geoms of a body that can touch, without planes."""
+        model, plane = self.model, int(self.mujoco.mjtGeom.mjGEOM_PLANE)
+        return [
+            geom
+            for geom in self.geoms(body)
+            if (model.geom_contype[geom] or model.geom_conaffinity[geom])
+            and model.geom_type[geom] != plane
+        ]
+
+    def body_name(self, body: int) -> str:
+        """Return the name of a body, or its number if it has none."""
+        return str(self.model.body(body).name) or f"body{body}"
+
+    def root(self, robot: Robot) -> int:
+        """Return the body that is a robot's root link; 0: the world."""
+        names = {self.body_name(body): body for body in self.floating}
+        names |= {WORLD: 0} if self.attached or not names else {}
+        if not robot.root and len(names) > 1:
+            raise ModelError(
+                f"it has several trees: choose one with Robot(root=...), or take all with "
+                f"mjcf_robots(...). Roots: {listed(names)}"
+            )
+        if robot.root and robot.root not in names:
+            near = nearest(robot.root, names)
+            raise ModelError(f'no tree has the root "{robot.root}".{near} Roots: {listed(names)}')
+        root = names[robot.root] if robot.root else next(iter(names.values()))
+        if root == 0 and not robot.fixed_base:
+            alone = self.attached if len(self.attached) == 1 else []
+            if not alone or len(self.joints(alone[0])):
+                raise ModelError(
+                    "its root link is the world, which cannot float; use fixed_base=True"
+                )
+            root = alone[0]
+        return root
+
+
+class _Links:
+    """The links of a robot.
+
+    Attributes:
+        found: The links, parents before children.
+        places: The link of each body, as an index.
+        joints: The file's joints.
+    """
+
+    def __init__(self, file: _File, robot: Robot, root: int) -> None:
+        self._file, self._robot = file, robot
+        name = WORLD if root == 0 else file.body_name(root)
+        inertia = _NO_MASS if root == 0 else self._inertia(root)
+        self.found = [RigidBody(name, -1, np.eye(4), None, np.zeros(3), *inertia)]
+        self.places = {root: 0}
+        self.joints: list[int] = []
+        apart = set(file.floating)
+        for body in range(1, file.model.nbody):
+            parent = int(file.model.body_parentid[body])
+            if body != root and parent in self.places and body not in apart:
+                self._add(body, self.places[parent])
+
+    def _add(self, body: int, parent: int) -> None:
+        model, name = self._file.model, self._file.body_name(body)
+        pose = _pose(model.body_pos[body], model.body_quat[body])
+        anchor, inertia = np.zeros(3), self._inertia(body)
+        joints = self._file.joints(body)
+        for number in joints:
+            joint, axis = self._joint(number), model.jnt_axis[number].copy()
+            here = model.jnt_pos[number]
+            pose = pose @ _moved(here - anchor) @ self._reference(number, joint.unit, axis)
+            anchor = here
+            last = number == joints[-1] and not anchor.any()
+            mass, link = (inertia, name) if last else (_NO_MASS, f"{name}.{joint.name}")
+            parent = self._append(RigidBody(link, parent, pose, joint, axis, *mass))
+            pose = np.eye(4)
+        if not joints or anchor.any():
+            still = RigidBody(name, parent, pose @ _moved(-anchor), None, np.zeros(3), *inertia)
+            parent = self._append(still)
+        self.places[body] = parent
+        self.joints += joints
+
+    def _append(self, link: RigidBody) -> int:
+        self.found.append(link)
+        return len(self.found) - 1
+
+    def _inertia(self, body: int) -> tuple[float, Vector, Vector]:
+        """Return mass, center of mass and moments of inertia of a body in its own frame."""
+        model = self._file.model
+        factor = float(self._robot.mass_factors.get(self._file.body_name(body), 1.0))
+        turn = _pose(np.zeros(3), model.body_iquat[body])[:3, :3]
+        moments = factor * (turn * model.body_inertia[body]) @ turn.T
+        return factor * float(model.body_mass[body]), model.body_ipos[body].copy(), moments
+
+    def _reference(self, joint: int, unit: str, axis: Vector) -> Vector:
+        """Return the joint's motion from its reference position to 0."""
+        model = self._file.model
+        back = -float(model.qpos0[model.jnt_qposadr[joint]])
+        if unit == "m":
+            return _moved(back * axis)
+        found = np.eye(4)
+        found[:3, :3] = to_matrix(from_axis_angle(axis.tolist(), back))
+        return found
+
+    def _joint(self, joint: int) -> Joint:
+        model, kinds = self._file.model, self._file.mujoco.mjtJoint
+        name = str(model.joint(joint).name) or f"joint{joint}"
+        kind, place = kinds(int(model.jnt_type[joint])), model.jnt_dofadr[joint]
+        if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
+            raise ModelError(f'joint "{name}" is a ball, which is not supported: use three hinges')
+        settings = self._robot.joints.get(name, JointSettings())
+        lower, upper = model.jnt_range[joint].tolist()
+        limited = bool(model.jnt_limited[joint])
+        strongest = np.inf
+        if model.jnt_actfrclimited[joint]:
+            strongest = float(np.abs(model.jnt_actfrcrange[joint]).max())
+        return Joint(
+            name,
+            lower if limited else -np.inf,
+            upper if limited else np.inf,
+            np.inf,
+            strongest,
+            settings.mode,
+            settings.gain,
+            "m" if kind == kinds.mjJNT_SLIDE else "rad",
+            **settings.resistance(
+                damping=float(model.dof_damping[place]),
+                friction=float(model.dof_frictionloss[place]),
+                stiffness=float(model.jnt_stiffness[joint]),
+                rest=float(model.qpos_spring[model.jnt_qposadr[joint]]),
+                armature=float(model.dof_armature[place]),
+            ),
+        )
+
+
+class _Shapes:
+    """The collision shapes of bodies.
+
+    Attributes:
+        found: The shapes.
+        left_out: What no engine is told.
+    """
+
+    def __init__(self, file: _File, robot: Robot, bodies: list[int]) -> None:
+        self._file, self._robot = file, robot
+        self.found: list[CollisionShape] = []
+        self._odd: dict[str, int] = {}
+        for body in bodies:
+            name = WORLD if body == 0 else file.body_name(body)
+            if name in robot.feet:
+                self.found.append(shape_of_foot(robot, name))
+            elif robot.collisions != "none":
+                shapes = [self._shape(geom, name) for geom in file.solid(body)]
+                self.found += [shape for shape in shapes if shape is not None]
+        self.left_out = [f"{what} ({count})" for what, count in self._odd.items()]
+
+    def _shape(self, geom: int, link: str) -> CollisionShape | None:
+        model, kinds = self._file.model, self._file.mujoco.mjtGeom
+        kind = kinds(int(model.geom_type[geom]))
+        size, pose = model.geom_size[geom], _pose(model.geom_pos[geom], model.geom_quat[geom])
+        found: tuple[float, ...]
+        mesh = None
+        if kind == kinds.mjGEOM_BOX:
+            name, found = "box", tuple((2 * size).tolist())
+        elif kind == kinds.mjGEOM_SPHERE:
+            name, found = "sphere", (float(size[0]),)
+        elif kind in (kinds.mjGEOM_CAPSULE, kinds.mjGEOM_CYLINDER):
+            name = "capsule" if kind == kinds.mjGEOM_CAPSULE else "cylinder"
+            found = float(size[0]), 2 * float(size[1])
+        elif kind == kinds.mjGEOM_ELLIPSOID:
+            name, found, turn = _capsule_of(size)
+            pose[:3, :3] = pose[:3, :3] @ turn
+            self._count("the form of ellipsoids, now capsules of their length and mean width")
+        elif kind == kinds.mjGEOM_MESH:
+            mesh, found, offset = self._mesh(int(model.geom_dataid[geom]))
+            name, pose = "mesh", pose @ offset
+        if kind == kinds.mjGEOM_MESH and mesh is None:
+            self._count("collision meshes that are not in a file")
+        elif kind in (kinds.mjGEOM_HFIELD, kinds.mjGEOM_SDF):
+            self._count("height fields and distance fields: use World(ground=HeightField(...))")
+        else:
+            material = self._robot.friction, self._robot.restitution
+            place = pose[:3, 3].copy(), pose[:3, :3].copy()
+            shape = CollisionShape(name, found, *place, link, *material, mesh)
+            return simplified(shape, self._robot.collisions)
+        return None
+
+    def _count(self, what: str) -> None:
+        self._odd[what] = self._odd.get(what, 0) + 1
+
+    def _mesh(self, mesh: int) -> tuple[Path | None, tuple[float, ...], Vector]:
+        """Return file and scale of a mesh, and its frame's pose before MuJoCo centered it."""
+        model = self._file.model
+        names = bytes(model.paths)
+        begin = int(model.mesh_pathadr[mesh])
+        centered = _pose(model.mesh_pos[mesh], model.mesh_quat[mesh])
+        offset: Vector = np.asarray(np.linalg.inv(centered), np.float64)
+        if begin < 0:
+            return None, (1.0, 1.0, 1.0), offset
+        name = names[begin : names.index(b"\0", begin)].decode()
+        path = self._file.path.parent / name
+        return path, tuple(model.mesh_scale[mesh].tolist()), offset
+
+
+def _left_out(robot: Robot, file: _File, links: _Links) -> Iterator[str]:
+    """Yield what of a file no engine is told, and what that changes."""
+    model, option = file.model, file.model.opt
+    for count, what, effect in (
+        (model.nu, "actuators", "command the joints, with JointSettings or Motors"),
+        (model.ntendon, "tendons", "neither their forces nor their limits act"),
+        (model.neq, "equality constraints", "what they hold together is free"),
+        (model.npair + model.nexclude, "contact pairs", "Robot(self_collisions=...) decides"),
+        (model.nflex, "deformable bodies", "they are missing"),
+        (model.nplugin, "plugins", "they do not run"),
+        (model.nmocap, "mocap bodies", "they stand still"),
+    ):
+        if count:
+            yield f"{what} ({count}: {effect})"
+    joints = links.joints
+    places = model.jnt_dofadr[joints]
+    solid = [geom for body in links.places for geom in file.solid(body)]
+    for found, what in (
+        (option.density or option.viscosity, "the fluid (there is no drag)"),
+        (model.ngravcomp, "gravity compensation"),
+        (option.disableflags, "flags that switch parts of the physics off"),
+        (model.jnt_stiffnesspoly[joints].any(), "the nonlinear part of springs"),
+        (model.dof_dampingpoly[places].any(), "the nonlinear part of dampers"),
+        (model.jnt_springyield[joints].any(), "springs that yield"),
+        ((model.geom_condim[solid] > 3).any(), "torsional and rolling friction (condim 4 and 6)"),
+        ((model.geom_condim[solid] < 3).any(), "that some contacts have no friction (condim 1)"),
+        (
+            (model.geom_friction[solid][:, 0] != robot.friction).any(),
+            "the friction of geoms (Robot(friction=...) decides)",
+        ),
+        (model.geom_margin[solid].any(), "margins of contacts"),
+    ):
+        if found:
+            yield what
+    if not np.allclose(option.gravity, (0.0, 0.0, -9.81)):
+        yield f"the gravity (World(gravity={tuple(option.gravity.tolist())}))"
+    planes = [geom for geom in file.geoms(0) if geom not in file.solid(0)]
+    if (0 not in links.places and len(file.geoms(0))) or planes:
+        yield "what is fixed to the world (World(ground=..., objects=...))"
+
+
+def _capsule_of(size: Vector) -> tuple[str, tuple[float, ...], Vector]:
+    """Return a capsule in the place of an ellipsoid with given semi-axes, and its axes."""
+    longest = int(np.argmax(size))
+    across = np.delete(size, longest)
+    radius = float(np.sqrt(across.prod()))
+    length = 2 * max(float(size[longest]) - radius, 0.0)
+    axes = np.roll(np.eye(3), 2 - longest, axis=1)
+    return ("capsule", (radius, length), axes) if length > 0 else ("sphere", (radius,), axes)
+
+
+def _pose(position: Vector, quaternion: Vector) -> Vector:
+    """Return a pose with MuJoCo's quaternion w, x, y, z as a homogeneous matrix (4, 4)."""
+    w, x, y, z = quaternion.tolist()
+    found = np.eye(4)
+    found[:3, :3], found[:3, 3] = to_matrix((x, y, z, w)), position
+    return found
+
+
+def _moved(motion: Vector) -> Vector:
+    found = np.eye(4)
+    found[:3, 3] = motion
+    return found
+
+
+def _mujoco() -> Any:
+    try:
+        import mujoco  # only MJCF files need it
+    except ImportError as error:
+        raise ModelError(
+            f"MJCF files are compiled by the package mujoco, which cannot be imported: {error}. "
+            f"{install_hint('physx-sim', 'mjcf')}"
+        ) from error
+    return mujoco

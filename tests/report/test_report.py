@@ -1,0 +1,187 @@
+"""Reports: one page of a session, from its results, its data, and its network."""
+
+from __future__ import annotations
+
+import base64
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from physx_core import (
+    DataGeneration,
+    Dataset,
+    DatasetConfig,
+    Environment,
+    EnvironmentConfig,
+    Field,
+    NetworkConfig,
+    Parameter,
+    Training,
+    View,
+)
+from physx_core.cli import main
+from physx_core.errors import SessionError
+from physx_report import Figure, Section, Table, Text, drawing, page, write_report
+from physx_report.errors import ReportError
+
+WINDOWS = View(window={"past": ("state", 0), "next": ("state", 1)})
+
+
+class Spring(Environment):
+    """A mass on a spring, whose field has a unit that looks like HTML."""
+
+    episode_steps = 12
+
+    def create(self):
+        self.define_parameters([Parameter("stiffness", 5.0, 30.0, unit="N/m")])
+
+    def init_database(self):
+        self.define_training_fields([Field("state", (2,), unit="<b>m")])
+
+    def reset_parameters(self, stiffness):
+        self.stiffness = stiffness
+        self.state = np.array([self.rng.uniform(0.5, 1.0), 0.0])
+
+    def step(self):
+        x, v = self.state
+        v -= 0.02 * self.stiffness * x
+        self.state = np.array([x + 0.02 * v, v])
+        self.set_training_data(state=self.state)
+
+
+@pytest.fixture(autouse=True)
+def sessions(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+
+
+def generate(episodes=40):
+    environment = EnvironmentConfig(Spring, as_tcp_ip_client=False, seed=1)
+    with DataGeneration(environment, episodes=episodes, session_name="data", quiet=True) as run:
+        run.execute()
+
+
+def train(data="sessions/data", view=WINDOWS, reads="past", learns="next", **options):
+    network = NetworkConfig("toy/linear", {"net_fields": reads, "opt_fields": learns})
+    config = DatasetConfig(existing_dir=data, view=view, normalize=True)
+    with Training(
+        network, config, epoch_nb=2, batch_size=16, seed=0, session_name="net", quiet=True,
+        **options,
+    ) as run:  # fmt: skip
+        run.execute()
+
+
+def written(session, **options):
+    return write_report(session, **options).read_text()
+
+
+def text_of(written):
+    return re.sub(r"\s+", " ", re.sub(r"<style>.*?</style>|<[^>]+>", " ", written, flags=re.S))
+
+
+def captions(written):
+    return re.findall(r"<figcaption>(.*?)</figcaption>", written)
+
+
+def test_report_of_a_training_says_how_good_its_network_is_beside_its_rivals():
+    generate()
+    train()
+    written_page = written("sessions/net")
+    told = text_of(written_page)
+    assert "next: relative error" in told and "against the best rival" in told
+    assert "96 samples" not in told and "8 of 40 episodes" in told
+    for which in ("Best", "Median", "Worst"):
+        assert any(text.startswith(f"{which} episode of next") for text in captions(written_page))
+    assert "Error of each episode by parameter (validation)" in captions(written_page)
+    assert "physx train --config sessions/net/config.toml --session-name again" in told
+
+
+def test_report_of_a_generation_says_what_was_simulated():
+    generate()
+    told = text_of(written("sessions/data"))
+    assert "40 of 40 episodes" in told and "finished 40" in told and "stiffness" not in told
+    assert "How often parameters, and durations in s, occurred" in told
+    assert "physx generate --config sessions/data/config.toml" in told
+
+
+def test_equal_sessions_give_equal_pages_without_scripts():
+    generate()
+    train()
+    first = written("sessions/net")
+    assert written("sessions/net", path="other.html") == first
+    assert "<script" not in first and "http" not in text_of(first)
+    for content in re.findall(r"base64,([^\"]+)", first):
+        assert "<script" not in base64.b64decode(content).decode()
+
+
+def test_text_is_never_read_as_html():
+    generate()
+    train()
+    for session in ("sessions/data", "sessions/net"):
+        content = written(session)
+        assert "<b>" not in content and "&lt;b&gt;m" in content
+
+
+def test_a_page_says_that_the_samples_are_gone():
+    generate()
+    train()
+    for file in list(Path("sessions/data/dataset").iterdir()):
+        file.unlink()
+    assert "cannot be run on its samples any more" in text_of(written("sessions/net"))
+
+
+def test_fields_of_many_components_are_pictures():
+    random = np.random.default_rng(0)
+    with Dataset.create("grids") as dataset:
+        step = np.arange(200)
+        fields = [Field("a", (3,)), Field("u", (8, 9)), Field("w", (20,))]
+        numbers = [Field(name, (), "int64", role="additional") for name in ("episode", "step")]
+        dataset.define_fields("training", [*fields, *numbers])
+        rows = {"a": random.normal(size=(200, 3)), "episode": step // 10, "step": step % 10}
+        rows["u"] = rows["a"][:, :1, None] * np.ones((8, 9))
+        rows["w"] = rows["a"][:, 1:2] * np.ones(20)
+        dataset.append("training", rows)
+    train("grids", View(), "a", ["u"])
+    assert sum("episode of u" in text for text in captions(written("sessions/net"))) == 3
+
+
+def test_a_section_of_a_plugin_is_on_the_page(monkeypatch):
+    generate(4)
+    own = Section("Mine <i>", lambda run: [Text([run.path.name]), Table(["x"], [["1"]])], 5)
+    monkeypatch.setattr(page, "all_sections", lambda: [own])
+    content = written("sessions/data")
+    assert "<h2>Mine &lt;i&gt;</h2>" in content and "<td>1</td>" in content
+
+
+@pytest.mark.parametrize(
+    ("blocks", "message"),
+    [
+        (lambda run: 1 / 0, 'section "Mine" of the report failed: ZeroDivisionError'),
+        (lambda run: ["text"], "which is no block"),
+    ],
+)
+def test_a_failing_section_is_named(monkeypatch, blocks, message):
+    generate(4)
+    monkeypatch.setattr(page, "all_sections", lambda: [Section("Mine", blocks)])
+    with pytest.raises(ReportError, match=message):
+        write_report("sessions/data")
+
+
+def test_mistakes_are_named(capsys):
+    with pytest.raises(SessionError, match="has no result"):
+        write_report("sessions/none")
+    generate(4)
+    with pytest.raises(SessionError, match="cannot be written"):
+        write_report("sessions/data", "nowhere/else/page.html")
+    assert main(["report", "sessions/data", "--output", "page.html"]) == 0
+    assert "report: page.html" in capsys.readouterr().out
+
+
+def test_a_figure_depends_on_its_numbers_alone():
+    made = []
+    for _ in range(2):
+        with drawing.figure("a line") as (found, (axes,)):
+            axes.plot([1, 2, 3])
+        made += found
+    assert made[0] == made[1] == Figure(made[0].svg, "a line")

@@ -1,0 +1,311 @@
+"""Robots from MJCF files are those that MuJoCo makes of them, on all engines."""
+
+from __future__ import annotations
+
+import sys
+import warnings
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from physx_core import plugins
+from physx_core.rotations import to_matrix
+from physx_sim import Ground, JointSettings, Robot, World, mjcf_robots
+from physx_sim.engines import read_robot
+from physx_sim.errors import ModelError
+
+pytestmark = [
+    pytest.mark.processes,
+    pytest.mark.filterwarnings("ignore:.*leaves out"),
+]
+
+mujoco = pytest.importorskip("mujoco")
+gymnasium = pytest.importorskip("gymnasium")
+
+ASSETS = Path(gymnasium.__file__).parent / "envs/mujoco/assets"
+ENGINES = ("dart", "pinocchio", "mujoco")
+
+ODD = """
+<mujoco model="odd">
+  <compiler angle="degree"/>
+  <option timestep="0.001"/>
+  <default><geom density="800" contype="1" conaffinity="1"/></default>
+  <worldbody>
+    <geom name="floor" type="plane" size="5 5 1"/>
+    <body name="crane" pos="0 0 1" euler="10 20 30">
+      <inertial pos="0.1 0 0" mass="2" fullinertia="0.3 0.2 0.25 0.01 0.02 -0.01"/>
+      <joint name="lift" type="slide" axis="1 2 2" ref="0.3" range="-0.5 0.7" limited="true"
+        damping="0.4" armature="0.05"/>
+      <joint name="swing" pos="0.1 -0.2 0.3" axis="0 1 1" ref="40" range="-90 60" limited="true"
+        stiffness="3" springref="15"/>
+      <joint name="roll" pos="0 0.1 0" axis="1 0 0" frictionloss="0.2" actuatorfrcrange="-3 3"
+        actuatorfrclimited="true"/>
+      <geom type="box" size="0.1 0.2 0.3" pos="0.2 0 0" euler="0 0 45"/>
+      <body pos="0 0.3 0" quat="0.5 0.5 -0.5 0.5">
+        <geom type="capsule" fromto="0 0 0 0.2 0.3 0" size="0.05"/>
+        <body name="tip" pos="0.3 0 0.1">
+          <joint name="turn" axis="0.6 0 0.8" ref="-70"/>
+          <geom type="ellipsoid" size="0.05 0.1 0.2"/>
+        </body>
+      </body>
+    </body>
+    <body name="puck" pos="1 2 0.5" euler="0 90 0">
+      <freejoint/>
+      <geom type="cylinder" size="0.1 0.02"/>
+      <body name="pin" pos="0 0 0.1"><joint name="spin" axis="0 0 1" pos="0.02 0 0"/>
+        <geom type="sphere" size="0.03" pos="0.05 0 0"/></body>
+    </body>
+  </worldbody>
+</mujoco>
+"""
+"""Joints on each other, about points and from positions of their own, in a tree that is fixed and
+one that floats."""
+
+
+@pytest.fixture
+def odd(tmp_path):
+    path = tmp_path / "odd.xml"
+    path.write_text(ODD, encoding="utf-8")
+    return path
+
+
+def states(layout, rng):
+    """Return random positions, velocities and torques."""
+    q = rng.uniform(-1, 1, layout.nq)
+    for part in layout.parts.values():
+        if part.floating:
+            turn = q[part.positions][3:7]
+            turn /= np.linalg.norm(turn)
+    return q, *rng.uniform(-1, 1, (2, layout.nv))
+
+
+class Theirs:
+    """A file in MuJoCo itself, without what no engine of physx has."""
+
+    def __init__(self, path, layout, *, armature=True):
+        self.model = mujoco.MjModel.from_xml_path(str(path))
+        self.model.opt.density = self.model.opt.viscosity = 0.0
+        self.model.opt.gravity[:] = 0.0, 0.0, -9.81
+        self.model.dof_frictionloss[:] = 0.0
+        self.model.dof_armature *= armature
+        self.data, self.layout = mujoco.MjData(self.model), layout
+        at = [self.model.joint(name.rpartition("/")[2]) for name in layout.joints]
+        self.q, self.v = ([int(getattr(j, a)[0]) for j in at] for a in ("qposadr", "dofadr"))
+        bases = [j for j in range(self.model.njnt) if self.model.jnt_type[j] == 0]
+        self.bases = [(self.model.jnt_qposadr[j], self.model.jnt_dofadr[j]) for j in bases]
+        self.floating = [part for part in layout.parts.values() if part.floating]
+
+    def set(self, q, v, tau):
+        data, layout = self.data, self.layout
+        data.qpos[self.q] = q[list(layout.position_index.values())]
+        ours = list(layout.velocity_index.values())
+        data.qvel[self.v], data.qfrc_applied[self.v] = v[ours], tau[ours]
+        for (x, y), part in zip(self.bases, self.floating, strict=True):
+            pose, twist, wrench = q[part.positions], v[part.velocities], tau[part.velocities]
+            turn = to_matrix(pose[3:7])
+            data.qpos[x : x + 7] = pose[[0, 1, 2, 6, 3, 4, 5]]
+            data.qvel[y : y + 6] = *(turn @ twist[:3]), *twist[3:6]
+            data.qfrc_applied[y : y + 6] = *(turn @ wrench[:3]), *wrench[3:6]
+        mujoco.mj_forward(self.model, data)
+
+    def accelerations(self, q, v, tau):
+        """Return what physx's forward dynamics is."""
+        self.set(q, v, tau)
+        found = np.zeros(self.layout.nv)
+        found[list(self.layout.velocity_index.values())] = self.data.qacc_smooth[self.v]
+        for (_, y), part in zip(self.bases, self.floating, strict=True):
+            a, twist = self.data.qacc_smooth[y : y + 6], v[part.velocities]
+            linear = a[:3] @ to_matrix(q[part.positions][3:7]) - np.cross(twist[3:6], twist[:3])
+            found[part.velocities][:6] = *linear, *a[3:]
+        return found
+
+    def masses(self):
+        """Return the mass matrix of the joints, after `set`."""
+        found = np.zeros((self.model.nv, self.model.nv))
+        mujoco.mj_fullM(self.model, self.data, found)
+        return found[np.ix_(self.v, self.v)]
+
+    def poses(self, names):
+        """Return the poses of bodies, with quaternions x, y, z, w, after `set`."""
+        found = []
+        for name in names:
+            body = self.data.body(name)
+            w, *xyz = body.xquat * (1 if body.xquat[0] >= 0 else -1)
+            found.append([*body.xpos, *xyz, w])
+        return np.array(found)
+
+
+def check_close(found, expected, bound):
+    assert np.abs(found - expected).max() <= bound * max(np.abs(expected).max(), 1.0)
+
+
+def without_friction(robots):
+    """Return robots without friction in their joints, which MuJoCo's smooth dynamics lack."""
+    found = []
+    for robot in robots:
+        names = [joint.name for joint in read_robot(robot).joints]
+        joints = {name: JointSettings(friction=0.0) for name in names}
+        found.append(Robot(**{**vars(robot), "joints": joints}))
+    return found
+
+
+def compare(path, engine):
+    robots = without_friction(mjcf_robots(path, collisions="none"))
+    with plugins.resolve("backend", engine).build(World(robots)) as simulation:
+        layout, rng = simulation.layout, np.random.default_rng(0)
+        theirs = Theirs(path, layout, armature=engine != "dart")
+        named = [name for name in layout.bodies if name.rpartition("/")[2] in path.read_text()]
+        named = [name for name in named if "." not in name and "world" not in name]
+        for _ in range(3):
+            q, v, tau = states(layout, rng)
+            check_close(
+                simulation.forward_dynamics(q, v, tau), theirs.accelerations(q, v, tau), 1e-9
+            )
+            ours = list(layout.velocity_index.values())
+            check_close(simulation.mass_matrix(q)[np.ix_(ours, ours)], theirs.masses(), 1e-9)
+            poses = theirs.poses([name.rpartition("/")[2] for name in named])
+            check_close(simulation.body_poses(named, q), poses, 1e-9)
+            a = simulation.forward_dynamics(q, v, tau)
+            check_close(simulation.inverse_dynamics(q, v, a), tau, 1e-9)
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_joints_on_each_other_and_away_from_the_origin_are_those_of_mujoco(odd, engine):
+    compare(odd, engine)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("engine", ENGINES)
+@pytest.mark.parametrize("name", sorted(path.name for path in ASSETS.glob("*.xml")))
+def test_robots_of_gymnasium_are_those_of_mujoco(name, engine):
+    if engine == "dart" and name.startswith("pusher"):
+        pytest.skip("a part of it has no inertia but that of a rotor")
+    compare(ASSETS / name, engine)
+
+
+def test_limits_springs_and_rotors_are_read(odd):
+    robot, puck = mjcf_robots(odd)
+    joints = {joint.name: joint for joint in read_robot(robot).joints}
+    assert list(joints) == ["lift", "swing", "roll", "turn"]
+    lift, swing, roll = joints["lift"], joints["swing"], joints["roll"]
+    assert (lift.unit, lift.lower, lift.upper, lift.damping) == ("m", -0.5, 0.7, 0.4)
+    assert lift.armature == 0.05 and roll.friction == 0.2 and roll.max_torque == 3.0
+    np.testing.assert_allclose([swing.lower, swing.upper], np.radians([-90, 60]))
+    assert swing.stiffness == 3.0 and swing.rest == pytest.approx(np.radians(15))
+    assert np.isinf([roll.lower, roll.upper, lift.max_torque, lift.max_velocity]).all()
+    settings = {"lift": JointSettings(armature=0.0, damping=1.0, stiffness=2.0)}
+    (given, *_) = read_robot(Robot(odd, root="world", joints=settings)).joints
+    assert (given.armature, given.damping, given.stiffness) == (0.0, 1.0, 2.0)
+    assert puck.position == (1.0, 2.0, 0.5) and not puck.fixed_base
+    assert puck.name == puck.root == "puck"
+
+
+@pytest.mark.parametrize("engine", ENGINES)
+def test_everything_in_a_file_lands_on_the_ground(odd, engine):
+    world = World(mjcf_robots(odd), ground=Ground(), contacts="static")
+    with plugins.resolve("backend", engine).build(world) as simulation:
+        simulation.step(1500)
+        # On its rim, and on the pin's ball.
+        assert 0.02 < simulation.body_poses(["puck/puck"])[0, 2] < 0.2
+        touching = {simulation.layout.names[i] for i in simulation.contacts()["body_a"]}
+        assert "puck/puck" in touching
+
+
+def test_shapes_are_where_mujoco_has_them(odd):
+    shapes = read_robot(Robot(odd, root="world"), touching=True).shapes
+    kinds = [(shape.body, shape.kind) for shape in shapes]
+    assert kinds == [("crane", "box"), ("body2", "capsule"), ("tip", "capsule")]
+    model = mujoco.MjModel.from_xml_path(str(odd))
+    np.testing.assert_allclose(shapes[0].position, model.geom_pos[1])
+    assert shapes[0].size == (0.2, 0.4, 0.6)
+    assert shapes[1].size[1] == pytest.approx(np.hypot(0.2, 0.3))
+    # The ellipsoid, along its longest axis.
+    np.testing.assert_allclose(np.abs(shapes[2].rotation[:, 2]), [0, 0, 1])
+    assert shapes[2].size[0] + 0.5 * shapes[2].size[1] == pytest.approx(0.2)
+
+
+def test_a_mesh_collides_where_mujoco_has_it(tmp_path):
+    (tmp_path / "shapes").mkdir()
+    corners = [(0, 0, 0), (3, 0, 0), (0, 2, 0), (0, 0, 1)]
+    lines = [f"v {x} {y} {z}" for x, y, z in corners] + ["f 1 3 2", "f 1 2 4", "f 2 3 4", "f 3 1 4"]
+    (tmp_path / "shapes/wedge.obj").write_text("\n".join(lines) + "\n", encoding="ascii")
+    path = tmp_path / "wedge.xml"
+    path.write_text(
+        '<mujoco><compiler meshdir="shapes"/><asset><mesh name="w" file="wedge.obj" scale=".1 .2 '
+        '.3"/></asset><worldbody><body name="wedge"><freejoint/><geom type="mesh" mesh="w" pos="1 2'
+        ' 3" euler="10 20 30"/></body></worldbody></mujoco>',
+        encoding="utf-8",
+    )
+    robot = Robot(path, fixed_base=False)
+    (shape,) = read_robot(robot, touching=True).shapes
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    theirs = model.mesh_vert @ data.geom_xmat[0].reshape(3, 3).T + data.geom_xpos[0]
+    with plugins.resolve("backend", "mujoco").build(World([robot], ground=Ground())) as simulation:
+        for direction in np.eye(3):
+            assert simulation.reach("robot", direction) == pytest.approx((theirs @ direction).max())
+    assert shape.mesh == tmp_path / "shapes/wedge.obj"
+
+
+def test_what_is_left_out_is_named_once(tmp_path):
+    path = tmp_path / "rich.xml"
+    path.write_text(
+        '<mujoco><option density="1000" gravity="0 0 -1.6"/><worldbody><geom type="plane" size="1 '
+        '1 1"/><body name="a"><freejoint/><geom type="ellipsoid" size=".1 .2 .3" condim="6" '
+        'friction="0.3"/><body name="b"><joint name="j"/><geom size=".1"/></body></body>'
+        '</worldbody><tendon><fixed name="t"><joint joint="j" coef="1"/></fixed></tendon>'
+        '<equality><joint joint1="j"/></equality><actuator><motor joint="j"/></actuator></mujoco>',
+        encoding="utf-8",
+    )
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        for _ in range(2):
+            plugins.resolve("backend", "mujoco").build(World([Robot(path, "rich")])).close()
+    (text,) = [str(each.message) for each in caught]
+    for part in (
+        *('Robot "rich"', "actuators (1: command", "tendons (1", "equality constraints (1"),
+        *("the fluid", "gravity=(0.0, 0.0, -1.6)", "rolling friction", "ellipsoids"),
+        *("the friction of geoms", "fixed to the world (World(ground=", "fixed_base=False lets"),
+    ):
+        assert part in text
+
+
+def test_without_mujoco_an_error_says_what_to_install(odd, monkeypatch):
+    monkeypatch.setitem(sys.modules, "mujoco", None)
+    with pytest.raises(ModelError, match=r"pip install .*physx.sim\[mjcf\]"):
+        read_robot(Robot(odd))
+
+
+@pytest.mark.parametrize(
+    ("text", "options", "said"),
+    [
+        ("<mujoco><worldbody/>", {}, "MuJoCo cannot read"),
+        ("<mujoco><worldbody/></mujoco>", {}, "no movable joint"),
+        (ODD, {}, r"several trees: choose one with Robot\(root=...\).*puck"),
+        (ODD, {"root": "pick"}, 'no tree has the root "pick"..* "puck"'),
+        (ODD, {"root": "world", "fixed_base": False}, "is the world, which cannot float"),
+        (ODD, {"root": "world", "feet": {"tap": 0.1}}, 'feet names "tap", which is not a link'),
+        (
+            "<mujoco><worldbody>"
+            + 401 * '<body><geom size=".1"/></body>'
+            + "</worldbody></mujoco>",
+            {},
+            "401 bodies; a model may have 400",
+        ),
+        (
+            '<mujoco><worldbody><body><joint name="b" type="ball"/><geom size="1"/></body>'
+            "</worldbody></mujoco>",
+            {},
+            'joint "b" is a ball',
+        ),
+    ],
+    ids=["xml", "empty", "trees", "root", "floating", "feet", "bodies", "ball"],
+)
+def test_what_is_wrong_with_a_file_is_said(tmp_path, text, options, said):
+    path = tmp_path / "wrong.xml"
+    path.write_text(text, encoding="utf-8")
+    with pytest.raises(ModelError, match=said) as caught:
+        plugins.resolve("backend", "mujoco").build(World([Robot(path, **options)]))
+    assert "wrong.xml" in str(caught.value)
