@@ -7,7 +7,9 @@ trained on rows whose held-back part cannot judge anything.
 
     python benchmarks/judged.py --check
 
-Claims: at most a tenth of the training; nothing with ``rivals="none"``; all planted truths named.
+Claims: at most a tenth of the training; nothing with ``rivals="none"``; all planted truths named;
+the page of a training on 5 fields with 10,000 validation rows within 30 s, of 5 MB at most, and the
+same bytes twice.
 """
 
 from __future__ import annotations
@@ -25,6 +27,7 @@ from measure import claim, finish
 from physx_core import Dataset, DatasetConfig, NetworkConfig, Optimization, Result, Training, View
 from physx_core.pipelines import training as pipeline
 from physx_core.toy import Linear
+from physx_report import write_report
 
 CASES = {
     "200 episodes of 500 rows, (12,) -> (12,), FC of 64": (100_000, 500, 12, [12, 64, 64, 12]),
@@ -205,6 +208,40 @@ def parts(rows: dict[str, np.ndarray]) -> list[str]:
     return named
 
 
+# The page -------------------------------------------------------------------------------------
+
+
+def pages() -> list[bool]:
+    """Write the page of a training twice."""
+    shapes: dict[str, tuple[int, ...]] = {
+        "a": (), "b": (3,), "c": (20,), "d": (16, 16), "e": (100, 3),
+    }  # fmt: skip
+    step = np.arange(50_000)
+    x = np.sin(0.1 * step[:, None] + RNG.normal(size=(500, 4)).repeat(100, axis=0))
+    with Dataset.create("data") as dataset:
+        for first in range(0, len(x), 5000):
+            rows = slice(first, first + 5000)
+            fields = {
+                name: x[rows, :1].reshape(-1, *(1,) * len(shape)) * np.ones(shape)
+                for name, shape in shapes.items()
+            }
+            numbers = {"episode": step[rows] // 100, "step": step[rows] % 100}
+            dataset.append("training", {"x": x[rows], **fields, **numbers})
+    options = {"layers": [4, 64, 580], "net_fields": "x", "opt_fields": list(shapes)}
+    network = NetworkConfig("torch/fc", options, loss="MSELoss", optimizer="Adam", lr=1e-3)
+    training = Training(network, "data", epoch_nb=1, batch_size=500, rivals="all", quiet=True)
+    judged = training.execute().parts["validation"]
+    begin = time.monotonic()
+    first_page = write_report(training.session.path).read_bytes()
+    seconds = time.monotonic() - begin
+    again = write_report(training.session.path).read_bytes()
+    return [
+        claim(f"seconds to the page of {judged.samples:,} rows", seconds, at_most=30.0),
+        claim("MB of the page", len(first_page) / 1e6, at_most=5.0),
+        claim("bytes that differ in a second page", int(first_page != again), at_most=0),
+    ]
+
+
 def main() -> None:
     """Measure, and print whether the claims hold."""
     parser = argparse.ArgumentParser()
@@ -224,6 +261,10 @@ def main() -> None:
             os.chdir(place)
             _, calls, _ = cost(next(iter(CASES)), 1.0, "none")
             met.append(claim('judgments with rivals="none"', calls, at_most=0))
+            os.chdir(folder)
+        with tempfile.TemporaryDirectory(dir=".") as place:
+            os.chdir(place)
+            met += pages()
             os.chdir(folder)
         named = list(planted())
         os.chdir("/")

@@ -91,9 +91,11 @@ def test_report_of_a_training_says_how_good_its_network_is_beside_its_rivals():
     told = text_of(written_page)
     assert "next: relative error" in told and "against the best rival" in told
     assert "96 samples" not in told and "8 of 40 episodes" in told
-    for which in ("Best", "Median", "Worst"):
-        assert any(text.startswith(f"{which} episode of next") for text in captions(written_page))
-    assert "Error of each episode by parameter (validation)" in captions(written_page)
+    assert any(
+        all(f"{which} episode: " in text for which in ("Best", "Median", "Worst"))
+        for text in captions(written_page)
+    )
+    assert "next. Error of each episode by parameter (validation)" in captions(written_page)
     assert "physx train --config sessions/net/config.toml --session-name again" in told
 
 
@@ -143,7 +145,7 @@ def test_fields_of_many_components_are_pictures():
         rows["w"] = rows["a"][:, 1:2] * np.ones(20)
         dataset.append("training", rows)
     train("grids", View(), "a", ["u"])
-    assert sum("episode of u" in text for text in captions(written("sessions/net"))) == 3
+    assert sum(" episode: " in text for text in captions(written("sessions/net"))) == 3
 
 
 def test_a_section_of_a_plugin_is_on_the_page(monkeypatch):

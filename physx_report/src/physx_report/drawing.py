@@ -103,7 +103,7 @@ def compare(
     else:
         picture = picture if picture.ndim == 2 else picture.reshape(-1, picture.shape[-1])
         found = None if prediction is None else prediction[row].reshape(picture.shape)
-        shown, where = [picture, found], f"{axis_names} {row}"
+        shown, where = [picture, found], f"at {axis_names} {row}"
     _pictures(axes, shown, label, where)
 
 
@@ -113,7 +113,7 @@ def _lines(axes: Sequence[Axes], truth: Array, prediction: Array | None, x: str)
     if prediction is not None:
         axes[0].plot(steps, prediction, color=PREDICTION, lw=1.2, ls=(0, (4, 2)))
         lines = axes[0].get_lines()
-        axes[0].legend([lines[0], lines[-1]], ["truth", "prediction"], frameon=False)
+        axes[0].legend([lines[0], lines[-1]], ["truth", "prediction"], framealpha=0.7, fontsize=8)
     axes[0].set_xlabel(x)
 
 
@@ -123,7 +123,8 @@ def _pictures(axes: Sequence[Axes], shown: Sequence[Array | None], label: str, w
     parts = [("truth", truth)]
     if prediction is not None:
         parts += [("prediction", prediction), ("difference", prediction - truth)]
-    low, high = float(truth.min()), float(truth.max())
+    low = min(float(values.min()) for _, values in parts[:2])
+    high = max(float(values.max()) for _, values in parts[:2])
     for place, (name, values) in zip(axes, parts, strict=False):
         most = float(np.abs(values).max()) or 1.0
         is_error = name == "difference"
@@ -132,11 +133,12 @@ def _pictures(axes: Sequence[Axes], shown: Sequence[Array | None], label: str, w
             values, vmin=limits[0], vmax=limits[1], cmap="RdBu" if is_error else None,
             aspect="auto", interpolation="nearest", origin="lower",
         )  # fmt: skip
-        place.set_title(f"{name}, {where}" if name == "truth" else name, fontsize=9)
+        place.set_title(name, fontsize=9)
+        place.set_xlabel(where)
         place.figure.colorbar(image, ax=place)
     axes[0].set_ylabel(label)
 
 
-def count_axes(values: Array) -> int:
-    """Return how many axes `compare` needs for values with a prediction."""
-    return 1 if values[0].size <= _FEW else 3
+def are_lines(values: Array) -> bool:
+    """Return whether `compare` draws values as lines in one of the axes."""
+    return int(values[0].size) <= _FEW

@@ -10,7 +10,7 @@ import numpy as np
 from physx_core import Batches
 from physx_core.errors import PhysxError
 from physx_core.pipelines import Unseen
-from physx_core.results import EpisodeError, PartResult
+from physx_core.results import EpisodeError, FieldResult, PartResult
 from physx_core.typing import Array
 from physx_report import drawing, wording
 from physx_report.blocks import Block, Text
@@ -50,20 +50,19 @@ def _errors(unseen: Unseen, part: str) -> Iterator[Block]:
             if values.dtype.kind == "f":
                 error = (values - true[name]).astype(np.float64).reshape(len(values), -1)
                 squares.setdefault(name, []).append((error**2).mean(axis=1))
-    known, first, place = np.unique(groups, return_index=True, return_inverse=True)
+    known, place = np.unique(groups, return_inverse=True)
     about = [batches.describe_group(int(group)) for group in known]
     step = np.concatenate([batches.rows(number)[0] for number in chosen])
     step = step - np.array([one["first_row"] for one in about])[place]
     for name, parts in squares.items():
         square, unit = np.concatenate(parts), batches.fields[name].unit
         label = f"{name}: error{f' / {unit}' if unit and ',' not in unit else ''}"
-        yield from _by_step(label, step, square, part)
+        yield from _by_step(name, label, step, square, part)
         by_episode = np.sqrt(np.bincount(place, square) / np.bincount(place))
-        yield from _by_parameter(label, about, by_episode, part)
-    del first
+        yield from _by_parameter(name, label, about, by_episode, part)
 
 
-def _by_step(label: str, step: Array, square: Array, part: str) -> Iterator[Block]:
+def _by_step(name: str, label: str, step: Array, square: Array, part: str) -> Iterator[Block]:
     if len(np.unique(step)) < 3 or step.min() < 0:
         return
     edges = np.unique(np.linspace(0, step.max() + 1, 41).astype(int))
@@ -72,7 +71,7 @@ def _by_step(label: str, step: Array, square: Array, part: str) -> Iterator[Bloc
     root = np.sqrt(square)
     quantiles = np.array([np.quantile(root[where == k], (0.1, 0.5, 0.9)) for k in filled])
     x = edges[filled]
-    with drawing.figure(f"Error by step of the episode ({part})") as (found, (axes,)):
+    with drawing.figure(f"{name}. Error by step of the episode ({part})") as (found, (axes,)):
         axes.fill_between(x, quantiles[:, 0], quantiles[:, 2], color=drawing.MUTED, alpha=0.3, lw=0)
         axes.plot(x, quantiles[:, 1], color=drawing.PREDICTION)
         axes.set_xlabel("step (line: median; area: 80 % of the samples)")
@@ -82,18 +81,18 @@ def _by_step(label: str, step: Array, square: Array, part: str) -> Iterator[Bloc
 
 
 def _by_parameter(
-    label: str, about: list[dict[str, Any]], errors: Array, part: str
+    name: str, label: str, about: list[dict[str, Any]], errors: Array, part: str
 ) -> Iterator[Block]:
     parameters = [one.get("parameters", {}) for one in about]
     names = [n for n in (parameters[0] if parameters else {}) if np.ndim(parameters[0][n]) == 0]
     names = [n for n in names if all(isinstance(p.get(n), float) for p in parameters)][:4]
     if not names or len(errors) < 3:
         return
-    caption = f"Error of each episode by parameter ({part})"
+    caption = f"{name}. Error of each episode by parameter ({part})"
     with drawing.figure(caption, 1, len(names)) as (found, axes):
-        for place, name in zip(axes, names, strict=True):
-            place.plot([p[name] for p in parameters], errors, ".", color=drawing.PREDICTION, ms=5)
-            place.set_xlabel(name)
+        for place, of in zip(axes, names, strict=True):
+            place.plot([p[of] for p in parameters], errors, ".", color=drawing.PREDICTION, ms=5)
+            place.set_xlabel(of)
             place.set_ylim(bottom=0)
         axes[0].set_ylabel(label)
     yield from found
@@ -103,27 +102,44 @@ def _pictures(unseen: Unseen, part: str, judged: PartResult) -> Iterator[Block]:
     """Draw the best, the median, and the worst episode of each field."""
     batches = unseen.parts[part]
     for name, of in judged.fields.items():
-        for which in _ORDER:
-            if which in of.episodes:
-                yield from _picture(unseen, batches, name, which, of.episodes[which], of.unit)
+        known = {which: of.episodes[which] for which in _ORDER if which in of.episodes}
+        drawn = {
+            f"{which.capitalize()} episode: {_described(episode, of)}": pair
+            for which, episode in known.items()
+            if (pair := _compared(unseen, batches, name, episode)) is not None
+        }
+        if not drawn:
+            continue
+        label = f"{name}{f' / {of.unit}' if of.unit and ',' not in of.unit else ''}"
+        if drawing.are_lines(next(iter(drawn.values()))[0]):
+            caption = f"{name}. {'. '.join(drawn)}."
+            with drawing.figure(caption, 1, len(drawn), width=9.0) as (found, axes):
+                for place, which, pair in zip(axes, known, drawn.values(), strict=False):
+                    drawing.compare([place], *pair, label, "step")
+                    place.set_title(which, fontsize=9)
+            yield from found
+            continue
+        for caption, pair in drawn.items():
+            with drawing.figure(f"{name}. {caption}.", 1, 3, width=9.0) as (found, axes):
+                drawing.compare(axes, *pair, label, "step")
+            yield from found
 
 
-def _picture(
-    unseen: Unseen, batches: Batches, name: str, which: str, episode: EpisodeError, unit: str
-) -> Iterator[Block]:
+def _described(episode: EpisodeError, of: FieldResult) -> str:
+    return f"{episode.text}, error {wording.measured('rmse', episode.error, of.unit)}"
+
+
+def _compared(
+    unseen: Unseen, batches: Batches, name: str, episode: EpisodeError
+) -> tuple[Array, Array] | None:
+    """Return the truth of an episode, and what was predicted; None if there are no numbers."""
     items = _items(batches, episode.about)
     if items is None or not len(items):
-        return
+        return None
     predicted, true = unseen.compare(batches.take(items))
-    if name not in predicted:
-        return
-    values, guess = true[name].astype(float), predicted[name].astype(float)
-    error = wording.measured("rmse", episode.error, unit)
-    caption = f"{which.capitalize()} episode of {name}: {episode.text}; error {error}"
-    label = f"{name}{f' / {unit}' if unit and ',' not in unit else ''}"
-    with drawing.figure(caption, 1, drawing.count_axes(values)) as (found, axes):
-        drawing.compare(axes, values, guess, label, "step")
-    yield from found
+    if name not in predicted or true[name].dtype.kind not in "fiub":
+        return None
+    return true[name].astype(float), predicted[name].astype(float)
 
 
 def _items(batches: Batches, about: Mapping[str, Any]) -> Array | None:
