@@ -110,7 +110,7 @@ class Watching(TorchTransformation):
 
 def test_only_what_is_learned_from_has_a_tape(data):
     data = dataclasses.replace(data, view=View(fold=0))
-    options = {"epoch_nb": 1, "batch_size": 20, "validation_every": 0, "seed": 0}
+    options = {"epoch_nb": 1, "batch_size": 20, "validation_every": 0, "seed": 0, "rivals": "none"}
     training = Training(config(transformation=Watching), data, **options)
     with training:
         training.execute()
