@@ -38,7 +38,7 @@ if (
 
 # How long an example takes says nothing on a busy machine.
 settings.register_profile("physx", deadline=None, suppress_health_check=[HealthCheck.too_slow])
-settings.register_profile("quick", settings.get_profile("physx"), max_examples=25)
+settings.register_profile("quick", settings.get_profile("physx"), max_examples=10)
 
 # A shell that starts the tests in the background has them ignore Ctrl-C, and every process that
 # they start inherits that; some tests press it.
