@@ -1,4 +1,4 @@
-"""Where a network is good and where it is bad: by step, by parameter, and in pictures."""
+"""The section on errors by step and by parameter, and on the best and the worst episode."""
 
 from __future__ import annotations
 
@@ -101,12 +101,15 @@ def _by_parameter(
 def _pictures(unseen: Unseen, part: str, judged: PartResult) -> Iterator[Block]:
     """Draw the best, the median, and the worst episode of each field."""
     batches = unseen.parts[part]
+    if len(batches.datasets) > 1 or not len(batches):
+        return
+    rows = np.concatenate([batches.rows(number)[0] for number in range(len(batches))])
     for name, of in judged.fields.items():
         known = {which: of.episodes[which] for which in _ORDER if which in of.episodes}
         drawn = {
             f"{which.capitalize()} episode: {_described(episode, of)}": pair
             for which, episode in known.items()
-            if (pair := _compared(unseen, batches, name, episode)) is not None
+            if (pair := _compared(unseen, batches, name, _items(rows, episode.about)))
         }
         if not drawn:
             continue
@@ -130,11 +133,10 @@ def _described(episode: EpisodeError, of: FieldResult) -> str:
 
 
 def _compared(
-    unseen: Unseen, batches: Batches, name: str, episode: EpisodeError
+    unseen: Unseen, batches: Batches, name: str, items: Array
 ) -> tuple[Array, Array] | None:
-    """Return the truth of an episode, and what was predicted; None if there are no numbers."""
-    items = _items(batches, episode.about)
-    if items is None or not len(items):
+    """Return the truth of some items, and what was predicted; None if there are no numbers."""
+    if not len(items):
         return None
     predicted, true = unseen.compare(batches.take(items))
     if name not in predicted or true[name].dtype.kind not in "fiub":
@@ -142,17 +144,15 @@ def _compared(
     return true[name].astype(float), predicted[name].astype(float)
 
 
-def _items(batches: Batches, about: Mapping[str, Any]) -> Array | None:
-    """Return the items of an episode, as they are numbered in the order of writing."""
-    if len(batches.datasets) > 1:
-        return None
-    first, rows = about["first_row"], about["rows"]
-    found = []
-    for number in range(len(batches)):
-        (places,) = batches.rows(number)
-        inside = np.flatnonzero((places >= first) & (places < first + rows))
-        found.append(number * batches.batch_size + inside)
-    return np.concatenate(found)[:_ROWS]
+def _items(rows: Array, about: Mapping[str, Any]) -> Array:
+    """Return the items of an episode.
+
+    Args:
+        rows: The reference rows of all items, in the order of writing.
+        about: See `EpisodeError`.
+    """
+    first, count = about["first_row"], about["rows"]
+    return np.flatnonzero((rows >= first) & (rows < first + count))[:_ROWS]
 
 
 SECTION = Section("Where it is good and where it is bad", _blocks, 20)

@@ -1,4 +1,4 @@
-"""What a run was made from, and how to repeat it."""
+"""The section on what a run was made from, and how to repeat it."""
 
 from __future__ import annotations
 

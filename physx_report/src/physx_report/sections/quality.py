@@ -1,4 +1,4 @@
-"""How good a network is, and compared with what."""
+"""The section on how good a network is, and compared with what."""
 
 from __future__ import annotations
 

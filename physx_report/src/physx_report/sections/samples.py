@@ -1,4 +1,4 @@
-"""What a data generation has simulated."""
+"""The section on what a data generation has simulated."""
 
 from __future__ import annotations
 

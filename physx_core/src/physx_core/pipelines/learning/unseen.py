@@ -32,12 +32,7 @@ class Unseen:
 
     def compare(self, batch: Batch) -> tuple[Batch, Batch]:
         """Return predictions for a batch, and the true values, both by the names of the latter."""
-        network = self.learner.network
-        answer = self.learner.predict(batch)
-        pairs = zip(network.opt_fields, network.pred_fields, strict=False)
-        found = {true: answer[name] for true, name in pairs if true in batch and name in answer}
-        same = [name for name, values in found.items() if values.shape == batch[name].shape]
-        return {name: found[name] for name in same}, {name: batch[name] for name in same}
+        return self.learner.compare(batch, _BATCH)
 
 
 @contextlib.contextmanager
