@@ -114,9 +114,7 @@ class Batches(Closeable):
             for name, source in zip(given, self._sources, strict=True)
         }
         self.num_items = self._count(np.array(list(given.values())))
-        whole, rest = divmod(self.num_items, batch_size)
-        self._num_batches = whole + (rest > 0 and not view.drop_last)
-        self._check()
+        self._num_batches = self._divide()
         self._choose(fields, dtype, reuse=reuse)
         self._is_plain = len(self._sources) == 1 and not (view.windows or view.weights)
         self._epoch: tuple[int, Epoch] | None = None
@@ -188,12 +186,16 @@ class Batches(Closeable):
         other._epoch, other._opened = None, contextlib.ExitStack()
         return other
 
-    def _check(self) -> None:
-        if self.num_items and not self._num_batches:
+    def _divide(self) -> int:
+        """Return the number of batches of an epoch."""
+        whole, rest = divmod(self.num_items, self.batch_size)
+        found = whole + (rest > 0 and not self.view.drop_last)
+        if self.num_items and not found:
             raise ConfigError(
                 f"An epoch has {self.num_items} items, fewer than a batch of {self.batch_size}, "
                 "and View.drop_last leaves out what is left."
             )
+        return found
 
     def _described(self, name: str) -> dict[str, Field]:
         """Return the fields of a window or stored field in a batch."""

@@ -21,6 +21,7 @@ from physx_core.pipelines.storage import GENERATION
 from physx_core.typing import Batch
 from physx_core.views.batches import Batches
 from physx_core.views.dataset_config import DatasetConfig
+from physx_core.views.folds import Part
 from physx_core.views.view import View
 
 _NOTHING: dict[str, Any] = {"rows": 0, "digest": "none", "partitions": []}
@@ -128,6 +129,26 @@ def training_view(
     order = view.order if config.shuffle else "stored"
     holds_back = view.hold_back and not (has_validation or is_generated)
     return replace(view, order=order, hold_back=holds_back)
+
+
+def unseen_parts(view: View, mode: str, *, has_mode: bool) -> dict[str, tuple[str, View, Part]]:
+    """Return the mode, view and part of the samples that a training does not learn from, by name.
+
+    Args:
+        view: That of the samples to train on: see `training_view`.
+        mode: Their mode.
+        has_mode: Whether the mode ``validation`` has the samples for validation.
+    """
+    plain = replace(view, order="stored", weights=None, drop_last=False)
+    found: dict[str, tuple[str, View, Part]] = {}
+    if has_mode:
+        alone = replace(plain, sources={}, hold_back=False)
+        found["validation"] = "validation", alone, "training"
+    elif view.hold_back:
+        found["validation"] = mode, plain, "validation"
+    if view.test_fold is not None:
+        found["test"] = mode, plain, "test"
+    return found
 
 
 def describe_record(former: Mapping[str, Any]) -> str:

@@ -4,16 +4,14 @@ from __future__ import annotations
 
 import contextlib
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 from physx_core import checkpoint
-from physx_core.pipelines.learning.data_record import open_data, training_view
+from physx_core.pipelines.learning.data_record import open_data, training_view, unseen_parts
 from physx_core.pipelines.learning.learner import Learner, load_learner
 from physx_core.typing import Batch
 from physx_core.views.batches import Batches
-from physx_core.views.folds import Part
-from physx_core.views.view import View
 
 _BATCH = 256
 
@@ -59,14 +57,7 @@ def open_unseen(session: str | Path, *, trust: bool = False) -> Iterator[Unseen]
         info = next(iter(datasets.values())).info
         has_mode = "validation" in taken
         view = training_view(config, info, has_validation=has_mode)
-        view = replace(view, order="stored", weights=None, drop_last=False)
-        alone = replace(view, sources={}, hold_back=False)
-        wanted: dict[str, tuple[View, str, Part]] = {}
-        wanted |= {"validation": (alone, "validation", "training")} if has_mode else {}
-        if view.hold_back:
-            wanted["validation"] = view, config.mode, "validation"
-        if view.test_fold is not None:
-            wanted["test"] = view, config.mode, "test"
+        wanted = unseen_parts(view, config.mode, has_mode=has_mode)
         parts = {
             name: opened.enter_context(
                 Batches(
@@ -80,6 +71,6 @@ def open_unseen(session: str | Path, *, trust: bool = False) -> Iterator[Unseen]
                     dtype=learner.config.data_type,
                 )
             )
-            for name, (chosen, mode, part) in wanted.items()
+            for name, (mode, chosen, part) in wanted.items()
         }
         yield Unseen(learner, {name: each for name, each in parts.items() if each.num_items})

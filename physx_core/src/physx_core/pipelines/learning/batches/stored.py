@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import replace
 from functools import cached_property, partial
 
 import numpy as np
@@ -13,7 +12,7 @@ from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, DatasetError, UsageError, listed
 from physx_core.fields import Field
 from physx_core.normalization import Normalization
-from physx_core.pipelines.learning.data_record import training_view
+from physx_core.pipelines.learning.data_record import training_view, unseen_parts
 from physx_core.pipelines.storage import other_samples
 from physx_core.results.judge import Judged
 from physx_core.typing import Batch, Index
@@ -133,11 +132,12 @@ class StoredBatches:
 
     @cached_property
     def _validation(self) -> Batches:
-        view = replace(self._view, order="stored", weights=None, drop_last=False)
-        size = self._validation_batch_size
-        if self._has_mode:
-            return self._open("validation", replace(view, sources={}, hold_back=False), size)
-        return self._open(self.mode, view, size, "validation")
+        return self._open_unseen("validation")
+
+    def _open_unseen(self, name: str) -> Batches:
+        parts = unseen_parts(self._view, self.mode, has_mode=self._has_mode)
+        mode, view, part = parts[name]
+        return self._open(mode, view, self._validation_batch_size, part)
 
     def begin_epoch(self, names: Sequence[str], batches: int) -> None:
         """Prepare an epoch.
@@ -193,8 +193,7 @@ class StoredBatches:
             division = "" if self._has_mode else " and ".join(held.division)
             found["validation"] = Judged(held, is_apart, division, used)
         if self._view.test_fold is not None:
-            view = replace(self._view, order="stored", weights=None, drop_last=False)
-            test = self._open(self.mode, view, self._validation_batch_size, "test")
+            test = self._open_unseen("test")
             found["test"] = Judged(test, test.is_whole, " and ".join(test.division))
         return found
 
