@@ -7,7 +7,6 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from html import escape
 from typing import Any, Literal, TypeAlias
 
 Verdict: TypeAlias = Literal["wins", "loses", "even", "unknown"]
@@ -197,6 +196,8 @@ class Result:
 
     def _repr_html_(self) -> str:
         """Return the text with tables, for notebooks."""
+        from html import escape  # takes as long to import as all else here; runs need it never
+
         found = [f"<p>{'<br>'.join(escape(line) for line in self.summary)}</p>"]
         for name, part in self.parts.items():
             found.append(f"<h4>{escape(_heading(name, part))}</h4>")

@@ -156,7 +156,7 @@ class EpisodeRunner:
                 self._fail(error)
             if self._number is None and self._began >= until:
                 break
-            if self._is_full or self._is_due:
+            if self._is_full or (self._number is not None and self._is_due):
                 break
         if self._number is not None:
             self._end(_MORE)
@@ -174,7 +174,7 @@ class EpisodeRunner:
     @property
     def _is_due(self) -> bool:
         """Whether the rows of an episode that goes on are to be stored now."""
-        if self._number is None or self._step <= self._stored:
+        if self._step <= self._stored:
             return False
         return self._now() - self._began >= (AIM if self._state else _PART_TIME)
 
