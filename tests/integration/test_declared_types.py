@@ -59,6 +59,10 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     physx_sim.JointSettings: {
         **{"damping": 0.5, "friction": 0.25, "stiffness": 2.0, "rest": 0.5, "armature": 0.125}
     },
+    physx_sim.Mimic: {"leader": "knee", "multiplier": -0.5, "offset": 0.25},
+    physx_sim.Weld: {"body_a": "hand", "position": (1.0, 0.5, 0.25)}
+    | {"orientation": BODY["orientation"]},
+    physx_sim.Connect: {"body_a": "hand", "point_a": (1.0, 0.5, 0.25), "point_b": (0.5, 2.0, 1.0)},
     physx_sim.Robot: {
         "urdf": "arm.urdf",
         "feet": {"foot": 0.25},
@@ -118,12 +122,22 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
 }
 # What physx returns, and what engines hold; users do not write these.
 RECORDS = {
-    *("Layout", "Part", "State", "AppliedWrench", "MotorState", "SensorState", "RobotInfo"),
+    *(
+        "Layout",
+        "Part",
+        "State",
+        "AppliedWrench",
+        "AppliedAttachment",
+        "MotorState",
+        "SensorState",
+        "RobotInfo",
+    ),
     *("UrdfShape", "Episode", "StepperState", "Result", "Trial", "Normalization"),
     *("CollisionShape", "Joint", "MovableBody", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
+    "Bond",
     *("Kind", "Format", "Table", "Section"),
 }
-ABSTRACT = {"Pipeline", "Sensor"}
+ABSTRACT = {"Attachment", "Pipeline", "Sensor"}
 
 FLOATS: dict[str, Callable[[float], Any]] = {
     "float32": np.float32,

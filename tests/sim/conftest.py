@@ -89,3 +89,11 @@ def example():
     if example_data_dir() is None:
         pytest.skip("example-robot-data is not installed")
     return example_robot
+
+
+@pytest.fixture(params=(*BACKENDS, "mujoco"))
+def engine(request):
+    """Each of the three engines."""
+    if request.param == "mujoco":
+        pytest.importorskip("mujoco")
+    return plugins.resolve("backend", request.param)

@@ -12,6 +12,8 @@ from physx_core.typing import Vector
 from physx_mujoco.robot import Running
 from physx_sim import Layout
 
+_STIFF = 1e6
+"""Inertia, in kg m² or kg, with which joints that follow others move together."""
 _MOST, _EXACT = 30, 1e-10
 """Maximum repetitions of a step, and the relative velocity error at which they end."""
 
@@ -59,6 +61,10 @@ class Drives:
         model, period = self._running.model, self._running.model.opt.timestep
         mass = np.diag(period * model.dof_damping)
         mass += np.diag(period**2 * model.jnt_stiffness[model.dof_jntid])
+        for place in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
+            pair = model.jnt_dofadr[[model.eq_obj1id[place], model.eq_obj2id[place]]]
+            row = np.array([1.0, -model.eq_data[place, 1]])
+            mass[np.ix_(pair, pair)] += _STIFF * np.outer(row, row)
         plain = np.zeros_like(mass)
         mujoco.mj_fullM(model, self._running.data, plain)
         found: Vector = np.linalg.inv(plain + mass)[np.ix_(self._places, self._places)]

@@ -14,7 +14,7 @@ import numpy as np
 
 from physx_core.rotations import to_matrix
 from physx_core.typing import Index, Vector
-from physx_sim import Ground, HeightField, Stairs
+from physx_sim import Ground, HeightField, Mimic, Stairs
 from physx_sim.engines import (
     CollisionShape,
     Joint,
@@ -40,6 +40,8 @@ _ALL, _STATIC, _MOVING, _OWN = (1 << 31) - 1, 1, 2, 2
 """Bits of MuJoCo's collision masks: static, moving and, from `_OWN` on, one for each robot."""
 _STEPS, _DAMPING, _IMPEDANCE = 2.0, 2.0, (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Time constant in steps, damping ratio, and impedance of the nearly rigid constraints."""
+_SPARE = 16
+"""Number of attachments that a world can get at a time in addition to those that it starts with."""
 _DEEP = 10.0
 """Depth of a height field below its lowest point, in m."""
 
@@ -52,11 +54,13 @@ class WorldModel:
         model: MuJoCo's model.
         bodies: The model's body for each link and object, in the order of `Layout.bodies`.
         owners: For each shape of the model, the index of its owner in `Layout.names`.
+        spare: Equality constraints for attachments.
     """
 
     model: Any
     bodies: Index
     owners: Index
+    spare: range
 
 
 class ModelBuilder:
@@ -82,6 +86,11 @@ class ModelBuilder:
         if self._parts.world.contacts != "none":
             for place, static in enumerate(self._parts.statics):
                 self._add_static(static, count + place)
+        coupled, spare = len(self._spec.equalities), len(self._parts.attachments) + _SPARE
+        for _ in range(spare):
+            kind, body = mujoco.mjtEq.mjEQ_WELD, mujoco.mjtObj.mjOBJ_BODY
+            added = self._spec.add_equality(type=kind, objtype=body, name1="0", name2="world")
+            added.active, added.solref, added.solimp = False, *self._hard.values()
         try:
             model = self._spec.compile()
         except ValueError as error:
@@ -97,7 +106,7 @@ class ModelBuilder:
             last = first + len(movable.model.links)
             check_loaded("mujoco", movable, _loaded(model, movable, bodies[first:last]))
             first = last
-        return WorldModel(model, bodies, owners)
+        return WorldModel(model, bodies, owners, range(coupled, coupled + spare))
 
     # Robots and objects ---------------------------------------------------------------------
 
@@ -114,12 +123,15 @@ class ModelBuilder:
                 pose, parent = body.pose, added[body.parent]
                 new = self._add_body(parent, body, pose[:3, 3], pose[:3, :3])
             if body.joint is not None:
-                self._add_joint(new, body.joint, body.axis)
+                self._add_joint(new, body.joint, body.axis, f"{place} {body.joint.name}")
                 if (
                     body.parent == 0 and movable.fixed_base
                 ):  # else it collides with its fixed parent
                     self._spec.add_exclude(bodyname1=new.parent.name, bodyname2=new.name)
             added.append(new)
+        for follower, leader, mimic in movable.model.followers:
+            names = (f"{place} {movable.model.joints[each].name}" for each in (follower, leader))
+            self._couple(mimic, *names)
         masks = self._masks(place, movable)
         for shape in movable.model.shapes:
             link = 0 if movable.is_object else movable.model.links.index(shape.body)
@@ -127,18 +139,26 @@ class ModelBuilder:
 
     def _add_body(self, parent: Any, body: RigidBody, position: Vector, turn: Vector) -> Any:
         """Add a link; its mass, which may be 0, and its moments of inertia are set later."""
-        new = parent.add_body(name=str(len(self._moments)), pos=position, quat=_quaternion(turn))
+        new = parent.add_body(name=str(len(self._moments)), pos=position, quat=quaternion_of(turn))
         moments, axes = np.linalg.eigh(body.inertia)
         axes[:, 2] *= np.linalg.det(axes)  # a rotation, not a reflection
         new.explicitinertial, new.mass, new.inertia = True, 1.0, (1.0, 1.0, 1.0)
-        new.ipos, new.iquat = body.center, _quaternion(axes)
+        new.ipos, new.iquat = body.center, quaternion_of(axes)
         self._masses.append(body.mass)
         self._moments.append(moments)
         return new
 
-    def _add_joint(self, new: Any, joint: Joint, axis: Vector) -> None:
+    def _couple(self, mimic: Mimic, follower: str, leader: str) -> None:
+        """Make a joint follow another, given their names in the model."""
+        kind = mujoco.mjtEq.mjEQ_JOINT
+        added = self._spec.add_equality(type=kind, name1=follower, name2=leader)
+        added.data[:5] = mimic.offset, mimic.multiplier, 0.0, 0.0, 0.0
+        added.solref, added.solimp = self._hard.values()
+
+    def _add_joint(self, new: Any, joint: Joint, axis: Vector, name: str) -> None:
         kind = mujoco.mjtJoint
         added = new.add_joint(axis=axis, frictionloss=joint.friction, armature=joint.armature)
+        added.name = name
         added.type = kind.mjJNT_SLIDE if joint.unit == "m" else kind.mjJNT_HINGE
         added.damping, added.springref = (joint.damping, 0.0, 0.0), joint.rest
         added.stiffness = (joint.stiffness, 0.0, 0.0)
@@ -166,7 +186,7 @@ class ModelBuilder:
         what, world = static.what, self._spec.worldbody
         more: dict[str, Any] = {"contype": _STATIC | _MOVING, "conaffinity": 0}
         if isinstance(what, CollisionShape):
-            turn = _quaternion(to_matrix(static.orientation))
+            turn = quaternion_of(to_matrix(static.orientation))
             frame = world.add_frame(pos=static.position, quat=turn)
             self._add_shape(world, what, owner, **more).set_frame(frame)
         elif isinstance(what, HeightField):
@@ -193,7 +213,7 @@ class ModelBuilder:
         self._add_geom(self._spec.worldbody, kind, owner, field.friction, **more)
 
     def _add_shape(self, body: Any, shape: CollisionShape, owner: int, **more: Any) -> Any:
-        more |= {"pos": shape.position, "quat": _quaternion(shape.rotation)}
+        more |= {"pos": shape.position, "quat": quaternion_of(shape.rotation)}
         if shape.mesh is not None:
             more["meshname"] = f"mesh {len(self._owners)}"
             vertices = read_vertices(shape.mesh, shape.size)
@@ -239,7 +259,7 @@ def _matrices(positions: Vector, quaternions: Vector) -> Vector:
     return found
 
 
-def _quaternion(rotation: Vector) -> Vector:
+def quaternion_of(rotation: Vector) -> Vector:
     """Return the quaternion w, x, y, z of a rotation matrix."""
     found = np.zeros(4)
     mujoco.mju_mat2Quat(found, rotation.ravel())

@@ -14,12 +14,13 @@ from physx_core.errors import UnknownOptionError
 from physx_core.typing import Records
 from physx_mujoco.algorithms import MujocoAlgorithms
 from physx_mujoco.drives import Drives
-from physx_mujoco.model import ModelBuilder, WorldModel
+from physx_mujoco.model import ModelBuilder, WorldModel, quaternion_of
 from physx_mujoco.robot import MujocoRobot, Running
 from physx_sim import CONTACT, FEATURES, Simulation, World
 from physx_sim.engines import (
     RK4_LACKS,
     Algorithms,
+    Bond,
     Parts,
     RobotBackend,
     RobotSimulation,
@@ -75,6 +76,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         _set_options(model, world)
         data = mujoco.MjData(model)
         self._running = Running(model, data, data.qpos.copy(), data.qvel.copy())
+        self._bound: dict[int, int] = {}
         layout = layout_of(parts)
         robots = [
             MujocoRobot(movable, part, self._world.bodies[part.bodies], self._running)
@@ -120,6 +122,37 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         else:
             for _ in range(n):
                 self._drives.step()
+
+    def bind(self, number: int, bond: Bond) -> None:
+        """Hold two bodies together until `unbind`.
+
+        Raises:
+            SimulationError: If too many bodies are attached while it runs.
+        """
+        model, data = self._running.model, self._running.data
+        free = [spare for spare in self._world.spare if spare not in self._bound.values()]
+        if not free:
+            raise SimulationError(
+                f"MuJoCo holds at most {len(self._world.spare)} attachments in this world; detach "
+                "some, or build it with more of them."
+            )
+        self._bound[number] = place = free[0]
+        first, second = (self._world.bodies[body] if body >= 0 else 0 for body in bond.bodies)
+        model.eq_obj1id[place], model.eq_obj2id[place] = first, second
+        frames, found = bond.frames, np.zeros(model.eq_data.shape[1])
+        if bond.rigid:
+            turn = frames[0][:3, :3] @ frames[1][:3, :3].T
+            found[:3], found[3:6] = frames[1][:3, 3], frames[0][:3, 3]
+            found[6:10], found[10] = quaternion_of(turn), 1.0
+        else:
+            found[:3], found[3:6] = frames[0][:3, 3], frames[1][:3, 3]
+        kinds = mujoco.mjtEq
+        model.eq_type[place] = kinds.mjEQ_WELD if bond.rigid else kinds.mjEQ_CONNECT
+        model.eq_data[place], data.eq_active[place] = found, True
+
+    def unbind(self, number: int) -> None:
+        """Stop holding two bodies together."""
+        self._running.data.eq_active[self._bound.pop(number)] = False
 
     def clear_warm_start(self) -> None:
         """Make the state alone determine what follows."""

@@ -4,6 +4,9 @@ from .backend import Backend as Backend
 from .backend import Hook as Hook
 from .backend import RobotInfo as RobotInfo
 from .backend import Simulation as Simulation
+from .description.attachment import Attachment as Attachment
+from .description.attachment import Connect as Connect
+from .description.attachment import Weld as Weld
 from .description.ground import Ground as Ground
 from .description.ground import HeightField as HeightField
 from .description.ground import Stairs as Stairs
@@ -14,6 +17,7 @@ from .description.objects import Mesh as Mesh
 from .description.objects import Sphere as Sphere
 from .description.objects import WorldObject as WorldObject
 from .description.robot import JointSettings as JointSettings
+from .description.robot import Mimic as Mimic
 from .description.robot import Robot as Robot
 from .description.world import World as World
 from .description.wrench import Wrench as Wrench
@@ -22,6 +26,7 @@ from .engines.models.mjcf import mjcf_robots as mjcf_robots
 from .features import FEATURES as FEATURES
 from .layout import CONTACT as CONTACT
 from .layout import RAY_HIT as RAY_HIT
+from .layout import AppliedAttachment as AppliedAttachment
 from .layout import AppliedWrench as AppliedWrench
 from .layout import Layout as Layout
 from .layout import Part as Part

@@ -14,6 +14,7 @@ import numpy as np
 
 from physx_core import Closeable
 from physx_core.typing import Records, Vector
+from physx_sim.description.attachment import Attachment
 from physx_sim.description.world import World
 from physx_sim.description.wrench import Wrench
 from physx_sim.errors import FeatureNotSupportedError
@@ -169,6 +170,25 @@ class Simulation(Closeable):
             SimulationError: If no wrench with that number is active.
         """
         raise self._lacks("wrenches")
+
+    def attach(self, attachment: Attachment) -> int:
+        """Hold two bodies together from now on; return the attachment's number for `detach`.
+
+        What the attachment leaves open is where the bodies are now. Bodies that are elsewhere than
+        it says are pulled there within some steps.
+
+        Raises:
+            SimulationError: If there is no body with one of the names, or neither can move.
+        """
+        raise self._lacks("attachments")
+
+    def detach(self, number: int) -> None:
+        """End an attachment. Those of a world and of its robots have the first numbers, from 0.
+
+        Raises:
+            SimulationError: If no attachment with that number is active.
+        """
+        raise self._lacks("attachments")
 
     # State ----------------------------------------------------------------------------------
 
@@ -326,9 +346,10 @@ class Simulation(Closeable):
     def forward_dynamics(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
         """Return the accelerations, shape (nv,), caused by torques (nv,) in a state.
 
-        Joint damping, springs, and Coulomb friction are included; contacts and limits are not. All
-        joints are driven by torques here, regardless of their mode. Accelerations are the time
-        derivatives of the velocities, so those of a base are in its own frame.
+        Joint damping, springs, and Coulomb friction are included; contacts, limits, attachments,
+        and what makes joints follow others are not. All joints are driven by torques here,
+        regardless of their mode. Accelerations are the time derivatives of the velocities, so those
+        of a base are in its own frame.
         """
 
     @abstractmethod

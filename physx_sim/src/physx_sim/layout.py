@@ -15,6 +15,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from physx_core.typing import Vector
+from physx_sim.description.attachment import Attachment
 from physx_sim.description.wrench import Wrench
 
 CONTACT = np.dtype(
@@ -134,6 +135,19 @@ class AppliedWrench:
 
 
 @dataclass(frozen=True)
+class AppliedAttachment:
+    """An attachment that holds bodies of a world together.
+
+    Attributes:
+        number: Its number for `Simulation.detach`.
+        attachment: The attachment; what was left to the moment of attaching is filled in.
+    """
+
+    number: int
+    attachment: Attachment
+
+
+@dataclass(frozen=True)
 class State:
     """A snapshot of a simulation; plain and picklable.
 
@@ -145,6 +159,7 @@ class State:
         wrenches: Active wrenches.
         engine: Name of the engine that it was taken from.
         native: The engine's own representation of its state.
+        attachments: Active attachments.
     """
 
     positions: Vector
@@ -154,3 +169,4 @@ class State:
     wrenches: tuple[AppliedWrench, ...] = ()
     engine: str = ""
     native: tuple[Vector, ...] = ()
+    attachments: tuple[AppliedAttachment, ...] = ()

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from physx_sim import Ground, JointSettings, Robot, Sphere, World, Wrench
-from physx_sim.errors import FeatureNotSupportedError, SimulationError
+from physx_sim.errors import SimulationError
 
 BALL = Sphere(name="ball", radius=0.1, mass=2.0)
 CALM = {"gravity": (0.0, 0.0, 0.0)}
@@ -219,17 +219,14 @@ def test_springs_are_implicit_and_stable(backend, bar):
         np.testing.assert_allclose(simulation.inverse_dynamics([0.3], [0.5], a), [0.2], atol=1e-9)
 
 
-def test_armature_is_a_feature_of_pinocchio(dart, pinocchio, bar):
+@pytest.mark.filterwarnings("ignore:.*armature")
+def test_armature_is_inertia(backend, bar):
     robot = bar(joints={"hinge": JointSettings(armature=0.4)})
-    with pinocchio.build(World([robot], **CALM)) as simulation:
+    with backend.build(World([robot], **CALM)) as simulation:
         np.testing.assert_allclose(simulation.mass_matrix([0.0]), [[1.0]], rtol=1e-8)
         simulation.set_torques([2.0])
         simulation.step(10)
         np.testing.assert_allclose(simulation.velocities(), [0.02], rtol=1e-8)
-    with pytest.raises(FeatureNotSupportedError, match="armature") as caught:
-        dart.build(World([robot]))
-    assert caught.value.engine == "dart"
-    assert "raycast" in caught.value.features
 
 
 # Bodies -----------------------------------------------------------------------------------------

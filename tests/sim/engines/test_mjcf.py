@@ -309,3 +309,52 @@ def test_what_is_wrong_with_a_file_is_said(tmp_path, text, options, said):
     with pytest.raises(ModelError, match=said) as caught:
         plugins.resolve("backend", "mujoco").build(World([Robot(path, **options)]))
     assert "wrong.xml" in str(caught.value)
+
+
+NAMES = "abetcd"
+EQUALITIES = """
+<mujoco><compiler angle="radian"/><option timestep="0.001"/><worldbody>
+  <body name="a"><joint name="ja" axis="0 1 0" ref="0.2"/>
+    <geom type="capsule" size="0.02 0.1" pos="0 0 0.1" mass="1"/>
+    <body name="b" pos="0.4 0 0.2"><joint name="jb" axis="0 1 0"/>
+      <geom type="capsule" size="0.02 0.1" pos="0 0 -0.1" mass="1"/>
+      <body name="e" pos="0 0 -0.2"><joint name="je" axis="0 1 0"/>
+        <geom size="0.03" pos="0.4 0 0" mass="0.3"/>
+        <body name="t" pos="0.4 0 0"><joint name="jt" axis="0 1 0"/>
+          <geom size="0.03" mass="0.3"/></body></body>
+    </body></body>
+  <body name="c" pos="0 0.5 0"><joint name="jc" axis="0 1 0" ref="0.1"/>
+    <geom size="0.05" pos="0.2 0 0" mass="1"/></body>
+  <body name="d" pos="0 -0.5 0"><joint name="jd" axis="0 1 0"/>
+    <geom size="0.05" pos="0.2 0 0" mass="1"/></body>
+</worldbody><equality>
+  <connect body1="e" body2="world" anchor="0.4 0 0"/>
+  <weld body1="t" body2="e"/>
+  <joint joint1="jc" joint2="ja" polycoef="0.05 -0.5 0 0 0"/>
+  <joint joint1="jd" polycoef="0 0 0 0 0"/>
+  <connect body1="c" body2="a" anchor="0 0 0" active="false"/>
+</equality></mujoco>
+"""
+
+
+@pytest.mark.filterwarnings("ignore:.*leaves out")
+def test_equality_constraints_hold_as_in_mujoco(engine, tmp_path):
+    mujoco = pytest.importorskip("mujoco")
+    path = tmp_path / "equalities.xml"
+    path.write_text(EQUALITIES)
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    for _ in range(200):
+        mujoco.mj_step(model, data)
+    world = World([Robot(path, collisions="none")])
+    with engine.build(world) as simulation:
+        places = [simulation.layout.joints.index(f"j{name}") for name in NAMES]
+        q = np.zeros(6)
+        q[places] = model.qpos0[[model.joint(f"j{name}").qposadr[0] for name in NAMES]]
+        simulation.set_state(q, np.zeros(6))
+        simulation.step(200)
+        ours = simulation.positions()[places]
+        theirs = data.qpos[[model.joint(f"j{name}").qposadr[0] for name in NAMES]]
+        np.testing.assert_allclose(ours[:5], theirs[:5], atol=3e-3)
+    said = " ".join(read_robot(world.robots[0]).warnings)
+    assert "equality constraints (2:" in said

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from physx_sim import JointSettings, Motor, Motors, Robot, World, with_rotors
-from physx_sim.errors import FeatureNotSupportedError
 
 INERTIA = 0.6 + 1e-9
 PERIOD = 1e-3
@@ -55,21 +54,18 @@ def test_viscous_friction_and_reduction_give_the_steady_speed(backend, bar):
             np.testing.assert_allclose(motors.torques, 0, atol=1e-7)
 
 
-def test_rigid_rotors_are_part_of_the_mass(pinocchio, dart, bar):
+@pytest.mark.filterwarnings("ignore:.*armature")
+def test_rigid_rotors_are_part_of_the_mass(backend, bar):
     world = floating(bar(joints={"hinge": JointSettings(damping=0.5)}))
     motor = Motor(joint="hinge", inertia=2e-3, reduction=10)
     geared = with_rotors(world, [motor])
     assert geared.robots[0].joints["hinge"] == JointSettings(damping=0.5, armature=2e-3 * 100)
-    with pinocchio.build(with_rotors(floating(bar()), [motor])) as simulation:
+    with backend.build(with_rotors(floating(bar()), [motor])) as simulation:
         motors = Motors(simulation, geared, [motor]).attach(simulation)
         motors.set_commands([0.4])
         simulation.step(500)
         exact = 0.5 * 0.4 * 10 / (INERTIA + 0.2)
         np.testing.assert_allclose(simulation.velocities(), exact, rtol=1e-7)
-    with pytest.raises(FeatureNotSupportedError, match="armature"):
-        dart.build(geared)
-    with dart.build(world) as simulation, pytest.raises(FeatureNotSupportedError, match="stiffn"):
-        Motors(simulation, world, [motor])
 
 
 def elastic(**options):

@@ -137,7 +137,7 @@ def test_a_mesh_is_found_where_a_person_finds_it(tmp_path, place):
 
 def test_habits_of_files_are_accepted_with_a_warning(backend, write_urdf):
     limits = '<limit lower="1" upper="0" effort="1" velocity="1"/>'
-    mimic = '<mimic joint="a" multiplier="-1"/>'
+    mimic = '<mimic joint="a" multiplier="0"/>'
     text = robot(
         *(LINK.format(name) for name in ("base", "left", "right")),
         JOINT.format("a", "revolute", "base", "left", limits),
@@ -145,9 +145,9 @@ def test_habits_of_files_are_accepted_with_a_warning(backend, write_urdf):
     )
     path = write_urdf(f'\n <?xml version="1.0"?>{text}')
     said = " ".join(read_robot(Robot(path)).warnings)
-    assert "so there is none: joints a" in said and "(mimic) move freely: b" in said
+    assert "so there is none: joints a" in said and "multiplier 0 move freely: b" in said
     with (
-        pytest.warns(UserWarning, match="above the upper|mimic"),
+        pytest.warns(UserWarning, match="above the upper|follow others"),
         backend.build(World([Robot(path, type(backend).__name__)])) as simulation,
     ):
         assert np.isinf(simulation.layout.lower).all()

@@ -75,7 +75,6 @@ def test_installed_robots_are_in_the_catalog(backend, example):
     assert found["go2/go2"].warnings[0].startswith("slow: 19 collision meshes")
     assert found["human/human"].collisions == "none"
     assert "LHand" in found["romeo/romeo"].warnings[1]  # whose fingers have no inertia
-    assert "mimic" in found["romeo/romeo"].warnings[-1]
     assert "principal moments of inertia" in found["romeo/romeo_laas_small"].error
     assert "has no link" in found["ur/ur3"].error
     assert {"anymal_b_simple/anymal", "anymal_c_simple/anymal"} < set(found)

@@ -7,15 +7,16 @@ position and velocity limits, servos, and Coulomb friction are constraints of it
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import dartpy
 import numpy as np
 from dartpy import constraint
 from dartpy.simulation import CollisionDetectorType
 
-from physx_core.errors import UnknownOptionError
+from physx_core.errors import UnknownOptionError, listed
 from physx_core.typing import Records, Vector
+from physx_dart.dart.bonds import bonded
 from physx_dart.dart.contacts import ContactReader
 from physx_dart.dart.loading import attach_shapes, static_skeleton
 from physx_dart.dart.skeleton import DartRobot
@@ -23,13 +24,14 @@ from physx_sim import FEATURES, Simulation, World, finite_rows
 from physx_sim.engines import (
     RK4_LACKS,
     Algorithms,
+    Bond,
     CollisionShape,
     Parts,
     RobotBackend,
     RobotSimulation,
     check_rk4,
     read_parts,
-    without_armature,
+    warn_once,
 )
 from physx_sim.errors import FeatureNotSupportedError, SimulationError
 
@@ -75,7 +77,6 @@ class DartSimulation(RobotSimulation[DartRobot]):
     """A world in DART."""
 
     engine = "dart"
-    lacks: ClassVar[frozenset[str]] = frozenset({"armature"})
 
     def __init__(self, world: World) -> None:
         """Build the world; raises the same errors as the backend's `build`."""
@@ -85,7 +86,8 @@ class DartSimulation(RobotSimulation[DartRobot]):
         ):
             if name is not None and name not in known:
                 raise UnknownOptionError(f"World.{option} for dart", [name], known)
-        parts = without_armature(read_parts(world), self.engine)
+        parts = read_parts(world)
+        _warn_of_rotors(parts)
         touching = any(movable.model.shapes for movable in parts.movables)
         solver = world.solver or ("nsgs" if touching else "dantzig")
         detector = world.detector or ("dart" if solver == "dantzig" else "bullet")
@@ -96,11 +98,13 @@ class DartSimulation(RobotSimulation[DartRobot]):
         self._rk4 = world.integrator == "rk4"
         robots = [self._add(parts, place) for place in range(len(parts.movables))]
         statics = [] if world.contacts == "none" else parts.statics
+        self._prepared = [robot for robot in robots if robot.prepares]
         self._statics = [static_skeleton(static) for static in statics]
         for skeleton in self._statics:
             self._world.addSkeleton(skeleton)
         bodies = [body for robot in robots for body in robot.bodies]
         bodies += [skeleton.getBodyNode(0) for skeleton in self._statics]
+        self._nodes, self._bonds = bodies, dict[int, tuple[Bond, Any]]()
         immobile = [[each.getBodyNode(0)] for each in self._statics]
         immobile += [robot.bodies for robot in robots if not robot.movable.moves]
         _disable_contacts(self._world, immobile)
@@ -120,9 +124,6 @@ class DartSimulation(RobotSimulation[DartRobot]):
         features = frozenset(FEATURES) - self.lacks
         if parts.world.integrator == "rk4":
             check_rk4(parts, self.engine, features)
-        settings = [each for robot in parts.world.robots for each in robot.joints.values()]
-        if any(each.armature for each in settings):
-            raise FeatureNotSupportedError(self.engine, "armature", features)
         shapes = [shape for each in parts.movables for shape in each.model.shapes]
         shapes += [each.what for each in parts.statics if isinstance(each.what, CollisionShape)]
         if detector == "fcl" and any(shape.kind == "capsule" for shape in shapes):
@@ -131,7 +132,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
 
     def _add(self, parts: Parts, place: int) -> DartRobot:
         movable = parts.movables[place]
-        robot = DartRobot(movable, parts.world.gravity)
+        robot = DartRobot(movable, parts.world)
         if parts.world.contacts != "none":
             attach_shapes(robot.skeleton, movable)
         if movable.self_collisions and movable.moves and parts.world.contacts == "all":
@@ -153,14 +154,33 @@ class DartSimulation(RobotSimulation[DartRobot]):
             return
         self._kept, step = None, self._step_world
         for _ in range(n):
+            for robot in self._prepared:
+                robot.prepare()
             step(False)
+
+    def bind(self, number: int, bond: Bond) -> None:
+        """Hold two bodies together until `unbind`."""
+        nodes = [self._nodes[body] if body >= 0 else None for body in bond.bodies]
+        held = bonded(nodes, bond)
+        self._bonds[number] = bond, held
+        self._world.getConstraintSolver().addConstraint(held)
+
+    def unbind(self, number: int) -> None:
+        """Stop holding two bodies together."""
+        self._world.getConstraintSolver().removeConstraint(self._bonds.pop(number)[1])
 
     def clear_warm_start(self) -> None:
         """Make the state alone determine what follows.
 
         Iterative solvers start from the impulses of the last step, and some detectors from its
-        contacts. DART keeps them as long as its solver holds the same skeletons.
+        contacts. DART keeps them as long as its solver holds the same skeletons. So do constraints
+        between bodies.
         """
+        for robot in self._robots:
+            robot.clear_warm_start()
+        for number, (bond, _) in list(self._bonds.items()):
+            self.unbind(number)
+            self.bind(number, bond)
         if self._stateless:
             return
         if self._stepped:
@@ -204,6 +224,19 @@ class DartSimulation(RobotSimulation[DartRobot]):
         if not self._closed:
             super().close()
             del self._step_world, self._reader, self._statics, self._world
+            del self._nodes, self._bonds, self._prepared
+
+
+def _warn_of_rotors(parts: Parts) -> None:
+    """Warn once for each robot whose rotors DART's impulses do not know."""
+    for movable in parts.movables:
+        names = [joint.name for joint in movable.model.joints if joint.armature]
+        if names:
+            warn_once(
+                f'Robot "{movable.name}", {movable.model.path}: in DART, impulses of contacts, '
+                f"limits and servos do not know the armature of the joints {listed(names)}: the "
+                "more of their inertia it is, the weaker they are."
+            )
 
 
 def _new_world(world: World, detector: str, solver: str) -> Any:

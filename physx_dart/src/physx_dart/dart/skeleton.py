@@ -16,7 +16,9 @@ from physx_core.rotations import (
     to_rotation_vector,
 )
 from physx_core.typing import Vector
+from physx_dart.dart.drives import Drives
 from physx_dart.dart.loading import load_skeleton
+from physx_sim import World
 from physx_sim.engines import MovableBody, RobotEngine, base_accelerations, rk4_step
 
 
@@ -26,13 +28,18 @@ class DartRobot(RobotEngine):
     Attributes:
         skeleton: The simulated skeleton.
         bodies: Its body for each link.
+        prepares: Whether `prepare` must be called before each step.
     """
 
-    def __init__(self, movable: MovableBody, gravity: tuple[float, ...]) -> None:
+    def __init__(self, movable: MovableBody, world: World) -> None:
         super().__init__(movable)
+        period, gravity = world.period, world.gravity
+        self._period = period
         self.skeleton = load_skeleton(movable)
         self._gravity = gravity
         self._made_shadow: Any = None
+        self._drives = Drives(self.model, self.skeleton, period)
+        self.prepares = self._drives.acts
         self.bodies = list(self.skeleton.getBodyNodes())
         self._held, self._commands = np.zeros(self.nv), np.zeros(self.nv - self.base)
         self._pushes: list[tuple[int, Vector, Vector, Vector, bool]] = []
@@ -47,6 +54,18 @@ class DartRobot(RobotEngine):
             commands = self._held
         if self.nv > self.base:
             self.skeleton.setCommands(commands)
+
+    def prepare(self) -> None:
+        """Write what DART is told anew before each step."""
+        if self._drives.outer:
+            self.skeleton.clearExternalForces()
+            for link, force, torque, point, local in self._pushes:
+                _push(self.bodies[link], force, torque, point, local)
+        self._drives.write(self._commands)
+
+    def clear_warm_start(self) -> None:
+        """Make the state alone determine what follows."""
+        self._drives.forget()
 
     def _read(self) -> None:
         """Read the state from DART; must be called after each change."""
@@ -178,6 +197,10 @@ class DartRobot(RobotEngine):
         if self._made_shadow is None:
             self._made_shadow = load_skeleton(self.movable, free=True)
             self._made_shadow.setGravity(list(self._gravity))
+            self._made_shadow.setTimeStep(self._period)
+            for dof, armature in enumerate(self.resistance.armature):
+                if armature:  # as in `Drives`
+                    self._made_shadow.getDof(dof).setDampingCoefficient(armature / self._period)
         return self._made_shadow
 
     def forward(
@@ -196,6 +219,7 @@ class DartRobot(RobotEngine):
         for link, force, torque, point, local in self._pushes if pushed else ():
             _push(self._shadow.getBodyNode(link), force, torque, point, local)
         forces = torques - self.resistance.torques(positions, velocities)
+        forces += self.resistance.armature / self._period * velocities
         if rotation is not None:
             forces = np.concatenate([rotation @ forces[3:6], rotation @ forces[:3], forces[6:]])
         self._shadow.setForces(forces)
@@ -218,6 +242,7 @@ class DartRobot(RobotEngine):
         forces = self._shadow.getForces()
         if rotation is not None:
             forces = np.concatenate([forces[3:6] @ rotation, forces[:3] @ rotation, forces[6:]])
+        forces += self.resistance.armature * accelerations
         return forces + self.resistance.torques(positions, velocities)
 
     def _place(self, skeleton: Any, positions: Vector, velocities: Vector) -> Vector | None:

@@ -17,7 +17,7 @@ from physx_core.components import Environment
 from physx_core.errors import ConfigError, UnknownOptionError
 from physx_core.typing import Sample, Vector
 from physx_dart.environments.trajectories import SmoothTrajectory
-from physx_sim import Robot, Simulation, World
+from physx_sim import JointSettings, Mimic, Robot, Simulation, World
 from physx_sim.engines import EXAMPLE_DATA, example_data_dir, example_robot
 
 _ARM = "panda_description/urdf/panda.urdf"
@@ -126,7 +126,9 @@ class ArmEnvironment(Environment):
         Raises:
             ModelError: If the package ``example-robot-data`` is not installed.
         """
-        self._robot = Robot(example_robot(_ARM), "arm", package_dirs=_package_dirs())
+        free = {"panda_finger_joint2": JointSettings(mimic=Mimic(""))}  # each has its own torque
+        path, folders = example_robot(_ARM), _package_dirs()
+        self._robot = Robot(path, "arm", package_dirs=folders, joints=free)
         world = World([self._robot], period=self.period)
         self.simulation: Simulation = plugins.resolve("backend", self.backend).build(world)
 

@@ -135,6 +135,7 @@ def constrained(
     solver: ImpulseSolver,
     pairs: ContactPoints | None = None,
     warm: Vector | None = None,
+    ties: tuple[Vector, Vector] | None = None,
 ) -> tuple[Vector, Vector]:
     """Return the velocities after the impulses of all constraints, and the impulses of pairs.
 
@@ -146,6 +147,7 @@ def constrained(
         solver: The solver.
         pairs: Contact points between them or with static shapes, k of them.
         warm: Impulses of these points to start with, shape (k, 3).
+        ties: Jacobian (m, nv) of what is held together, and the velocities along its rows (m,).
     """
     ends = itertools.accumulate((part.nv for part in parts), initial=0)
     spans = [slice(*pair) for pair in itertools.pairwise(ends)]
@@ -156,9 +158,10 @@ def constrained(
         if part.touching is not None:
             touching.append(part.touching.widened(span, len(v)))
         guess.append(part.last())
-    points = joined([each.jacobian for each in touching])
-    bias = joined([each.bias(before, period) for each in touching])
-    friction = joined([each.friction for each in touching])
+    held, pace = (np.zeros((0, len(v))), np.zeros(0)) if ties is None else ties
+    points = joined([each.jacobian for each in touching]) if touching else held[:0]
+    bias = joined([each.bias(before, period) for each in touching]) if touching else pace[:0]
+    friction = joined([each.friction for each in touching]) if touching else pace[:0]
     of_parts = zip(*(part.rows() for part in parts), strict=True)
     columns, least, most, aims, last = (joined(each) for each in of_parts)
     if len(parts) > 1:
@@ -170,23 +173,23 @@ def constrained(
         if len(parts) > 1:  # the solver expects rows with one bound first
             two_sided = np.isinf(least[rows]) == np.isinf(most[rows])
             rows = rows[np.argsort(two_sided, kind="stable")]
-        jacobian = np.concatenate([points, unit(len(v)).take(columns[rows], 0)])
+        jacobian = np.concatenate([points, unit(len(v)).take(columns[rows], 0), held])
         spread = inverse.dot(jacobian.T)
-        impulses = solver.solve(
-            jacobian.dot(spread),
-            jacobian.dot(v) + np.concatenate([bias, -aims[rows]]),
-            friction,
-            least[rows],
-            most[rows],
-            np.concatenate([*guess, last[rows]]),
-        )
+        response, gaps = jacobian.dot(spread), np.concatenate([bias, -aims[rows], -pace])
+        low = np.concatenate([least[rows], np.full(len(pace), -np.inf)])
+        high = np.concatenate([most[rows], np.full(len(pace), np.inf)])
+        if len(bias):
+            begin = np.concatenate([*guess, last[rows], np.zeros(len(pace))])
+            impulses = solver.solve(response, jacobian.dot(v) + gaps, friction, low, high, begin)
+        else:
+            impulses = solve(response, -jacobian.dot(v) - gaps, low, high)
         after = v + spread.dot(impulses)
         missed = False
         for part, span in zip(parts, spans, strict=True):
             missed |= part.add_missed(after[span])
     of_rows = np.zeros(len(columns))
-    of_rows[rows] = impulses[len(bias) :]
-    of_pairs, *of_points = np.split(impulses, np.cumsum([len(each) for each in guess]))
+    of_rows[rows] = impulses[len(bias) : len(bias) + len(rows)]
+    of_pairs, *of_points = np.split(impulses[: len(bias)], np.cumsum([len(each) for each in guess]))
     of_joints = np.split(of_rows, np.cumsum([len(part.acts) for part in parts]))
     for part, *own in zip(parts, of_points, of_joints, strict=False):
         part.keep(*own)

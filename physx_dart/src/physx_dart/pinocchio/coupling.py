@@ -1,4 +1,4 @@
-"""Stepping of robots and objects that may touch each other or static shapes."""
+"""Stepping of robots and objects that touch, or are held together."""
 
 from __future__ import annotations
 
@@ -11,12 +11,13 @@ from physx_dart.pinocchio.constraints import constrained
 from physx_dart.pinocchio.pairs import PairFinder, PairPoints
 from physx_dart.pinocchio.robot import PinocchioRobot
 from physx_dart.pinocchio.solver import ImpulseSolver
+from physx_dart.pinocchio.ties import Ties
 from physx_sim import CONTACT
 from physx_sim.engines import Parts
 
 
 class Coupling:
-    """Steps robots whose shapes may touch other shapes; those that touch are solved together."""
+    """Steps robots that touch each other's shapes or are held together, those that do as one."""
 
     def __init__(
         self,
@@ -30,12 +31,13 @@ class Coupling:
         self._finder = PairFinder(parts, robots, features)
         self._touching: PairPoints | None = None
         self._impulses = np.zeros((0, 3))
+        self.ties = Ties(robots, self._period)
         # Impulses of pairs in the last step, in the world frame, which warm-start the next one.
         self._warmth = np.zeros((len(self._finder), 3))
 
     def __bool__(self) -> bool:
-        """Return whether any pair of shapes may touch."""
-        return len(self._finder) > 0
+        """Return whether any pair of shapes may touch, or anything is held together."""
+        return len(self._finder) > 0 or bool(self.ties)
 
     def clear_warm_start(self) -> None:
         """Discard the impulses of the last step."""
@@ -44,20 +46,30 @@ class Coupling:
     def step(self) -> None:
         """Simulate one step of all robots."""
         free = [robot.free_velocities() for robot in self._robots]
-        self._touching = touching = self._finder.find(free, self._period)
-        coupled = [] if touching is None else sorted(touching.robots)
+        touching = self._finder.find(free, self._period) if len(self._finder) else None
+        self._touching = touching
+        coupled = sorted(self.ties.robots | (set() if touching is None else touching.robots))
         for place, robot in enumerate(self._robots):
             if place not in coupled:
                 robot.finish(robot.constrained(free[place]))
-        if touching is None:
+        if not coupled:
             self.clear_warm_start()
             return
         group = [self._robots[place] for place in coupled]
-        contacts = touching.contacts
-        wide = [contacts.jacobian[:, self._finder.columns[place]] for place in coupled]
-        contacts.jacobian = np.concatenate(wide, axis=1)
-        share = self._warmth[touching.pairs] / np.bincount(touching.pairs)[touching.pairs, None]
-        parts = [self._robots[place].constraints(free[place], touched=True) for place in coupled]
+        contacts, warm = None, None
+        if touching is not None:
+            contacts = touching.contacts
+            wide = [contacts.jacobian[:, self._finder.columns[place]] for place in coupled]
+            contacts.jacobian = np.concatenate(wide, axis=1)
+            share = self._warmth[touching.pairs] / np.bincount(touching.pairs)[touching.pairs, None]
+            warm = np.einsum("kij,kj->ki", contacts.axes, share)
+        ties = self.ties.rows(coupled) if self.ties else None
+        parts = [
+            self._robots[place].constraints(
+                free[place], touched=True, tied=place in self.ties.robots
+            )
+            for place in coupled
+        ]
         after, self._impulses = constrained(
             parts,
             np.concatenate([robot.native()[1] for robot in group]),
@@ -65,11 +77,13 @@ class Coupling:
             self._period,
             self._solver,
             contacts,
-            np.einsum("kij,kj->ki", contacts.axes, share),
+            warm,
+            ties,
         )
         self.clear_warm_start()
-        along = np.einsum("kij,ki->kj", contacts.axes, self._impulses)
-        np.add.at(self._warmth, touching.pairs, along)
+        if touching is not None:
+            along = np.einsum("kij,ki->kj", touching.contacts.axes, self._impulses)
+            np.add.at(self._warmth, touching.pairs, along)
         first = 0
         for robot in group:
             robot.finish(after[first : first + robot.nv])

@@ -185,19 +185,21 @@ class PinocchioRobot(RobotEngine):
             return limited(part, v)
         return constrained([part], self._velocities, v, self._period, self._solver)[0]
 
-    def constraints(self, v: Vector, *, touched: bool = False) -> Constraints:
+    def constraints(self, v: Vector, *, touched: bool = False, tied: bool = False) -> Constraints:
         """Return the constraints in a step.
 
         Args:
             v: Velocities (nv,) without constraints.
             touched: Whether it touches more than planes.
+            tied: Whether it is held by ties. They act on the robot with its implicit damping, so
+                that a spring on one side and a torque on the other are in equilibrium.
         """
         q, base = self._positions, self.base
         touching = self._contacts.find(q, v, self._period) if self._contacts else None
         self._constraints = Constraints(
             self._joints,
             self._warmth,
-            self._inverse,
+            functools.partial(self._inverse, self.model_in_motion if tied else self._model),
             touching,
             q[self.nq - self.nv + base :],
             v[base:],
@@ -205,9 +207,9 @@ class PinocchioRobot(RobotEngine):
         )
         return self._constraints
 
-    def _inverse(self) -> Vector:
-        """Return the inverse of the mass matrix, shape (nv, nv)."""
-        upper = self._upper * pinocchio.computeMinverse(self._model, self._data, self._positions)
+    def _inverse(self, model: Any) -> Vector:
+        """Return the inverse of the mass matrix of a model, shape (nv, nv)."""
+        upper = self._upper * pinocchio.computeMinverse(model, self._data, self._positions)
         return upper + upper.T
 
     def clear_warm_start(self) -> None:
@@ -218,6 +220,10 @@ class PinocchioRobot(RobotEngine):
         """Place the joints in `data`; return the twists for unit velocities, shape (6, nv)."""
         q = self._positions
         return twists_of(pinocchio.computeJointJacobians(self.model_in_motion, self.data, q))
+
+    def joint_positions(self) -> Vector:
+        """Return the positions of the joints, shape (joints,)."""
+        return self._positions[self.nq - self.nv + self.base :]
 
     def _step_rk4(self) -> None:
         """Simulate one step with the classic fourth-order Runge-Kutta method."""

@@ -18,6 +18,7 @@ from physx_sim import FEATURES, Simulation, World
 from physx_sim.engines import (
     RK4_LACKS,
     Algorithms,
+    Bond,
     Parts,
     RobotBackend,
     RobotSimulation,
@@ -85,6 +86,14 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
             return
         for robot in self._robots:
             robot.run(n)
+
+    def bind(self, number: int, bond: Bond) -> None:
+        """Hold two bodies together until `unbind`."""
+        self._coupling.ties.bind(number, bond)
+
+    def unbind(self, number: int) -> None:
+        """Stop holding two bodies together."""
+        self._coupling.ties.unbind(number)
 
     def clear_warm_start(self) -> None:
         """Make the state alone determine what follows: discard the impulses of the last step."""

@@ -15,7 +15,7 @@ from physx_gym.env.pipeline_env import Info
 from physx_gym.environments import limits
 from physx_gym.environments.goal import GoalEnv, GoalTask
 from physx_gym.simulator.simulator import Simulator
-from physx_sim import JointSettings, Motor, Robot, World
+from physx_sim import JointSettings, Mimic, Motor, Robot, World
 
 HAND = "panda_hand"
 SPEED = 1.5
@@ -47,7 +47,7 @@ class ArmReachEnv(GoalTask):
             backend: Reference of the engine.
             options: Options of `RobotEnv`: ``render_mode``, ``debug``, ``simulation_duration_max``.
         """
-        fingers = JointSettings(stiffness=1e3, damping=50.0)
+        fingers = JointSettings(stiffness=1e3, damping=50.0, mimic=Mimic(""))  # held, and faster
         # The engine damps at every physics step: the wrist is too light for the controller's rate.
         pairs = zip(_ARM, DAMPING.tolist(), strict=True)
         damped = {joint: JointSettings(damping=damping) for joint, damping in pairs}

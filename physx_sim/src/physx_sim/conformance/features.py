@@ -11,10 +11,13 @@ from physx_core.typing import Vector
 from physx_sim import (
     FEATURES,
     Box,
+    Connect,
     Ground,
     JointSettings,
+    Mimic,
     Robot,
     Simulation,
+    Weld,
     World,
     Wrench,
 )
@@ -31,6 +34,7 @@ def _zeros(simulation: Simulation) -> tuple[Vector, Vector]:
 
 _CALLS: Mapping[str, _Call] = {
     "accelerations": lambda one: one.accelerations(),
+    "attachments": lambda one: one.detach(one.attach(Connect("hand"))),
     "contacts": lambda one: one.contacts(),
     "derivatives": lambda one: one.forward_dynamics_derivatives(*_zeros(one), _zeros(one)[1]),
     "forward_dynamics": lambda one: one.forward_dynamics(*_zeros(one), _zeros(one)[1]),
@@ -64,6 +68,8 @@ def _touching() -> World:
 _WORLDS: Mapping[str, Callable[[], World]] = {
     "actuators": lambda: _with_joint(JointSettings(mode="servo")),
     "armature": lambda: _with_joint(JointSettings(armature=0.1)),
+    "attachments": lambda: arm(attachments=[Weld("hand")]),
+    "mimic": lambda: _with_joint(JointSettings(mimic=Mimic("waist", 0.5))),
     "joint_friction": lambda: _with_joint(JointSettings(friction=0.1)),
     "springs": lambda: _with_joint(JointSettings(stiffness=1.0, damping=0.1)),
     "rk4": lambda: pendulum(integrator="rk4"),

@@ -16,6 +16,34 @@ Collisions = Literal["shapes", "boxes", "capsules", "none"]
 
 
 @dataclass(frozen=True)
+class Mimic:
+    """How a joint follows another: its position is ``multiplier`` x the leader's + ``offset``.
+
+    A follower takes no commands. Its motion, limits and resistance act on its leader.
+
+    Attributes:
+        leader: Name of the other joint in the file; empty: the joint moves freely.
+        multiplier: In rad or m of the follower per rad or m of the leader; not 0.
+        offset: Position of the follower where the leader's is 0, in rad or m.
+
+    Raises:
+        ConfigError: If an option has the wrong type, or the multiplier is 0.
+    """
+
+    leader: str
+    multiplier: float = 1.0
+    offset: float = 0.0
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.leader, str):
+            raise ConfigError(f"Mimic.leader is {self.leader!r}, not the name of a joint.")
+        checks.store_declared("Mimic.", self)
+        checks.finite("Mimic.offset", self.offset)
+        if not checks.finite("Mimic.multiplier", self.multiplier):
+            raise ConfigError("Mimic.multiplier must not be 0.")
+
+
+@dataclass(frozen=True)
 class JointSettings:
     """Drive and resistance of a joint. None: as in the robot's file, 0 if it does not say.
 
@@ -31,6 +59,7 @@ class JointSettings:
         stiffness: Stiffness of a spring between the links, in N m/rad or N/m.
         rest: Rest position of the spring, in rad or m.
         armature: Inertia of the motor's rotor as seen from the joint, in kg m² or kg.
+        mimic: How it follows another joint; ``Mimic("")``: it moves freely, whatever its file says.
 
     Raises:
         UnknownOptionError: If there is no such mode.
@@ -44,10 +73,13 @@ class JointSettings:
     stiffness: float | None = None
     rest: float | None = None
     armature: float | None = None
+    mimic: Mimic | None = None
 
     def __post_init__(self) -> None:
         if self.mode not in get_args(Mode):
             raise UnknownOptionError("JointSettings.mode", [str(self.mode)], get_args(Mode))
+        if self.mimic is not None and not isinstance(self.mimic, Mimic):
+            raise ConfigError(f"JointSettings.mimic is {self.mimic!r}, not a Mimic.")
         checks.store_declared("JointSettings.", self)
         checks.positive("JointSettings.gain", self.gain)
         if self.rest is not None:

@@ -8,6 +8,7 @@ from typing import Literal, get_args
 
 from physx_core import checks
 from physx_core.errors import ConfigError, UnknownOptionError
+from physx_sim.description.attachment import Attachment
 from physx_sim.description.ground import Ground, HeightField, Stairs
 from physx_sim.description.objects import WorldObject
 from physx_sim.description.robot import Robot
@@ -26,6 +27,7 @@ class World:
         gravity: Acceleration of free fall in the world frame, in m/s².
         objects: Boxes, spheres, and the like; names must be unique among robots and objects.
         ground: `Ground`, `Stairs`, or `HeightField`; None: no ground.
+        attachments: What holds bodies together, as of the start: `Weld`, `Connect`.
         contacts: Which contacts to simulate: ``"all"``; ``"static"``, only between moving and
             static bodies; ``"none"``.
         integrator: ``"euler"``, semi-implicit, which every engine supports, or ``"rk4"``, of fourth
@@ -38,8 +40,8 @@ class World:
 
     Raises:
         UnknownOptionError: If there is no such choice of `contacts` or `integrator`.
-        ConfigError: If a robot, object, or ground has the wrong type, a name is used twice, nothing
-            can move, or another option is out of range.
+        ConfigError: If a robot, object, attachment, or ground has the wrong type, a name is used
+            twice, nothing can move, or another option is out of range.
     """
 
     robots: Sequence[Robot] = ()
@@ -47,6 +49,7 @@ class World:
     gravity: tuple[float, ...] = (0.0, 0.0, -9.81)
     objects: Sequence[WorldObject] = ()
     ground: Ground | Stairs | HeightField | None = None
+    attachments: Sequence[Attachment] = ()
     contacts: Contacts = "all"
     integrator: Integrator = "euler"
     detector: str | None = None
@@ -55,7 +58,11 @@ class World:
 
     def __post_init__(self) -> None:
         kinds: tuple[tuple[type, Sequence[object]], ...]
-        kinds = ((Robot, self.robots), (WorldObject, self.objects))
+        kinds = (
+            (Robot, self.robots),
+            (WorldObject, self.objects),
+            (Attachment, self.attachments),
+        )
         for kind, things in kinds:
             wrong = [thing for thing in things if not isinstance(thing, kind)]
             if wrong:

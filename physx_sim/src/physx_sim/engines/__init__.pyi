@@ -1,6 +1,7 @@
 """Common code of engines for articulated bodies: robot models and the simulation around them."""
 
 from .algorithms import Algorithms as Algorithms
+from .attachments import Bond as Bond
 from .backend import RobotBackend as RobotBackend
 from .engine import RobotEngine as RobotEngine
 from .engine import base_accelerations as base_accelerations
@@ -19,7 +20,7 @@ from .models.parts import Static as Static
 from .models.parts import layout_of as layout_of
 from .models.parts import read_parts as read_parts
 from .models.parts import static_poses as static_poses
-from .models.parts import without_armature as without_armature
+from .models.parts import warn_once as warn_once
 from .models.reading import read_robot as read_robot
 from .models.rigid_bodies import Joint as Joint
 from .models.rigid_bodies import RigidBody as RigidBody

@@ -39,7 +39,11 @@ class RobotEngine(ABC):
         """Return the rest positions: 0 or the nearest limit, with the base at its initial pose."""
         movable = self.movable
         base = [] if self.fixed_base else [*movable.position, *movable.orientation]
-        return np.array([*base, *(max(j.lower, min(0.0, j.upper)) for j in self.model.joints)])
+        found = np.array([*base, *(max(j.lower, min(0.0, j.upper)) for j in self.model.joints)])
+        joints = found[len(base) :]
+        for follower, leader, mimic in self.model.followers:
+            joints[follower] = mimic.multiplier * joints[leader] + mimic.offset
+        return found
 
     @abstractmethod
     def hold(self, commands: Vector) -> None:

@@ -12,11 +12,13 @@ from physx_sim.errors import FeatureNotSupportedError
 
 RK4_LACKS = (
     "actuators",
+    "attachments",
     "contacts",
     "body_contacts",
     "isotropic_friction",
     "joint_friction",
     "limits",
+    "mimic",
     "restitution",
     "self_collisions",
 )
@@ -27,18 +29,21 @@ def check_rk4(parts: Parts, engine: str, features: Collection[str]) -> None:
     """Raise an error if a world needs constraints.
 
     Raises:
-        FeatureNotSupportedError: If there may be contacts, or a joint has limits, friction, or a
-            mode other than ``"force"``.
+        FeatureNotSupportedError: If there may be contacts, attachments, or a joint has limits,
+            friction, a leader, or a mode other than ``"force"``.
     """
     advice = 'Use World(integrator="euler").'
     solid = sum(bool(movable.model.shapes) for movable in parts.movables) + len(parts.statics)
     if parts.world.contacts != "none" and solid > 1:
         raise FeatureNotSupportedError(engine, "contacts in rk4", features, advice)
+    if parts.attachments:
+        raise FeatureNotSupportedError(engine, "attachments in rk4", features, advice)
     for joint in (joint for movable in parts.movables for joint in movable.model.joints):
         limits = [joint.lower, joint.upper, joint.max_velocity]
         for name, asked in (
             ("limits", np.isfinite(limits).any()),
             ("joint_friction", joint.friction > 0),
+            ("mimic", joint.mimic is not None),
             ("actuators", joint.mode != "force"),
         ):
             if asked:

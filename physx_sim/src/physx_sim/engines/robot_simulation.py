@@ -18,14 +18,18 @@ from physx_core.typing import Records, Vector
 from physx_sim import (
     CONTACT,
     FEATURES,
+    AppliedAttachment,
+    Attachment,
     Hook,
     Simulation,
     State,
+    Weld,
     Wrench,
     copy_to,
     finite_vector,
 )
 from physx_sim.engines.algorithms import Algorithms
+from physx_sim.engines.attachments import Attachments, Bond, filled, frames_of
 from physx_sim.engines.checks import LayoutChecks, integer
 from physx_sim.engines.engine import RobotEngine
 from physx_sim.engines.influences import Hooks, Wrenches
@@ -83,6 +87,9 @@ class RobotSimulation(Simulation, Generic[Engine]):
         commands = np.zeros(self._joint_count)
         commands[self._positioned] = self.positions()[self._positioned_q]
         self._hold(commands)
+        self._attachments = Attachments(self._bind, self.unbind)
+        for attachment in parts.attachments:
+            self.attach(attachment)
         self.clear_warm_start()
 
     def _set_command_limits(self) -> None:
@@ -292,6 +299,59 @@ class RobotSimulation(Simulation, Generic[Engine]):
         if not len(self._wrenches):
             self._release()
 
+    def attach(self, attachment: Attachment) -> int:
+        """Hold two bodies together from now on; return the attachment's number for `detach`."""
+        self._check_has("attachments")
+        self._check_attachment(attachment)
+        poses = [self._pose_of(name) for name in (attachment.body_a, attachment.body_b)]
+        return self._attachments.add(filled(attachment, poses))
+
+    def detach(self, number: int) -> None:
+        """End an attachment."""
+        self._check_open()
+        self._attachments.remove(number)
+
+    def _check_attachment(self, attachment: Attachment) -> None:
+        if not isinstance(attachment, Attachment):
+            raise SimulationError(f"{attachment!r} is not a Weld or Connect.")
+        if not any(self._moves(name) for name in (attachment.body_a, attachment.body_b)):
+            other = attachment.body_b or "the world"
+            raise SimulationError(
+                f'Neither "{attachment.body_a}" nor "{other}" can move, so nothing holds them.'
+            )
+
+    def _moves(self, name: str) -> bool:
+        body = self._checks.body(name) if name else len(self._links)
+        return body < len(self._links) and self._links[body][0].can_move(self._links[body][1])
+
+    def _pose_of(self, name: str) -> Vector:
+        """Return the pose of a body as a homogeneous matrix; no name: of the world."""
+        found = np.eye(4)
+        if name:
+            pose = self.body_poses([name])[0]
+            found[:3, :3], found[:3, 3] = to_matrix(pose[3:]), pose[:3]
+        return found
+
+    def _bind(self, number: int, attachment: Attachment) -> None:
+        bodies, frames = [], list(frames_of(attachment))
+        for side, name in enumerate((attachment.body_a, attachment.body_b)):
+            moves = self._moves(name)
+            bodies.append(self._checks.body(name) if moves else -1)
+            if not moves:
+                frames[side] = self._pose_of(name) @ frames[side]
+        first, second = bodies
+        self.bind(
+            number, Bond((first, second), (frames[0], frames[1]), isinstance(attachment, Weld))
+        )
+
+    def bind(self, number: int, bond: Bond) -> None:
+        """Hold two bodies together until `unbind`; feature `attachments`."""
+        raise self._lacks("attachments")
+
+    def unbind(self, number: int) -> None:
+        """Stop holding two bodies together, given the number from `bind`."""
+        raise self._lacks("attachments")
+
     # State ----------------------------------------------------------------------------------
 
     def positions(self, out: Vector | None = None) -> Vector:
@@ -346,6 +406,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
             self._wrenches.snapshot(),
             self.engine,
             tuple(values for robot in self._robots for values in robot.native()),
+            self._attachments.snapshot(),
         )
 
     def restore(self, state: State) -> None:
@@ -363,16 +424,27 @@ class RobotSimulation(Simulation, Generic[Engine]):
         frame = integer("state.frame", state.frame, 0)
         for applied in state.wrenches:
             self._check_wrench(applied.wrench)
+        for each in state.attachments:
+            self._check_applied(each)
         native = self._checked_native(state) if state.engine == self.engine else []
         self._write(q, v)
         for robot, pair in zip(self._robots, native, strict=False):
             robot.set_native(*pair)
+        self._attachments.restore(state.attachments)
         self.clear_warm_start()
         self._release()
         self._wrenches.restore(state.wrenches)
         self._watch()
         self._hold(commands)
         self._frame = frame
+
+    def _check_applied(self, applied: AppliedAttachment) -> None:
+        self._check_has("attachments")
+        self._check_attachment(applied.attachment)
+        if filled(applied.attachment, (np.eye(4), np.eye(4))) != applied.attachment:
+            raise SimulationError(
+                f"The snapshot does not say where {applied.attachment} holds its bodies."
+            )
 
     def _checked_native(self, state: State) -> list[tuple[Vector, Vector]]:
         wanted = [len(values) for robot in self._robots for values in robot.native()]
@@ -394,6 +466,10 @@ class RobotSimulation(Simulation, Generic[Engine]):
     def joint_wrenches(self) -> Vector:
         """Return the joint reactions in the last step, shape (joints, 6)."""
         self._check_has("joint_wrenches")
+        if len(self._attachments):
+            raise SimulationError(
+                "joint_wrenches needs the forces of all attachments, which are not known."
+            )
         q, v, a = self.positions(), self.velocities(), self.accelerations()
         return self._algorithms.joint_wrenches(q, v, a, self._outer(q))
 

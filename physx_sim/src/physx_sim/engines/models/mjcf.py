@@ -19,11 +19,11 @@ import numpy as np
 from physx_core.errors import listed, nearest
 from physx_core.files import read_content
 from physx_core.origin import install_hint
-from physx_core.rotations import from_axis_angle, to_matrix
+from physx_core.rotations import from_axis_angle, from_matrix_rows, to_matrix
 from physx_core.typing import Vector
-from physx_sim import JointSettings, Robot
+from physx_sim import Attachment, Connect, JointSettings, Mimic, Robot, Weld
 from physx_sim.engines.models.rigid_bodies import Joint, RigidBody
-from physx_sim.engines.models.robot_model import RobotModel, check_names
+from physx_sim.engines.models.robot_model import RobotModel, check_names, with_leaders
 from physx_sim.engines.models.shapes import CollisionShape, shape_of_foot, simplified
 from physx_sim.errors import ModelError
 
@@ -92,11 +92,14 @@ def read_mjcf(robot: Robot, path: Path, *, touching: bool) -> RobotModel:
     joints = [body.joint.name for body in links.found if body.joint is not None]
     check_names(robot, names, joints)
     shapes = _Shapes(file, robot, list(links.places))
-    left_out = [*_left_out(robot, file, links), *shapes.left_out]
+    mimics, attachments, untold = _equalities(file, links)
+    left_out = [*_left_out(robot, file, links), *untold, *shapes.left_out]
     if robot.fixed_base and root in file.floating:
         left_out.append("the free joint of its root body (fixed_base=False lets it float)")
     warnings = (f"physx leaves out {'; '.join(left_out)}",) if left_out else ()
-    return RobotModel(path, tuple(links.found), tuple(shapes.found if touching else ()), warnings)
+    solid = tuple(shapes.found if touching else ())
+    model = RobotModel(path, tuple(links.found), solid, warnings, attachments)
+    return with_leaders(robot, model, mimics)
 
 
 class _File:
@@ -236,9 +239,13 @@ class _Links:
         found[:3, :3] = to_matrix(from_axis_angle(axis.tolist(), back))
         return found
 
+    def joint_name(self, joint: int) -> str:
+        """Return the name of a joint, or its number if it has none."""
+        return str(self._file.model.joint(joint).name) or f"joint{joint}"
+
     def _joint(self, joint: int) -> Joint:
         model, kinds = self._file.model, self._file.mujoco.mjtJoint
-        name = str(model.joint(joint).name) or f"joint{joint}"
+        name = self.joint_name(joint)
         kind, place = kinds(int(model.jnt_type[joint])), model.jnt_dofadr[joint]
         if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
             raise ModelError(f'joint "{name}" is a ball, which is not supported: use three hinges')
@@ -264,6 +271,7 @@ class _Links:
                 rest=float(model.qpos_spring[model.jnt_qposadr[joint]]),
                 armature=float(model.dof_armature[place]),
             ),
+            mimic=None,
         )
 
 
@@ -336,13 +344,64 @@ class _Shapes:
         return path, tuple(model.mesh_scale[mesh].tolist()), offset
 
 
+def _equalities(
+    file: _File, links: _Links
+) -> tuple[dict[str, Mimic], tuple[Attachment, ...], list[str]]:
+    """Return how joints follow others, what holds links together, and what no engine is told."""
+    model, kinds = file.model, file.mujoco.mjtEq
+    mimics: dict[str, Mimic] = {}
+    attachments: list[Attachment] = []
+    left_out = 0
+    for place in range(model.neq):
+        kind, data = kinds(int(model.eq_type[place])), model.eq_data[place]
+        pair = [int(model.eq_obj1id[place]), int(model.eq_obj2id[place])]
+        found: Attachment | None = None
+        if not model.eq_active0[place]:
+            pass
+        elif kind == kinds.mjEQ_JOINT and set(pair) <= set(links.joints):
+            if data[1] and not data[2:5].any():
+                first, second = (float(model.qpos0[model.jnt_qposadr[each]]) for each in pair)
+                follower, leader = map(links.joint_name, pair)
+                offset = first + float(data[0]) - float(data[1]) * second
+                mimics[follower] = Mimic(leader, float(data[1]), offset)
+                continue
+        elif kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
+            found = _attachment(file, links, place, pair)
+        if found is None:
+            left_out += 1
+        else:
+            attachments.append(found)
+    untold = f"equality constraints ({left_out}: what they hold together is free)"
+    return mimics, tuple(attachments), [untold] if left_out else []
+
+
+def _attachment(file: _File, links: _Links, place: int, pair: list[int]) -> Attachment | None:
+    """Return what holds two links together; None if one of them is not of this robot."""
+    model, data = file.model, file.model.eq_data[place]
+    weld = model.eq_type[place] == file.mujoco.mjtEq.mjEQ_WELD
+    if model.eq_objtype[place] == file.mujoco.mjtObj.mjOBJ_SITE:
+        first, second = (_pose(model.site_pos[site], model.site_quat[site]) for site in pair)
+        pair = [int(model.site_bodyid[site]) for site in pair]
+    elif weld:
+        first, second = _pose(data[3:6], data[6:10]), _moved(data[:3])
+    else:
+        first, second = _moved(data[:3]), _moved(data[3:6])
+    if not set(pair) <= links.places.keys():
+        return None
+    one, other = (links.found[links.places[body]].name for body in pair)
+    if not weld:
+        return Connect(one, other, tuple(first[:3, 3].tolist()), tuple(second[:3, 3].tolist()))
+    held = first @ np.linalg.inv(second)
+    turn = from_matrix_rows(held[None, :3, :3])[0]
+    return Weld(one, other, tuple(held[:3, 3].tolist()), tuple(turn.tolist()))
+
+
 def _left_out(robot: Robot, file: _File, links: _Links) -> Iterator[str]:
     """Yield what of a file no engine is told, and what that changes."""
     model, option = file.model, file.model.opt
     for count, what, effect in (
         (model.nu, "actuators", "command the joints, with JointSettings or Motors"),
         (model.ntendon, "tendons", "neither their forces nor their limits act"),
-        (model.neq, "equality constraints", "what they hold together is free"),
         (model.npair + model.nexclude, "contact pairs", "Robot(self_collisions=...) decides"),
         (model.nflex, "deformable bodies", "they are missing"),
         (model.nplugin, "plugins", "they do not run"),

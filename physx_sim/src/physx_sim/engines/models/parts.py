@@ -10,8 +10,8 @@ from pathlib import Path
 
 import numpy as np
 
-from physx_core.errors import listed
 from physx_sim import (
+    Attachment,
     Ground,
     HeightField,
     Layout,
@@ -81,11 +81,13 @@ class Parts:
         world: Its description.
         movables: Robots, then moving objects.
         statics: The ground, then static objects.
+        attachments: What holds bodies together, by their names in the layout.
     """
 
     world: World
     movables: tuple[MovableBody, ...]
     statics: tuple[Static, ...]
+    attachments: tuple[Attachment, ...] = ()
 
 
 def read_parts(world: World) -> Parts:
@@ -101,7 +103,7 @@ def read_parts(world: World) -> Parts:
     for movable in movables:
         for text in movable.model.warnings:
             where = f'Robot "{movable.name}", {movable.model.path}'
-            _warn(f"{where}: {text}.")
+            warn_once(f"{where}: {text}.")
     statics = [] if world.ground is None else [Static("ground", world.ground)]
     for thing in world.objects:
         if thing.static:
@@ -111,7 +113,19 @@ def read_parts(world: World) -> Parts:
             movables.append(_object(thing))
     if not any(movable.moves for movable in movables):
         raise _nothing_moves(scenery[0])
-    return Parts(world, tuple(movables), tuple(statics))
+    attachments: list[Attachment] = []
+    for movable in movables:
+        prefix = _prefix(world, movable)
+        attachments += (
+            replace(each, body_a=prefix + each.body_a, body_b=prefix + each.body_b)
+            for each in movable.model.attachments
+        )
+    return Parts(world, tuple(movables), tuple(statics), (*attachments, *world.attachments))
+
+
+def _prefix(world: World, movable: MovableBody) -> str:
+    """Return what the names of a robot's links and joints begin with in the layout."""
+    return f"{movable.name}/" if len(world.robots) > 1 else ""
 
 
 def _robot(robot: Robot, touching: bool) -> MovableBody:
@@ -121,7 +135,7 @@ def _robot(robot: Robot, touching: bool) -> MovableBody:
 
 
 @functools.cache
-def _warn(text: str) -> None:
+def warn_once(text: str) -> None:
     """Warn once: simulations of the same file are built many times."""
     warnings.warn(text, stacklevel=5)
 
@@ -153,28 +167,6 @@ def _object(thing: WorldObject) -> MovableBody:
     return MovableBody(thing.name, model, False, thing.position, thing.orientation, is_object=True)
 
 
-def without_armature(parts: Parts, engine: str) -> Parts:
-    """Return parts without the inertia of rotors, for an engine that has none; warn once."""
-    movables = list(parts.movables)
-    for place, movable in enumerate(movables):
-        model = movable.model
-        if any(joint.armature for joint in model.joints):
-            where = f'Robot "{movable.name}", {model.path}'
-            names = [joint.name for joint in model.joints if joint.armature]
-            _warn(
-                f"{where}: the engine {engine} leaves out the armature of the joints "
-                f"{listed(names)}. Other engines move them more slowly."
-            )
-            bodies = tuple(
-                body
-                if body.joint is None
-                else replace(body, joint=replace(body.joint, armature=0.0))
-                for body in model.bodies
-            )
-            movables[place] = replace(movable, model=replace(model, bodies=bodies))
-    return replace(parts, movables=tuple(movables))
-
-
 def static_poses(parts: Parts) -> np.ndarray:
     """Return the poses of static bodies, shape (statics, 7)."""
     poses = [[*static.position, *static.orientation] for static in parts.statics]
@@ -185,7 +177,6 @@ def static_poses(parts: Parts) -> np.ndarray:
 
 def layout_of(parts: Parts) -> Layout:
     """Return the names and indices of everything in the state."""
-    several = len(parts.world.robots) > 1
     joints: list[Joint] = []
     joint_names: list[str] = []
     bodies: list[str] = []
@@ -194,7 +185,7 @@ def layout_of(parts: Parts) -> Layout:
     places: dict[str, Part] = {}
     nq = nv = 0
     for movable in parts.movables:
-        prefix = f"{movable.name}/" if several else ""
+        prefix = _prefix(parts.world, movable)
         begin = nq, nv, len(joint_names), len(bodies)
         nq, nv = nq + (0 if movable.fixed_base else 7), nv + (0 if movable.fixed_base else 6)
         for joint in movable.model.joints:

@@ -10,7 +10,7 @@ import numpy as np
 
 from physx_core.rotations import from_roll_pitch_yaw, to_matrix
 from physx_core.typing import Vector
-from physx_sim.description.robot import Mode
+from physx_sim.description.robot import Mimic, Mode
 
 
 @dataclass(frozen=True)
@@ -31,6 +31,7 @@ class Joint:
         stiffness: Stiffness of a spring between the links, in N m/rad or N/m.
         rest: Rest position of the spring, in rad or m.
         armature: Inertia of the motor's rotor as seen from the joint, in kg m² or kg.
+        mimic: How it follows another joint, which follows none; it then has no torque.
     """
 
     name: str
@@ -46,6 +47,7 @@ class Joint:
     stiffness: float
     rest: float
     armature: float
+    mimic: Mimic | None = None
 
 
 @dataclass(frozen=True, eq=False)

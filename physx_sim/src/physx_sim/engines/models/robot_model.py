@@ -3,14 +3,14 @@
 from __future__ import annotations
 
 import functools
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from physx_core.errors import listed, nearest
-from physx_sim import Robot
+from physx_sim import Attachment, Mimic, Robot
 from physx_sim.engines.models.rigid_bodies import Inertial, Joint, RigidBody
 from physx_sim.engines.models.shapes import CollisionShape
 from physx_sim.errors import ModelError
@@ -24,6 +24,7 @@ class RobotModel:
         path: Absolute path of the file.
         bodies: The links, parents before children, in tree order.
         shapes: Collision shapes; empty if there is nothing to touch.
+        attachments: What holds its links together besides its joints, by their names in the file.
         warnings: What is wrong with the file, although it can be simulated, and what of it no
             engine is told.
     """
@@ -32,6 +33,7 @@ class RobotModel:
     bodies: tuple[RigidBody, ...]
     shapes: tuple[CollisionShape, ...] = ()
     warnings: tuple[str, ...] = ()
+    attachments: tuple[Attachment, ...] = ()
 
     @functools.cached_property
     def links(self) -> tuple[str, ...]:
@@ -42,6 +44,16 @@ class RobotModel:
     def joints(self) -> tuple[Joint, ...]:
         """The joints with one degree of freedom, in the order of `bodies`."""
         return tuple(body.joint for body in self.bodies if body.joint is not None)
+
+    @functools.cached_property
+    def followers(self) -> tuple[tuple[int, int, Mimic], ...]:
+        """Joints that follow others: place of the joint in `joints`, place of its leader, how."""
+        places = {joint.name: place for place, joint in enumerate(self.joints)}
+        return tuple(
+            (place, places[joint.mimic.leader], joint.mimic)
+            for place, joint in enumerate(self.joints)
+            if joint.mimic is not None
+        )
 
 
 def model_of_body(name: str, path: Path, inertial: Inertial, shape: CollisionShape) -> RobotModel:
@@ -55,6 +67,56 @@ def model_of_body(name: str, path: Path, inertial: Inertial, shape: CollisionSha
     """
     body = RigidBody(name, -1, np.eye(4), None, np.zeros(3), *inertial.in_link())
     return RobotModel(path, (body,), (shape,))
+
+
+def with_leaders(robot: Robot, model: RobotModel, file: Mapping[str, Mimic]) -> RobotModel:
+    """Return a model whose joints follow others.
+
+    Args:
+        robot: The robot's description, whose settings come before the file's.
+        model: Its model.
+        file: How joints follow others in the file, by name.
+
+    Raises:
+        ModelError: If a leader does not exist or follows its follower, or a follower has commands.
+    """
+    names = [joint.name for joint in model.joints]
+    given = {name: each.mimic for name, each in robot.joints.items() if each.mimic is not None}
+    follows = {name: mimic for name, mimic in {**file, **given}.items() if mimic.leader}
+    if not follows:
+        return model
+    for name, mimic in follows.items():
+        if mimic.leader not in names:
+            near = nearest(mimic.leader, names)
+            raise ModelError(
+                f'joint "{name}" follows "{mimic.leader}", which is not a movable joint.{near}'
+            )
+    found = {name: _through(name, follows) for name in follows}
+    bodies = list(model.bodies)
+    for place, body in enumerate(bodies):
+        joint = body.joint
+        if joint is not None and joint.name in found:
+            if joint.mode != "force":
+                raise ModelError(
+                    f'joint "{joint.name}" follows "{found[joint.name].leader}", so it takes no '
+                    f'commands of the mode "{joint.mode}"; Mimic("") lets it move freely'
+                )
+            joint = replace(joint, mimic=found[joint.name], max_torque=0.0)
+            bodies[place] = replace(body, joint=joint)
+    return replace(model, bodies=tuple(bodies))
+
+
+def _through(name: str, follows: Mapping[str, Mimic]) -> Mimic:
+    """Return how a joint follows the first of a chain of leaders."""
+    mimic, passed = follows[name], [name]
+    while mimic.leader in follows:
+        if mimic.leader in passed:
+            raise ModelError(f"joints follow each other in a circle: {listed(passed)}")
+        passed.append(mimic.leader)
+        above = follows[mimic.leader]
+        offset = mimic.multiplier * above.offset + mimic.offset
+        mimic = Mimic(above.leader, mimic.multiplier * above.multiplier, offset)
+    return mimic
 
 
 def check_names(robot: Robot, links: Sequence[str], joints: Sequence[str]) -> None:

@@ -5,7 +5,7 @@ means the same in each of them:
 
 - `physx_sim.engines.models.shapes` reads the collision shapes, whose meshes must exist.
 - A link without mass gets 1e-9 kg and, unless it has moments of inertia, 1e-12 kg m².
-- Mimic joints are treated as ordinary joints, with a warning.
+- A joint that follows another (mimic) with the multiplier 0 stays an ordinary one, with a warning.
 - A position limit whose ends are equal or absent, or a velocity or effort limit that is 0 or
   absent, counts as no limit: many files contain zeros for unknown limits. So does, with a warning,
   a lower limit above the upper one.
@@ -23,6 +23,7 @@ import numpy as np
 from physx_core.errors import listed
 from physx_sim import (
     JointSettings,
+    Mimic,
     Robot,
     UrdfTree,
     link_of,
@@ -32,7 +33,7 @@ from physx_sim import (
 from physx_sim.engines.models.inertias import MASSLESS, NEGLIGIBLE
 from physx_sim.engines.models.rigid_bodies import Inertial, Joint, Origin, RigidBody
 from physx_sim.engines.models.robot_files import missing_meshes
-from physx_sim.engines.models.robot_model import RobotModel, check_names
+from physx_sim.engines.models.robot_model import RobotModel, check_names, with_leaders
 from physx_sim.engines.models.shapes import shapes_of_robot
 from physx_sim.errors import MissingMeshesError, ModelError
 
@@ -68,7 +69,7 @@ def read_urdf(robot: Robot, path: Path, *, touching: bool) -> RobotModel:
     places = {name: place for place, name in enumerate(tree.links)}
     bodies = tuple(_body(robot, tree, name, places) for name in tree.links)
     shapes = shapes_of_robot(robot, path, tree) if touching else ()
-    return RobotModel(path, bodies, shapes, doubts)
+    return with_leaders(robot, RobotModel(path, bodies, shapes, doubts), _mimics(moving))
 
 
 def _odd_joints(moving: Sequence[Element]) -> Iterator[str]:
@@ -78,9 +79,31 @@ def _odd_joints(moving: Sequence[Element]) -> Iterator[str]:
     unlimited = [name for name, (low, high) in zip(names, limits, strict=True) if low > high]
     if unlimited:
         yield f"the lower limit is above the upper, so there is none: joints {listed(unlimited)}"
-    mimics = [joint.get("name", "") for joint in moving if joint.find("mimic") is not None]
-    if mimics:
-        yield f"joints that follow others (mimic) move freely: {listed(mimics)}. Command them, too"
+    still = [joint.get("name", "") for joint in moving if _multiplier(joint) == 0]
+    if still:
+        yield f"joints that follow others with the multiplier 0 move freely: {listed(still)}"
+
+
+def _multiplier(joint: Element) -> float | None:
+    """Return the multiplier of a joint that follows another; None if it follows none."""
+    element = joint.find("mimic")
+    if element is None:
+        return None
+    return numbers_of(f'joint "{joint.get("name")}"', element, "multiplier", "1", 1)[0]
+
+
+def _mimics(moving: Sequence[Element]) -> dict[str, Mimic]:
+    """Return how joints follow others, by name."""
+    found = {}
+    for joint in moving:
+        element, multiplier = joint.find("mimic"), _multiplier(joint)
+        if element is not None and multiplier:
+            name = joint.get("name", "")
+            (offset,) = numbers_of(f'joint "{name}"', element, "offset", "0", 1)
+            found[name] = Mimic(element.get("joint", ""), multiplier, offset)
+            if not found[name].leader:
+                raise ModelError(f'joint "{name}" follows (mimic) a joint without a name')
+    return found
 
 
 def _missing_meshes(robot: Robot, path: Path, root: Element) -> Iterator[str]:
@@ -125,6 +148,7 @@ def _joint(joint: Element, all_settings: Mapping[str, JointSettings]) -> Joint:
             damping=_number(joint, "dynamics", "damping"),
             friction=_number(joint, "dynamics", "friction"),
         ),
+        mimic=None,
     )
 
 

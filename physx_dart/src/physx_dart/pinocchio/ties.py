@@ -1,0 +1,113 @@
+"""Rows that hold bodies and joints together: attachments, and joints that follow others."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pinocchio
+
+from physx_core.rotations import cross_rows
+from physx_core.typing import Vector
+from physx_dart.pinocchio.contacts import supports_of
+from physx_dart.pinocchio.robot import PinocchioRobot
+from physx_sim.engines import Bond
+
+_RETURN = 0.2
+"""Fraction of a gap that is closed in each step."""
+_FASTEST_RETURN = 1.0
+"""Maximum speed at which it is closed, in m/s or rad/s."""
+_STUCK = 1e-9
+"""Motion of a point per motion of a joint below which it cannot move."""
+_FASTEST_FOLLOWER = 10.0
+"""Maximum speed at which a joint returns to where its leader has it, as to its limits."""
+
+
+class Ties:
+    """What holds bodies and joints together at all times, whatever impulse that takes."""
+
+    def __init__(self, robots: Sequence[PinocchioRobot], period: float) -> None:
+        self._robots, self._period = robots, period
+        self._links = [(place, link) for place, each in enumerate(robots) for link in each.frames]
+        self._supports = [supports_of(each.model_in_motion) for each in robots]
+        self._bonds: dict[int, Bond] = {}
+        self._following = {place for place, each in enumerate(robots) if each.model.followers}
+        self.robots = frozenset(self._following)
+
+    def __bool__(self) -> bool:
+        """Return whether anything is held."""
+        return bool(self.robots)
+
+    def bind(self, number: int, bond: Bond) -> None:
+        """Hold two bodies together until `unbind`."""
+        self._bonds[number] = bond
+        self._note()
+
+    def unbind(self, number: int) -> None:
+        """Stop holding two bodies together."""
+        del self._bonds[number]
+        self._note()
+
+    def _note(self) -> None:
+        """Note which robots are held."""
+        bodies = [body for bond in self._bonds.values() for body in bond.bodies if body >= 0]
+        self.robots = frozenset(self._following | {self._links[body][0] for body in bodies})
+
+    def rows(self, coupled: Sequence[int]) -> tuple[Vector, Vector]:
+        """Return the Jacobian of all rows, shape (m, nv), and the velocities along them (m,).
+
+        Args:
+            coupled: Robots whose velocities, one after the other, are the columns.
+        """
+        robots = [self._robots[place] for place in coupled]
+        ends = np.cumsum([0, *(robot.nv for robot in robots)])
+        motions = [robot.place_joints() for robot in robots]
+        blocks, aims = [np.zeros((0, ends[-1]))], [np.zeros(0)]
+        for begin, robot in zip(ends, robots, strict=False):
+            for follower, leader, mimic in robot.model.followers:
+                row = np.zeros((1, ends[-1]))
+                row[0, begin + robot.base + follower] = 1.0
+                row[0, begin + robot.base + leader] = -mimic.multiplier
+                q = robot.joint_positions()
+                gap = q[follower] - mimic.multiplier * q[leader] - mimic.offset
+                speed = -gap / self._period
+                blocks.append(row)
+                aims.append(np.clip([speed], -_FASTEST_FOLLOWER, _FASTEST_FOLLOWER))
+        for bond in self._bonds.values():
+            poses, jacobians = [], []
+            for body, frame in zip(bond.bodies, bond.frames, strict=True):
+                pose, wide = frame, np.zeros((6, ends[-1]))
+                if body >= 0:
+                    place, link = self._links[body]
+                    at = coupled.index(place)
+                    pose, jacobian = self._moved(place, link, frame, motions[at])
+                    wide[:, ends[at] : ends[at + 1]] = jacobian
+                poses.append(pose)
+                jacobians.append(wide)
+            (first, second), turn = poses, poses[0][:3, :3].T
+            parts = 6 if bond.rigid else 3
+            relative = jacobians[1] - jacobians[0]
+            relative = np.concatenate([turn @ relative[:3], turn @ relative[3:]])
+            gap = np.concatenate(
+                [
+                    turn @ (second[:3, 3] - first[:3, 3]),
+                    pinocchio.log3(turn @ second[:3, :3]) if bond.rigid else (),
+                ]
+            )
+            moves = (np.abs(relative[:parts]) > _STUCK).any(axis=1)  # not what joints hold anyway
+            blocks.append(relative[:parts][moves])
+            speeds = -_RETURN / self._period * gap[moves]
+            aims.append(np.clip(speeds, -_FASTEST_RETURN, _FASTEST_RETURN))
+        return np.concatenate(blocks), np.concatenate(aims)
+
+    def _moved(
+        self, place: int, frame: int, inner: Vector, motions: Vector
+    ) -> tuple[Vector, Vector]:
+        """Return the pose of a frame on a link, and its Jacobian in the world frame, (6, nv)."""
+        robot = self._robots[place]
+        link = robot.model_in_motion.frames[frame]
+        joint = robot.data.oMi[link.parentJoint]
+        pose: Vector = (joint * link.placement).homogeneous @ inner
+        jacobian = motions * self._supports[place][link.parentJoint]
+        jacobian[:3] += cross_rows(jacobian[3:].T, pose[:3, 3][None]).T
+        return pose, jacobian
