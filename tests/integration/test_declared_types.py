@@ -81,6 +81,10 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     physx_sim.Imu: {"name": "imu", "body": "head", "period": 0.25},
     physx_sim.ContactSensor: {"name": "sole", "body": "foot", "period": 0.25},
     physx_sim.ForceTorqueSensor: {"name": "wrist", "joint": "wrist", "period": 0.25},
+    physx_sim.Lidar: {"name": "lidar", "body": "head", "directions": [(1.0, 0.5, 0.0)]}
+    | {"position": (1.0, 0.5, 0.25), "reach": 4.5, "period": 0.25},
+    physx_sim.HeightScan: {"name": "scan", "body": "head", "points": [(1.0, 0.5)], "reach": 4.5}
+    | {"period": 0.25},
     physx_sim.EffortSensor: {"name": "knee", "joint": "knee", "period": 0.25},
     physx_core.Field: {"name": "q", "shape": (3, 2)},
     physx_core.Parameter: {
@@ -137,7 +141,7 @@ RECORDS = {
     "Bond",
     *("Kind", "Format", "Table", "Section"),
 }
-ABSTRACT = {"Attachment", "Pipeline", "Sensor"}
+ABSTRACT = {"Attachment", "Pipeline", "RaySensor", "Sensor"}
 
 FLOATS: dict[str, Callable[[float], Any]] = {
     "float32": np.float32,

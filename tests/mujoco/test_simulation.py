@@ -281,16 +281,14 @@ def test_what_mujoco_does_not_have_is_refused(backend, world, error, said):
         backend.build(world)
 
 
-def test_derivatives_and_rays_are_refused(backend):
+def test_derivatives_are_refused(backend):
     zeros = np.zeros(2)
     with backend.build(World([Robot("cartpole")])) as simulation:
-        assert simulation.features.isdisjoint({"derivatives", "raycast", "restitution"})
+        assert simulation.features.isdisjoint({"derivatives", "restitution"})
         with pytest.raises(FeatureNotSupportedError, match="derivatives"):
             simulation.forward_dynamics_derivatives(zeros, zeros, zeros)
         with pytest.raises(FeatureNotSupportedError, match="derivatives"):
             simulation.forward_dynamics_gradients_batch(*[zeros[None]] * 4)
-        with pytest.raises(FeatureNotSupportedError, match="raycast"):
-            simulation.raycast([[0, 0, 1]], [[0, 0, -1]])
 
 
 @pytest.mark.parametrize("solver", ["newton", "cg", "pgs"])

@@ -6,7 +6,7 @@ world frame, not in the base frame.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import mujoco
 import numpy as np
@@ -97,28 +97,6 @@ class MujocoAlgorithms(Algorithms):
             at = data.xpos[place] + data.xmat[place].reshape(3, 3) @ point
             mujoco.mj_jac(self._model, data, found[:3], found[3:], at, place)
         return self._turned(q, found)
-
-    def joint_wrenches(
-        self, q: Vector, v: Vector, a: Vector, outer: Mapping[int, Sequence[float]]
-    ) -> Vector:
-        """Return the joint reactions in a state, shape (joints, 6)."""
-        model, data = self._model, self._data
-        self._place(q)
-        data.xfrc_applied[:] = 0.0
-        for body, wrench in outer.items():
-            place = self._bodies[body]
-            arm = data.xipos[place] - data.xpos[place]
-            data.xfrc_applied[place] = wrench
-            data.xfrc_applied[place, 3:] -= np.cross(arm, wrench[:3])
-        self._move(q, v, a)
-        moving = model.jnt_bodyid[model.jnt_type != mujoco.mjtJoint.mjJNT_FREE]
-        found = np.zeros((len(moving), 6))
-        for row, body in zip(found, moving, strict=True):
-            torque, force = data.cfrc_int[body, :3], data.cfrc_int[body, 3:]
-            arm = data.xpos[body] - data.subtree_com[model.body_rootid[body]]
-            turn = data.xmat[body].reshape(3, 3)
-            row[:3], row[3:] = force @ turn, (torque - np.cross(arm, force)) @ turn
-        return found
 
     def _mass(self) -> Vector:
         """Return the mass matrix in MuJoCo's convention, as a sum over the bodies, after `_place`.

@@ -60,7 +60,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
     """A world in MuJoCo."""
 
     engine = "mujoco"
-    lacks: ClassVar[frozenset[str]] = frozenset({"derivatives", "raycast", "restitution"})
+    lacks: ClassVar[frozenset[str]] = frozenset({"derivatives", "restitution"})
 
     def __init__(self, world: World) -> None:
         """Build the world; raises the same errors as the backend's `build`."""

@@ -39,8 +39,12 @@ from .sensors.sensor import ContactSensor as ContactSensor
 from .sensors.sensor import EffortSensor as EffortSensor
 from .sensors.sensor import Encoder as Encoder
 from .sensors.sensor import ForceTorqueSensor as ForceTorqueSensor
+from .sensors.sensor import HeightScan as HeightScan
 from .sensors.sensor import Imu as Imu
+from .sensors.sensor import Lidar as Lidar
+from .sensors.sensor import RaySensor as RaySensor
 from .sensors.sensor import Sensor as Sensor
+from .sensors.sensor import fan as fan
 from .sensors.sensors import Sensors as Sensors
 from .sensors.sensors import SensorState as SensorState
 from .urdf import UrdfShape as UrdfShape

@@ -236,24 +236,50 @@ class Simulation(Closeable):
         """Return the velocity change in the last step divided by the period, shape (nv,).
 
         Uses the convention of the velocities and includes the effects of constraints. 0 before the
-        first step and after `set_state` and `restore`.
+        first step and after `set_state`; after `restore` those before the snapshot.
         """
         raise self._lacks("accelerations")
 
     def contacts(self) -> Records:
-        """Return the contacts of the last physics step as a new array of `CONTACT` records."""
+        """Return the contacts of the last physics step as a new array of `CONTACT` records.
+
+        After `restore`, those of the last step before the snapshot.
+        """
         raise self._lacks("contacts")
 
     def joint_wrenches(self) -> Vector:
         """Return the joint reactions in the last step, shape (joints, 6): in N, then in N m."""
         raise self._lacks("joint_wrenches")
 
-    def raycast(self, begins: Vector, ends: Vector) -> Records:
+    def link_wrenches(self, names: Sequence[str]) -> Vector:
+        """Return the reactions of the joints that lead to links, as `joint_wrenches`.
+
+        Args:
+            names: Names of links, as in `Layout.bodies`. Their joints may be fixed; that of the
+                root link of a robot with a fixed base holds the whole robot.
+
+        Returns:
+            Per row, the force in N, then the torque in N m, on the link, at its origin, in its
+            frame, shape (names, 6).
+
+        Raises:
+            SimulationError: If there is no link with one of these names, or no joint leads to it.
+        """
+        raise self._lacks("joint_wrenches")
+
+    def raycast(self, begins: Vector, ends: Vector, ignored: Sequence[str] = ()) -> Records:
         """Return the first hit of each ray as an array of `RAY_HIT` records.
+
+        A ray hits the collision shapes and the ground that it enters from outside.
 
         Args:
             begins: Start points of the rays, shape (n, 3), in m, in the world frame.
             ends: End points of the rays, in the same form.
+            ignored: Names of bodies that rays pass.
+
+        Raises:
+            SimulationError: If a shape is wrong, a number is not finite, or there is no body with
+                one of these names.
         """
         raise self._lacks("raycast")
 

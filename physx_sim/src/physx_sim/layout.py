@@ -14,7 +14,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from physx_core.typing import Vector
+from physx_core.typing import Records, Vector
 from physx_sim.description.attachment import Attachment
 from physx_sim.description.wrench import Wrench
 
@@ -160,6 +160,8 @@ class State:
         engine: Name of the engine that it was taken from.
         native: The engine's own representation of its state.
         attachments: Active attachments.
+        accelerations: Accelerations of the last step, shape (nv,); empty: none.
+        contacts: Contacts of the last step, `CONTACT` records.
     """
 
     positions: Vector
@@ -170,3 +172,5 @@ class State:
     engine: str = ""
     native: tuple[Vector, ...] = ()
     attachments: tuple[AppliedAttachment, ...] = ()
+    accelerations: Vector = field(default_factory=lambda: np.zeros(0))
+    contacts: Records = field(default_factory=lambda: np.zeros(0, CONTACT))

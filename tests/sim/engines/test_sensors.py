@@ -9,6 +9,7 @@ import sys
 import numpy as np
 import pytest
 
+from physx_core.errors import ConfigError
 from physx_sim import (
     Box,
     ContactSensor,
@@ -26,6 +27,7 @@ from physx_sim import (
     World,
     Wrench,
 )
+from physx_sim.errors import SimulationError
 
 pytestmark = pytest.mark.processes
 
@@ -370,3 +372,59 @@ def test_a_ball_in_the_air_touches_nothing(backend):
         sensors.attach(simulation)
         simulation.step(5)
         assert not sensors.values.any()
+
+
+def test_a_fixed_joint_measures_what_it_carries(engine, bar):
+    robot = bar('<limit lower="0" upper="0" effort="50" velocity="10"/>')
+    world = World([robot], gravity=(0, 0, -9.81))
+    with engine.build(world) as simulation:
+        simulation.apply_wrench(Wrench("tip", force=(1.0, 2.0, 3.0), torque=(0.1, 0.2, 0.3)))
+        simulation.step()
+        sensors = Sensors(
+            simulation,
+            world,
+            [
+                ForceTorqueSensor(name="tool", link="tip"),
+                ForceTorqueSensor(name="hinge", joint="hinge"),
+                ForceTorqueSensor(name="whole", link="base"),
+            ],
+        )
+        sensors.update(simulation)
+        tool, hinge = sensors["tool"], sensors["hinge"]
+        np.testing.assert_allclose(tool["force"], (-1, -2, -3), atol=1e-4)
+        np.testing.assert_allclose(tool["torque"], (-0.1, -0.2, -0.3), atol=1e-4)
+        whole = simulation.link_wrenches(["bar"])[0]
+        np.testing.assert_allclose([*hinge["force"], *hinge["torque"]], whole, atol=1e-12)
+        assert np.isfinite(sensors["whole"]["force"]).all()
+    with pytest.raises(ConfigError, match="needs a joint or a link"):
+        ForceTorqueSensor(name="both", joint="hinge", link="tip")
+
+
+def test_no_joint_leads_to_a_floating_root(engine, brick):
+    with (
+        engine.build(brick) as simulation,
+        pytest.raises(SimulationError, match='leads to "brick"'),
+    ):
+        simulation.link_wrenches(["brick"])
+
+
+def test_the_first_reading_after_restore_is_that_of_the_snapshot(engine):
+    ball = Sphere(name="ball", radius=0.1, mass=2.0, position=(0, 0, 0.1))
+    world = World(objects=[ball], ground=Ground())
+    kinds = [
+        Imu(name="imu", body="ball"),
+        ContactSensor(name="touch", body="ball"),
+    ]
+    with engine.build(world) as simulation, engine.build(world) as other:
+        simulation.step(200)
+        sensors = Sensors(simulation, world, kinds)
+        sensors.update(simulation)
+        state = simulation.snapshot()
+        for each in (simulation, other):
+            each.restore(state)
+            again = Sensors(each, world, kinds)
+            again.update(each)
+            np.testing.assert_array_equal(again.values, sensors.values)
+        assert sensors["touch"]["normal_force"] == pytest.approx(2 * 9.81, rel=1e-3)
+        other.set_state(other.positions(), other.velocities())
+        assert not len(other.contacts()) and not other.accelerations().any()

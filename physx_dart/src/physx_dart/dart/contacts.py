@@ -1,14 +1,13 @@
-"""Contacts and ray hits from DART, copied to arrays; DART's own objects never leave this module."""
+"""Contacts from DART, copied to arrays; DART's own objects never leave this module."""
 
 from __future__ import annotations
 
 from typing import Any
 
 import numpy as np
-from dartpy import collision
 
-from physx_core.typing import Records, Vector
-from physx_sim import CONTACT, RAY_HIT
+from physx_core.typing import Records
+from physx_sim import CONTACT
 
 
 class ContactReader:
@@ -43,23 +42,6 @@ class ContactReader:
                 bodies_a[row], bodies_b[row] = second, first
                 forces[row], normals[row] = -contact.force, -contact.normal
             points[row], depths[row] = contact.point, contact.penetrationDepth
-        return records
-
-    def raycast(self, begins: Vector, ends: Vector) -> Records:
-        """Return the first hit of each ray as an array of `RAY_HIT` records."""
-        records = np.zeros(len(begins), RAY_HIT)
-        records["body"] = -1
-        group = self._world.getConstraintSolver().getCollisionGroup()
-        option = collision.RaycastOption()
-        option.mSortByClosest = True
-        for record, begin, end in zip(records, begins, ends, strict=True):
-            result = collision.RaycastResult()
-            if not group.raycast(begin, end, option, result) or not result.hasHit():
-                continue
-            hit = result.mRayHits[0]
-            record["hit"], record["body"] = True, self._place(hit.mCollisionObject)
-            record["point"], record["normal"] = hit.mPoint, hit.mNormal
-            record["fraction"] = hit.mFraction
         return records
 
     def clear_warm_start(self) -> None:

@@ -20,7 +20,7 @@ from physx_dart.dart.bonds import bonded
 from physx_dart.dart.contacts import ContactReader
 from physx_dart.dart.loading import attach_shapes, static_skeleton
 from physx_dart.dart.skeleton import DartRobot
-from physx_sim import FEATURES, Simulation, World, finite_rows
+from physx_sim import FEATURES, Simulation, World
 from physx_sim.engines import (
     RK4_LACKS,
     Algorithms,
@@ -33,7 +33,7 @@ from physx_sim.engines import (
     read_parts,
     warn_once,
 )
-from physx_sim.errors import FeatureNotSupportedError, SimulationError
+from physx_sim.errors import FeatureNotSupportedError
 
 _DETECTORS = {
     "dart": CollisionDetectorType.DART,
@@ -49,7 +49,6 @@ kept by this detector depend on memory addresses, so even a rerun differs."""
 _SWEEPS, _TOLERANCE = 50, 1e-6
 """Maximum iterations of ``nsgs`` per step, and the error in m/s that ends them. They start from
 the impulses of the last step, so more iterations mostly sharpen impacts (docs/contacts.md)."""
-_RAYS = ("dart", "bullet")
 
 
 class DartBackend(RobotBackend):
@@ -116,7 +115,6 @@ class DartSimulation(RobotSimulation[DartRobot]):
         self._step_world = self._world.step
         lacks = [] if solver in _ISOTROPIC else ["isotropic_friction"]
         lacks += ["exact_restore"] if detector == "dart" and not self._stateless else []
-        lacks += [] if detector in _RAYS else ["raycast"]
         lacks += RK4_LACKS if self._rk4 else []
         super().__init__(parts, robots, lacks)
 
@@ -194,18 +192,6 @@ class DartSimulation(RobotSimulation[DartRobot]):
     def read_contacts(self) -> Records:
         """Return the contacts of the last physics step."""
         return self._reader.contacts() if self._kept is None else self._kept.copy()
-
-    def raycast(self, begins: Vector, ends: Vector) -> Records:
-        """Return the first hit of each ray as an array of `RAY_HIT` records."""
-        self._check_open()
-        if "raycast" not in self.features:
-            raise self._lacks("raycast")
-        first, last = finite_rows("begins", begins, 3), finite_rows("ends", ends, 3)
-        if len(first) != len(last):
-            raise SimulationError(
-                f"There are {len(first)} ray start points but {len(last)} end points."
-            )
-        return self._reader.raycast(first, last)
 
     def forward_dynamics(self, positions: Vector, velocities: Vector, torques: Vector) -> Vector:
         """Return the accelerations, shape (nv,), caused by torques (nv,), computed by DART."""

@@ -6,7 +6,7 @@ float64 arrays, which ``torch.from_numpy`` accepts directly.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from typing import Any, Self
 
 import numpy as np
@@ -71,29 +71,6 @@ class MovableAlgorithms:
     def inverse(self, q: Vector, v: Vector, a: Vector) -> Vector:
         """Return the torques that produce accelerations, including joint resistance."""
         return pinocchio.rnea(self.model, self.data, q, v, a) + self.resistance.torques(q, v)
-
-    def joint_wrenches(
-        self, q: Vector, v: Vector, a: Vector, outer: Mapping[int, Sequence[float]]
-    ) -> Vector:
-        """Return the joint reactions, shape (joints, 6), given external wrenches on links."""
-        model, data = self.model, self.data
-        if outer:
-            pinocchio.forwardKinematics(model, data, q)
-            forces = [pinocchio.Force.Zero() for _ in range(model.njoints)]
-            for link, wrench in outer.items():
-                frame = self.frames[link]
-                joint = model.frames[frame].parentJoint
-                origin = pinocchio.updateFramePlacement(model, data, frame).translation
-                place = pinocchio.SE3(np.eye(3), origin)
-                acting = place.act(pinocchio.Force(np.array(wrench)))
-                forces[joint] += data.oMi[joint].actInv(acting)
-            more = pinocchio.StdVec_Force()
-            more.extend(forces)
-            pinocchio.rnea(model, data, q, v, a, more)
-        else:
-            pinocchio.rnea(model, data, q, v, a)
-        found = [force.vector for force in data.f.tolist()[self._first :]]
-        return np.array(found).reshape(-1, 6)
 
     def mass(self, q: Vector) -> Vector:
         """Return the mass matrix, shape (nv, nv)."""
@@ -242,26 +219,6 @@ class PinocchioAlgorithms(Algorithms):
         """Return the torques, shape (nv,), that produce accelerations (nv,) in a state."""
         slices = self._slices
         return np.concatenate([x.inverse(q[a], v[b], acceleration[b]) for x, a, b in slices])
-
-    def joint_wrenches(
-        self, q: Vector, v: Vector, a: Vector, outer: Mapping[int, Sequence[float]]
-    ) -> Vector:
-        """Return the joint reactions in a state, shape (joints, 6).
-
-        Args:
-            q: Positions.
-            v: Velocities.
-            a: Accelerations.
-            outer: External wrenches by body index: force, then torque about the body's origin, 6
-                numbers in the world frame.
-        """
-        found, begin = [], 0
-        for each, x, y in self._slices:
-            end = begin + len(each.frames)
-            mine = {body - begin: outer[body] for body in outer if begin <= body < end}
-            found.append(each.joint_wrenches(q[x], v[y], a[y], mine))
-            begin = end
-        return np.concatenate(found)
 
     def mass_matrix(self, q: Vector) -> Vector:
         """Return the mass matrix, shape (nv, nv)."""

@@ -52,7 +52,7 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
     """A world in Pinocchio."""
 
     engine = "pinocchio"
-    lacks: ClassVar[frozenset[str]] = frozenset({"mesh_contacts", "raycast"})
+    lacks: ClassVar[frozenset[str]] = frozenset({"mesh_contacts"})
 
     def __init__(self, world: World) -> None:
         """Build the world; raises the same errors as the backend's `build`."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -60,20 +60,6 @@ class Algorithms(Closeable):
     @abstractmethod
     def jacobian(self, body: int, q: Vector, point: Vector) -> Vector:
         """Return the Jacobian, shape (6, nv), of a point on a body, given by its index."""
-
-    def joint_wrenches(
-        self, q: Vector, v: Vector, a: Vector, outer: Mapping[int, Sequence[float]]
-    ) -> Vector:
-        """Return the joint reactions in a state, shape (joints, 6); feature `joint_wrenches`.
-
-        Args:
-            q: Positions.
-            v: Velocities.
-            a: Accelerations.
-            outer: External wrenches by body index: force, then torque about the body's origin, 6
-                numbers in the world frame.
-        """
-        raise NotImplementedError
 
     def forward_dynamics_derivatives(
         self, q: Vector, v: Vector, tau: Vector

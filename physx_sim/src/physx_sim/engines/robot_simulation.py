@@ -26,6 +26,7 @@ from physx_sim import (
     Weld,
     Wrench,
     copy_to,
+    finite_rows,
     finite_vector,
 )
 from physx_sim.engines.algorithms import Algorithms
@@ -35,10 +36,14 @@ from physx_sim.engines.engine import RobotEngine
 from physx_sim.engines.influences import Hooks, Wrenches
 from physx_sim.engines.models.parts import Parts, layout_of
 from physx_sim.engines.models.reach import Reach
+from physx_sim.engines.rays import Caster
+from physx_sim.engines.reactions import Reactions
 from physx_sim.errors import SimulationError
 
 _FASTEST = 1e8
 """Speed, in m/s or rad/s, above which a state counts as no longer finite."""
+_NOTHING = np.zeros(0), np.zeros(0, CONTACT)
+"""What is measured before the first step."""
 _BLOCK = 64
 """Physics steps between checks of the state."""
 
@@ -69,6 +74,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._only = robots[0] if len(robots) == 1 else None
         self._joint_count = len(self.layout.joints)
         self._closed = self._stepped = self._stepping = False
+        self._last: tuple[Vector, Records] = _NOTHING
         self._frame = 0
         places = self.layout.parts.values()
         self._slices = [
@@ -78,6 +84,10 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._joints = [place.joints for place in places]
         self._links = [(robot, link) for robot in robots for link in range(len(robot.model.links))]
         self._made_algorithms: Algorithms | None = None
+        self._caster: Caster | None = None
+        self._made_reactions: Reactions | None = None
+        carried = [body for movable in parts.movables for body in movable.model.bodies]
+        self._jointed = [place for place, body in enumerate(carried) if body.joint is not None]
         self._reaches: dict[int, Reach] = {}
         for robot in robots:
             robot.write(robot.neutral(), np.zeros(robot.nv))
@@ -375,7 +385,8 @@ class RobotSimulation(Simulation, Generic[Engine]):
         if self._closed:
             self._check_open()
         if not self._stepped:
-            return np.zeros(self.layout.nv)
+            found = self._last[0]
+            return found.copy() if len(found) else np.zeros(self.layout.nv)
         only = self._only
         return only.accelerations() if only else _join([r.accelerations() for r in self._robots])
 
@@ -387,7 +398,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self.clear_warm_start()
 
     def _write(self, q: Vector, v: Vector) -> None:
-        self._stepped = False
+        self._stepped, self._last = False, _NOTHING
         for robot, part, speed in self._slices:
             robot.write(q[part], v[speed])
 
@@ -397,6 +408,9 @@ class RobotSimulation(Simulation, Generic[Engine]):
         The engine's warm start is cleared, so that this simulation continues alike.
         """
         self._check_open()
+        last = self._last
+        if self._stepped:
+            last = self.accelerations(), self.read_contacts()
         self.clear_warm_start()
         return State(
             self.positions(),
@@ -407,6 +421,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
             self.engine,
             tuple(values for robot in self._robots for values in robot.native()),
             self._attachments.snapshot(),
+            *last,
         )
 
     def restore(self, state: State) -> None:
@@ -426,6 +441,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
             self._check_wrench(applied.wrench)
         for each in state.attachments:
             self._check_applied(each)
+        last = self._checked_last(state)
         native = self._checked_native(state) if state.engine == self.engine else []
         self._write(q, v)
         for robot, pair in zip(self._robots, native, strict=False):
@@ -436,7 +452,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._wrenches.restore(state.wrenches)
         self._watch()
         self._hold(commands)
-        self._frame = frame
+        self._frame, self._last = frame, last
 
     def _check_applied(self, applied: AppliedAttachment) -> None:
         self._check_has("attachments")
@@ -445,6 +461,19 @@ class RobotSimulation(Simulation, Generic[Engine]):
             raise SimulationError(
                 f"The snapshot does not say where {applied.attachment} holds its bodies."
             )
+
+    def _checked_last(self, state: State) -> tuple[Vector, Records]:
+        """Return what was measured in the last step before a snapshot."""
+        if not len(state.accelerations):
+            return _NOTHING
+        found = finite_vector("state.accelerations", state.accelerations, self.layout.nv)
+        contacts = np.array(state.contacts)
+        if contacts.dtype != CONTACT or contacts.ndim != 1:
+            raise SimulationError("state.contacts are not CONTACT records.")
+        bodies = np.stack([contacts["body_a"], contacts["body_b"]])
+        if ((bodies < 0) | (bodies >= len(self.layout.names))).any():
+            raise SimulationError("state.contacts name bodies that are not in this world.")
+        return found, contacts
 
     def _checked_native(self, state: State) -> list[tuple[Vector, Vector]]:
         wanted = [len(values) for robot in self._robots for values in robot.native()]
@@ -461,22 +490,52 @@ class RobotSimulation(Simulation, Generic[Engine]):
     def contacts(self) -> Records:
         """Return the contacts of the last physics step as a new array of `CONTACT` records."""
         self._check_has("contacts")
-        return self.read_contacts() if self._stepped else np.zeros(0, CONTACT)
+        return self.read_contacts() if self._stepped else self._last[1].copy()
+
+    def raycast(self, begins: Vector, ends: Vector, ignored: Sequence[str] = ()) -> Records:
+        """Return the first hit of each ray as an array of `RAY_HIT` records."""
+        self._check_has("raycast")
+        first, last = finite_rows("begins", begins, 3), finite_rows("ends", ends, 3)
+        if len(first) != len(last):
+            raise SimulationError(
+                f"There are {len(first)} ray start points but {len(last)} end points."
+            )
+        if self._caster is None:
+            self._caster = Caster(self.parts)
+        poses = self._algorithms.body_poses(self.positions(), range(len(self.layout.bodies)))
+        return self._caster.cast(first, last, poses, self._checks.bodies(ignored))
 
     def joint_wrenches(self) -> Vector:
         """Return the joint reactions in the last step, shape (joints, 6)."""
+        return self._reactions(self._jointed)
+
+    def link_wrenches(self, names: Sequence[str]) -> Vector:
+        """Return the reactions of the joints that lead to links, shape (names, 6)."""
+        self._check_has("joint_wrenches")
+        places = self._checks.bodies(names)
+        for name, place in zip(names, places, strict=True):
+            if place >= len(self._links) or self._is_root(place):
+                raise SimulationError(f'No joint leads to "{name}".')
+        return self._reactions(places)
+
+    def _is_root(self, body: int) -> bool:
+        robot, link = self._links[body]
+        return link == 0 and not robot.fixed_base
+
+    def _reactions(self, links: Sequence[int]) -> Vector:
         self._check_has("joint_wrenches")
         if len(self._attachments):
             raise SimulationError(
-                "joint_wrenches needs the forces of all attachments, which are not known."
+                "Reactions of joints need the forces of all attachments, which are not known."
             )
-        q, v, a = self.positions(), self.velocities(), self.accelerations()
-        return self._algorithms.joint_wrenches(q, v, a, self._outer(q))
+        if self._made_reactions is None:
+            self._made_reactions = Reactions(self.parts)
+        return self._made_reactions.of(links, self.body_motions(), self._outer(self.positions()))
 
     def _outer(self, q: Vector) -> dict[int, list[float]]:
         """Return the external forces on bodies in the last step, and torques about origins."""
         found: dict[int, list[float]] = {}
-        if not self._stepped:
+        if not (self._stepped or len(self._last[0])):
             return found
         poses = self._algorithms.body_poses(q, range(len(self.layout.bodies)))
         contacts = self.contacts() if "contacts" in self.features else np.zeros(0, CONTACT)

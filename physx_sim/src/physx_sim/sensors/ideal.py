@@ -5,6 +5,7 @@ They only use the interface of `Simulation`, so they are independent of the engi
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, Protocol
@@ -13,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physx_core.errors import ConfigError
-from physx_core.rotations import IDENTITY, cross, multiply, rotate, rotate_back
+from physx_core.rotations import IDENTITY, cross, multiply, rotate, rotate_back, to_matrix
 from physx_core.typing import Vector
 from physx_sim.backend import Simulation
 from physx_sim.description.world import World
@@ -24,7 +25,9 @@ from physx_sim.sensors.sensor import (
     EffortSensor,
     Encoder,
     ForceTorqueSensor,
+    HeightScan,
     Imu,
+    Lidar,
     Sensor,
 )
 
@@ -154,12 +157,70 @@ class IdealForceTorqueSensors:
 
     def __init__(self, sensors: Sequence[ForceTorqueSensor], simulation: Simulation) -> None:
         _require("joint_wrenches", simulation, "A ForceTorqueSensor")
-        joints = [sensor.joint for sensor in sensors]
-        self._joints = as_slice(places_of("joint", joints, simulation.layout.joints))
+        joints = [sensor.joint for sensor in sensors if sensor.joint]
+        self._joints = places_of("joint", joints, simulation.layout.joints)
+        self._jointed = [row for row, sensor in enumerate(sensors) if sensor.joint]
+        self._links = [sensor.link for sensor in sensors if sensor.link]
+        places_of("body", self._links, simulation.layout.bodies)
+        self._linked = [row for row, sensor in enumerate(sensors) if sensor.link]
 
     def measure(self, simulation: Simulation, out: Vector) -> None:
         """Write force and torque."""
-        out[:] = simulation.joint_wrenches()[self._joints]
+        if self._jointed:
+            out[self._jointed] = simulation.joint_wrenches()[self._joints]
+        if self._linked:
+            out[self._linked] = simulation.link_wrenches(self._links)
+
+
+class IdealLidars:
+    """Distances along rays from points on bodies."""
+
+    def __init__(self, sensors: Sequence[Lidar], simulation: Simulation) -> None:
+        _require("raycast", simulation, "A Lidar")
+        self._sensors = sensors
+        self._bodies = [sensor.body for sensor in sensors]
+        for sensor in sensors:
+            places_of("body", [sensor.body, *sensor.ignored], simulation.layout.names)
+        self._ways = [
+            sensor.reach * np.array(sensor.directions) @ to_matrix(sensor.rotation).T
+            for sensor in sensors
+        ]
+
+    def measure(self, simulation: Simulation, out: Vector) -> None:
+        """Write the distances."""
+        poses = simulation.body_poses(self._bodies)
+        for row, sensor, ways, pose in zip(out, self._sensors, self._ways, poses, strict=True):
+            turn = to_matrix(pose[3:])
+            begin = pose[:3] + turn @ sensor.position
+            begins, ends = np.broadcast_to(begin, ways.shape), begin + ways @ turn.T
+            hits = simulation.raycast(begins, ends, (sensor.body, *sensor.ignored))
+            row[:] = np.where(hits["hit"], hits["fraction"], 1.0) * sensor.reach
+
+
+class IdealHeightScans:
+    """Heights below points around bodies."""
+
+    def __init__(self, sensors: Sequence[HeightScan], simulation: Simulation) -> None:
+        _require("raycast", simulation, "A HeightScan")
+        self._sensors = sensors
+        self._bodies = [sensor.body for sensor in sensors]
+        for sensor in sensors:
+            places_of("body", [sensor.body, *sensor.ignored], simulation.layout.names)
+        self._points = [np.array(sensor.points) for sensor in sensors]
+
+    def measure(self, simulation: Simulation, out: Vector) -> None:
+        """Write the heights."""
+        poses = simulation.body_poses(self._bodies)
+        for row, sensor, points, pose in zip(out, self._sensors, self._points, poses, strict=True):
+            x, y, _ = rotate(pose[3:].tolist(), 1.0, 0.0, 0.0)
+            length = math.hypot(x, y)
+            cos, sin = (x / length, y / length) if length > 0 else (1.0, 0.0)
+            begins = np.empty((len(points), 3))
+            begins[:, :2] = pose[:2] + points @ np.array([[cos, sin], [-sin, cos]])
+            begins[:, 2] = pose[2] + sensor.reach
+            ends = begins - (0.0, 0.0, 2 * sensor.reach)
+            hits = simulation.raycast(begins, ends, (sensor.body, *sensor.ignored))
+            row[:] = (1 - 2 * np.where(hits["hit"], hits["fraction"], 1.0)) * sensor.reach
 
 
 class IdealEffortSensors:
@@ -193,6 +254,8 @@ def ideal_sensors(
         ContactSensor: IdealContactSensors,
         ForceTorqueSensor: IdealForceTorqueSensors,
         EffortSensor: IdealEffortSensors,
+        Lidar: IdealLidars,
+        HeightScan: IdealHeightScans,
     }
     if kind not in kinds:
         raise ConfigError(f"{kind.__name__} is not a known kind of sensor.")
@@ -202,7 +265,7 @@ def ideal_sensors(
 
 @dataclass(frozen=True, eq=False)
 class SensorGroup:
-    """All sensors of one kind, and where their components are stored.
+    """All sensors of one kind and width, and where their components are stored.
 
     Attributes:
         kind: Their class.
@@ -250,7 +313,7 @@ class SensorGroup:
 def groups_of(
     sensors: Sequence[Sensor], every: Sequence[int], simulation: Simulation, world: World
 ) -> list[SensorGroup]:
-    """Return the groups of sensors; sensors of one kind must be adjacent.
+    """Return the groups of sensors; those of one kind and width must be adjacent.
 
     Args:
         sensors: The sensors.
@@ -259,10 +322,11 @@ def groups_of(
         world: The world that the simulation was built from.
     """
     found, begin = [], 0
-    for kind in dict.fromkeys(type(sensor) for sensor in sensors):
-        places = [place for place, sensor in enumerate(sensors) if type(sensor) is kind]
+    kinds = [(type(sensor), sum(sensor.quantities.values())) for sensor in sensors]
+    for kind, width in dict.fromkeys(kinds):
+        places = [place for place, each in enumerate(kinds) if each == (kind, width)]
         steps = [every[place] for place in places]
-        shape = len(places), sum(kind.quantities.values())
+        shape = len(places), width
         end = begin + shape[0] * shape[1]
         found.append(
             SensorGroup(

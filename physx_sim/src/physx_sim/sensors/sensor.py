@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import ClassVar
@@ -40,7 +41,7 @@ class Sensor:
     """
 
     quantities: ClassVar[Mapping[str, int]] = {}
-    """Number of components of each quantity, in the measurement's order."""
+    """Number of components of each quantity, in the measurement's order; some sensors choose it."""
     exact: ClassVar[frozenset[str]] = frozenset()
     """Quantities that have no errors."""
 
@@ -185,11 +186,22 @@ class ForceTorqueSensor(Sensor):
 
     Attributes:
         joint: Name of the joint in `Layout.joints`.
+        link: Instead, the name of the child link, as in `Layout.bodies`, of any joint: a fixed one,
+            such as that of a gripper or a tool, too.
+
+    Raises:
+        ConfigError: If not exactly one of both is given, or another option is out of range.
     """
 
     quantities: ClassVar[Mapping[str, int]] = {"force": 3, "torque": 3}
 
-    joint: str
+    joint: str = ""
+    link: str = ""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if bool(self.joint) == bool(self.link):
+            raise ConfigError(f'ForceTorqueSensor "{self.name}" needs a joint or a link.')
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -203,3 +215,112 @@ class EffortSensor(Sensor):
     quantities: ClassVar[Mapping[str, int]] = {"torque": 1}
 
     joint: str
+
+
+@dataclass(frozen=True, kw_only=True)
+class RaySensor(Sensor):
+    """Options common to `Lidar` and `HeightScan`, which see shapes and the ground.
+
+    Attributes:
+        body: Name of the link or object that carries it; rays pass its own shapes.
+        reach: Length of the rays, in m; what is beyond is not seen.
+        ignored: Names of other bodies that rays pass.
+    """
+
+    body: str
+    reach: float = 10.0
+    ignored: Sequence[str] = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        where = f'{type(self).__name__} "{self.name}": '
+        checks.positive(f"{where}reach", self.reach)
+        names = self.ignored
+        if isinstance(names, str) or not all(isinstance(name, str) for name in names):
+            raise ConfigError(f"{where}ignored is {names!r}, not a list of names.")
+
+    def _store_rows(self, option: str, width: int) -> None:
+        where, rows = f'{type(self).__name__} "{self.name}": {option}', getattr(self, option)
+        try:
+            found = tuple(checks.vector(where, row, width) for row in rows)
+        except TypeError:
+            found = ()
+        if not found:
+            raise ConfigError(f"{where} is {rows!r} but must be rows of {width} numbers.")
+        object.__setattr__(self, option, found)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Lidar(RaySensor):
+    """Measures ``distances`` along rays, in m; `reach` where nothing is hit.
+
+    Attributes:
+        directions: Directions of the rays in the sensor's frame, of any length: see `fan`.
+        position: Position of the sensor in the body's frame, in m.
+        rotation: Rotation of the sensor in the body's frame: quaternion x, y, z, w.
+
+    Raises:
+        ConfigError: If a direction is 0, or another option is out of range.
+    """
+
+    directions: Sequence[tuple[float, ...]]
+    position: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rotation: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
+
+    @property
+    def quantities(self) -> Mapping[str, int]:  # type: ignore[override]
+        """Number of components of each quantity."""
+        return {"distances": len(self.directions)}
+
+    def __post_init__(self) -> None:
+        self._store_rows("directions", 3)
+        super().__post_init__()
+        where = f'Lidar "{self.name}": '
+        lengths = [math.hypot(*direction) for direction in self.directions]
+        if not min(lengths) > 0:
+            raise ConfigError(f"{where}a direction is 0.")
+        scaled = zip(self.directions, lengths, strict=True)
+        unit = tuple(checks.scaled(direction, length) for direction, length in scaled)
+        object.__setattr__(self, "directions", unit)
+        object.__setattr__(self, "position", checks.vector(f"{where}position", self.position, 3))
+        rotation = checks.unit_quaternion(f"{where}rotation", self.rotation)
+        object.__setattr__(self, "rotation", rotation)
+
+
+@dataclass(frozen=True, kw_only=True)
+class HeightScan(RaySensor):
+    """Measures ``heights`` of what is below points around a body, relative to its origin, in m.
+
+    The points turn with the body's heading, but not with its roll and pitch. Rays go down from
+    `reach` above the body to `reach` below it; where they hit nothing, the height is -`reach`.
+
+    Attributes:
+        points: x and y of the points, in m: ahead of the body and to its left.
+    """
+
+    points: Sequence[tuple[float, ...]]
+
+    @property
+    def quantities(self) -> Mapping[str, int]:  # type: ignore[override]
+        """Number of components of each quantity."""
+        return {"heights": len(self.points)}
+
+    def __post_init__(self) -> None:
+        self._store_rows("points", 2)
+        super().__post_init__()
+
+
+def fan(
+    azimuths: Sequence[float], elevations: Sequence[float] = (0.0,)
+) -> list[tuple[float, float, float]]:
+    """Return the directions of a lidar's rays: of each elevation at each azimuth.
+
+    Args:
+        azimuths: Angles about z, from x, in rad.
+        elevations: Angles above the xy plane, in rad.
+    """
+    return [
+        (math.cos(up) * math.cos(turn), math.cos(up) * math.sin(turn), math.sin(up))
+        for up in elevations
+        for turn in azimuths
+    ]

@@ -95,7 +95,10 @@ class Sensors:
             FeatureNotSupportedError: If the engine lacks a feature that a sensor needs.
         """
         kinds = list(dict.fromkeys(type(sensor) for sensor in sensors))
-        sensors = sorted(sensors, key=lambda sensor: kinds.index(type(sensor)))
+        sensors = sorted(
+            sensors,
+            key=lambda one: (kinds.index(type(one)), sum(one.quantities.values())),
+        )
         self.sensors = tuple(sensors)
         check_unique("sensors", [sensor.name for sensor in sensors])
         every = [
@@ -192,10 +195,15 @@ class Sensors:
 
         Raises:
             ComponentNotFoundError: If there is no sensor of that kind.
+            SimulationError: If sensors of that kind have different numbers of rays.
         """
-        for group in self._groups:
-            if group.kind is kind:
-                return _read_only(group.block(self._values))
+        found = [group for group in self._groups if group.kind is kind]
+        if len(found) > 1:
+            raise SimulationError(
+                f"The sensors of the kind {kind.__name__} differ in size: read each by its name."
+            )
+        for group in found:
+            return _read_only(group.block(self._values))
         known = [group.kind.__name__ for group in self._groups]
         name = getattr(kind, "__name__", str(kind))
         raise ComponentNotFoundError("kind of sensor", name, "The set", known)

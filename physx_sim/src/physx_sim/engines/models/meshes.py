@@ -1,10 +1,11 @@
-"""Vertices of mesh files, and the boxes and capsules around them."""
+"""Vertices and triangles of mesh files, and the boxes and capsules around them."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -31,6 +32,26 @@ def read_vertices(path: Path, scale: Sequence[float]) -> Vector:
         ModelError: If the file is missing, too large, damaged, or in another format, has no
             vertices or some that are not finite, or the package coal is not installed.
     """
+    return _vertices(path, _read(path, scale))
+
+
+def read_triangles(path: Path, scale: Sequence[float]) -> Vector:
+    """Return the corners of the triangles of a mesh file, shape (n, 3, 3), in m.
+
+    Args:
+        path: Path of an stl, obj, or dae file.
+        scale: Scale factor along each axis.
+
+    Raises:
+        ModelError: As `read_vertices`.
+    """
+    mesh = _read(path, scale)
+    vertices = _vertices(path, mesh)
+    corners = [[mesh.tri_indices(i)[k] for k in range(3)] for i in range(mesh.num_tris)]
+    return vertices[np.array(corners, np.intp).reshape(-1, 3)]
+
+
+def _read(path: Path, scale: Sequence[float]) -> Any:
     if not path.is_file():
         raise ModelError(f"There is no mesh file {path}.")
     if path.suffix.lower() not in _FORMATS:
@@ -46,10 +67,13 @@ def read_vertices(path: Path, scale: Sequence[float]) -> Vector:
         ) from error
     try:
         with geometry_file(path) as bare:
-            mesh = coal.MeshLoader().load(str(bare), np.array(scale, np.float64))
-        vertices = np.array(mesh.vertices(), np.float64).reshape(-1, 3)
+            return coal.MeshLoader().load(str(bare), np.array(scale, np.float64))
     except (ValueError, RuntimeError, TypeError) as error:
         raise ModelError(f"The mesh {path} cannot be read: {error}") from error
+
+
+def _vertices(path: Path, mesh: Any) -> Vector:
+    vertices = np.array(mesh.vertices(), np.float64).reshape(-1, 3)
     if not len(vertices) or not np.isfinite(vertices).all():
         raise ModelError(f"The mesh {path} has no vertices, or some that are not finite.")
     return vertices
