@@ -4,6 +4,7 @@ import importlib
 import inspect
 import re
 
+import engines
 import figures
 import plain_pages
 import public_names
@@ -193,3 +194,7 @@ def test_llms_txt_lists_every_page_and_each_page_is_plain_markdown(root, tmp_pat
         assert plain.startswith("# ") and "{toctree}" not in plain and "{eval-rst}" not in plain
     reference = plain_pages.plain(root / "docs/reference/physx_core.md")
     assert "### Environment(" in reference and "#### Dataset.append(" in reference
+
+
+def test_the_table_of_engines_is_what_they_say():
+    assert engines.PAGE.read_text() == engines.page()

@@ -40,7 +40,7 @@ _ALL, _STATIC, _MOVING, _OWN = (1 << 31) - 1, 1, 2, 2
 """Bits of MuJoCo's collision masks: static, moving and, from `_OWN` on, one for each robot."""
 _STEPS, _DAMPING, _IMPEDANCE = 2.0, 2.0, (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Time constant in steps, damping ratio, and impedance of the nearly rigid constraints."""
-_SPARE = 16
+SPARE = 16
 """Number of attachments that a world can get at a time in addition to those that it starts with."""
 _DEEP = 10.0
 """Depth of a height field below its lowest point, in m."""
@@ -86,7 +86,7 @@ class ModelBuilder:
         if self._parts.world.contacts != "none":
             for place, static in enumerate(self._parts.statics):
                 self._add_static(static, count + place)
-        coupled, spare = len(self._spec.equalities), len(self._parts.attachments) + _SPARE
+        coupled, spare = len(self._spec.equalities), len(self._parts.attachments) + SPARE
         for _ in range(spare):
             kind, body = mujoco.mjtEq.mjEQ_WELD, mujoco.mjtObj.mjOBJ_BODY
             added = self._spec.add_equality(type=kind, objtype=body, name1="0", name2="world")

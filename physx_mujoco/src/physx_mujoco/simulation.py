@@ -5,6 +5,7 @@ Steps are semi-implicit Euler, with implicit damping and springs (MuJoCo's integ
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import mujoco
@@ -14,7 +15,7 @@ from physx_core.errors import UnknownOptionError
 from physx_core.typing import Records
 from physx_mujoco.algorithms import MujocoAlgorithms
 from physx_mujoco.drives import Drives
-from physx_mujoco.model import ModelBuilder, WorldModel, quaternion_of
+from physx_mujoco.model import SPARE, ModelBuilder, WorldModel, quaternion_of
 from physx_mujoco.robot import MujocoRobot, Running
 from physx_sim import CONTACT, FEATURES, Simulation, World
 from physx_sim.engines import (
@@ -61,6 +62,13 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
 
     engine = "mujoco"
     lacks: ClassVar[frozenset[str]] = frozenset({"derivatives", "restitution"})
+    caveats: ClassVar[Mapping[str, str]] = {
+        "attachments": f"while it runs, {SPARE} more than at the start; soft",
+        "contacts": "soft",
+        "body_contacts": "soft",
+        "joint_wrenches": "not while anything is attached",
+        "mesh_contacts": "as convex hulls",
+    }
 
     def __init__(self, world: World) -> None:
         """Build the world; raises the same errors as the backend's `build`."""

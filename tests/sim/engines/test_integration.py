@@ -192,6 +192,8 @@ def test_accelerations_are_those_of_the_last_step(backend, example):
         gained = (simulation.velocities() - before) / 1e-3
         np.testing.assert_allclose(simulation.accelerations(), gained, atol=1e-9)
         simulation.restore(simulation.snapshot())
+        np.testing.assert_allclose(simulation.accelerations(), gained, atol=1e-9)
+        simulation.set_state(simulation.positions(), simulation.velocities())
         assert not simulation.accelerations().any()
 
 

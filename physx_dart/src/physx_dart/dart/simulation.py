@@ -7,7 +7,8 @@ position and velocity limits, servos, and Coulomb friction are constraints of it
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Mapping
+from typing import Any, ClassVar
 
 import dartpy
 import numpy as np
@@ -76,6 +77,13 @@ class DartSimulation(RobotSimulation[DartRobot]):
     """A world in DART."""
 
     engine = "dart"
+    caveats: ClassVar[Mapping[str, str]] = {
+        "armature": "impulses of contacts, limits and servos do not know it: a warning",
+        "exact_restore": "not with the detector `dart` and an iterative solver",
+        "isotropic_friction": "not with the solver `dantzig`",
+        "joint_wrenches": "not while anything is attached",
+        "mimic": "what contacts, limits and servos change is corrected in the next step",
+    }
 
     def __init__(self, world: World) -> None:
         """Build the world; raises the same errors as the backend's `build`."""

@@ -5,6 +5,7 @@ All calls to pinocchio are in `physx_dart.pinocchio` and `physx_dart.batch`.
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from typing import ClassVar
 
 import numpy as np
@@ -53,6 +54,7 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
 
     engine = "pinocchio"
     lacks: ClassVar[frozenset[str]] = frozenset({"mesh_contacts"})
+    caveats: ClassVar[Mapping[str, str]] = {"joint_wrenches": "not while anything is attached"}
 
     def __init__(self, world: World) -> None:
         """Build the world; raises the same errors as the backend's `build`."""

@@ -7,7 +7,7 @@ abstract methods of `RobotSimulation` for stepping.
 from __future__ import annotations
 
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
@@ -56,6 +56,8 @@ class RobotSimulation(Simulation, Generic[Engine]):
 
     lacks: ClassVar[frozenset[str]] = frozenset()
     """Features that the engine never supports."""
+    caveats: ClassVar[Mapping[str, str]] = {}
+    """What is limited in features that it has; both make the table in docs/engines.md."""
 
     def __init__(self, parts: Parts, robots: Sequence[Engine], lacks: Sequence[str]) -> None:
         """Put the robots at rest in their neutral configuration.
@@ -493,7 +495,11 @@ class RobotSimulation(Simulation, Generic[Engine]):
         return self.read_contacts() if self._stepped else self._last[1].copy()
 
     def raycast(self, begins: Vector, ends: Vector, ignored: Sequence[str] = ()) -> Records:
-        """Return the first hit of each ray as an array of `RAY_HIT` records."""
+        """Return the first hit of each ray as an array of `RAY_HIT` records.
+
+        Raises:
+            SimulationError: If there are not as many start as end points, or a name is unknown.
+        """
         self._check_has("raycast")
         first, last = finite_rows("begins", begins, 3), finite_rows("ends", ends, 3)
         if len(first) != len(last):
@@ -510,7 +516,11 @@ class RobotSimulation(Simulation, Generic[Engine]):
         return self._reactions(self._jointed)
 
     def link_wrenches(self, names: Sequence[str]) -> Vector:
-        """Return the reactions of the joints that lead to links, shape (names, 6)."""
+        """Return the reactions of the joints that lead to links, shape (names, 6).
+
+        Raises:
+            SimulationError: If no joint leads to a link, or anything is attached.
+        """
         self._check_has("joint_wrenches")
         places = self._checks.bodies(names)
         for name, place in zip(names, places, strict=True):

@@ -225,6 +225,9 @@ class RaySensor(Sensor):
         body: Name of the link or object that carries it; rays pass its own shapes.
         reach: Length of the rays, in m; what is beyond is not seen.
         ignored: Names of other bodies that rays pass.
+
+    Raises:
+        ConfigError: If an option is out of range, or `ignored` are not names.
     """
 
     body: str

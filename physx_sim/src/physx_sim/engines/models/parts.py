@@ -134,10 +134,18 @@ def _robot(robot: Robot, touching: bool) -> MovableBody:
     return MovableBody(robot.name, model, robot.fixed_base, *pose, robot.self_collisions)
 
 
-@functools.cache
 def warn_once(text: str) -> None:
-    """Warn once: simulations of the same file are built many times."""
-    warnings.warn(text, stacklevel=5)
+    """Warn once of a text: simulations of the same file are built many times.
+
+    Args:
+        text: What to say, as in `warnings.warn`.
+    """
+    _warn(text)
+
+
+@functools.cache
+def _warn(text: str) -> None:
+    warnings.warn(text, stacklevel=6)
 
 
 def _nothing_moves(scenery: MovableBody) -> ModelError:
