@@ -131,6 +131,10 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
             for _ in range(n):
                 self._drives.step()
 
+    def change_gravity(self, gravity: tuple[float, ...]) -> None:
+        """Change the gravity in MuJoCo."""
+        self._running.model.opt.gravity[:] = gravity
+
     def bind(self, number: int, bond: Bond) -> None:
         """Hold two bodies together until `unbind`.
 
@@ -169,15 +173,20 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
     def read_contacts(self) -> Records:
         """Return the contacts of the last physics step."""
         model, data = self._running.model, self._running.data
-        found, force = np.zeros(data.ncon, CONTACT), np.zeros(6)
-        for number, (row, contact) in enumerate(zip(found, data.contact, strict=True)):
-            frame = contact.frame.reshape(3, 3)
+        found, forces = np.zeros(data.ncon, CONTACT), np.zeros((data.ncon, 6))
+        if not len(found):
+            return found
+        for number, force in enumerate(forces):
             mujoco.mj_contactForce(model, data, number, force)
-            first, second = self._world.owners[contact.geom].tolist()
-            sign = -1.0 if first < second else 1.0  # MuJoCo's force acts on the second body
-            row["body_a"], row["body_b"] = sorted((first, second))
-            row["point"], row["depth"] = contact.pos, -contact.dist
-            row["normal"], row["force"] = sign * frame[0], sign * (force[:3] @ frame)
+        contact = data.contact
+        frames = contact.frame.reshape(-1, 3, 3)
+        owners = self._world.owners[contact.geom]
+        # MuJoCo's force acts on the second body.
+        sign = np.where(owners[:, 0] < owners[:, 1], -1.0, 1.0)[:, None]
+        found["body_a"], found["body_b"] = owners.min(axis=1), owners.max(axis=1)
+        found["point"], found["depth"] = contact.pos, -contact.dist
+        found["normal"] = sign * frames[:, 0]
+        found["force"] = sign * (forces[:, None, :3] @ frames)[:, 0]
         return found
 
     def close(self) -> None:

@@ -171,6 +171,22 @@ class Simulation(Closeable):
         """
         raise self._lacks("wrenches")
 
+    @property
+    def gravity(self) -> Vector:
+        """Acceleration of free fall in the world frame, in m/s², shape (3,); a copy."""
+        raise self._lacks("gravity")
+
+    def set_gravity(self, gravity: Sequence[float]) -> None:
+        """Change the acceleration of free fall from now on; snapshots contain it.
+
+        Args:
+            gravity: In the world frame, in m/s², shape (3,).
+
+        Raises:
+            SimulationError: If it is not three finite numbers.
+        """
+        raise self._lacks("gravity")
+
     def attach(self, attachment: Attachment) -> int:
         """Hold two bodies together from now on; return the attachment's number for `detach`.
 

@@ -12,6 +12,7 @@ FEATURES = {
     "derivatives": "derivatives of the forward dynamics",
     "exact_restore": "bit-identical continuation after restore",
     "forward_dynamics": "forward dynamics of any state",
+    "gravity": "gravity that changes while it runs",
     "hooks": "functions called before physics steps",
     "inverse_dynamics": "inverse dynamics of any state",
     "isotropic_friction": "friction that is the same in all directions (a cone)",

@@ -162,6 +162,7 @@ class State:
         attachments: Active attachments.
         accelerations: Accelerations of the last step, shape (nv,); empty: none.
         contacts: Contacts of the last step, `CONTACT` records.
+        gravity: Acceleration of free fall, in m/s², shape (3,); empty: that of the world.
     """
 
     positions: Vector
@@ -174,3 +175,4 @@ class State:
     attachments: tuple[AppliedAttachment, ...] = ()
     accelerations: Vector = field(default_factory=lambda: np.zeros(0))
     contacts: Records = field(default_factory=lambda: np.zeros(0, CONTACT))
+    gravity: Vector = field(default_factory=lambda: np.zeros(0))

@@ -9,8 +9,8 @@ import pytest
 
 from physx_core import plugins
 from physx_dart.environments.double_pendulum import URDF
-from physx_sim import JointSettings, Robot, World, Wrench
-from physx_sim.errors import FeatureNotSupportedError
+from physx_sim import Imu, JointSettings, Robot, Sensors, Sphere, World, Wrench
+from physx_sim.errors import FeatureNotSupportedError, SimulationError
 
 SLIDERS = """
 <robot name="sliders">
@@ -243,3 +243,29 @@ def test_engines_agree_in_rk4_under_wrenches(dart, pinocchio, brick):
             gained = (simulation.velocities() - before) / 1e-3
             ends.append([*simulation.positions(), *before, *gained])
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-6)
+
+
+def test_gravity_changes_while_it_runs(engine):
+    world = World(objects=[Sphere(name="ball", radius=0.1, position=(0, 0, 5))])
+    imu = Imu(name="imu", body="ball")
+    moon = (0.0, 0.5, -1.6)
+    with engine.build(world) as simulation, engine.build(world) as other:
+        simulation.step(100)
+        simulation.set_gravity(moon)
+        np.testing.assert_array_equal(simulation.gravity, moon)
+        before = simulation.body_velocities(["ball"])[0, :3]
+        simulation.step(100)
+        gained = simulation.body_velocities(["ball"])[0, :3] - before
+        np.testing.assert_allclose(gained, np.array(moon) * 0.1, atol=1e-9)
+        q, zero = simulation.positions(), np.zeros(6)
+        np.testing.assert_allclose(simulation.forward_dynamics(q, zero, zero)[:3], moon, atol=1e-9)
+        sensors = Sensors(simulation, world, [imu])
+        sensors.update(simulation)
+        np.testing.assert_allclose(sensors["imu"]["acceleration"], 0, atol=1e-9)
+        other.restore(simulation.snapshot())
+        for each in (simulation, other):
+            each.step(50)
+        np.testing.assert_array_equal(other.positions(), simulation.positions())
+        np.testing.assert_array_equal(other.gravity, moon)
+        with pytest.raises(SimulationError, match="gravity"):
+            simulation.set_gravity((0, 0))

@@ -164,6 +164,12 @@ class DartSimulation(RobotSimulation[DartRobot]):
                 robot.prepare()
             step(False)
 
+    def change_gravity(self, gravity: tuple[float, ...]) -> None:
+        """Change the gravity in DART."""
+        self._world.setGravity(list(gravity))
+        for robot in self._robots:
+            robot.change_gravity(gravity)
+
     def bind(self, number: int, bond: Bond) -> None:
         """Hold two bodies together until `unbind`."""
         nodes = [self._nodes[body] if body >= 0 else None for body in bond.bodies]

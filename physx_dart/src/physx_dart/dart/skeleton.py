@@ -55,6 +55,10 @@ class DartRobot(RobotEngine):
         if self.nv > self.base:
             self.skeleton.setCommands(commands)
 
+    def change_gravity(self, gravity: tuple[float, ...]) -> None:
+        """Change the gravity in the dynamics of other states."""
+        self._gravity, self._made_shadow = gravity, None
+
     def prepare(self) -> None:
         """Write what DART is told anew before each step."""
         if self._drives.outer:

@@ -173,16 +173,22 @@ def constrained(
         if len(parts) > 1:  # the solver expects rows with one bound first
             two_sided = np.isinf(least[rows]) == np.isinf(most[rows])
             rows = rows[np.argsort(two_sided, kind="stable")]
-        jacobian = np.concatenate([points, unit(len(v)).take(columns[rows], 0), held])
-        spread = inverse.dot(jacobian.T)
-        response, gaps = jacobian.dot(spread), np.concatenate([bias, -aims[rows], -pace])
-        low = np.concatenate([least[rows], np.full(len(pace), -np.inf)])
-        high = np.concatenate([most[rows], np.full(len(pace), np.inf)])
+        jacobian = [points, unit(len(v)).take(columns[rows], 0)]
+        targets, low, high = [bias, -aims[rows]], least[rows], most[rows]
+        begin = [*guess, last[rows]]
+        if len(pace):
+            jacobian.append(held)
+            targets.append(-pace)
+            begin.append(np.zeros(len(pace)))
+            low = np.concatenate([low, np.full(len(pace), -np.inf)])
+            high = np.concatenate([high, np.full(len(pace), np.inf)])
+        along = np.concatenate(jacobian)
+        spread = inverse.dot(along.T)
+        response, free = along.dot(spread), along.dot(v) + np.concatenate(targets)
         if len(bias):
-            begin = np.concatenate([*guess, last[rows], np.zeros(len(pace))])
-            impulses = solver.solve(response, jacobian.dot(v) + gaps, friction, low, high, begin)
+            impulses = solver.solve(response, free, friction, low, high, np.concatenate(begin))
         else:
-            impulses = solve(response, -jacobian.dot(v) - gaps, low, high)
+            impulses = solve(response, -free, low, high)
         after = v + spread.dot(impulses)
         missed = False
         for part, span in zip(parts, spans, strict=True):

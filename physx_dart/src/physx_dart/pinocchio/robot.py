@@ -212,6 +212,11 @@ class PinocchioRobot(RobotEngine):
         upper = self._upper * pinocchio.computeMinverse(model, self._data, self._positions)
         return upper + upper.T
 
+    def change_gravity(self, gravity: tuple[float, ...]) -> None:
+        """Change the acceleration of free fall, in m/s²."""
+        for model in (self.model_in_motion, self._model):
+            model.gravity.linear = np.array(gravity)
+
     def clear_warm_start(self) -> None:
         """Discard the impulses of the last step."""
         self._warmth.clear_warm_start()

@@ -89,6 +89,11 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
         for robot in self._robots:
             robot.run(n)
 
+    def change_gravity(self, gravity: tuple[float, ...]) -> None:
+        """Change the gravity of all robots and objects."""
+        for robot in self._robots:
+            robot.change_gravity(gravity)
+
     def bind(self, number: int, bond: Bond) -> None:
         """Hold two bodies together until `unbind`."""
         self._coupling.ties.bind(number, bond)

@@ -38,6 +38,7 @@ _CALLS: Mapping[str, _Call] = {
     "contacts": lambda one: one.contacts(),
     "derivatives": lambda one: one.forward_dynamics_derivatives(*_zeros(one), _zeros(one)[1]),
     "forward_dynamics": lambda one: one.forward_dynamics(*_zeros(one), _zeros(one)[1]),
+    "gravity": lambda one: one.set_gravity((0.0, 0.0, -1.6)),
     "hooks": lambda one: one.add_hook(lambda simulation: None),
     "inverse_dynamics": lambda one: one.inverse_dynamics(*_zeros(one), _zeros(one)[1]),
     "jacobian": lambda one: one.jacobian("hand", one.positions()),

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from abc import abstractmethod
 from collections.abc import Mapping, Sequence
+from dataclasses import replace
 from typing import Any, ClassVar, Generic, TypeVar
 
 import numpy as np
@@ -311,6 +312,32 @@ class RobotSimulation(Simulation, Generic[Engine]):
         if not len(self._wrenches):
             self._release()
 
+    @property
+    def gravity(self) -> Vector:
+        """Acceleration of free fall in the world frame, in m/s², shape (3,); a copy."""
+        self._check_open()
+        return np.array(self.parts.world.gravity)
+
+    def set_gravity(self, gravity: Sequence[float]) -> None:
+        """Change the acceleration of free fall from now on.
+
+        Raises:
+            SimulationError: If it is not three finite numbers.
+        """
+        self._check_has("gravity")
+        wanted = tuple(finite_vector("gravity", gravity, 3).tolist())
+        if wanted == self.parts.world.gravity:
+            return
+        self.parts = replace(self.parts, world=replace(self.parts.world, gravity=wanted))
+        if self._made_algorithms is not None:
+            self._made_algorithms.close()
+        self._made_algorithms = self._made_reactions = None
+        self.change_gravity(wanted)
+
+    def change_gravity(self, gravity: tuple[float, ...]) -> None:
+        """Change the gravity in the engine; feature `gravity`."""
+        raise self._lacks("gravity")
+
     def attach(self, attachment: Attachment) -> int:
         """Hold two bodies together from now on; return the attachment's number for `detach`."""
         self._check_has("attachments")
@@ -424,6 +451,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
             tuple(values for robot in self._robots for values in robot.native()),
             self._attachments.snapshot(),
             *last,
+            self.gravity,
         )
 
     def restore(self, state: State) -> None:
@@ -444,7 +472,11 @@ class RobotSimulation(Simulation, Generic[Engine]):
         for each in state.attachments:
             self._check_applied(each)
         last = self._checked_last(state)
+        gravity = self.gravity
+        if len(state.gravity):
+            gravity = finite_vector("state.gravity", state.gravity, 3)
         native = self._checked_native(state) if state.engine == self.engine else []
+        self.set_gravity(gravity.tolist())
         self._write(q, v)
         for robot, pair in zip(self._robots, native, strict=False):
             robot.set_native(*pair)

@@ -66,7 +66,8 @@ class IdealImus:
         places_of("body", self._bodies, simulation.layout.names)
         self._arms = [_none_if(sensor.position, (0.0, 0.0, 0.0)) for sensor in sensors]
         self._rotations = [_none_if(sensor.rotation, IDENTITY) for sensor in sensors]
-        self._gravity = tuple(float(part) for part in world.gravity)
+        self._gravity: Sequence[float] = world.gravity
+        self._changes = "gravity" in simulation.features
         layout = simulation.layout
         floating = [part for part in layout.parts.values() if part.floating]
         bases = {layout.bodies[part.bodies.start]: part for part in floating}
@@ -74,6 +75,8 @@ class IdealImus:
 
     def measure(self, simulation: Simulation, out: Vector) -> None:
         """Write orientation, angular velocity, and acceleration."""
+        if self._changes:
+            self._gravity = simulation.gravity.tolist()
         if len(self._bases) == len(out):
             self._measure_bases(simulation, out)
             return
