@@ -17,6 +17,7 @@ from physx_core import (
     Training,
     read_scalars,
 )
+from physx_core.cli import main
 from physx_core.components import PredictedBatch
 from physx_core.errors import ConfigError
 from physx_core.pipelines import Learner, load_learner
@@ -395,3 +396,46 @@ def test_predictions_without_targets_need_a_loss_for_them(tmp_path):
         optimization.set_optimizer(
             "Adam", Learner(NetworkConfig(Parts, PARTS), trains=False).network
         )
+
+
+# From the command line ---------------------------------------------------------------------------
+
+LOSSES = '''
+"""Losses of a batch."""
+
+def momentum(batch):
+    """Return the mean squared residual of dv = 0.1 F, with a force in N and a mass of 1 kg."""
+    before, after = batch.data["v"], batch.physical_prediction["next_v"]
+    return (after - before - 0.1 * batch.data["force"]).square().mean()
+'''
+
+
+def falling(rng, rows):
+    v, force, x = rng.normal(size=(3, rows, 1))
+    return {"v": v, "force": force, "x": x, "next_v": v + 0.1 * force, "next_x": x + 0.1 * v}
+
+
+def test_losses_by_target_and_of_the_batch_are_named_in_a_command(tmp_path, capsys):
+    store(falling)
+    (tmp_path / "losses.py").write_text(LOSSES)
+    words = [
+        *("train", "--dataset.existing-dir", "data", "--session-name", "run"),
+        *("--epoch-nb", "3", "--batch-size", "16"),
+        *("--network.network", "torch/fc", "--network.network-kwargs", "layers=[2,8,2]"),
+        *("net_fields=[v,x]", "opt_fields=[next_v,next_x]", "--network.optimizer", "Adam"),
+        *("--network.loss", "next_v=MSELoss", "next_x=L1Loss", "law=losses.py:momentum"),
+        *("--network.optimization-kwargs", "extra_fields=[force]", "loss_weights={law=0.5}"),
+        *("--network.device", "cpu", "--dataset.normalize", "--seed", "0", "--quiet"),
+    ]
+    assert main(words) == 0
+    curves = read_scalars(tmp_path / "sessions/run")
+    parts = [curves["epoch", f"loss/{name}/training"] for name in ("next_v", "next_x", "law")]
+    first, second, law = (np.array(list(part.values())) for part in parts)
+    total = np.array(list(curves["epoch", "loss/training"].values()))
+    np.testing.assert_allclose(total, (first + second + 0.5 * law) / 2.5, rtol=1e-6)
+    assert ("epoch", "loss/law/validation") in curves
+    again = ["train", "sessions/run", "--resume", "--quiet", "--epoch-nb", "4"]
+    (tmp_path / "losses.py").rename(tmp_path / "laws.py")
+    assert main([*again, "--network.loss.law", "laws.py:momentum"]) == 0
+    assert main([*again, "--network.loss.next_x", "MSELoss"]) != 0
+    assert "network.loss was" in capsys.readouterr().err

@@ -33,8 +33,10 @@ class Optimization(ABC):
     stops_at_nan: bool = True
     scheduler_interval: str | None = None
 
-    def set_loss(self, loss: str | type[Any] | None) -> None:
+    def set_loss(self, loss: Any) -> None:
         """Choose the loss function, by class or by its name in the network's library.
+
+        A table has several by name: see `NetworkConfig.loss`.
 
         Unless this is implemented, the optimization has its own loss.
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -69,13 +69,13 @@ class Predictor:
         predict: Returns the prediction for a batch, both in physical units.
         given: Names of its inputs.
         pairs: Name of each true field, and of its prediction.
-        loss: Name of its loss.
+        losses: Name of the loss of each true field.
     """
 
     predict: Callable[[Batch], Batch]
     given: Sequence[str]
     pairs: Mapping[str, str]
-    loss: str = ""
+    losses: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -103,7 +103,8 @@ class Judge:
             self._sample = TrainingSample(self._training, network.given)
         fields, batch = self._training.fields, self._sample.batch
         self._targets = {
-            name: Target.of(fields[name], batch[name], network.loss) for name in network.pairs
+            name: Target.of(fields[name], batch[name], network.losses.get(name, ""))
+            for name in network.pairs
         }
         self._rivals: dict[str, Rival] = {}
         self._why: dict[tuple[str, str], str] = {}

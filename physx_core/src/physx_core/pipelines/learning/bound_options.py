@@ -104,6 +104,13 @@ def _is_same(name: str, before: Any, after: Any) -> bool:
     """Return whether two values of an option mean the same."""
     if before == after or name not in _REFERENCES or None in (before, after):
         return bool(before == after)
+    if isinstance(before, Mapping) or isinstance(after, Mapping):  # losses by name
+        both = isinstance(before, Mapping) and isinstance(after, Mapping)
+        return (
+            both
+            and before.keys() == after.keys()
+            and all(_is_same(name, each, after[key]) for key, each in before.items())
+        )
     return is_recorded_as(after, before) or _last_name(before) == _last_name(after)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 from physx_core.errors import ConfigError, PhysxError, listed, nearest
@@ -38,11 +39,12 @@ def make_judge(learner: Learner, stored: StoredBatches) -> Judge:
         stored: The samples.
     """
     network, loss = learner.network, learner.config.loss
+    table = loss if isinstance(loss, Mapping) else dict.fromkeys(network.opt_fields, loss)
     predictor = Predictor(
         learner.predict_in_training,
         network.net_fields,
         dict(zip(network.opt_fields, network.pred_fields, strict=False)),
-        loss if isinstance(loss, str) else getattr(loss, "__name__", ""),
+        {name: getattr(one, "__name__", str(one)) for name, one in table.items()},
     )
     return Judge(predictor, stored.training)
 
