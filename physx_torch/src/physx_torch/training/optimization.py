@@ -23,6 +23,7 @@ from physx_core.errors import (
     listed,
 )
 from physx_torch.choices import choose, find_classes, make
+from physx_torch.networks.averaging import ParameterAverage
 from physx_torch.networks.network import TorchNetwork
 from physx_torch.parallel import average_gradients, broadcast_parameters
 from physx_torch.storage.attributes import Attributes
@@ -67,9 +68,8 @@ class TorchOptimization(Optimization):
     dictionaries of these; and plain data that have changed since the training began. Anything else
     that is state is an error before or after the first batch.
 
-    Validation, the checkpoint "best", predictions and exports use the parameters of the network.
-    Averaged ones must be copied into the network to be used, for example in
-    `Training.train_end`, before the last checkpoint.
+    With ``average``, validation, checkpoints, predictions and exports use the mean of the
+    parameters over the steps; a resumed training goes on with what was learned.
 
     Attributes:
         network: The network to train; set by `set_optimizer`.
@@ -92,6 +92,7 @@ class TorchOptimization(Optimization):
         loss_kwargs: Mapping[str, Any] | None = None,
         loss_weights: Mapping[str, float] | None = None,
         extra_fields: Sequence[str] | None = None,
+        average: float | None = None,
     ) -> None:
         """Set the options.
 
@@ -110,6 +111,9 @@ class TorchOptimization(Optimization):
                 losses in a table; 1 of others. The loss is the weighted mean, so weights change
                 what counts more, not how large the steps are.
             extra_fields: Fields of the batch that a loss reads in addition to the network's.
+            average: Share of the mean of the parameters that is left after each step, for example
+                0.999: an exponential mean over about 1000 steps, with which the network is
+                validated and predicts. None: no mean.
 
         Raises:
             ConfigError: If an option is invalid.
@@ -118,6 +122,8 @@ class TorchOptimization(Optimization):
             raise ConfigError(f"gradient_clip is {gradient_clip!r} but must be positive.")
         if type(accumulate) is not int or accumulate < 1:
             raise ConfigError(f"accumulate is {accumulate!r} but must be a positive integer.")
+        if average is not None and not 0 < average < 1:
+            raise ConfigError(f"average is {average!r} but must be between 0 and 1.")
         if mixed_precision not in (None, *PRECISIONS):
             raise ConfigError(
                 f"mixed_precision is {mixed_precision!r} but must be {listed(PRECISIONS)} or None."
@@ -127,6 +133,7 @@ class TorchOptimization(Optimization):
         self.scheduler: LRScheduler | None = None
         self._gradient_clip = gradient_clip
         self._accumulate, self._accumulated = accumulate, 0
+        self._decay = average
         self._precision = PRECISIONS[mixed_precision] if mixed_precision else None
         self._backend = "inductor" if compile is True else compile
         self._loss_kwargs = dict(loss_kwargs or {})
@@ -224,6 +231,9 @@ class TorchOptimization(Optimization):
         if type(self).compute_loss is TorchOptimization.compute_loss:
             find_terms(self.loss or torch.nn.MSELoss(), network, self._loss_weights)
         self.optimizer = made
+        if self._decay is not None:
+            network.average = average = ParameterAverage(network, self._decay)
+            made.register_step_post_hook(lambda *_: average.update())
         self._set_forward(network)
 
     def _set_forward(self, network: TorchNetwork) -> None:
