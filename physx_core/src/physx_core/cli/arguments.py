@@ -22,6 +22,7 @@ METAVAR = "NAME=VALUE ..."
 Change = tuple[str, tuple[str, ...], Any]
 """The option ``--OPTION.NAME`` as written, the path of the argument, and its value."""
 
+_REFERENCES = (str | type[Any], str | type[Any] | None, str | Callable[..., Any])
 _WORDS = re.compile(r"\[[^][{},\s\"'=]+(\s*,\s*[^][{},\s\"'=]+)*\]")
 """A list of words without brackets, spaces, or quotes."""
 
@@ -45,7 +46,7 @@ def argument_registry() -> ConstructorRegistry:
     @registry.primitive_rule
     def reference(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
         takes_table = info.type == str | Callable[..., Any] | dict[str, Any] | None
-        if not takes_table and info.type not in (str | type[Any], str | type[Any] | None):
+        if not takes_table and info.type not in _REFERENCES:
             return None
         return PrimitiveConstructorSpec(
             nargs="*" if takes_table else 1,

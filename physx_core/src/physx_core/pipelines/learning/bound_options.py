@@ -16,7 +16,7 @@ _FREE = {
         *("session_dir", "session_name", "new_session", "epoch_nb"),
         *("validation_every", "validation_batch_size", "patience", "min_improvement"),
         *("on_nan", "statistics", "statistics_kwargs", "histograms_every", "checkpoint_every"),
-        *("max_failed", "rivals"),
+        *("max_failed", "rivals", "metrics"),
     },
     "network": {"network_name", "save_each_epoch", "save_best", "device"},
     "dataset": {"existing_dir", "max_file_size", "writers"},
