@@ -144,6 +144,10 @@ class Network(ABC):
         """
         raise UsageError(f"{type(self).__name__} does not implement forward().")
 
+    def join_tensors(self, parts: Sequence[Any], axis: int = 0) -> Any:
+        """Return tensors joined along an axis that exists."""
+        return np.concatenate(parts, axis=axis)
+
     def set_train(self) -> None:  # noqa: B027
         """Switch to training mode."""
 

@@ -6,7 +6,6 @@ import contextlib
 import math
 import shlex
 import time
-import warnings
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
@@ -25,8 +24,8 @@ from physx_core.pipelines.learning.bound_options import bound_options, check_bou
 from physx_core.pipelines.learning.components import create
 from physx_core.pipelines.learning.data_record import (
     describe_batch,
-    describe_changes,
     record_data,
+    warn_of_changes,
 )
 from physx_core.pipelines.learning.judging import (
     NOT_JUDGED,
@@ -39,6 +38,7 @@ from physx_core.pipelines.learning.opening import DataOpening, join_group, open_
 from physx_core.pipelines.learning.resuming import Start, can_resume, find_start
 from physx_core.pipelines.learning.training_data import TrainingData
 from physx_core.pipelines.learning.training_record import BestEpoch, TrainingRecord
+from physx_core.pipelines.learning.unrolling import Unrolling, open_unrolling
 from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed
 from physx_core.pipelines.run_description import (
     describe_samples,
@@ -133,6 +133,14 @@ class Training(NewSessionPipeline):
     samples of episodes before ``k - run_ahead``."""
     max_failed: int = at_least(0, 0)
     """Number of independent episodes that may fail before the training fails."""
+    unroll: Sequence[int] = ()
+    """Number of steps in which the network learns from its own predictions, for each epoch; the
+    last number holds for all further ones: [1, 2, 4]. A prediction that is the same quantity as an
+    input, such as a later window of the same field, takes its place in the next step; the loss is
+    that of all steps. Validations have one step. Empty: one step always."""
+    noise: float = at_least(0, 0.0)
+    """Standard deviation of noise on the inputs that are fed back so, in standard deviations of
+    their normalization: the network learns to correct errors of that size."""
     validation_every: int = at_least(0, 1)
     """Number of epochs between validations, if the dataset has a validation mode or
     `View.hold_back` does; 0: never."""
@@ -200,6 +208,7 @@ class Training(NewSessionPipeline):
     _told: Sequence[str] = field(init=False, repr=False, default=())
     _recorded: dict[str, float] | None = field(init=False, repr=False, default=None)
     _batches_read: int = field(init=False, repr=False, default=0)
+    _unrolling: Unrolling | None = field(init=False, repr=False, default=None)
     _judging: Judging = field(init=False, repr=False)
     _judgment: Judgment = field(init=False, repr=False, default=NOT_JUDGED)
 
@@ -276,6 +285,8 @@ class Training(NewSessionPipeline):
         if self._epoch_batches is not None:
             return
         names = self.learner.batch_fields
+        if self._unrolling is not None:
+            self._unrolling.begin(self.epoch_id, self.batch_id)
         self._epoch_batches = self.data.begin_epoch(self.epoch_id, names, self.batch_id)
         if self.data.stored.has_changed:
             self.learner.normalize(self.data.normalization())
@@ -647,12 +658,21 @@ class Training(NewSessionPipeline):
             max_failed=self.max_failed,
         )
         self.data = opening.open(resources, dataset)
+        self._unrolling = open_unrolling(
+            *(self.unroll, self.noise, self.learner, self.data.stored),
+            *(start.environment, self._resumed.seed),
+        )
         self._prepare_learner(start)
+        if self._unrolling is not None:
+            self._unrolling.check(self.data.stored, self.learner.transformation)
         validates = self.validation_every > 0 and self.data.stored.has_validation
         of = self.learner, self.data.stored
         self._judging = Judging(*of, self.monitor, metrics, validates=validates)
         if start.checkpoint is not None and start.environment is None and self._is_main:
-            self._tell_changed_data(start.config.mode)
+            fixed, folder = self._resumed.snapshots, self.data.dataset.directory
+            data = self._resumed.data, self.data.stored.datasets, start.config.mode, fixed
+            if text := warn_of_changes(folder, *data):
+                self.session.note(text)
         resources.push(self._close)
 
     def _begin(self) -> None:
@@ -664,20 +684,6 @@ class Training(NewSessionPipeline):
         seed = self._resumed.seed if self.seed is None else self.seed
         now = bound_options(self, seed, self.group.size)
         check_bound(session, self._resumed.options, now)
-
-    def _tell_changed_data(self, mode: str) -> None:
-        """Warn if the data are not those that the training had, as then it is another one."""
-        fixed, datasets = self._resumed.snapshots, self.data.stored.datasets
-        changes = describe_changes(self._resumed.data, datasets, mode, fixed)
-        if changes:
-            text = (
-                f"The data in {self.data.dataset.directory} changed since the checkpoint was "
-                f"written: {'; '.join(changes)}. The training goes on with the data as they are, "
-                "so their order, normalization and validation samples may differ, and the network "
-                "will not be the one of an uninterrupted training."
-            )
-            warnings.warn(text, stacklevel=2)
-            self.session.note(text)
 
     def _data_record(self) -> dict[str, Any]:
         """Return what identifies the data; nothing while they are replaced by a replay."""
@@ -765,6 +771,8 @@ class Training(NewSessionPipeline):
         if self.data.online is not None:
             yield from self.data.online.announce()
         yield from self.data.stored.describe_parts()
+        if self._unrolling is not None:
+            yield self._unrolling.describe()
         size = self.batch_size * self.group.size
         if self.data.generated is None and size > self.data.stored.num_samples:
             yield f"batches of {self.data.stored.num_samples:,} samples, because there are no more"

@@ -235,6 +235,10 @@ class TorchNetwork(torch.nn.Module, Network):
             dict.fromkeys(names, f"expected; returned: {given}"),
         )
 
+    def join_tensors(self, parts: Sequence[torch.Tensor], axis: int = 0) -> torch.Tensor:
+        """Return tensors joined along an axis that exists."""
+        return torch.cat(list(parts), dim=axis)
+
     def set_train(self) -> None:
         """Switch to training mode."""
         self.train()

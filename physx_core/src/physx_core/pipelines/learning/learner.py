@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -89,6 +89,7 @@ class Learner:
         self.group = Group()
         self.row_losses: Array = np.zeros(0)
         self._is_between_steps = False
+        self._predict_training = self._predict_batch
         if trains:
             self.optimization = self._create_optimization(config)
             self.optimization.stops_at_nan = stops_at_nan
@@ -155,6 +156,15 @@ class Learner:
         network = self.network
         return PredictedBatch.of(network, self.transformation, network.numpy_to_tensor(batch))
 
+    def unroll(self, predict: Callable[[Batch, Transformation, int], PredictedBatch]) -> None:
+        """Have `optimize` predict batches otherwise than in one step.
+
+        Args:
+            predict: Returns the predictions for a batch, the transformation, and the index of the
+                process.
+        """
+        self._predict_training = lambda batch: predict(batch, self.transformation, self.group.rank)
+
     def _trainer(self) -> Optimization:
         if self.optimization is None:
             raise UsageError("This network was created for prediction and cannot be trained.")
@@ -185,7 +195,7 @@ class Learner:
         share = batch
         if weight is None:
             share, weight = (batch, 1.0) if group.size == 1 else group.share_of(batch)
-        step = self._predict_batch(share)
+        step = self._predict_training(share)
         loss, stops = optimization.compute_loss(step), optimization.stops_at_nan
         if stops and isinstance(loss, (float, np.floating)) and not math.isfinite(loss):
             raise DivergedError(self._explain(f"the loss is {loss}", step))
