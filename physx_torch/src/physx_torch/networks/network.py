@@ -235,6 +235,15 @@ class TorchNetwork(torch.nn.Module, Network):
             dict.fromkeys(names, f"expected; returned: {given}"),
         )
 
+    def with_gradients(self, tensors: Tensors) -> Tensors:
+        """Return tensors with respect to whose `net_fields` predictions can be differentiated."""
+        leaves = {
+            name: tensors[name].detach().requires_grad_()
+            for name in self.net_fields
+            if tensors[name].is_floating_point() or tensors[name].is_complex()
+        }
+        return {**tensors, **leaves}
+
     def join_tensors(self, parts: Sequence[torch.Tensor], axis: int = 0) -> torch.Tensor:
         """Return tensors joined along an axis that exists."""
         return torch.cat(list(parts), dim=axis)

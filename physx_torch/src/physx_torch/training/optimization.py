@@ -92,6 +92,7 @@ class TorchOptimization(Optimization):
         loss_kwargs: Mapping[str, Any] | None = None,
         loss_weights: Mapping[str, float] | None = None,
         extra_fields: Sequence[str] | None = None,
+        differentiates_inputs: bool | None = None,
         average: float | None = None,
     ) -> None:
         """Set the options.
@@ -111,6 +112,8 @@ class TorchOptimization(Optimization):
                 losses in a table; 1 of others. The loss is the weighted mean, so weights change
                 what counts more, not how large the steps are.
             extra_fields: Fields of the batch that a loss reads in addition to the network's.
+            differentiates_inputs: Whether a loss of the batch differentiates predictions with
+                respect to the network's inputs, as the residual of a differential equation does.
             average: Share of the mean of the parameters that is left after each step, for example
                 0.999: an exponential mean over about 1000 steps, with which the network is
                 validated and predicts. None: no mean.
@@ -140,6 +143,8 @@ class TorchOptimization(Optimization):
         self._loss_weights = check_weights(loss_weights or {})
         if extra_fields is not None:
             self.extra_fields = tuple(extra_fields)
+        if differentiates_inputs is not None:
+            self.differentiates_inputs = differentiates_inputs
         self._network: TorchNetwork | None = None
         self._scaler: torch.amp.GradScaler | None = None
         self._sums = False
@@ -363,7 +368,8 @@ class TorchOptimization(Optimization):
         if by_row is None or type(self).compute_loss is not TorchOptimization.compute_loss:
             rows = range(len(next(iter(batch.prediction.values()))))
             # With gradients, which the loss of a subclass may need.
-            return torch.stack([self.compute_loss(batch[row : row + 1]).detach() for row in rows])
+            each = [self.compute_loss(self._row_of(batch, row)).detach() for row in rows]
+            return torch.stack(each)
         with torch.no_grad():
             losses = []
             for pred_name, opt_name in compared_fields(self._network):
@@ -371,6 +377,13 @@ class TorchOptimization(Optimization):
                 losses.append(by_row(pred, as_target(target, pred, self.loss)))
             flat = [loss.reshape(len(loss), -1).mean(1) for loss in losses]
             return torch.stack(flat).mean(0)
+
+    def _row_of(self, batch: PredictedBatch, row: int) -> PredictedBatch:
+        one = batch[row : row + 1]
+        if not self.differentiates_inputs:
+            return one
+        data = batch.network.with_gradients(one.data)
+        return PredictedBatch.of(batch.network, batch.transformation, data)
 
     def transform_loss(self, loss: torch.Tensor, batch: PredictedBatch) -> dict[str, Any]:
         """Return ``{"loss": <number>}``, for a loss with the reduction "sum" per sample.
