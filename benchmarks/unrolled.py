@@ -1,10 +1,11 @@
 """Unrolled training against training on single steps: the error of a rollout of 100 steps.
 
 Lorenz-96 with 8 variables and F = 8, in steps of 0.01 (100 of them are about 1.7 Lyapunov times). A
-fully connected network learns the change in a step. Each network predicts 100 steps of 20 unseen
-episodes from their first states; its error is the root mean square over them, in standard
-deviations. Unrolled training (2, 4 and 8 steps, longer by epoch) and training with noise compete
-with training on single steps that takes about as long.
+fully connected network learns the change in a step from 60 episodes of 60 rows: exact ones, and
+measured ones, with an error of 1 % of the standard deviation. Each network predicts 100 steps of 20
+unseen episodes from their first states; its error is the root mean square over them, in standard
+deviations. Unrolled training (1, 2, 4 and 8 steps, more by epoch) competes with training on single
+steps for half as many epochs more; the seconds are those of one training.
 
     python benchmarks/unrolled.py --check
 """
@@ -23,12 +24,12 @@ from physx_core import Dataset, DatasetConfig, NetworkConfig, Training, View
 from physx_core.pipelines import load_learner
 
 SIZE, FORCING, DT, STEPS = 8, 8.0, 0.01, 100
-EPISODES, ROWS = 100, 120
+EPISODES, ROWS = 60, 60
+CASES = {"exact states": 0.0, "states measured with an error of 1 %": 0.01}
 SCHEDULE = [1] * 50 + [2] * 25 + [4] * 25 + [8] * 20
-SINGLE = 180  # takes as long
+SINGLE = 180
 KINDS = {
     "single steps": {"epoch_nb": SINGLE},
-    "single steps with noise": {"epoch_nb": SINGLE, "noise": 0.003},
     "unrolled": {"epoch_nb": len(SCHEDULE), "unroll": SCHEDULE},
 }
 
@@ -52,7 +53,7 @@ def simulate(episodes: int, rows: int, seed: int) -> np.ndarray:
     return states
 
 
-def train(name: str, seed: int, options: dict) -> str:
+def train(folder: str, name: str, seed: int, options: dict) -> str:
     """Train a network; return its session's folder."""
     network = NetworkConfig(
         "torch/fc",
@@ -64,11 +65,11 @@ def train(name: str, seed: int, options: dict) -> str:
         scheduler_kwargs={"T_max": options["epoch_nb"]},
         device="cpu",
     )
-    view = View(window={"now": ("state", 0), "next": ("state", 1)})
-    data = DatasetConfig(existing_dir="data", normalize={"next": "increment"}, view=view)
+    view = View(window={"now": ("state", 0), "next": ("state", 1)}, hold_back=False)
+    data = DatasetConfig(existing_dir=folder, normalize={"next": "increment"}, view=view)
     training = Training(
-        network, data, batch_size=256, seed=seed, rivals="none", quiet=True, validation_every=0,
-        session_name=f"{name}_{seed}".replace(" ", "_"), **options,
+        network, data, batch_size=128, seed=seed, rivals="none", quiet=True, validation_every=0,
+        session_dir=folder, session_name=f"{name}_{seed}".replace(" ", "_"), **options,
     )  # fmt: skip
     training.execute()
     return str(training.session.path)
@@ -83,17 +84,20 @@ def error(session: str, truth: np.ndarray) -> float:
     return float(np.sqrt(np.square(state - truth[:, STEPS]).mean()) / truth.std())
 
 
-def compare(seeds: int) -> float:
+def compare(case: str, seeds: int) -> float:
     """Print the errors; return that of unrolled training divided by that on single steps."""
+    folder = case.replace(" ", "_").replace("%", "percent")
     states = simulate(EPISODES, ROWS, seed=1)
+    states += CASES[case] * states.std() * np.random.default_rng(3).normal(size=states.shape)
     episode, step = np.divmod(np.arange(EPISODES * ROWS), ROWS)
-    with Dataset.create("data") as dataset:
+    with Dataset.create(folder) as dataset:
         rows = {"state": states.reshape(-1, SIZE), "episode": episode, "step": step}
         dataset.append("training", rows)
     truth, errors = simulate(20, STEPS + 1, seed=2), {}
+    print(case)
     for name, options in KINDS.items():
         begin = time.monotonic()
-        errors[name] = [error(train(name, seed, options), truth) for seed in range(seeds)]
+        errors[name] = [error(train(folder, name, seed, options), truth) for seed in range(seeds)]
         seconds = (time.monotonic() - begin) / seeds
         each = ", ".join(f"{value:.3g}" for value in errors[name])
         print(
@@ -103,6 +107,14 @@ def compare(seeds: int) -> float:
     return float(np.median(errors["unrolled"]) / np.median(errors["single steps"]))
 
 
+def claims(seeds: int = 5) -> list[bool]:
+    """Print the errors in all cases in the working directory, and whether the claims hold."""
+    return [
+        claim("error of unrolled training, as a share", compare(case, seeds), at_most=0.7)
+        for case in CASES
+    ]
+
+
 def main() -> None:
     """Measure, and print whether the claim holds."""
     parser = argparse.ArgumentParser()
@@ -110,9 +122,9 @@ def main() -> None:
     seeds = parser.parse_known_args()[0].seeds
     with tempfile.TemporaryDirectory() as folder:
         os.chdir(folder)
-        ratio = compare(seeds)
+        met = claims(seeds)
         os.chdir("/")
-    finish([claim("error of unrolled training, as a share of single steps", ratio, at_most=0.7)])
+    finish(met)
 
 
 if __name__ == "__main__":
