@@ -50,6 +50,7 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/dataset.py
 	$(BIN)/python benchmarks/views.py
 	$(BIN)/python benchmarks/judged.py
+	$(BIN)/python benchmarks/unrolled.py
 	$(BIN)/python benchmarks/larger_than_memory.py
 	$(BIN)/python benchmarks/online.py
 	$(BIN)/python benchmarks/states.py

@@ -25,7 +25,7 @@ import numpy as np
 from measure import claim, finish
 
 from physx_core import Dataset, DatasetConfig, NetworkConfig, Optimization, Result, Training, View
-from physx_core.pipelines import training as pipeline
+from physx_core.pipelines.learning.judging import Judging
 from physx_core.toy import Linear
 from physx_report import write_report
 
@@ -77,7 +77,7 @@ def cost(case: str, seconds: float, rivals: str) -> tuple[float, int, Result]:
         lr=1e-3,
     )
     spent: list[float] = []
-    judge = pipeline.judge
+    judge = Judging.judge
 
     def timed(*arguments: Any) -> Any:
         begin = time.monotonic()
@@ -85,14 +85,14 @@ def cost(case: str, seconds: float, rivals: str) -> tuple[float, int, Result]:
         spent.append(time.monotonic() - begin)
         return found
 
-    pipeline.judge = timed
+    Judging.judge = timed  # type: ignore[method-assign]
     training = Timed(network, data, epoch_nb=10**6, batch_size=64, rivals=rivals, quiet=True)
     with training:
         begin = time.monotonic()
         training.until = begin + seconds
         found = training.execute()
         share = sum(spent) / (time.monotonic() - begin - sum(spent))
-    pipeline.judge = judge
+    Judging.judge = judge  # type: ignore[method-assign]
     return share, len(spent), found
 
 

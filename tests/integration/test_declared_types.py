@@ -106,7 +106,7 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     physx_core.DataGeneration: {"environment_config": ENVIRONMENT, "batch_nb": 2, "batch_size": 4},
     physx_core.Training: {"network_config": NetworkConfig(), "epoch_nb": 2, "batch_size": 4}
     | {"batch_nb": 2, "seed": 1, "patience": 2, "checkpoint_every": 5}
-    | {"validation_batch_size": 8},
+    | {"validation_batch_size": 8, "unroll": (1, 2), "noise": 0.5},
     physx_core.Prediction: {
         "network_config": NetworkConfig(),
         "environment_config": ENVIRONMENT,

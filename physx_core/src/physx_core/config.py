@@ -14,6 +14,7 @@ import typing
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from types import FunctionType
 from typing import Any, Literal, TypeVar, dataclass_transform
 
 from physx_core import checks
@@ -277,8 +278,9 @@ class NetworkConfig:
     """Reference of the transformation; None: the network's default."""
     transformation_kwargs: dict[str, Any] = field(default_factory=dict)
     """Keyword arguments of the transformation's constructor."""
-    loss: str | type[Any] | None = None
-    """Loss function: a class, or the name of one in the network's library."""
+    loss: str | Callable[..., Any] | dict[str, Any] | None = None
+    """Loss function: a class, or the name of one in the network's library; or a table of them by
+    the name of the target, and of losses of the whole batch by any name."""
     optimizer: str | type[Any] | None = None
     """Optimizer: a class, or the name of one in the network's library."""
     optimizer_kwargs: dict[str, Any] = field(default_factory=dict)
@@ -329,7 +331,7 @@ def _is_recorded(option: dataclasses.Field[Any]) -> bool:
 
 
 def _plain_value(where: str, value: Any) -> Any:
-    if isinstance(value, type):
+    if isinstance(value, (type, FunctionType)):
         with contextlib.suppress(UsageError):  # a class that only this process can find
             return reference_of(value)
         return f"{value.__module__}:{value.__qualname__}"

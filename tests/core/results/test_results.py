@@ -401,3 +401,72 @@ def test_of_an_accuracy_the_largest_decides():
     assert training.best.epoch == 3
     assert found["error/y/accuracy/best"] == 1.0
     assert "largest error/y/accuracy 1, after epoch 3" in str(found)
+
+
+# Metrics ----------------------------------------------------------------------------------------
+
+
+def largest_drift(prediction, truth):
+    """Return the largest change of the error within an episode of 20 rows."""
+    assert set(prediction) == {"y"} and set(truth) == {"x", "y"} and len(truth["x"]) == 20
+    error = prediction["y"] - truth["y"]
+    return np.ptp(error[:, 0])
+
+
+def step_accuracy(prediction, truth):
+    return 1.0 / (1.0 + np.abs(prediction["y"] - truth["y"]).max())
+
+
+def test_metrics_of_the_user_are_means_over_whole_episodes_whatever_the_batches():
+    x, y = noisy()
+    store(x, y)
+    data = DatasetConfig(existing_dir="data", view=View(test_fold=1))
+    network, values = planted(lambda x: x @ MAP), []
+    for number, size in enumerate((7, 20, 1000)):
+        found = judged(
+            network, metrics=[largest_drift, step_accuracy], validation_batch_size=size,
+            session_name=f"run{number}", data=data,
+        )  # fmt: skip
+        values.append([found[f"{part}metric/largest_drift"] for part in ("", "test/")])
+        curve = read_scalars(Path(found.session))["epoch", "metric/largest_drift"]
+        assert curve == {1: pytest.approx(values[-1][0])}
+    drifts = np.ptp((x @ MAP - y)[:, 0].reshape(50, 20), axis=1)
+    assert np.ptp(values, axis=0) == pytest.approx([0, 0], abs=1e-12)
+    assert drifts.min() < values[0][0] < drifts.max()
+    assert "largest_drift: " in str(found) and "the mean over 10 episodes" in str(found)
+    assert read_results(found.session)["training"].parts == found.parts
+
+
+@pytest.mark.parametrize("interleaved", [False, True])
+def test_a_metric_decides_which_network_is_the_best(interleaved):
+    x, y = noisy(noise=0)
+    number, step = np.divmod(np.arange(1000), 20)
+    if interleaved:  # the rows of several streams
+        number, step = step, number
+    with Dataset.create("data") as dataset:
+        dataset.append("training", {"x": x, "y": y, "episode": number, "step": step})
+    training = drifting(monitor="metric/step_accuracy", metrics=[step_accuracy])
+    found = training.execute()
+    assert training.best.epoch == 3
+    assert found["metric/step_accuracy/best"] == pytest.approx(1, abs=1e-5)
+    assert "largest metric/step_accuracy 1" in str(found)
+
+
+def no_number(prediction, truth):
+    return prediction["y"]
+
+
+@pytest.mark.parametrize(
+    ("metrics", "reason"),
+    [
+        (["drag"], "name one as"),
+        ([5], "not callable"),
+        ([largest_drift, largest_drift], "two functions"),
+        (["physx_core.toy:Lineer"], 'Did you mean "Linear"'),
+        ([no_number], "no_number must return a number for each episode"),
+    ],
+)
+def test_metrics_that_are_none_are_refused(metrics, reason):
+    store(*noisy())
+    with pytest.raises(ConfigError, match=reason):
+        drifting(metrics=metrics).execute()

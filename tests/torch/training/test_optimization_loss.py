@@ -134,3 +134,76 @@ def test_tensors_of_the_loss_follow_the_network(first):
     if first == "optimizer":
         optimization.set_loss(Weighted)
     assert optimization.loss.weight.dtype == torch.float64
+
+
+# Terms ------------------------------------------------------------------------------------------
+
+
+def two_fields():
+    network = FC([2, 4], opt_fields=["u", "p"])
+    prediction = {"u": torch.zeros(5, 3), "p": torch.zeros(5, 1)}
+    targets = {"u": torch.full((5, 3), 2.0), "p": torch.full((5, 1), 4.0)}
+    return network, batch_of(prediction, targets)
+
+
+def total(batch):
+    return sum((batch.targets[name] - batch.prediction[name]).mean() for name in batch.targets)
+
+
+@pytest.mark.parametrize(
+    ("loss", "weights", "expected", "terms"),
+    [
+        ({"u": "MSELoss", "p": "L1Loss"}, None, (4 + 4) / 2, {"u": 4, "p": 4}),
+        ("L1Loss", {"u": 1.0, "p": 0.25}, (2 + 0.25 * 4) / 1.25, {"u": 2, "p": 4}),
+        ("L1Loss", {"p": 3}, (2 + 3 * 4) / 4, {"u": 2, "p": 4}),
+        ({"u": "L1Loss", "both": total}, {"both": 0.5}, (2 + 0.5 * 6) / 1.5, {"u": 2, "both": 6}),
+        ({"both": total}, None, 6, {"both": 6}),
+        (total, None, 6, {}),
+    ],
+)
+def test_the_loss_is_the_weighted_mean_of_its_terms(loss, weights, expected, terms):
+    network, batch = two_fields()
+    optimization = optimization_of(network, loss, loss_weights=weights)
+    value = optimization.compute_loss(batch)
+    assert value.item() == pytest.approx(expected)
+    found = optimization.transform_loss(value, batch)
+    known = {"loss": expected, **{f"loss/{name}": each for name, each in terms.items()}}
+    assert {name: float(each) for name, each in found.items()} == pytest.approx(known)
+
+
+def test_each_loss_of_a_table_has_its_own_arguments_and_learns():
+    class Scaled(torch.nn.Module):
+        def __init__(self, power=1):
+            super().__init__()
+            self.power, self.scale = power, torch.nn.Parameter(torch.ones(()))
+
+        def forward(self, prediction, target):
+            return self.scale * (prediction - target).abs().pow(self.power).mean()
+
+    network, batch = two_fields()
+    table = {"u": Scaled, "p": "HuberLoss"}
+    arguments = {"u": {"power": 3}, "p": {"delta": 2.0}}
+    optimization = optimization_of(network, table, loss_kwargs=arguments)
+    assert optimization.compute_loss(batch).item() == (8 + 2 * (4 - 1)) / 2
+    learned = optimization.optimizer.param_groups[0]["params"]
+    assert any(each is optimization.loss.losses["u"].scale for each in learned)
+
+
+@pytest.mark.parametrize(
+    ("loss", "options", "told"),
+    [
+        ({"u": "MSELoss"}, {}, "has none for p"),
+        ({"u": "MSELoss", "q": "MSELoss"}, {}, '"q" compares .* its targets are p, u'),
+        ({"u": "MSELos", "p": "MSELoss"}, {}, 'Did you mean "MSELoss"'),
+        ({}, {}, "is empty"),
+        ("MSELoss", {"loss_weights": {"u": 1.0, "v": 1.0}}, "loss_weights names v"),
+        (total, {"loss_weights": {"u": 1.0}}, "a single one without a name"),
+        ("MSELoss", {"loss_weights": {"u": -1.0}}, "not negative"),
+        ("MSELoss", {"loss_weights": {"u": 0.0}}, "not all 0"),
+        ("MSELoss", {"loss_weights": 2.0}, "numbers by name"),
+        ({"u": "MSELoss", "p": "MSELoss"}, {"loss_kwargs": {"v": {}}}, "loss_kwargs names v"),
+    ],
+)
+def test_wrong_terms(loss, options, told):
+    with pytest.raises(ConfigError, match=told):
+        optimization_of(two_fields()[0], loss, **options)

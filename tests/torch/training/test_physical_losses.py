@@ -15,11 +15,14 @@ from physx_core import (
     NetworkConfig,
     Prediction,
     Training,
+    View,
     read_scalars,
 )
+from physx_core.cli import main
 from physx_core.components import PredictedBatch
 from physx_core.errors import ConfigError
 from physx_core.pipelines import Learner, load_learner
+from physx_core.toy import LeastSquares
 from physx_torch import FC, TorchOptimization
 
 COMMON = {"loss": "MSELoss", "optimizer": "Adam", "device": "cpu", "data_type": "float64"}
@@ -395,3 +398,137 @@ def test_predictions_without_targets_need_a_loss_for_them(tmp_path):
         optimization.set_optimizer(
             "Adam", Learner(NetworkConfig(Parts, PARTS), trains=False).network
         )
+
+
+# Differential equations --------------------------------------------------------------------------
+
+
+class Field2D(torch.nn.Module):
+    """A product of tanh, whose derivatives are known."""
+
+    def __init__(self):
+        super().__init__()
+        self.rate = torch.nn.Parameter(torch.tensor([0.7, -0.4]))
+
+    def forward(self, x):
+        return torch.tanh(x @ self.rate)[:, None]
+
+
+def heat(batch):
+    """Return the mean squared residual of u_t = 3 u_xx, of u in K, x in m and t in s."""
+    x, u = batch.data["x"], batch.physical_prediction["u"]
+    (slope,) = torch.autograd.grad(u.sum(), x, create_graph=True)
+    (bend,) = torch.autograd.grad(slope[:, 0].sum(), x, create_graph=True)
+    residual = slope[:, 1] - 3 * bend[:, 0]
+    np.testing.assert_allclose(residual.detach(), heat_exactly(batch), rtol=1e-9, atol=1e-12)
+    heat.modes.add(batch.network.training)
+    return residual.square().mean()
+
+
+def heat_exactly(batch):
+    """Return the residual of a `Field2D`, derived by hand."""
+    known = batch.transformation.normalization
+    x0, dx, du = 0.0, np.ones(2), 1.0
+    if known:
+        x0, dx, du = known["x"].mean, known["x"].std, known["u"].std
+    rate = batch.network.module.rate.detach().numpy() / dx
+    bent = np.tanh((batch.data["x"].detach().numpy() - x0) @ rate)
+    first = 1 - bent**2
+    return du * (first * rate[1] + 3 * 2 * bent * first * rate[0] ** 2)
+
+
+def warm(rng, rows):
+    x = rng.uniform(10, 14, (rows, 2))
+    return {"x": x, "u": 300 + x[:, :1] * x[:, 1:]}
+
+
+@pytest.mark.parametrize("normalize", [False, True])
+def test_the_residual_of_a_differential_equation_is_a_term_of_the_loss(normalize):
+    store(warm)
+    heat.modes = set()
+    config = NetworkConfig(
+        Field2D, {"net_fields": "x", "opt_fields": "u"}, optimizer="Adam", device="cpu",
+        data_type="float64", loss={"u": "MSELoss", "heat": heat},
+        optimization_kwargs={"differentiates_inputs": True, "loss_weights": {"heat": 0.1}},
+    )  # fmt: skip
+    data = DatasetConfig(existing_dir="data", normalize=normalize)
+    training = Training(config, data, epoch_nb=2, batch_size=16, quiet=True, session_name="run")
+    training.execute()
+    assert heat.modes == {True, False}  # it was trained and validated
+    curves = read_scalars(training.session.path)
+    assert curves["epoch", "loss/heat/validation"][2] > 0
+    learner = training.learner
+    rows = learner.network.numpy_to_tensor(warm(np.random.default_rng(1), 3))
+    learner.network.set_train()
+    batch = PredictedBatch.of(
+        learner.network, learner.transformation, learner.network.with_gradients(rows)
+    )
+    losses = learner.optimization.compute_row_losses(batch)
+    assert losses.mean().item() == pytest.approx(learner.optimization.compute_loss(batch).item())
+
+
+def test_inputs_that_cannot_be_differentiated_are_refused():
+    store(warm)
+
+    class Differentiating(LeastSquares):
+        differentiates_inputs = True
+
+    network = NetworkConfig(
+        "toy/linear", {"net_fields": "x", "opt_fields": "u"}, optimization=Differentiating
+    )
+    with pytest.raises(ConfigError, match="leave out differentiates_inputs"):
+        Training(network, "data", epoch_nb=1, batch_size=8, quiet=True).execute()
+    network = NetworkConfig(
+        Field2D, {"net_fields": "x", "opt_fields": "u"}, loss="MSELoss", optimizer="Adam",
+        optimization_kwargs={"differentiates_inputs": True},
+    )  # fmt: skip
+    view = View(window={"x": ("u", 0), "u": ("u", 1)})
+    rows = {"u": np.ones((10, 2)), "episode": np.zeros(10, int), "step": np.arange(10)}
+    with Dataset.create("steps") as dataset:
+        dataset.append("training", rows)
+    data = DatasetConfig(existing_dir="steps", view=view)
+    with pytest.raises(ConfigError, match=r"leave out Training\.unroll and noise"):
+        Training(network, data, epoch_nb=1, batch_size=8, quiet=True, unroll=[2]).execute()
+
+
+# From the command line ---------------------------------------------------------------------------
+
+LOSSES = '''
+"""Losses of a batch."""
+
+def momentum(batch):
+    """Return the mean squared residual of dv = 0.1 F, with a force in N and a mass of 1 kg."""
+    before, after = batch.data["v"], batch.physical_prediction["next_v"]
+    return (after - before - 0.1 * batch.data["force"]).square().mean()
+'''
+
+
+def falling(rng, rows):
+    v, force, x = rng.normal(size=(3, rows, 1))
+    return {"v": v, "force": force, "x": x, "next_v": v + 0.1 * force, "next_x": x + 0.1 * v}
+
+
+def test_losses_by_target_and_of_the_batch_are_named_in_a_command(tmp_path, capsys):
+    store(falling)
+    (tmp_path / "losses.py").write_text(LOSSES)
+    words = [
+        *("train", "--dataset.existing-dir", "data", "--session-name", "run"),
+        *("--epoch-nb", "3", "--batch-size", "16"),
+        *("--network.network", "torch/fc", "--network.network-kwargs", "layers=[2,8,2]"),
+        *("net_fields=[v,x]", "opt_fields=[next_v,next_x]", "--network.optimizer", "Adam"),
+        *("--network.loss", "next_v=MSELoss", "next_x=L1Loss", "law=losses.py:momentum"),
+        *("--network.optimization-kwargs", "extra_fields=[force]", "loss_weights={law=0.5}"),
+        *("--network.device", "cpu", "--dataset.normalize", "--seed", "0", "--quiet"),
+    ]
+    assert main(words) == 0
+    curves = read_scalars(tmp_path / "sessions/run")
+    parts = [curves["epoch", f"loss/{name}/training"] for name in ("next_v", "next_x", "law")]
+    first, second, law = (np.array(list(part.values())) for part in parts)
+    total = np.array(list(curves["epoch", "loss/training"].values()))
+    np.testing.assert_allclose(total, (first + second + 0.5 * law) / 2.5, rtol=1e-6)
+    assert ("epoch", "loss/law/validation") in curves
+    again = ["train", "sessions/run", "--resume", "--quiet", "--epoch-nb", "4"]
+    (tmp_path / "losses.py").rename(tmp_path / "laws.py")
+    assert main([*again, "--network.loss.law", "laws.py:momentum"]) == 0
+    assert main([*again, "--network.loss.next_x", "MSELoss"]) != 0
+    assert "network.loss was" in capsys.readouterr().err

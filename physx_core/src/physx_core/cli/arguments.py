@@ -22,6 +22,7 @@ METAVAR = "NAME=VALUE ..."
 Change = tuple[str, tuple[str, ...], Any]
 """The option ``--OPTION.NAME`` as written, the path of the argument, and its value."""
 
+_REFERENCES = (str | type[Any], str | type[Any] | None, str | Callable[..., Any])
 _WORDS = re.compile(r"\[[^][{},\s\"'=]+(\s*,\s*[^][{},\s\"'=]+)*\]")
 """A list of words without brackets, spaces, or quotes."""
 
@@ -39,19 +40,20 @@ def argument_registry() -> ConstructorRegistry:
             metavar=METAVAR,
             instance_from_str=lambda words: dict(_argument(word) for word in words),
             is_instance=lambda value: isinstance(value, dict),
-            str_from_instance=lambda value: [f"{name}={item}" for name, item in value.items()],
+            str_from_instance=_words_of,
         )
 
     @registry.primitive_rule
     def reference(info: PrimitiveTypeInfo) -> PrimitiveConstructorSpec[Any] | None:
-        if info.type not in (str | type[Any], str | type[Any] | None):
+        takes_table = info.type == str | Callable[..., Any] | dict[str, Any] | None
+        if not takes_table and info.type not in _REFERENCES:
             return None
         return PrimitiveConstructorSpec(
-            nargs=1,
-            metavar="REFERENCE",
-            instance_from_str=lambda words: None if words[0] == "None" else words[0],
+            nargs="*" if takes_table else 1,
+            metavar="REFERENCE|NAME=REFERENCE ..." if takes_table else "REFERENCE",
+            instance_from_str=_reference_or_table if takes_table else _reference,
             is_instance=lambda value: True,
-            str_from_instance=lambda value: [str(value)],
+            str_from_instance=_words_of,
         )
 
     @registry.primitive_rule
@@ -67,11 +69,7 @@ def argument_registry() -> ConstructorRegistry:
                 else bool(_switched(words))
             ),
             is_instance=lambda value: isinstance(value, (bool, dict)),
-            str_from_instance=lambda value: (
-                [f"{name}={item}" for name, item in value.items()]
-                if isinstance(value, dict)
-                else [str(value)]
-            ),
+            str_from_instance=_words_of,
         )
 
     @registry.primitive_rule
@@ -87,6 +85,21 @@ def argument_registry() -> ConstructorRegistry:
         )
 
     return registry
+
+
+def _words_of(value: Any) -> list[str]:
+    if isinstance(value, dict):
+        return [f"{name}={item}" for name, item in value.items()]
+    return [str(value)]
+
+
+def _reference(words: Sequence[str]) -> str | None:
+    return None if words[0] == "None" else words[0]
+
+
+def _reference_or_table(words: Sequence[str]) -> str | dict[str, Any] | None:
+    is_table = len(words) != 1 or "=" in words[0]
+    return dict(_argument(word) for word in words) if is_table else _reference(words)
 
 
 def _switched(words: Sequence[str]) -> bool | None:

@@ -144,6 +144,21 @@ class Network(ABC):
         """
         raise UsageError(f"{type(self).__name__} does not implement forward().")
 
+    def with_gradients(self, tensors: Tensors) -> Tensors:
+        """Return tensors with respect to whose `net_fields` predictions can be differentiated.
+
+        Raises:
+            ConfigError: If the network's library cannot.
+        """
+        raise ConfigError(
+            f"{type(self).__name__} cannot be differentiated with respect to its inputs: leave out "
+            "differentiates_inputs."
+        )
+
+    def join_tensors(self, parts: Sequence[Any], axis: int = 0) -> Any:
+        """Return tensors joined along an axis that exists."""
+        return np.concatenate(parts, axis=axis)
+
     def set_train(self) -> None:  # noqa: B027
         """Switch to training mode."""
 

@@ -18,6 +18,8 @@ class Optimization(ABC):
 
     Attributes:
         extra_fields: Fields of the batch that the loss reads in addition to the network's.
+        differentiates_inputs: Whether the loss differentiates predictions with respect to the
+            network's inputs in `PredictedBatch.data`, in physical units, in validations too.
         state_file: Name of the file that `save_state` writes into a checkpoint; empty if the
             optimization has no state.
         network: The network to train; set by `set_optimizer`.
@@ -29,12 +31,15 @@ class Optimization(ABC):
 
     state_file: ClassVar[str] = ""
     extra_fields: Sequence[str] = ()
+    differentiates_inputs: bool = False
     network: Network
     stops_at_nan: bool = True
     scheduler_interval: str | None = None
 
-    def set_loss(self, loss: str | type[Any] | None) -> None:
+    def set_loss(self, loss: Any) -> None:
         """Choose the loss function, by class or by its name in the network's library.
+
+        A table has several by name: see `NetworkConfig.loss`.
 
         Unless this is implemented, the optimization has its own loss.
 

@@ -60,6 +60,22 @@ class PredictedBatch:
         compared = transformation.transform_before_loss(output, targets)
         return cls(network, transformation, data, inputs, output, *compared)
 
+    @classmethod
+    def joined(cls, parts: Sequence[PredictedBatch]) -> PredictedBatch:
+        """Return the rows of several batches of the same fields as one."""
+        first, names = parts[0], ("data", "inputs", "output", "prediction", "targets")
+        if len(parts) == 1:
+            return first
+        join = first.network.join_tensors
+        rows = (
+            {
+                key: join([getattr(part, name)[key] for part in parts])
+                for key in getattr(first, name)
+            }
+            for name in names
+        )
+        return cls(first.network, first.transformation, *rows)
+
     @property
     def physical_prediction(self) -> Tensors:
         """The network's `pred_fields` in physical units; computed anew each time."""

@@ -6,8 +6,7 @@ import contextlib
 import math
 import shlex
 import time
-import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import KW_ONLY, dataclass, field
 from functools import partial
 from pathlib import Path
@@ -19,27 +18,27 @@ from physx_core.components.buffer import Buffer
 from physx_core.components.group import Group
 from physx_core.config import EnvironmentConfig, NetworkConfig, at_least, options, to_plain
 from physx_core.dataset import Dataset
-from physx_core.errors import ConfigError, DivergedError, PhysxError, listed
+from physx_core.errors import ConfigError, DivergedError, PhysxError
 from physx_core.observers import REPORT_SECONDS, statistics_observers
 from physx_core.pipelines.learning.bound_options import bound_options, check_bound
 from physx_core.pipelines.learning.components import create
 from physx_core.pipelines.learning.data_record import (
     describe_batch,
-    describe_changes,
     record_data,
+    warn_of_changes,
 )
 from physx_core.pipelines.learning.judging import (
     NOT_JUDGED,
+    Judging,
     Judgment,
-    check_monitor,
-    judge,
-    make_judge,
+    find_metrics,
 )
 from physx_core.pipelines.learning.learner import Learner
 from physx_core.pipelines.learning.opening import DataOpening, join_group, open_dataset
 from physx_core.pipelines.learning.resuming import Start, can_resume, find_start
 from physx_core.pipelines.learning.training_data import TrainingData
 from physx_core.pipelines.learning.training_record import BestEpoch, TrainingRecord
+from physx_core.pipelines.learning.unrolling import Unrolling, open_unrolling
 from physx_core.pipelines.pipeline import NewSessionPipeline, choose_seed
 from physx_core.pipelines.run_description import (
     describe_samples,
@@ -53,7 +52,6 @@ from physx_core.pipelines.storage import (
 from physx_core.processes import Interrupt, deferred_interrupt, is_from_signal
 from physx_core.results import Result
 from physx_core.results.errors import as_loss
-from physx_core.results.judge import Judge
 from physx_core.session import Session
 from physx_core.typing import Batch
 from physx_core.views.dataset_config import DatasetConfig
@@ -135,6 +133,14 @@ class Training(NewSessionPipeline):
     samples of episodes before ``k - run_ahead``."""
     max_failed: int = at_least(0, 0)
     """Number of independent episodes that may fail before the training fails."""
+    unroll: Sequence[int] = ()
+    """Number of steps in which the network learns from its own predictions, for each epoch; the
+    last number holds for all further ones: [1, 2, 4]. A prediction that is the same quantity as an
+    input, such as a later window of the same field, takes its place in the next step; the loss is
+    that of all steps. Validations have one step. Empty: one step always."""
+    noise: float = at_least(0, 0.0)
+    """Standard deviation of noise on the inputs that are fed back so, in standard deviations of
+    their normalization: the network learns to correct errors of that size."""
     validation_every: int = at_least(0, 1)
     """Number of epochs between validations, if the dataset has a validation mode or
     `View.hold_back` does; 0: never."""
@@ -144,8 +150,14 @@ class Training(NewSessionPipeline):
     monitor: str | None = None
     """What decides which network is the "best", when `patience` ends, and what a scheduler such as
     "ReduceLROnPlateau" gets: an error on the validation samples in physical units, for example
-    "error/FIELD/relative_l2", all of which are then recorded; see `FieldResult.errors`. None: the
-    validation loss, or if nothing is validated the training loss."""
+    "error/FIELD/relative_l2", all of which are then recorded; see `FieldResult.errors`; or one of
+    `metrics`, "metric/NAME". None: the validation loss, or if nothing is validated the training
+    loss."""
+    metrics: Sequence[str | Callable[..., Any]] = ()
+    """Your own errors, measured in each validation and at the end, by "script.py:function" or
+    "package.module:function". A function gets the predictions and the true values of one episode in
+    physical units, arrays by the name of the true field, and returns a number, small if it is good;
+    the mean over the episodes counts. The true values include the network's inputs."""
     patience: int | None = at_least(1, None)
     """Number of consecutive validations (epochs, if nothing is validated) without improvement of
     the loss after which to stop; None: never. The last network is kept in addition to "best"."""
@@ -196,7 +208,8 @@ class Training(NewSessionPipeline):
     _told: Sequence[str] = field(init=False, repr=False, default=())
     _recorded: dict[str, float] | None = field(init=False, repr=False, default=None)
     _batches_read: int = field(init=False, repr=False, default=0)
-    _errors: Judge | None = field(init=False, repr=False, default=None)
+    _unrolling: Unrolling | None = field(init=False, repr=False, default=None)
+    _judging: Judging = field(init=False, repr=False)
     _judgment: Judgment = field(init=False, repr=False, default=NOT_JUDGED)
 
     def __post_init__(self) -> None:
@@ -272,6 +285,8 @@ class Training(NewSessionPipeline):
         if self._epoch_batches is not None:
             return
         names = self.learner.batch_fields
+        if self._unrolling is not None:
+            self._unrolling.begin(self.epoch_id, self.batch_id)
         self._epoch_batches = self.data.begin_epoch(self.epoch_id, names, self.batch_id)
         if self.data.stored.has_changed:
             self.learner.normalize(self.data.normalization())
@@ -413,20 +428,9 @@ class Training(NewSessionPipeline):
             self.observers.predictions(*compared, self.epoch_id, "epoch")
         if self.on_nan == "stop" and not math.isfinite(self.validation_loss):
             raise self._diverged(f"the validation loss is {self.validation_loss}", 0)
-        return self.validation_loss if self.monitor is None else self._monitor(values)
-
-    def _monitor(self, values: dict[str, float]) -> float:
-        """Measure the errors on the validation samples; return the one that decides."""
-        stored, monitor = self.data.stored, str(self.monitor)
-        self._errors = self._errors or make_judge(self.learner, stored)
-        found = self._errors.measure(stored.validation)
-        values |= {f"error/{name}": value for name, value in found.items()}
-        if monitor not in values:
-            raise ConfigError(
-                f"Training.monitor is {monitor!r}, but the errors of this field are: "
-                f"{listed(name for name in values if name.startswith('error/'))}."
-            )
-        return as_loss(monitor, values[monitor])
+        errors = self._judging.measure() if self._judging.measures else {}
+        values |= errors
+        return self._judging.deciding(errors, self.validation_loss)
 
     def train_end(self) -> None:
         """Called after the last epoch; before the last checkpoint is written."""
@@ -442,9 +446,7 @@ class Training(NewSessionPipeline):
     def _judge(self) -> None:
         """Measure how good the network is, unless that is not wanted."""
         if self._is_main and self.rivals != "none":
-            self._judgment = judge(
-                *(self.learner, self.data.stored, self._duration, self._decided), self._errors
-            )
+            self._judgment = self._judging.judge(self._duration, self._decided)
 
     @property
     def _decided(self) -> str:
@@ -626,6 +628,7 @@ class Training(NewSessionPipeline):
         if start.checkpoint is not None and start.session is not None:
             self._check_resumed(start.session.path)
         buffer = self._create_buffer()
+        metrics = find_metrics(self.metrics)
         network_class.set_seed(self._resumed.seed)
         self.learner = Learner(self.network_config, trains=True, stops_at_nan=self.on_nan == "stop")
         existing = start.config.existing_dir
@@ -655,13 +658,21 @@ class Training(NewSessionPipeline):
             max_failed=self.max_failed,
         )
         self.data = opening.open(resources, dataset)
+        self._unrolling = open_unrolling(
+            *(self.unroll, self.noise, self.learner, self.data.stored),
+            *(start.environment, self._resumed.seed),
+        )
         self._prepare_learner(start)
-        self._errors = None
-        if self.monitor is not None:
-            validates = self.validation_every > 0 and self.data.stored.has_validation
-            check_monitor(self.monitor, self.learner, validates=validates)
+        if self._unrolling is not None:
+            self._unrolling.check(self.data.stored, self.learner.transformation)
+        validates = self.validation_every > 0 and self.data.stored.has_validation
+        of = self.learner, self.data.stored
+        self._judging = Judging(*of, self.monitor, metrics, validates=validates)
         if start.checkpoint is not None and start.environment is None and self._is_main:
-            self._tell_changed_data(start.config.mode)
+            fixed, folder = self._resumed.snapshots, self.data.dataset.directory
+            data = self._resumed.data, self.data.stored.datasets, start.config.mode, fixed
+            if text := warn_of_changes(folder, *data):
+                self.session.note(text)
         resources.push(self._close)
 
     def _begin(self) -> None:
@@ -673,20 +684,6 @@ class Training(NewSessionPipeline):
         seed = self._resumed.seed if self.seed is None else self.seed
         now = bound_options(self, seed, self.group.size)
         check_bound(session, self._resumed.options, now)
-
-    def _tell_changed_data(self, mode: str) -> None:
-        """Warn if the data are not those that the training had, as then it is another one."""
-        fixed, datasets = self._resumed.snapshots, self.data.stored.datasets
-        changes = describe_changes(self._resumed.data, datasets, mode, fixed)
-        if changes:
-            text = (
-                f"The data in {self.data.dataset.directory} changed since the checkpoint was "
-                f"written: {'; '.join(changes)}. The training goes on with the data as they are, "
-                "so their order, normalization and validation samples may differ, and the network "
-                "will not be the one of an uninterrupted training."
-            )
-            warnings.warn(text, stacklevel=2)
-            self.session.note(text)
 
     def _data_record(self) -> dict[str, Any]:
         """Return what identifies the data; nothing while they are replaced by a replay."""
@@ -774,6 +771,8 @@ class Training(NewSessionPipeline):
         if self.data.online is not None:
             yield from self.data.online.announce()
         yield from self.data.stored.describe_parts()
+        if self._unrolling is not None:
+            yield self._unrolling.describe()
         size = self.batch_size * self.group.size
         if self.data.generated is None and size > self.data.stored.num_samples:
             yield f"batches of {self.data.stored.num_samples:,} samples, because there are no more"

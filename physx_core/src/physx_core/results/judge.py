@@ -4,11 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from physx_core.results.errors import Errors, Target, compare
+from physx_core.results.metrics import Metric, Metrics
 from physx_core.results.result import EpisodeError, FieldResult, PartResult, RivalResult
 from physx_core.results.rivals import (
     Linear,
@@ -69,13 +70,13 @@ class Predictor:
         predict: Returns the prediction for a batch, both in physical units.
         given: Names of its inputs.
         pairs: Name of each true field, and of its prediction.
-        loss: Name of its loss.
+        losses: Name of the loss of each true field.
     """
 
     predict: Callable[[Batch], Batch]
     given: Sequence[str]
     pairs: Mapping[str, str]
-    loss: str = ""
+    losses: Mapping[str, str] = field(default_factory=dict)
 
     @property
     def names(self) -> list[str]:
@@ -91,19 +92,23 @@ class Judge:
             validation; NaN before the first.
     """
 
-    def __init__(self, network: Predictor, training: Batches) -> None:
+    def __init__(
+        self, network: Predictor, training: Batches, metrics: Mapping[str, Metric] | None = None
+    ) -> None:
         """Read some of the samples that the network learns from.
 
         Args:
             network: The network.
             training: Batches of these samples.
+            metrics: Further errors by name.
         """
-        self._network = network
+        self._network, self._metrics = network, metrics or {}
         with training.reading(network.names) as self._training:
             self._sample = TrainingSample(self._training, network.given)
         fields, batch = self._training.fields, self._sample.batch
         self._targets = {
-            name: Target.of(fields[name], batch[name], network.loss) for name in network.pairs
+            name: Target.of(fields[name], batch[name], network.losses.get(name, ""))
+            for name in network.pairs
         }
         self._rivals: dict[str, Rival] = {}
         self._why: dict[tuple[str, str], str] = {}
@@ -151,18 +156,32 @@ class Judge:
         self._why |= {(rival, name): str(error) for name in self._targets}
 
     def measure(self, batches: Batches) -> dict[str, float]:
-        """Return the network's errors, as ``FIELD/NAME``: see `FieldResult.errors`."""
+        """Return the network's errors, as ``error/FIELD/NAME`` and ``metric/NAME``."""
         sums = {name: Errors(of, batches.num_groups) for name, of in self._targets.items()}
         missing: dict[str, str] = {}
         with batches.reading(self._network.names) as reading:
+            metrics = self._begin_metrics(reading)
             for number in range(len(reading)):
-                batch = reading[number]
-                self._add(sums, self._predict(batch, missing), batch, reading.groups(number))
-        return {
-            f"{name}/{key}": value
+                batch, where = reading[number], reading.groups(number)
+                guesses = self._predict(batch, missing)
+                self._add(sums, guesses, batch, where)
+                if metrics is not None:
+                    metrics.add(guesses, batch, where)
+        found = {
+            f"error/{name}/{key}": value
             for name, of in sums.items() if name not in missing
             for key, value in of.errors()[0].items()
         }  # fmt: skip
+        means = {} if metrics is None else metrics.means
+        return found | {f"metric/{name}": value for name, value in means.items()}
+
+    def _begin_metrics(self, batches: Batches) -> Metrics | None:
+        if not self._metrics:
+            return None
+        counts = np.zeros(batches.num_groups, np.intp)
+        for number in range(len(batches)):
+            np.add.at(counts, batches.groups(number), 1)
+        return Metrics(self._metrics, counts)
 
     def judge(self, part: Judged) -> PartResult:
         """Measure all errors on a part of the data; the rivals must have learned.
@@ -181,6 +200,7 @@ class Judge:
             for who in (_NETWORK, *self._rivals)
         }
         missing: dict[str, str] = {}
+        metrics = self._begin_metrics(batches)
         seen, compared, steps, spread = np.zeros(groups, bool), 0, 0.0, 0.0
         for number in range(len(batches)):
             batch, where = batches[number], batches.groups(number)
@@ -191,6 +211,8 @@ class Judge:
                 spread += 2.0 * (inputs.size - inputs.shape[1])
             guesses = self._predict(batch, missing)
             self._add(whole, guesses, batch, where)
+            if metrics is not None:
+                metrics.add(guesses, batch, where)
             if number % every == 0:
                 compared += len(where)
                 self._add(sums[_NETWORK], guesses, batch, where)
@@ -207,7 +229,8 @@ class Judge:
         count = int(seen.sum())
         division = part.division or f'{count} {self._nouns(batches)} of the mode "validation"'
         return PartResult(
-            batches.num_items, count, division, part.used, fields, compared, why, missing
+            *(batches.num_items, count, division, part.used, fields, compared, why, missing),
+            {} if metrics is None else metrics.means,
         )
 
     def _nouns(self, batches: Batches) -> str:

@@ -109,6 +109,7 @@ class PartResult:
         compared: Number of samples on which rivals are compared, whole batches from all places.
         why: What speaks against comparing on these samples; empty: nothing.
         missing: Why other predicted fields are not judged, by name.
+        metrics: The user's own errors, `Training.metrics`, averaged over the episodes, by name.
     """
 
     samples: int
@@ -119,6 +120,7 @@ class PartResult:
     compared: int = 0
     why: str = ""
     missing: Mapping[str, str] = field(default_factory=dict)
+    metrics: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)
@@ -151,11 +153,14 @@ class Result:
     def values(self) -> dict[str, float]:
         """All numbers by name: `numbers`, and errors as ``error/FIELD/NAME``, ``test/FIELD/NAME``.
 
-        The errors of a rival are ``error/FIELD/RIVAL/NAME``.
+        The errors of a rival are ``error/FIELD/RIVAL/NAME``; the user's own ones ``metric/NAME``
+        and ``test/metric/NAME``.
         """
         found = dict(self.numbers)
         for part, judged in self.parts.items():
             start = "error" if part == "validation" else part
+            own = "metric" if part == "validation" else f"{part}/metric"
+            found |= {f"{own}/{name}": value for name, value in judged.metrics.items()}
             for name, of in judged.fields.items():
                 found |= {f"{start}/{name}/{key}": value for key, value in of.errors.items()}
                 for rival, other in of.rivals.items():
@@ -212,7 +217,7 @@ class Result:
                     f"<th>the network is</th></tr>{''.join(cells)}</table>"
                 )
                 found += [f"<p>{escape(line)}</p>" for line in _details(of)]
-            notes = [*_missing(part), *([part.why] if part.why else [])]
+            notes = [*_metrics(part), *_missing(part), *([part.why] if part.why else [])]
             found += [f"<p>{escape(line)}</p>" for line in notes]
         if self.why:
             found.append(f"<p>not judged: {escape(self.why)}</p>")
@@ -234,9 +239,14 @@ def _part_lines(name: str, part: PartResult) -> Iterator[str]:
         for rival, errors, told in rows:
             yield "    " + f"{rival:{width}}  {errors:24}  {told}".rstrip()
         yield from (f"    {line}" for line in _details(of))
-    yield from (f"  {line}" for line in _missing(part))
+    yield from (f"  {line}" for line in (*_metrics(part), *_missing(part)))
     if part.why:
         yield f"  {part.why}"
+
+
+def _metrics(part: PartResult) -> Iterator[str]:
+    for name, value in part.metrics.items():
+        yield f"{name}: {_number(value)}, the mean over {part.episodes:,} episodes"
 
 
 def _missing(part: PartResult) -> Iterator[str]:

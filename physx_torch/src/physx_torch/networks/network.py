@@ -5,7 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, ClassVar
+from typing import Any, ClassVar, Self
 
 import numpy as np
 import torch
@@ -23,6 +23,7 @@ from physx_core.errors import (
 )
 from physx_core.typing import Array, Batch, Tensors
 from physx_torch.devices import find_device
+from physx_torch.networks.averaging import ParameterAverage
 from physx_torch.parallel import join_group
 from physx_torch.storage.parameters import check_match, read_shapes, read_tensors, write_tensors
 
@@ -56,6 +57,8 @@ class TorchNetwork(torch.nn.Module, Network):
         device: Device of the parameters.
         data_type: Floating-point type of parameters and tensors.
         differentiates: Whether ``forward`` differentiates; known after the first prediction.
+        average: The mean of the parameters over the steps of a training, with which the network
+            predicts, and which it stores; None: there is none.
     """
 
     parameters_file: ClassVar[str] = "parameters.safetensors"
@@ -97,6 +100,7 @@ class TorchNetwork(torch.nn.Module, Network):
         self.data_type = torch.float32
         self._training_forward: Callable[..., Any] | None = None
         self.differentiates = False
+        self.average: ParameterAverage | None = None
 
     @classmethod
     def set_seed(cls, seed: int) -> None:
@@ -231,6 +235,19 @@ class TorchNetwork(torch.nn.Module, Network):
             dict.fromkeys(names, f"expected; returned: {given}"),
         )
 
+    def with_gradients(self, tensors: Tensors) -> Tensors:
+        """Return tensors with respect to whose `net_fields` predictions can be differentiated."""
+        leaves = {
+            name: tensors[name].detach().requires_grad_()
+            for name in self.net_fields
+            if tensors[name].is_floating_point() or tensors[name].is_complex()
+        }
+        return {**tensors, **leaves}
+
+    def join_tensors(self, parts: Sequence[torch.Tensor], axis: int = 0) -> torch.Tensor:
+        """Return tensors joined along an axis that exists."""
+        return torch.cat(list(parts), dim=axis)
+
     def set_train(self) -> None:
         """Switch to training mode."""
         self.train()
@@ -239,6 +256,12 @@ class TorchNetwork(torch.nn.Module, Network):
         """Switch to evaluation mode, without recording gradients."""
         if self.training:  # visiting all layers takes as long as a small network's prediction
             self.eval()
+
+    def train(self, mode: bool = True) -> Self:
+        """Switch to training or evaluation mode, and to the parameters of that mode."""
+        if self.average is not None:
+            self.average.use(is_used=not mode)
+        return super().train(mode)
 
     def set_device(self, device: str) -> None:
         """Move to ``"cpu"``, ``"cuda"``, ``"cuda:<index>"``, ``"mps"`` or ``"auto"``.
@@ -306,12 +329,19 @@ class TorchNetwork(torch.nn.Module, Network):
         return ""
 
     def save_parameters(self, path: Path) -> None:
-        """Write parameters and buffers to a safetensors file.
+        """Write parameters and buffers, those of evaluation mode, to a safetensors file.
 
         Raises:
             CheckpointError: If the file cannot be written, or the state contains non-tensors.
         """
-        write_tensors(path, self._state())
+        if self.average is None:
+            write_tensors(path, self._state())
+            return
+        self.average.use(is_used=True)
+        try:
+            write_tensors(path, self._state())
+        finally:
+            self.average.use(is_used=not self.training)
 
     def load_parameters(self, path: Path) -> None:
         """Read parameters and buffers written by `save_parameters`, in any floating-point type.
@@ -321,6 +351,8 @@ class TorchNetwork(torch.nn.Module, Network):
                 network is then unchanged.
         """
         check_match(path, type(self).__name__, read_shapes(path), self._state())
+        if self.average is not None:
+            self.average.restart()
         self.load_state_dict(read_tensors(path)[0])
 
     def _state(self) -> dict[str, Any]:

@@ -23,11 +23,22 @@ from physx_core.errors import (
     listed,
 )
 from physx_torch.choices import choose, find_classes, make
+from physx_torch.networks.averaging import ParameterAverage
 from physx_torch.networks.network import TorchNetwork
 from physx_torch.parallel import average_gradients, broadcast_parameters
 from physx_torch.storage.attributes import Attributes
 from physx_torch.training.gradients import GradientCheck, clear, is_finite
-from physx_torch.training.losses import Loss, as_target, compared_fields, without_reduction
+from physx_torch.training.losses import (
+    Loss,
+    LossTable,
+    Term,
+    as_target,
+    check_weights,
+    compared_fields,
+    find_terms,
+    make_loss,
+    without_reduction,
+)
 from physx_torch.training.optimization_state import OptimizationState, describe, gradients_of
 from physx_torch.training.schedules import TrainingLength, choose_interval
 from physx_torch.training.training_forward import (
@@ -44,8 +55,9 @@ class TorchOptimization(Optimization):
     """Gradient descent with any PyTorch loss, optimizer and scheduler.
 
     The loss of a network with several prediction fields is the mean of the fields' losses: the i-th
-    of `pred_fields` is compared with the i-th of `opt_fields`. If a subclass returns more than
-    ``loss`` from `transform_loss`, that is recorded too.
+    of `pred_fields` is compared with the i-th of `opt_fields`. A table has a loss for each target,
+    and losses of the whole batch, such as the residual of an equation; `set_loss` says how. If a
+    subclass returns more than ``loss`` from `transform_loss`, that is recorded too.
 
     Parameters of the loss are trained with the network's, by the same optimizer.
 
@@ -56,9 +68,8 @@ class TorchOptimization(Optimization):
     dictionaries of these; and plain data that have changed since the training began. Anything else
     that is state is an error before or after the first batch.
 
-    Validation, the checkpoint "best", predictions and exports use the parameters of the network.
-    Averaged ones must be copied into the network to be used, for example in
-    `Training.train_end`, before the last checkpoint.
+    With ``average``, validation, checkpoints, predictions and exports use the mean of the
+    parameters over the steps; a resumed training goes on with what was learned.
 
     Attributes:
         network: The network to train; set by `set_optimizer`.
@@ -79,6 +90,10 @@ class TorchOptimization(Optimization):
         mixed_precision: str | None = None,
         compile: bool | str = False,
         loss_kwargs: Mapping[str, Any] | None = None,
+        loss_weights: Mapping[str, float] | None = None,
+        extra_fields: Sequence[str] | None = None,
+        differentiates_inputs: bool | None = None,
+        average: float | None = None,
     ) -> None:
         """Set the options.
 
@@ -92,7 +107,16 @@ class TorchOptimization(Optimization):
                 range is small, gradients are scaled. None: use the network's type everywhere.
             compile: Whether to compile the network for training with ``torch.compile``, or the name
                 of its backend; True is ``"inductor"``.
-            loss_kwargs: Keyword arguments of the loss, if it is a class.
+            loss_kwargs: Keyword arguments of the loss, if it is a class; of a table, by name.
+            loss_weights: Weights of the terms of the loss, by the names of the targets, or of the
+                losses in a table; 1 of others. The loss is the weighted mean, so weights change
+                what counts more, not how large the steps are.
+            extra_fields: Fields of the batch that a loss reads in addition to the network's.
+            differentiates_inputs: Whether a loss of the batch differentiates predictions with
+                respect to the network's inputs, as the residual of a differential equation does.
+            average: Share of the mean of the parameters that is left after each step, for example
+                0.999: an exponential mean over about 1000 steps, with which the network is
+                validated and predicts. None: no mean.
 
         Raises:
             ConfigError: If an option is invalid.
@@ -101,6 +125,8 @@ class TorchOptimization(Optimization):
             raise ConfigError(f"gradient_clip is {gradient_clip!r} but must be positive.")
         if type(accumulate) is not int or accumulate < 1:
             raise ConfigError(f"accumulate is {accumulate!r} but must be a positive integer.")
+        if average is not None and not 0 < average < 1:
+            raise ConfigError(f"average is {average!r} but must be between 0 and 1.")
         if mixed_precision not in (None, *PRECISIONS):
             raise ConfigError(
                 f"mixed_precision is {mixed_precision!r} but must be {listed(PRECISIONS)} or None."
@@ -110,9 +136,15 @@ class TorchOptimization(Optimization):
         self.scheduler: LRScheduler | None = None
         self._gradient_clip = gradient_clip
         self._accumulate, self._accumulated = accumulate, 0
+        self._decay = average
         self._precision = PRECISIONS[mixed_precision] if mixed_precision else None
         self._backend = "inductor" if compile is True else compile
         self._loss_kwargs = dict(loss_kwargs or {})
+        self._loss_weights = check_weights(loss_weights or {})
+        if extra_fields is not None:
+            self.extra_fields = tuple(extra_fields)
+        if differentiates_inputs is not None:
+            self.differentiates_inputs = differentiates_inputs
         self._network: TorchNetwork | None = None
         self._scaler: torch.amp.GradScaler | None = None
         self._sums = False
@@ -121,33 +153,30 @@ class TorchOptimization(Optimization):
         self._total = (0, 0)  # epochs of the training, batches in each
         self._attributes: Attributes | None = None
         self._has_saved = False
-        self._compared: list[tuple[str, str]] | None = None
+        self._terms: list[Term] | None = None
+        self._is_plain = True  # nothing but the mean of targets' losses
+        self._losses: dict[str, torch.Tensor] = {}  # of the terms, of the last batch
         self._check = GradientCheck()
         self._known: tuple[torch.Tensor | None, float] = (None, 0.0)  # the loss that was last read
 
-    def set_loss(self, loss: str | type[Any] | Loss | None) -> None:
+    def set_loss(self, loss: str | Loss | Mapping[str, Any] | None) -> None:
         """Choose the loss function.
 
         Args:
             loss: Name of a class in `torch.nn` such as ``"MSELoss"``; ``"package.module:Name"``; a
-                class; a module; or a function of prediction and target.
+                class; a module; a function of prediction and target; a function of a
+                `PredictedBatch`, as a loss of several predictions and targets together; or a table
+                of these, by the name of a target, or any name of a function of the batch.
 
         Raises:
             ConfigError: If the loss does not exist, rejects `loss_kwargs`, or is None.
         """
-        known = find_classes(torch.nn.modules.loss, torch.nn.Module)
         if loss is None:
             raise ConfigError(
                 'A training needs a loss, for example loss="MSELoss" (--network.loss MSELoss).'
             )
-        chosen = choose("loss", loss, known)
-        if isinstance(chosen, type):
-            chosen = make("loss", object, chosen, **self._loss_kwargs)
-        elif self._loss_kwargs:
-            raise ConfigError(f"loss_kwargs needs a loss that is a class, not {chosen!r}.")
-        if not callable(chosen):
-            raise ConfigError(f"The loss {loss!r} cannot be called with prediction and target.")
-        self.loss = chosen
+        chosen = make_loss(loss, self._loss_kwargs)
+        self.loss, self._terms = chosen, None
         options = getattr(chosen, "keywords", {})  # of a functools.partial
         self._sums = getattr(chosen, "reduction", options.get("reduction")) == "sum"
         self._place_loss()
@@ -191,7 +220,7 @@ class TorchOptimization(Optimization):
             raise ConfigError(f"{type(network).__name__} is not a TorchNetwork.")
         chosen = choose("optimizer", optimizer, find_classes(torch.optim, torch.optim.Optimizer))
         self._network = self.network = network
-        self._compared = None
+        self._terms = None
         self._place_loss()
         trained = [p for p in network.parameters() if p.requires_grad]
         trained += self._learned_by_loss.values()
@@ -205,8 +234,11 @@ class TorchOptimization(Optimization):
                 "does not support. Choose another optimizer."
             )
         if type(self).compute_loss is TorchOptimization.compute_loss:
-            compared_fields(network)
+            find_terms(self.loss or torch.nn.MSELoss(), network, self._loss_weights)
         self.optimizer = made
+        if self._decay is not None:
+            network.average = average = ParameterAverage(network, self._decay)
+            made.register_step_post_hook(lambda *_: average.update())
         self._set_forward(network)
 
     def _set_forward(self, network: TorchNetwork) -> None:
@@ -291,7 +323,7 @@ class TorchOptimization(Optimization):
         return TrainingLength(*self._total, self._accumulate if by_step else None)
 
     def compute_loss(self, batch: PredictedBatch) -> torch.Tensor:
-        """Return the mean of the prediction fields' losses, of normalized values if configured.
+        """Return the mean of the terms of the loss, of normalized values if configured.
 
         Raises:
             UsageError: If the loss or optimizer has not been chosen yet.
@@ -300,18 +332,27 @@ class TorchOptimization(Optimization):
         """
         if self.loss is None or self._network is None:
             raise UsageError("compute_loss() must be called after set_loss() and set_optimizer().")
-        if self._compared is None:
-            self._compared = compared_fields(self._network)
+        if self._terms is None:
+            self._terms = find_terms(self.loss, self._network, self._loss_weights)
+            self._is_plain = not (isinstance(self.loss, LossTable) or self._loss_weights)
         losses = []
-        for pred_name, opt_name in self._compared:
-            pred, target = batch.prediction[pred_name], batch.targets[opt_name]
+        for name, loss, _, pair in self._terms:  # calls would take as long as a small loss
+            if pair is None:
+                losses.append(loss(batch))
+                continue
+            pred, target = batch.prediction[pair[0]], batch.targets[name]
             if not target.is_floating_point():  # class indices, for example, of another shape
-                target = as_target(target, pred, self.loss)
+                target = as_target(target, pred, loss)
             elif pred.shape != target.shape:
-                text = f'shape {tuple(pred.shape)}, but "{opt_name}" has {tuple(target.shape)}'
-                raise FieldsMismatchError("Prediction and target differ", {pred_name: text})
-            losses.append(self.loss(pred, target))
-        return losses[0] if len(losses) == 1 else torch.stack(losses).mean()
+                text = f'shape {tuple(pred.shape)}, but "{name}" has {tuple(target.shape)}'
+                raise FieldsMismatchError("Prediction and target differ", {pair[0]: text})
+            losses.append(loss(pred, target))
+        if self._is_plain:
+            return losses[0] if len(losses) == 1 else torch.stack(losses).mean()
+        pairs = list(zip(self._terms, losses, strict=True))
+        self._losses = {term.name: loss.detach() for term, loss in pairs}
+        weighted = torch.stack([term.weight * loss for term, loss in pairs])
+        return weighted.sum() / sum(term.weight for term in self._terms)
 
     def compute_row_losses(self, batch: PredictedBatch) -> torch.Tensor:
         """Return the loss of each row.
@@ -323,11 +364,12 @@ class TorchOptimization(Optimization):
         """
         if self.loss is None or self._network is None:
             raise UsageError("compute_row_losses() needs set_loss() and set_optimizer() first.")
-        by_row = without_reduction(self.loss)
+        by_row = None if self._loss_weights else without_reduction(self.loss)
         if by_row is None or type(self).compute_loss is not TorchOptimization.compute_loss:
             rows = range(len(next(iter(batch.prediction.values()))))
             # With gradients, which the loss of a subclass may need.
-            return torch.stack([self.compute_loss(batch[row : row + 1]).detach() for row in rows])
+            each = [self.compute_loss(self._row_of(batch, row)).detach() for row in rows]
+            return torch.stack(each)
         with torch.no_grad():
             losses = []
             for pred_name, opt_name in compared_fields(self._network):
@@ -336,16 +378,28 @@ class TorchOptimization(Optimization):
             flat = [loss.reshape(len(loss), -1).mean(1) for loss in losses]
             return torch.stack(flat).mean(0)
 
+    def _row_of(self, batch: PredictedBatch, row: int) -> PredictedBatch:
+        one = batch[row : row + 1]
+        if not self.differentiates_inputs:
+            return one
+        data = batch.network.with_gradients(one.data)
+        return PredictedBatch.of(batch.network, batch.transformation, data)
+
     def transform_loss(self, loss: torch.Tensor, batch: PredictedBatch) -> dict[str, Any]:
         """Return ``{"loss": <number>}``, for a loss with the reduction "sum" per sample.
 
-        Losses are thus comparable, whatever the sizes of the batches.
+        Losses are thus comparable, whatever the sizes of the batches. Of a table, or with weights,
+        each term is ``loss/<name>``.
         """
         number = self._known[1]
         if loss is not self._known[0]:  # on a GPU, reading it again would wait for the step
             number = loss.item()
         self._known = (None, 0.0)
-        return {"loss": number / len(next(iter(batch.data.values()))) if self._sums else number}
+        mean = number / len(next(iter(batch.data.values()))) if self._sums else number
+        found: dict[str, Any] = {"loss": mean}
+        if self._losses:
+            found |= {f"loss/{name}": loss for name, loss in self._losses.items()}
+        return found
 
     def optimize(self, loss: torch.Tensor) -> None:
         """Update the parameters along the gradient of the loss, or of the mean of several batches.
@@ -537,7 +591,7 @@ class TorchOptimization(Optimization):
             self,
             skipped=_own_attributes(),
             extra=("loss",),
-            unsaved=self.unsaved,
+            unsaved=(*self.unsaved, *(["loss.losses"] if isinstance(self.loss, LossTable) else [])),
             known=[*modules, *tensors, *(item for item in used if item is not None)],
         )
 

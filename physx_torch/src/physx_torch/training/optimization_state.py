@@ -70,6 +70,8 @@ class OptimizationState:
                 state[name] = item.state_dict()
         if self.scheduler is not None:
             state["interval"] = self.interval
+        if self.network.average is not None:
+            state["average"] = self.network.average.state()
         if accumulated:
             state["accumulated"] = accumulated
             state["gradients"] = self.network.get_gradients()
@@ -97,6 +99,8 @@ class OptimizationState:
         for name, item in (("scheduler", self.scheduler), ("scaler", self.scaler)):
             if item is not None:
                 item.load_state_dict(state[name])
+        if self.network.average is not None:
+            self.network.average.load(state["average"])
         try:
             self.attributes.load(state.get("attributes", {}), self.network.device)
         except CheckpointError as error:
@@ -123,7 +127,7 @@ class OptimizationState:
 
     @property
     def _kinds(self) -> list[str]:
-        used = (self.optimizer, self.scheduler, self.scaler)
+        used = (self.optimizer, self.scheduler, self.scaler, self.network.average)
         return [type(item).__name__ for item in used if item is not None]
 
 

@@ -16,7 +16,7 @@ _FREE = {
         *("session_dir", "session_name", "new_session", "epoch_nb"),
         *("validation_every", "validation_batch_size", "patience", "min_improvement"),
         *("on_nan", "statistics", "statistics_kwargs", "histograms_every", "checkpoint_every"),
-        *("max_failed", "rivals"),
+        *("max_failed", "rivals", "metrics"),
     },
     "network": {"network_name", "save_each_epoch", "save_best", "device"},
     "dataset": {"existing_dir", "max_file_size", "writers"},
@@ -104,6 +104,13 @@ def _is_same(name: str, before: Any, after: Any) -> bool:
     """Return whether two values of an option mean the same."""
     if before == after or name not in _REFERENCES or None in (before, after):
         return bool(before == after)
+    if isinstance(before, Mapping) or isinstance(after, Mapping):  # losses by name
+        both = isinstance(before, Mapping) and isinstance(after, Mapping)
+        return (
+            both
+            and before.keys() == after.keys()
+            and all(_is_same(name, each, after[key]) for key, each in before.items())
+        )
     return is_recorded_as(after, before) or _last_name(before) == _last_name(after)
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Container, Iterator, Mapping, Sequence
 from dataclasses import replace
 from hashlib import blake2b
@@ -186,6 +187,28 @@ def describe_changes(
         ]
     except (DatasetError, LookupError, TypeError, ValueError) as error:
         return [f"they cannot be compared: {error}"]
+
+
+def warn_of_changes(folder: Path, *data: Any) -> str:
+    """Warn if the data are not those that a resumed training had, as then it is another one.
+
+    Args:
+        folder: The dataset's folder.
+        data: The arguments of `describe_changes`.
+
+    Returns:
+        The warning; empty if nothing changed.
+    """
+    changes = describe_changes(*data)
+    if not changes:
+        return ""
+    text = (
+        f"The data in {folder} changed since the checkpoint was written: {'; '.join(changes)}. The "
+        "training goes on with the data as they are, so their order, normalization and validation "
+        "samples may differ, and the network will not be the one of an uninterrupted training."
+    )
+    warnings.warn(text, stacklevel=3)
+    return text
 
 
 def _changes(former: Mapping[str, Any], now: Mapping[str, Any], *, grows: bool) -> Iterator[str]:

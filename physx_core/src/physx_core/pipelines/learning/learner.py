@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -36,7 +36,7 @@ from physx_core.plugins import import_component
 from physx_core.plugins.networks import resolve_network
 from physx_core.plugins.references import check_recorded, is_of_plugin, is_recorded_as
 from physx_core.rows import concatenate
-from physx_core.typing import Array, Batch, Index
+from physx_core.typing import Array, Batch, Index, Tensors
 
 
 class Learner:
@@ -89,9 +89,13 @@ class Learner:
         self.group = Group()
         self.row_losses: Array = np.zeros(0)
         self._is_between_steps = False
+        self._predict_training = self._predict_batch
+        self._read = self.network.numpy_to_tensor
         if trains:
             self.optimization = self._create_optimization(config)
             self.optimization.stops_at_nan = stops_at_nan
+            if self.optimization.differentiates_inputs:
+                self._read = self._read_with_gradients
 
     def _create_optimization(self, config: NetworkConfig) -> Optimization:
         reference = config.optimization or self.network.default_optimization
@@ -152,8 +156,27 @@ class Learner:
 
     def _predict_batch(self, batch: Batch) -> PredictedBatch:
         """Predict a batch in physical units that contains `batch_fields`."""
-        network = self.network
-        return PredictedBatch.of(network, self.transformation, network.numpy_to_tensor(batch))
+        return PredictedBatch.of(self.network, self.transformation, self._read(batch))
+
+    def _read_with_gradients(self, batch: Batch) -> Tensors:
+        return self.network.with_gradients(self.network.numpy_to_tensor(batch))
+
+    def unroll(self, predict: Callable[[Batch, Transformation, int], PredictedBatch]) -> None:
+        """Have `optimize` predict batches otherwise than in one step.
+
+        Args:
+            predict: Returns the predictions for a batch, the transformation, and the index of the
+                process.
+
+        Raises:
+            ConfigError: If the loss differentiates what the network reads.
+        """
+        if self._trainer().differentiates_inputs:
+            raise ConfigError(
+                "A loss that differentiates the network's inputs (differentiates_inputs) is one of "
+                "single steps: leave out Training.unroll and noise."
+            )
+        self._predict_training = lambda batch: predict(batch, self.transformation, self.group.rank)
 
     def _trainer(self) -> Optimization:
         if self.optimization is None:
@@ -185,7 +208,7 @@ class Learner:
         share = batch
         if weight is None:
             share, weight = (batch, 1.0) if group.size == 1 else group.share_of(batch)
-        step = self._predict_batch(share)
+        step = self._predict_training(share)
         loss, stops = optimization.compute_loss(step), optimization.stops_at_nan
         if stops and isinstance(loss, (float, np.floating)) and not math.isfinite(loss):
             raise DivergedError(self._explain(f"the loss is {loss}", step))

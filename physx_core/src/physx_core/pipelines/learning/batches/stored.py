@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import cached_property, partial
 
 import numpy as np
@@ -81,6 +81,7 @@ class StoredBatches:
         self._validation_batch_size = validation_batch_size
         self._seed, self._names, self._data_type = seed, list(batch_fields), data_type
         self._batches: Batches | None = None
+        self._longer: Batches | None = None
         if environment is None and not self.has_samples and not config.view.sources:
             raise DatasetError(
                 f'The dataset in {dataset.directory} has no samples of mode "{self.mode}" to '
@@ -139,6 +140,18 @@ class StoredBatches:
         mode, view, part = parts[name]
         return self._open(mode, view, self._validation_batch_size, part)
 
+    def read_as(self, change: Callable[[View], View]) -> None:
+        """Read training batches of another view of the same samples, such as longer windows.
+
+        Args:
+            change: Returns it for the view that is configured.
+        """
+        self._longer = self._open(self.mode, change(self._view), self._batch_size)
+
+    @property
+    def _read(self) -> Batches:
+        return self._training if self._longer is None else self._longer
+
     def begin_epoch(self, names: Sequence[str], batches: int) -> None:
         """Prepare an epoch.
 
@@ -147,7 +160,7 @@ class StoredBatches:
             batches: Number of batches that will be taken; ignored, because nothing is read ahead.
         """
         if self._batches is None:
-            self._batches = self._training.reading(names)
+            self._batches = self._read.reading(names)
 
     def next(self) -> Batch:
         """Return the next batch, in physical units; valid until the next call."""
@@ -158,7 +171,7 @@ class StoredBatches:
 
     def read(self, number: int, names: Sequence[str]) -> Batch:
         """Read a batch by its number, in physical units."""
-        return self._training.reading(names)[number]
+        return self._read.reading(names)[number]
 
     def update(self, index: Index, rows: Batch) -> None:
         """Replace samples.
@@ -234,12 +247,12 @@ class StoredBatches:
     @property
     def num_samples(self) -> int:
         """Number of samples to train on."""
-        return self._training.num_items
+        return self._read.num_items
 
     @property
     def num_batches(self) -> int:
         """Number of batches of one pass over them."""
-        return len(self._training)
+        return len(self._read)
 
     @property
     def rows(self) -> Index | None:
