@@ -30,6 +30,17 @@ class Judgment:
 NOT_JUDGED = Judgment(why='rivals is "none"')
 
 
+def predictor_of(learner: Learner) -> Predictor:
+    """Return a network as it is judged; it may go on learning."""
+    network, loss = learner.network, learner.config.loss
+    return Predictor(
+        learner.predict_in_training,
+        network.net_fields,
+        dict(zip(network.opt_fields, network.pred_fields, strict=False)),
+        loss if isinstance(loss, str) else getattr(loss, "__name__", ""),
+    )
+
+
 def make_judge(learner: Learner, stored: StoredBatches) -> Judge:
     """Return what measures a network's errors.
 
@@ -37,14 +48,7 @@ def make_judge(learner: Learner, stored: StoredBatches) -> Judge:
         learner: The network, which may go on learning.
         stored: The samples.
     """
-    network, loss = learner.network, learner.config.loss
-    predictor = Predictor(
-        learner.predict_in_training,
-        network.net_fields,
-        dict(zip(network.opt_fields, network.pred_fields, strict=False)),
-        loss if isinstance(loss, str) else getattr(loss, "__name__", ""),
-    )
-    return Judge(predictor, stored.training)
+    return Judge(predictor_of(learner), stored.training)
 
 
 def judge(
