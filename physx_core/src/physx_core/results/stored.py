@@ -26,9 +26,9 @@ def store_result(session: Path, result: Result) -> None:
     Raises:
         SessionError: If the session cannot be written to.
     """
-    try:
-        known = {name: each.to_plain() for name, each in read_results(session).items()}
-    except SessionError:  # damaged, or of another version: the new one matters more
+    try:  # as they are: those of another version are kept, too
+        known = dict(parse_json(files.read_content(session / FILE, _LARGEST)))
+    except (OSError, ValueError, TypeError):  # none yet, or damaged: the new one matters more
         known = {}
     try:
         text = json.dumps({**known, result.kind: result.to_plain()}, indent=1, allow_nan=False)

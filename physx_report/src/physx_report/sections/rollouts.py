@@ -38,13 +38,12 @@ def _rollout(name: str, of: RolloutResult) -> Iterator[Block]:
         axes.set_ylim(bottom=0)
         axes.legend(frameon=False)
     yield from found
+    columns = of.errors, of.low, of.high, of.unchanged
     rows = [
-        [f"{of.rows[k]:,}", *(wording.measured("rmse", each[k], of.unit)
-                              for each in (of.errors, of.low, of.high, of.unchanged))]
-        for k in of.shown
-    ]  # fmt: skip
+        [f"{of.rows[k]:,}", *(wording.number(each[k]) for each in columns)] for k in of.shown
+    ]
     head = ["row", "error", "a tenth of the episodes below", "a tenth above", "nothing changes"]
-    yield Table(head, rows, name)
+    yield Table(head, rows, f"{name}{f' / {unit}' if unit else ''}")
     if of.episode_errors:
         rows = [
             [which, each.text, wording.measured("rmse", each.error, of.unit)]
