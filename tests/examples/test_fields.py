@@ -64,6 +64,7 @@ def test_a_flow_carries_vorticity_along_with_it(flow):
     np.testing.assert_allclose(found / small, exact, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_shorter_steps_lead_to_the_same_flow(module, simulate):
     vortices = module("environments.vortices").Vortices
     finer = type("Finer", (vortices,), {"STEPS": 40, "PERIOD": 0.025})

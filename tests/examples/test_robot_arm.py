@@ -26,6 +26,7 @@ def test_a_function_that_is_exact_follows_as_the_exact_model_does(arm):
         assert arm.tracking_error(exact, 5, 60) == arm.tracking_error("model", 5, 60) < 0.1
 
 
+@pytest.mark.slow
 def test_worse_torques_follow_worse(arm):
     def wrong(state):
         return np.full((len(state), 9), 5.0)

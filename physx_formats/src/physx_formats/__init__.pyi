@@ -1,5 +1,6 @@
 """Exports datasets to files of other formats, and imports them, block by block."""
 
+from .editing import edit as edit
 from .errors import ExchangeError as ExchangeError
 from .exporting import export as export
 from .format import Format as Format

@@ -15,7 +15,7 @@ from physx_core.dataset import (
     EpisodeStatus,
     rows_per_block,
 )
-from physx_core.errors import ConfigError
+from physx_core.errors import ConfigError, SampleError
 from physx_core.fields import Field
 from physx_core.typing import Batch
 from physx_formats.errors import ExchangeError
@@ -49,6 +49,25 @@ def split_records(path: Path, table: Batch, lengths: Mapping[str, int]) -> dict[
     return found
 
 
+def copy_stream(
+    dataset: Dataset, mode: str, fields: Mapping[str, Field], columns: Columns, advance: Advance
+) -> int:
+    """Store the rows of a mode without records, and return their number."""
+    dataset.define_fields(mode, fields.values())
+    rows = next(iter(columns.values())).shape[0]
+    step = rows_per_block(sum(field.nbytes for field in fields.values()), BLOCK)
+    for start in range(0, rows, step):
+        count = min(step, rows - start)
+        block = {name: column.read(start, count) for name, column in columns.items()}
+        try:
+            dataset.append(mode, block)
+        except SampleError as error:
+            error.add_note(f"in rows {start} to {start + count - 1}")
+            raise
+        advance(sum(array.nbytes for array in block.values()))
+    return rows
+
+
 class EpisodeCopier:
     """Stores the rows of a mode with their records, a few megabytes at once."""
 
@@ -60,6 +79,7 @@ class EpisodeCopier:
         columns: Columns,
         table: Mapping[str, Field],
         advance: Advance,
+        reasons: Mapping[tuple[int, int], str] | None = None,
     ) -> None:
         """Prepare the mode.
 
@@ -70,8 +90,10 @@ class EpisodeCopier:
             columns: Its columns, read from the first row on.
             table: The fields of the records.
             advance: Called with the number of bytes stored.
+            reasons: Why episodes have failed, by campaign and number.
         """
         dataset.define_fields(mode, fields.values())
+        self._reasons = reasons or {}
         self._dataset, self._mode, self._columns = dataset, mode, columns
         self._step = rows_per_block(sum(field.nbytes for field in fields.values()), BLOCK)
         self._advance, self._done = advance, 0
@@ -121,6 +143,7 @@ class EpisodeCopier:
                 seconds=float(record["seconds"]) if is_last else 0.0,
                 parameters={name: value for name, value in record.items() if name not in taken},
                 fields={} if is_range else {each.name: record[each.name] for each in self._once},
+                reason=self._reasons.get((int(record["campaign"]), int(record["episode"])), ""),
             )
 
     def _store(self, waiting: list[EpisodeRecord]) -> None:

@@ -11,14 +11,14 @@ from dataclasses import replace
 from pathlib import Path
 
 from physx_core.config import MODES
-from physx_core.dataset import EPISODES, TABLE_FIELDS, Dataset, holds_dataset, rows_per_block
-from physx_core.errors import SampleError, listed
+from physx_core.dataset import EPISODES, TABLE_FIELDS, Dataset, holds_dataset
+from physx_core.errors import listed
 from physx_core.fields import Field
 from physx_core.typing import Batch
-from physx_formats.episodes import EpisodeCopier, split_records
+from physx_formats.episodes import EpisodeCopier, copy_stream, split_records
 from physx_formats.errors import ExchangeError
 from physx_formats.format import Columns, all_formats
-from physx_formats.table import BLOCK, Advance, Column, Notes, check_size
+from physx_formats.table import Advance, Column, Notes, check_size
 
 _SESSION = "import"
 _ALWAYS = 2**28
@@ -75,7 +75,7 @@ def import_file(
                 dataset.update_info(**{**notes.info, "imported_from": path.name})
             records = _take_records(path, modes, tables)
             done = {
-                name: _copy(dataset, name, tables[name], found, advance)
+                name: copy_stream(dataset, name, tables[name], found, advance)
                 for name, found in modes.items()
                 if name not in records
             }
@@ -206,21 +206,3 @@ def _make_fields(path: Path, mode: str, columns: Columns, notes: Notes) -> dict[
     noted = mode if mode in notes.modes else next(iter(notes.modes), mode)
     fields = {name: notes.field(noted, name, column) for name, column in columns.items()}
     return {n: f if f.like in fields else replace(f, like="") for n, f in fields.items()}
-
-
-def _copy(
-    dataset: Dataset, mode: str, fields: Mapping[str, Field], columns: Columns, advance: Advance
-) -> int:
-    dataset.define_fields(mode, fields.values())
-    rows = next(iter(columns.values())).shape[0]
-    step = rows_per_block(sum(field.nbytes for field in fields.values()), BLOCK)
-    for start in range(0, rows, step):
-        count = min(step, rows - start)
-        block = {name: column.read(start, count) for name, column in columns.items()}
-        try:
-            dataset.append(mode, block)
-        except SampleError as error:
-            error.add_note(f"in rows {start} to {start + count - 1} of the file")
-            raise
-        advance(sum(array.nbytes for array in block.values()))
-    return rows

@@ -34,7 +34,7 @@ class Case(Environment):
 
     def create(self):
         if self.has_parameters:
-            self.define_parameters(Parameter("p", 1.0, 2.0))
+            self.define_parameters(Parameter("p", 1.0, 2.0, unit="kg"))
 
     def init_database(self):
         self.define_training_fields(Field("x", ()))
@@ -128,6 +128,7 @@ def check(name="run", total=8, failed=()):
         fields = dataset.fields(EPISODES)
         assert (fields["nodes"].role, fields["nodes"].unit) == ("episode", "m")
         assert fields["nodes"].numpy_dtype == np.float32
+        assert "p" not in fields or fields["p"].unit == "kg"
         table = episodes(dataset)
         assert table["episode"].tolist() == list(range(total))
         good = np.array([number not in failed for number in range(total)])

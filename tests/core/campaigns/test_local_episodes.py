@@ -76,6 +76,7 @@ def test_episode_of_more_rows_than_a_block_has_parts():
     assert {status for _, status in parts[:-1]} == {EpisodeStatus.MORE}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("at", [0, 5000, 8999])
 def test_failed_episode_leaves_no_rows_of_its_parts(at):
     for kind in ("raises", "is not finite"):
@@ -118,6 +119,7 @@ def test_mistake_in_one_row_ends_the_campaign(environment, kind):
         simulate(50, {"least": 1, "troubles": {"30": [kind, 0]}}, (), environment, episode_steps=1)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("environment", [TROUBLED, UNCHECKED])
 def test_joined_records_hold_the_parameters_of_each(environment):
     results = simulate(20, {"least": 1, "parameters": True}, (), environment, episode_steps=1,

@@ -238,6 +238,7 @@ def test_normalization_is_switched_on_or_chosen_by_field(
             assert found[name].mean.shape == ()
 
 
+@pytest.mark.slow
 def test_a_method_or_field_that_does_not_exist_is_named(tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(tmp_path)
     store_samples()

@@ -226,6 +226,7 @@ def killed_at(monkeypatch, changes, call):
     return False
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("call", ["rebuild", "repair"])
 def test_killed_rebuild_always_leaves_a_manifest(folder, call, thousand, monkeypatch):
     left = folder.with_name("left")

@@ -176,6 +176,8 @@ def test_a_number_of_a_removed_partition_is_not_used_again(folder, thousand):
 def test_a_merged_dataset_holds_the_rows_of_both(folder, tmp_path, shared, thousand):
     thousand.write(folder, thousand.part(0, 400))
     thousand.write(tmp_path / "other", thousand.part(400, 1000), "other")
+    with Dataset.open(tmp_path / "other", writable=True) as other:
+        other.update_info(seed=7)
     before = {p.name: p.read_bytes() for p in (tmp_path / "other").iterdir()}
     with Dataset.open(folder, writable=True, shared=shared, max_file_size=thousand.size) as dataset:
         dataset.append("training", thousand.part(0, 10))
@@ -185,6 +187,7 @@ def test_a_merged_dataset_holds_the_rows_of_both(folder, tmp_path, shared, thous
             thousand.stacked(thousand.rows, (0, 10))["n"][ORDER],
         )
         dataset.append("training", thousand.part(10, 20))
+        assert dataset.info["merged"] == [{"seed": 7}]
     rows = thousand.stacked((0, 400), (0, 10), (400, 1000), (10, 20))
     thousand.check(folder, rows)
     assert {p.name: p.read_bytes() for p in (tmp_path / "other").iterdir()} == before

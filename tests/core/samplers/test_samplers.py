@@ -138,6 +138,7 @@ def test_a_sobol_sequence_fills_every_part_once():
     assert len({*map(tuple, cells.tolist())}) == 64
 
 
+@pytest.mark.slow
 def test_each_latin_hypercube_has_one_set_in_each_part_of_each_parameter():
     sampler = begun("latin_hypercube", points=10)
     for first in (0, 10, 70):

@@ -86,6 +86,7 @@ def test_predictions_are_the_same_in_any_order_of_events(program, choose):
         assert run(source) == expected
 
 
+@pytest.mark.slow
 @settings(max_examples=size(30, 4))
 @given(drawn, rooms, st.integers(1, 100), st.booleans(), st.sampled_from([1, 2]))
 def test_rows_are_the_same_whenever_a_client_is_lost(program, choose, room, event, begun, victim):

@@ -104,6 +104,7 @@ def test_stored_rows_do_not_depend_on_kills(states, every):
     assert run(states(every, env_kwargs=kwargs, retries=100), stored=True) == expected
 
 
+@pytest.mark.slow
 def test_rows_that_run_ahead_do_not_depend_on_kills(states):
     options = {"run_ahead": 30, "record_wrong_samples": True}
     expected = run(states(3, env_kwargs={"asks": False}, **options), applies=False)
@@ -225,6 +226,7 @@ def test_a_state_of_another_environment_is_an_error_that_names_what_differs(stat
 # The journal -------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_journal_is_bounded_by_the_rows_between_states(states, said, simulation):
     """Without states it has 100 kB for these rows."""
     source = states(10, env_kwargs={"refuse": 0}, retries=1, journal_size=15e-6)

@@ -106,6 +106,7 @@ def test_feed_forward_makes_the_arm_follow(arm, drive):
     assert follow("none", trajectory=1) != alone
 
 
+@pytest.mark.slow
 def test_predictions_act_in_their_own_period(drive):
     model = drive(DartArm, 100, task="track", feedforward="model")
     # An exact network gives the same motion, bit for bit, whatever the name of its field.

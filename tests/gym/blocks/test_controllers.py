@@ -220,6 +220,7 @@ def test_an_adapter_goes_on_a_pd_controller():
 # Safety --------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_the_safety_limit_keeps_joints_within_soft_limits():
     env = RobotEnv(simulator(control_period=1e-3), 0.01)
     safety = MotorSafetyLimit(

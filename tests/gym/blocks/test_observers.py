@@ -126,6 +126,7 @@ def test_each_link_uses_the_nearest_of_several_imus():
         assert turn_between(seen[1], truth[1]) < 3e-2  # a calf is shaken by its foot
 
 
+@pytest.mark.slow
 def test_several_imus_are_filtered_like_one():
     one = walker(sensors=[*encoders(), Imu(name="a", body="base")])
     two = walker(sensors=[*encoders(), Imu(name="a", body="base"), Imu(name="b", body="base")])

@@ -24,6 +24,7 @@ def targets(n=4, *, seed=0, period=DT):
     return made, lower, upper, fastest, most
 
 
+@pytest.mark.slow
 def test_fuzz_of_100_s_stays_within_all_bounds():
     n, steps = 32, 20_000
     made, lower, upper, fastest, most = targets(n)
@@ -72,6 +73,7 @@ def test_targets_can_always_stop():
         assert (rest <= upper + 1e-9).all()
 
 
+@pytest.mark.slow
 def test_rest_is_close_to_the_bound():
     made, _, upper, _, most = targets(5)
     for _ in range(20_000):

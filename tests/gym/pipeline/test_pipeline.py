@@ -99,6 +99,7 @@ def in_code():
     return ControlledEnv(env, pd, augment_observation=True)
 
 
+@pytest.mark.slow
 def test_toml_json_and_code_are_the_same(tmp_path):
     content = {"env_config": ENVIRONMENT, "layers_config": LAYERS_OF_BLOCKS}
     write_toml(tmp_path / "walker.toml", content)

@@ -76,6 +76,7 @@ def plays(env, given):
 # All of them ------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_seed_and_number_of_the_episode_determine_everything(make, backend):
     env, twin = make(backend=backend), make(backend=backend)
     given = actions(env, 5)

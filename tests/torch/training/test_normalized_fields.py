@@ -52,6 +52,7 @@ def train(normalize, network=Scaled, **options):
     return load_learner("sessions/run", NetworkConfig(network))
 
 
+@pytest.mark.slow
 def test_a_network_normalized_by_channel_predicts_at_other_resolutions():
     learner = train(True)
     assert learner.transformation.normalization["u"].mean.shape == (2, 1, 1)

@@ -576,7 +576,8 @@ class Dataset(EpisodeReading, Closeable):
     def merge(self, directory: str | Path) -> None:
         """Append either all rows or none of another dataset; that one is not changed.
 
-        The other's campaigns of episodes follow the dataset's own.
+        The other's campaigns of episodes follow the dataset's own. Its `info` is kept as well: the
+        dataset's has an entry ``merged``, a list of those of all datasets that were appended.
 
         Args:
             directory: The other dataset's folder, or the session's folder that holds it.

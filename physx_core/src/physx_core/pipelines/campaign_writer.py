@@ -74,9 +74,8 @@ class CampaignWriter:
         self.campaign.check_parameters(source.sets.parameters)
         self._check_episode_fields(source)
         self._delegation = delegation
-        if delegation is not None:
-            parameters = (replace(each.field, unit="") for each in source.sets.parameters)
-            self._dataset.define_episodes(parameters, source.episode_fields)
+        parameters = [each.field for each in source.sets.parameters]
+        self._dataset.define_episodes(parameters, source.episode_fields)
         self._source, self._episodes = source, source.lease(self.queue)
 
     def _check_episode_fields(self, source: Source) -> None:

@@ -9,6 +9,7 @@ no code, and restoring it runs none but the `restore` of objects that have a `sn
 from __future__ import annotations
 
 from physx_core.states.baseline import Baseline
+from physx_core.states.kind import StateAdapter
 from physx_core.states.kinds import as_lists
 
-__all__ = ["Baseline", "as_lists"]
+__all__ = ["Baseline", "StateAdapter", "as_lists"]

@@ -39,11 +39,12 @@ class _Array(Kind):
             content = np.frombuffer(content, node.dtype).reshape(whole.shape)
         if whole.shape != content.shape:
             raise StateError(f"The shape of an array was changed in place, to {content.shape}.")
-        if not node.flags.writeable and whole.tobytes() == content.tobytes():
-            return
-        writeable, node.flags.writeable = node.flags.writeable, True
-        node.transpose(_axes(node))[...] = content
-        node.flags.writeable = writeable
+        if node.flags.writeable:
+            whole[...] = content
+        elif whole.tobytes() != content.tobytes():
+            node.flags.writeable = True
+            node.transpose(_axes(node))[...] = content
+            node.flags.writeable = False
 
 
 class _View(Kind):

@@ -25,8 +25,9 @@ class Baseline:
 
     Known are numbers, texts, bytes, paths, NumPy arrays and their views, random generators, lists,
     dictionaries, tuples, sets, deques, members of enumerations, objects of Python classes with
-    their attributes, their methods, what functions remember, and any object with methods
-    ``snapshot()`` and ``restore(snapshot)``, such as the simulations of engines.
+    their attributes, their methods, what functions remember, any object with methods
+    ``snapshot()`` and ``restore(snapshot)``, such as the simulations of engines, and objects in C
+    that an installed package has a `StateAdapter` for.
     """
 
     def __init__(self, root: Any, left_out: Iterable[str] = ()) -> None:
@@ -99,9 +100,8 @@ class Baseline:
 
         fill()
         for number, content in contents.items():
-            if kinds[number] == "snapshot" and content is not None:
-                nodes[number].restore(made.value(content))
-        fill()  # what restoring a snapshot has changed around it
+            KINDS[kinds[number]].settle(nodes[number], content, made.value)
+        fill()  # what that has changed around it
 
     def _check_created(self, state: Mapping[str, Any]) -> None:
         here, there = (

@@ -44,3 +44,28 @@ class Kind:
 
     def fill(self, node: Any, content: Any, value: Value, kept: frozenset[str]) -> None:
         """Give an object its content, in place."""
+
+    def settle(self, node: Any, content: Any, value: Value) -> None:
+        """Bring an object into line with its parts, all of which are filled; again afterwards."""
+
+
+class StateAdapter:
+    """How objects of a class in C are captured.
+
+    A package names it in its entry points ``[project.entry-points."physx.states"]`` by the class,
+    such as ``"mujoco._structs.MjData" = "package.module:Adapter"``; it is made without arguments.
+    """
+
+    def parts(self, value: Any) -> dict[str, Any]:
+        """Return all parts of an object that may change, by name, and always the same names.
+
+        Arrays must be the object's own, the same ones at each call: they are filled in place.
+        Others are numbers, texts, or objects that states know.
+        """
+        raise NotImplementedError
+
+    def assign(self, value: Any, parts: dict[str, Any]) -> None:
+        """Give an object those of its parts that are numbers or texts."""
+
+    def settle(self, value: Any) -> None:
+        """Compute what follows from the parts; the parts themselves are filled again afterwards."""

@@ -15,7 +15,7 @@ import numpy as np
 from physx_core.errors import StateError
 from physx_core.states.arrays import ARRAYS
 from physx_core.states.classes import class_named, class_of, new_of, recipe_of, slots_of
-from physx_core.states.kind import Kind, Part, RefusedError, Value
+from physx_core.states.kind import Kind, Part, RefusedError, StateAdapter, Value
 
 _BITS = {
     kind.__name__: kind
@@ -35,6 +35,27 @@ class _Unknown(Kind):
 class _Snapshot(Kind):
     def read(self, value: Any, part: Part) -> Any:
         return part(value.snapshot(), ".snapshot()")
+
+    def settle(self, node: Any, content: Any, value: Value) -> None:
+        if content is not None:
+            node.restore(value(content))
+
+
+class _Adapted(Kind):
+    """An object of a class that a package has an adapter for."""
+
+    def __init__(self, adapter: StateAdapter) -> None:
+        self._adapter = adapter
+
+    def read(self, value: Any, part: Part) -> Any:
+        return {name: part(each, f".{name}") for name, each in self._adapter.parts(value).items()}
+
+    def fill(self, node: Any, content: Any, value: Value, kept: frozenset[str]) -> None:
+        plain = {name: part for name, part in content.items() if type(part) is not tuple}
+        self._adapter.assign(node, plain)
+
+    def settle(self, node: Any, content: Any, value: Value) -> None:
+        self._adapter.settle(node)
 
 
 class _Object(Kind):
@@ -246,7 +267,18 @@ def _kind_of_class(kind: Any) -> str:
     is_known &= kind is not object and (base is not deque or kind is deque)
     if kind is OrderedDict or (is_known and (base is object or not slots)):
         return base.__name__
-    return "unknown"
+    return _adapted(f"{kind.__module__}.{kind.__qualname__}") or "unknown"
+
+
+def _adapted(name: str) -> str | None:
+    """Return the kind of a class that an installed package has an adapter for, by its name."""
+    from importlib.metadata import entry_points  # few states have objects in C
+
+    entries = list(entry_points(group="physx.states", name=name))
+    if not entries:
+        return None
+    KINDS[name] = _Adapted(entries[0].load()())
+    return name
 
 
 def read_attributes(value: Any, part: Part, left_out: frozenset[str] = frozenset()) -> Any:
