@@ -121,7 +121,7 @@ RECORDS = {
     *("Layout", "Part", "State", "AppliedWrench", "MotorState", "SensorState", "RobotInfo"),
     *("UrdfShape", "Episode", "StepperState", "Result", "Trial", "Normalization"),
     *("CollisionShape", "Joint", "MovableBody", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
-    *("Kind", "Format", "Table", "Section", "RolloutResult"),
+    *("Kind", "Format", "Table", "Section", "RolloutResult", "Unseen"),
 }
 ABSTRACT = {"Pipeline", "Sensor"}
 

@@ -97,6 +97,7 @@ def test_report_of_a_training_says_how_good_its_network_is_beside_its_rivals():
         for text in captions(written_page)
     )
     assert "next. Error of each episode by parameter (validation)" in captions(written_page)
+    assert re.search(r"network predicted [\d,]+ samples per s, their simulation generated", told)
     assert "physx train --config sessions/net/config.toml --session-name again" in told
 
 

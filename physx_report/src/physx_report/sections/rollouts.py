@@ -39,9 +39,7 @@ def _rollout(name: str, of: RolloutResult) -> Iterator[Block]:
         axes.legend(frameon=False)
     yield from found
     columns = of.errors, of.low, of.high, of.unchanged
-    rows = [
-        [f"{of.rows[k]:,}", *(wording.number(each[k]) for each in columns)] for k in of.shown
-    ]
+    rows = [[f"{of.rows[k]:,}", *(wording.number(each[k]) for each in columns)] for k in of.shown]
     head = ["row", "error", "a tenth of the episodes below", "a tenth above", "nothing changes"]
     yield Table(head, rows, f"{name}{f' / {unit}' if unit else ''}")
     if of.episode_errors:
