@@ -151,6 +151,16 @@ def test_another_resolution_is_compared_with_what_needs_no_samples():
     assert result.rollouts["after"].rows[-1] == ROWS
 
 
+def test_a_result_of_another_version_is_replaced_and_the_others_stay():
+    session = train(store("data"))
+    file = session / "results.json"
+    file.write_text(json.dumps({**json.loads(file.read_text()), "evaluation": {"kind": 3}}))
+    result = evaluate(session, store("more", range(50, 60)))
+    kept = read_results(session)
+    assert kept["evaluation"].parts.keys() == result.parts.keys() == {"other"}
+    assert kept["training"].parts
+
+
 def test_a_network_without_held_back_samples_needs_a_dataset():
     session = train(store("data"), View(hold_back=False))
     with pytest.raises(DatasetError, match="name another dataset"):
