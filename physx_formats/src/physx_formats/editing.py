@@ -26,8 +26,7 @@ from physx_core.errors import ConfigError, DatasetError, listed, nearest
 from physx_core.fields import RESERVED, Field
 from physx_core.plugins import import_component
 from physx_core.typing import Array, Batch, Index
-from physx_core.views import Batches, View
-from physx_core.views.folds import Part
+from physx_core.views import Batches, Part, View
 from physx_formats.episodes import EpisodeCopier, copy_stream
 from physx_formats.errors import ExchangeError
 from physx_formats.table import BLOCK, Advance

@@ -2,4 +2,5 @@
 
 from .batches import Batches as Batches
 from .dataset_config import DatasetConfig as DatasetConfig
+from .folds import Part as Part
 from .view import View as View
