@@ -139,7 +139,7 @@ RECORDS = {
     *("UrdfShape", "Episode", "StepperState", "Result", "Trial", "Normalization"),
     *("CollisionShape", "Joint", "MovableBody", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
     "Bond",
-    *("Kind", "Format", "Table", "Section"),
+    *("Kind", "Format", "Table", "Section", "RolloutResult", "Unseen"),
 }
 ABSTRACT = {"Attachment", "Pipeline", "RaySensor", "Sensor"}
 

@@ -20,6 +20,7 @@ from physx_core import (
     Parameter,
     Training,
     View,
+    evaluate,
 )
 from physx_core.cli import main
 from physx_core.errors import SessionError
@@ -96,7 +97,26 @@ def test_report_of_a_training_says_how_good_its_network_is_beside_its_rivals():
         for text in captions(written_page)
     )
     assert "next. Error of each episode by parameter (validation)" in captions(written_page)
+    assert re.search(r"network predicted [\d,]+ samples per s, their simulation generated", told)
     assert "physx train --config sessions/net/config.toml --session-name again" in told
+
+
+def energy(values):
+    x, v = values["state"].T
+    return values["stiffness"] * x**2 + v**2
+
+
+def test_report_of_an_evaluation_draws_the_error_of_what_is_fed_back():
+    generate()
+    train()
+    evaluate("sessions/net", invariants=[energy])
+    first = written("sessions/net")
+    told = text_of(first)
+    assert "What becomes of it over time" in told and "the first error" in told
+    caption = "next. Error of predictions that are fed back, by row after the beginning of 8"
+    assert any(text.startswith(caption) for text in captions(first))
+    assert any(text.startswith("energy. How far it moves") for text in captions(first))
+    assert written("sessions/net", path="other.html") == first
 
 
 def test_report_of_a_generation_says_what_was_simulated():

@@ -25,5 +25,11 @@ def physx_environments() -> Components:
     return {**registered, "module": _named}
 
 
+@hookimpl
+def physx_evaluations() -> Components:
+    """Return how policies are evaluated."""
+    return {"policy": "physx_gym.cli.evaluate:EVALUATION"}
+
+
 def _named(*, module: str, **kwargs: Any) -> GymEnvironment:
     return GymEnvironment(id=module, **kwargs)

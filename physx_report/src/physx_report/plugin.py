@@ -10,6 +10,7 @@ def physx_report_sections() -> Components:
     """Return the sections of each report; those that do not apply to a run are empty."""
     return {
         "quality": "physx_report.sections.quality:SECTION",
+        "rollouts": "physx_report.sections.rollouts:SECTION",
         "episodes": "physx_report.sections.episodes:SECTION",
         "training": "physx_report.sections.training:SECTION",
         "samples": "physx_report.sections.samples:SECTION",

@@ -4,6 +4,7 @@ from .buffer import BatchSelection as BatchSelection
 from .buffer import Buffer as Buffer
 from .environment import Environment as Environment
 from .environment import options_of as options_of
+from .evaluation import Evaluation as Evaluation
 from .group import Group as Group
 from .launcher import ClientHandle as ClientHandle
 from .launcher import Launcher as Launcher

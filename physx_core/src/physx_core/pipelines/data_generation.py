@@ -9,7 +9,7 @@ import warnings
 from collections.abc import Iterable, Mapping
 from dataclasses import KW_ONLY, dataclass, field
 from pathlib import Path
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from physx_core.config import MODES, WRONG, EnvironmentConfig, at_least, options, read_toml
 from physx_core.dataset import Dataset
@@ -102,6 +102,7 @@ class DataGeneration(NewSessionPipeline):
     _writer: CampaignWriter | None = field(init=False, repr=False, default=None)
     _first_row: int = field(init=False, repr=False, default=0)
     _former_rows: int = field(init=False, repr=False, default=0)
+    _rows: int = field(init=False, repr=False, default=0)
     _streams: StoredStreams | None = field(init=False, repr=False, default=None)
     _states: PastFiles | None = field(init=False, repr=False, default=None)
     _is_described: bool = field(init=False, repr=False, default=False)
@@ -127,6 +128,7 @@ class DataGeneration(NewSessionPipeline):
                 samples are kept.
         """
         with self._running():
+            before = self.dataset.num_samples(self._mode)
             self.observers.begin("generation", *self._amount())
             self.data_generation_begin()
             if self.episodes is None:
@@ -136,6 +138,7 @@ class DataGeneration(NewSessionPipeline):
             if self._writer is not None and self.prove_independence:
                 self._writer.prove_independence()
             self.data_generation_end()
+            self._rows = self.dataset.num_samples(self._mode) - before
         return self.result
 
     def _amount(self) -> tuple[int, str]:
@@ -441,6 +444,10 @@ class DataGeneration(NewSessionPipeline):
         yield describe_samples(self.dataset.directory)
         if self._writer is not None and self._writer.failed:
             yield f"{self._writer.failed} episodes failed"
+
+    def _findings(self) -> dict[str, Any]:
+        rate = self._rows / self._duration if self._rows > 0 else 0.0
+        return {"numbers": {"generated samples per s": rate} if rate else {}}
 
     def _next(self, error: BaseException | None) -> Iterable[str]:
         path = shlex.quote(str(self.session.path))

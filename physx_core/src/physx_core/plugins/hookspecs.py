@@ -106,3 +106,8 @@ def physx_buffers() -> Components:  # type: ignore[empty-body]
 @kind_hook("physx_core.components:Sampler")
 def physx_samplers() -> Components:  # type: ignore[empty-body]
     """Return subclasses of `physx_core.Sampler` by name."""
+
+
+@kind_hook("physx_core.components:Evaluation")
+def physx_evaluations() -> Components:  # type: ignore[empty-body]
+    """Return instances of `physx_core.components.Evaluation` by name."""

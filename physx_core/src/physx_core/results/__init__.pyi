@@ -1,8 +1,11 @@
 """Results: what a run found, and how good its network is, compared with predictions without one."""
 
+from .result import Drift as Drift
 from .result import EpisodeError as EpisodeError
 from .result import FieldResult as FieldResult
 from .result import PartResult as PartResult
 from .result import Result as Result
 from .result import RivalResult as RivalResult
+from .result import RolloutResult as RolloutResult
+from .result import rollout_notes as rollout_notes
 from .stored import read_results as read_results

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
@@ -64,6 +64,16 @@ class Target:
             spread = values.std(axis=0, dtype=np.float64)
             scale = np.where(spread > 0, spread, 1.0)
         return cls(field, None, scale)
+
+    def at(self, field: Field) -> Target:
+        """Return the same for a field of another shape; units belong to its last axis."""
+        if field.shape == self.field.shape:
+            return self
+        own, wanted = self.scale.shape, field.shape or ()
+        scale = np.ones(())
+        if own and wanted and own[-1] == wanted[-1]:
+            scale = self.scale.reshape(-1, own[-1]).mean(axis=0)
+        return replace(self, field=field, scale=scale)
 
     @property
     def kind(self) -> Literal["real", "classes"]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Mapping, Sequence
+from copy import copy
 from dataclasses import dataclass, field
 
 import numpy as np
@@ -52,14 +53,28 @@ class Judged:
     Attributes:
         batches: Their batches, in the order of writing.
         is_apart: Whether they are of other episodes than those that the network learned from.
-        division: Which part of the episodes they are, in words; empty: a mode of their own.
+        division: Which part of the episodes they are, in words; empty: all of `place`.
         used: What they decided about the network, in words; empty: nothing.
+        place: Where they are, in words.
     """
 
     batches: Batches
     is_apart: bool
     division: str
     used: str = ""
+    place: str = 'the mode "validation"'
+
+    @classmethod
+    def of(cls, batches: Batches, *, has_mode: bool, used: str = "") -> Judged:
+        """Take samples that a training held back.
+
+        Args:
+            batches: Their batches.
+            has_mode: Whether they are a mode of their own.
+            used: What they decided about the network, in words.
+        """
+        is_apart = "block" not in batches.group_nouns and (has_mode or batches.is_whole)
+        return cls(batches, is_apart, "" if has_mode else " and ".join(batches.division), used)
 
 
 @dataclass(frozen=True, eq=False)
@@ -113,6 +128,11 @@ class Judge:
         self._rivals: dict[str, Rival] = {}
         self._why: dict[tuple[str, str], str] = {}
         self._predicted, self._predicting = 0, 0.0
+
+    @property
+    def targets(self) -> Mapping[str, Target]:
+        """How errors are measured, by predicted field."""
+        return self._targets
 
     @property
     def rate(self) -> float:
@@ -190,7 +210,20 @@ class Judge:
             part: The samples.
         """
         with part.batches.reading(self._network.names) as batches:
-            return self._judge(part, batches)
+            return self._of_shapes(batches)._judge(part, batches)
+
+    def _of_shapes(self, batches: Batches) -> Judge:
+        """Return a judge of samples whose fields may have other shapes: another resolution."""
+        shapes = {n: batches.fields[n].shape for n in self._network.names}
+        if all(self._training.fields[name].shape == shape for name, shape in shapes.items()):
+            return self
+        other = copy(self)
+        other._targets = {name: of.at(batches.fields[name]) for name, of in self._targets.items()}
+        why = "it learned from samples of another shape"
+        other._rivals = {n: r for n, r in self._rivals.items() if n == UNCHANGED}
+        gone = (MEAN, LINEAR, NEAREST)
+        other._why = {**self._why, **{(n, f): why for n in gone for f in self._targets}}
+        return other
 
     def _judge(self, part: Judged, batches: Batches) -> PartResult:
         groups, every = batches.num_groups, max(1, -(-batches.num_items // _COMPARED))
@@ -205,7 +238,7 @@ class Judge:
         for number in range(len(batches)):
             batch, where = batches[number], batches.groups(number)
             seen[where] = True
-            if "block" in batches.group_nouns:
+            if "block" in batches.group_nouns and not self._is_reshaped(batches):
                 inputs = self._sample.read(batch)
                 steps += float(np.square(np.diff(inputs, axis=0)).sum())
                 spread += 2.0 * (inputs.size - inputs.shape[1])
@@ -219,7 +252,7 @@ class Judge:
                 self._add_rivals(sums, part, batch, where)
         why = ""
         if "block" in batches.group_nouns:
-            alike = steps < _ALIKE * spread
+            alike = steps < _ALIKE * spread or self._is_reshaped(batches)
             why = _TRAJECTORY if alike else "nothing is known of episodes: blocks of rows count"
         fields = {
             name: self._field(name, part, whole[name], sums, is_said=why != _TRAJECTORY)
@@ -227,11 +260,15 @@ class Judge:
             if name not in missing
         }
         count = int(seen.sum())
-        division = part.division or f'{count} {self._nouns(batches)} of the mode "validation"'
+        division = part.division or f"{count} {self._nouns(batches)} of {part.place}"
         return PartResult(
             *(batches.num_items, count, division, part.used, fields, compared, why, missing),
             {} if metrics is None else metrics.means,
         )
+
+    def _is_reshaped(self, batches: Batches) -> bool:
+        names = self._network.given
+        return any(batches.fields[n].shape != self._training.fields[n].shape for n in names)
 
     def _nouns(self, batches: Batches) -> str:
         return " or ".join(dict.fromkeys(_NOUNS[noun] for noun in batches.group_nouns))

@@ -124,18 +124,78 @@ class PartResult:
 
 
 @dataclass(frozen=True)
+class Drift:
+    """How far a number that the physics keeps moves away, on average over episodes.
+
+    Attributes:
+        prediction: Absolute difference from its true value at the beginning, by row of
+            `RolloutResult.rows`, of predictions that are fed back.
+        truth: The same of the simulation.
+    """
+
+    prediction: Sequence[float]
+    truth: Sequence[float]
+
+
+@dataclass(frozen=True)
+class RolloutResult:
+    """How good predictions of a field are that are fed back, from the beginning of episodes.
+
+    Attributes:
+        unit: The unit of the errors; of components of several units, which it lists with commas,
+            they are in standard deviations of each component.
+        part: The samples: a name of `Result.parts`.
+        episodes: Number of episodes.
+        rows: Numbers of rows after the beginning, as far as half of the episodes reach.
+        errors: Root mean square error of all values and episodes after each of them.
+        low: The error that a tenth of the episodes is below.
+        high: The error that a tenth is above.
+        unchanged: The root mean square error of predicting that nothing changes.
+        doubles: Number of rows after which the error is twice the first one; None: never.
+        loses: Number of rows after which it is no smaller than if nothing changes; None: never.
+        episode_errors: The "best", "median" and "worst" episode, over all rows.
+        invariants: How numbers that the physics keeps move away, by name.
+    """
+
+    unit: str
+    part: str
+    episodes: int
+    rows: Sequence[int]
+    errors: Sequence[float]
+    low: Sequence[float]
+    high: Sequence[float]
+    unchanged: Sequence[float]
+    doubles: int | None = None
+    loses: int | None = None
+    episode_errors: Mapping[str, EpisodeError] = field(default_factory=dict)
+    invariants: Mapping[str, Drift] = field(default_factory=dict)
+
+    @property
+    def shown(self) -> list[int]:
+        """Places in `rows` of about six rows, at growing distances."""
+        wanted = {0, len(self.rows) - 1}
+        size = 1
+        while size < len(self.rows):
+            wanted.add(size)
+            size *= 4
+        return sorted(wanted)
+
+
+@dataclass(frozen=True)
 class Result:
     """What a run found, and where it is.
 
     ``print(result)`` shows what the run prints at its end, ``result["error/x/rmse"]`` is a number.
 
     Attributes:
-        kind: The pipeline: "training", "data_generation", "prediction" or "replay".
+        kind: The pipeline: "training", "data_generation", "prediction" or "replay"; or
+            "evaluation".
         session: Folder of the session.
         seconds: Duration in s.
         summary: What was done, in lines.
         numbers: Losses and rates by name, with units in the names: see `values`.
         parts: The network's errors on the parts "validation" and "test", as far as they exist.
+        rollouts: How good predictions are that are fed back, by predicted field.
         why: Why the network was not judged; empty if it was.
         places: Where things are, by what they are.
     """
@@ -146,6 +206,7 @@ class Result:
     summary: Sequence[str] = ()
     numbers: Mapping[str, float] = field(default_factory=dict)
     parts: Mapping[str, PartResult] = field(default_factory=dict)
+    rollouts: Mapping[str, RolloutResult] = field(default_factory=dict)
     why: str = ""
     places: Mapping[str, str] = field(default_factory=dict)
 
@@ -154,7 +215,8 @@ class Result:
         """All numbers by name: `numbers`, and errors as ``error/FIELD/NAME``, ``test/FIELD/NAME``.
 
         The errors of a rival are ``error/FIELD/RIVAL/NAME``; the user's own ones ``metric/NAME``
-        and ``test/metric/NAME``.
+        and ``test/metric/NAME``. ``rollout/FIELD/`` has ``rmse``, the error at the last row, and as
+        numbers of rows ``doubles`` and ``loses``: see `RolloutResult`.
         """
         found = dict(self.numbers)
         for part, judged in self.parts.items():
@@ -168,6 +230,11 @@ class Result:
                         f"{start}/{name}/{rival}/{key}": value
                         for key, value in other.errors.items()
                     }
+        for name, rollout in self.rollouts.items():
+            found[f"rollout/{name}/rmse"] = rollout.errors[-1]
+            for key, row in (("doubles", rollout.doubles), ("loses", rollout.loses)):
+                if row is not None:
+                    found[f"rollout/{name}/{key}"] = row
         return found
 
     def __getitem__(self, name: str) -> float:
@@ -192,6 +259,8 @@ class Result:
         found = list(self.summary)
         for name, part in self.parts.items():
             found += _part_lines(name, part)
+        for name, rollout in self.rollouts.items():
+            found += _rollout_lines(name, rollout)
         if self.why:
             found.append(f"not judged: {self.why}")
         return found
@@ -219,6 +288,9 @@ class Result:
                 found += [f"<p>{escape(line)}</p>" for line in _details(of)]
             notes = [*_metrics(part), *_missing(part), *([part.why] if part.why else [])]
             found += [f"<p>{escape(line)}</p>" for line in notes]
+        for name, rollout in self.rollouts.items():
+            told = "\n".join(_rollout_lines(name, rollout))
+            found.append(f"<pre>{escape(told)}</pre>")
         if self.why:
             found.append(f"<p>not judged: {escape(self.why)}</p>")
         return "\n".join(found)
@@ -247,6 +319,40 @@ def _part_lines(name: str, part: PartResult) -> Iterator[str]:
 def _metrics(part: PartResult) -> Iterator[str]:
     for name, value in part.metrics.items():
         yield f"{name}: {_number(value)}, the mean over {part.episodes:,} episodes"
+
+
+def _rollout_lines(name: str, of: RolloutResult) -> Iterator[str]:
+    unit = _one_unit(of.unit)
+    yield f"{name}, predictions fed back: {of.episodes} episodes ({of.part}), {of.rows[-1]:,} rows"
+    head = ["after row", f"rmse {unit}".rstrip(), "80 % of the episodes", "if nothing changes"]
+    cells = [head, *([
+        f"{of.rows[k]:,}", _number(of.errors[k]), f"{_number(of.low[k])} to {_number(of.high[k])}",
+        _number(of.unchanged[k]),
+    ] for k in of.shown)]  # fmt: skip
+    widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
+    for row in cells:
+        padded = (f"{cell:>{size}}" for cell, size in zip(row, widths, strict=True))
+        yield f"  {'  '.join(padded)}"
+    yield f"  {'; '.join(rollout_notes(of))}"
+    if of.episode_errors:
+        each = (f"{n} {e.text}: {_number(e.error)} {unit}" for n, e in of.episode_errors.items())
+        yield f"  episodes: {', '.join(map(str.rstrip, each))}"
+    for label, drift in of.invariants.items():
+        yield (
+            f"  {label} moves by {_number(drift.prediction[-1])} in the predictions, by "
+            f"{_number(drift.truth[-1])} in the simulation, after row {of.rows[-1]:,}"
+        )
+
+
+def rollout_notes(of: RolloutResult) -> list[str]:
+    """Return after how many rows predictions that are fed back become bad, in words."""
+    last = of.rows[-1]
+    return [
+        f"twice the first error after row {of.doubles:,}"
+        if of.doubles is not None else f"less than twice the first error to row {last:,}",
+        f'no better than "nothing changes" after row {of.loses:,}'
+        if of.loses is not None else f'better than "nothing changes" to row {last:,}',
+    ]  # fmt: skip
 
 
 def _missing(part: PartResult) -> Iterator[str]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import json
 import math
@@ -18,6 +19,7 @@ from physx_core.results.result import Result
 
 FILE = "results.json"
 _LARGEST = 2**24
+_WRONG = ValueError, TypeError, AttributeError, LookupError
 
 
 def store_result(session: Path, result: Result) -> None:
@@ -26,10 +28,11 @@ def store_result(session: Path, result: Result) -> None:
     Raises:
         SessionError: If the session cannot be written to.
     """
-    try:
-        known = {name: each.to_plain() for name, each in read_results(session).items()}
-    except SessionError:  # damaged, or of another version: the new one matters more
-        known = {}
+    known = {}
+    with contextlib.suppress(OSError, ValueError, AttributeError):  # none yet, or damaged
+        for name, each in parse_json(files.read_content(session / FILE, _LARGEST)).items():
+            with contextlib.suppress(*_WRONG):  # of another version: the new one matters more
+                known[name] = _typed(Result, each).to_plain()
     try:
         text = json.dumps({**known, result.kind: result.to_plain()}, indent=1, allow_nan=False)
         files.replace(session / FILE, f"{text}\n".encode())
@@ -52,7 +55,7 @@ def read_results(session: str | Path) -> dict[str, Result]:
     try:
         plain = parse_json(files.read_content(path, _LARGEST))
         return {name: _typed(Result, each) for name, each in plain.items()}
-    except (OSError, ValueError, TypeError, AttributeError, LookupError) as error:
+    except (OSError, *_WRONG) as error:
         raise SessionError(f"{path} is damaged: {error}. Remove it.") from error
 
 

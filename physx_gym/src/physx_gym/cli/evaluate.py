@@ -13,6 +13,7 @@ import numpy as np
 import tyro
 
 from physx_core.cli import argument_registry, show, show_table
+from physx_core.components import Evaluation
 from physx_core.errors import ConfigError
 from physx_gym.bridge.make_env import make_env
 from physx_gym.bridge.plain import PlainEnv
@@ -187,3 +188,11 @@ def _evaluate_all(
         return evaluate(env, act, seeds), {}
     first, recording = evaluate_recorded(env, act, seeds[0])
     return [first, *evaluate(env, act, seeds[1:])], recording
+
+
+def _is_policy(fields: Sequence[str]) -> bool:
+    """Return whether a network's fields are parts of an observation and of an action."""
+    return bool(fields) and all(name.startswith(("observation", "action")) for name in fields)
+
+
+EVALUATION = Evaluation(_is_policy, run)

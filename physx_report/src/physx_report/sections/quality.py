@@ -20,12 +20,11 @@ _WORDS = {
 
 
 def _blocks(run: Run) -> Iterator[Block]:
-    result = run.training
-    if result is None:
-        return
-    if result.why:
+    result, evaluated = run.training, run.results.get("evaluation")
+    if result is not None and result.why:
         yield Text([f"How good the network is, is not known: {result.why}."], "verdict")
-    for name, part in result.parts.items():
+    parts = {**(result.parts if result else {}), **(evaluated.parts if evaluated else {})}
+    for name, part in parts.items():
         yield Text([_verdict(label, of) for label, of in part.fields.items()], "verdict")
         yield Text(list(_about(name, part)))
         for label, of in part.fields.items():

@@ -34,6 +34,18 @@ class Judgment:
 NOT_JUDGED = Judgment(why='rivals is "none"')
 
 
+def predictor_of(learner: Learner) -> Predictor:
+    """Return a network as it is judged; it may go on learning."""
+    network, loss = learner.network, learner.config.loss
+    table = loss if isinstance(loss, Mapping) else dict.fromkeys(network.opt_fields, loss)
+    return Predictor(
+        learner.predict_in_training,
+        network.net_fields,
+        dict(zip(network.opt_fields, network.pred_fields, strict=False)),
+        {name: getattr(one, "__name__", str(one)) for name, one in table.items()},
+    )
+
+
 class Judging:
     """Measures a training's network on samples that it does not learn from.
 
@@ -87,15 +99,7 @@ class Judging:
 
     def _begin(self) -> Judge:
         if self._judge is None:
-            network, loss = self._learner.network, self._learner.config.loss
-            table = loss if isinstance(loss, Mapping) else dict.fromkeys(network.opt_fields, loss)
-            predictor = Predictor(
-                self._learner.predict_in_training,
-                network.net_fields,
-                dict(zip(network.opt_fields, network.pred_fields, strict=False)),
-                {name: getattr(one, "__name__", str(one)) for name, one in table.items()},
-            )
-            self._judge = Judge(predictor, self._stored.training, self._metrics)
+            self._judge = Judge(predictor_of(self._learner), self._stored.training, self._metrics)
         return self._judge
 
     def measure(self) -> dict[str, float]:

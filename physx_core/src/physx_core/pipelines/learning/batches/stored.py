@@ -201,13 +201,9 @@ class StoredBatches:
         """
         found = {}
         if self.has_validation:
-            held = self._validation
-            is_apart = "block" not in held.group_nouns and (self._has_mode or held.is_whole)
-            division = "" if self._has_mode else " and ".join(held.division)
-            found["validation"] = Judged(held, is_apart, division, used)
+            found["validation"] = Judged.of(self._validation, has_mode=self._has_mode, used=used)
         if self._view.test_fold is not None:
-            test = self._open_unseen("test")
-            found["test"] = Judged(test, test.is_whole, " and ".join(test.division))
+            found["test"] = Judged.of(self._open_unseen("test"), has_mode=False)
         return found
 
     @property
