@@ -27,6 +27,8 @@ from physx_core.errors import SessionError
 from physx_report import Figure, Section, Table, Text, drawing, page, write_report
 from physx_report.errors import ReportError
 
+pytestmark = pytest.mark.slow
+
 WINDOWS = View(window={"past": ("state", 0), "next": ("state", 1)})
 
 
