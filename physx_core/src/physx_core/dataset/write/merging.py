@@ -46,7 +46,8 @@ def add_partitions(writer: Writer, source: Path, given: Manifest) -> None:
         files.sync_folder(writer.store.directory)
         with writer.store.change() as manifest:
             statistics_file.load(writer.store.directory, manifest)
-            manifest.info["merged"] = [*manifest.info.get("merged", []), given.info]
+            if given.info:
+                manifest.info["merged"] = [*manifest.info.get("merged", []), given.info]
             for name, partitions in pairs.items():
                 _accept(manifest, manifest.modes[name], given.modes[name], partitions)
             for entry in sealed:
