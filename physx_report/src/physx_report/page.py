@@ -41,17 +41,27 @@ def write_report(
     """
     with Run(session, trust=trust) as run:
         place = run.path / NAME if path is None else Path(path)
-        sections = [(each.title, _blocks(each, run)) for each in all_sections()]
-        kinds = ", ".join(kind.replace("_", " ") for kind in run.results)
-        text = _template().render(
-            title=f"{run.path.name}: {kinds}",
-            sections=[(title, _plain(blocks)) for title, blocks in sections if blocks],
-        )
+        text = page_of(run, all_sections())
     try:
         files.replace(place, text.encode())
     except OSError as error:
         raise SessionError(f"{place} cannot be written: {error}.") from error
     return place
+
+
+def page_of(run: Run, sections: Iterable[Section]) -> str:
+    """Return a session's page with some sections.
+
+    Raises:
+        ReportError: If a section fails.
+    """
+    found = [(each.title, _blocks(each, run)) for each in sections]
+    kinds = ", ".join(kind.replace("_", " ") for kind in run.results)
+    text: str = _template().render(
+        title=f"{run.path.name}: {kinds}",
+        sections=[(title, _plain(blocks)) for title, blocks in found if blocks],
+    )
+    return text
 
 
 def _blocks(section: Section, run: Run) -> list[Block]:

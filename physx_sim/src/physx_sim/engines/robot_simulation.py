@@ -439,7 +439,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._check_open()
         last = self._last
         if self._stepped:
-            last = self.accelerations(), self.read_contacts()
+            last = self.accelerations().copy(), self.read_contacts()
         self.clear_warm_start()
         return State(
             self.positions(),
