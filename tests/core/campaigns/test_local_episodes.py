@@ -66,6 +66,7 @@ def test_blocks_of_few_rows_hold_parts(troubles, long):
     assert max(record.part for record in results.records) >= 1
 
 
+@pytest.mark.slow
 def test_episode_of_more_rows_than_a_block_has_parts():
     troubles = {"1": ["is long", 9000]}
     results = simulate(3, {"troubles": troubles})
@@ -133,6 +134,7 @@ def test_joined_records_hold_the_parameters_of_each(environment):
     assert [parts[number < 10][number]["height"] for number in range(20)] == heights
 
 
+@pytest.mark.slow
 def test_thousands_of_numbers_are_few_records():
     results = simulate(5000, {"least": 1}, episode_steps=1)
     check(results, 5000, least=1, episode_steps=1)

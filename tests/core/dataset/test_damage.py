@@ -133,6 +133,7 @@ def campaign(copy, step, *, repair_every):
     return tried, noticed
 
 
+@pytest.mark.slow
 def test_corrupt_files_give_no_wrong_rows(copy):
     tried, noticed = campaign(copy, 4500, repair_every=9)
     assert noticed > tried / 2
@@ -323,6 +324,7 @@ DAMAGED = [
 ]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("place", "paths"), DAMAGED)
 def test_random_corruption_gives_no_wrong_rows(places, tmp_path, place, paths):
     folder = shutil.copytree(places / place, tmp_path / "copy")

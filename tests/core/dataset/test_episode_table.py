@@ -270,6 +270,7 @@ def test_a_torn_reason_costs_only_itself(folder):
         assert [f.episode for f in dataset.failed_episodes("training")] == [0, 1, 2]
 
 
+@pytest.mark.slow
 def test_merged_campaigns_keep_their_rows_and_reasons(tmp_path):
     for name in "ab":
         with Dataset.create(tmp_path / name) as dataset:

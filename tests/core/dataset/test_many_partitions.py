@@ -65,6 +65,7 @@ def test_the_manifest_is_seldom_written_anew(folder):
     assert_array_equal(read(folder), np.arange(600))
 
 
+@pytest.mark.slow
 def test_a_refreshed_reader_sees_new_partitions(folder):
     with Dataset.create(folder, max_file_size=SIZE) as dataset:
         dataset.append("training", block(0, 5))

@@ -140,6 +140,7 @@ def test_a_reader_gets_other_rows_and_an_error_that_names_the_damaged_ones(folde
     assert before == {path.name: path.read_bytes() for path in folder.iterdir()}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", range(2))
 def test_salvage_after_any_bit_flip_drops_at_most_one_block(folder, tmp_path, seed):
     """Records and digests may be hit too; a damaged header makes the partition unreadable."""

@@ -147,6 +147,7 @@ TestStream = Stream.TestCase
 TestStream.settings = settings(max_examples=size(25, 4), stateful_step_count=25, deadline=None)
 
 
+@pytest.mark.slow
 @settings(max_examples=size(40, 5))
 @given(data=st.data())
 def test_tls_truncation_and_corruption_are_errors(data):

@@ -206,6 +206,7 @@ def measured(**options):
     return sizes[False], recorded(pipeline.session.path.name)["loss/validation"]
 
 
+@pytest.mark.slow
 def test_a_validation_takes_as_many_rows_at_once_as_the_training(many):
     sizes, losses = measured()
     assert sizes == {20, 1}

@@ -138,6 +138,7 @@ def test_another_dataset_is_compared_with_the_same_rivals():
         evaluate(session, "data", mode="nothing")
 
 
+@pytest.mark.slow
 def test_another_resolution_is_compared_with_what_needs_no_samples():
     pytest.importorskip("torch")
     place = {"module": "torch.nn:Linear", "in_features": 2, "out_features": 2}

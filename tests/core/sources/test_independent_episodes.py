@@ -114,6 +114,7 @@ def rows_of(services, environment, count, name="x", **options):
         return source.batch(count)[name].copy()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("instances", [1, 2, 3])
 def test_single_steps_have_the_parameters_and_the_stream_of_their_number(services, instances):
     options = {"num_clients": instances, "sampler": "physx/sobol"}

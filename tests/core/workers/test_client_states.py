@@ -181,6 +181,7 @@ FATES = st.lists(
 )
 
 
+@pytest.mark.slow
 @settings(max_examples=size(150, 10), phases=[Phase.generate])
 @given(
     drawn,

@@ -179,6 +179,7 @@ class NoNetwork:
         return {}
 
 
+@pytest.mark.slow
 @settings(max_examples=size(40, 6), deadline=None)
 @given(drawn, st.sampled_from([100, 3000, ROOM]), st.lists(st.integers(1, 600), max_size=5))
 def test_rows_are_the_same_in_any_order_of_events_and_kills(undisturbed, choose, room, events):

@@ -508,6 +508,7 @@ def falling(rng, rows):
     return {"v": v, "force": force, "x": x, "next_v": v + 0.1 * force, "next_x": x + 0.1 * v}
 
 
+@pytest.mark.slow
 def test_losses_by_target_and_of_the_batch_are_named_in_a_command(tmp_path, capsys):
     store(falling)
     (tmp_path / "losses.py").write_text(LOSSES)

@@ -283,6 +283,7 @@ def test_environments_and_rows_of_unknown_trajectories_are_refused():
                  quiet=True).execute()  # fmt: skip
 
 
+@pytest.mark.slow
 def test_unrolling_from_the_command_line(capsys):
     store()
     words = [
