@@ -124,7 +124,7 @@ def test_each_option_that_takes_a_component_is_known(after, capsys):
         main([command, "--help"])
         found = re.findall(r"(--[\w.-]+) \[?REFERENCE", capsys.readouterr().out)
         for option in found:
-            if option.rpartition(".")[2] not in others:
+            if option.rpartition(".")[2].removeprefix("--") not in others:
                 assert after(f"{command} {option}") or "visualizer" in option, (command, option)
 
 
