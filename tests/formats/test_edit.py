@@ -93,12 +93,18 @@ def test_episodes_and_rows_are_chosen(data, tmp_path):
     heavy = View(hold_back=False, episodes={"mass": [1.0, 9.0]})
     edit(data, tmp_path / "heavy", view=heavy)
     assert rows_of(tmp_path / "heavy") == [*range(200, 203), *range(300, 308)]
+    with Dataset.open(tmp_path / "heavy") as dataset:
+        assert dataset.failed_episodes("training") == []
+    edit(data, tmp_path / "gone", drop_episodes=[1])
+    with Dataset.open(tmp_path / "gone") as dataset:
+        assert dataset.failed_episodes("training") == [] and dataset.num_samples("training") == 16
     with Dataset.open(tmp_path / "fewer") as dataset:
+        assert "0x" not in str(dataset.info["edits"])
         found = dataset.recorded_episodes("training")
         entries = np.flatnonzero(found.rows)
         assert found.episode[entries].tolist() == [2, 3]
         assert found.rows[entries].tolist() == [1, 2]
-        assert dataset.failed_episodes("training") == []
+        assert [each.episode for each in dataset.failed_episodes("training")] == [1]
         values = dataset.recorded_values("training", entries)
         assert values["mass"].tolist() == [1.0, 1.5]
         assert values["mesh"].tolist() == [[2, 1], [3, 1]]

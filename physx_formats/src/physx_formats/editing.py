@@ -29,7 +29,7 @@ from physx_core.typing import Array, Batch, Index
 from physx_core.views import Batches, Part, View
 from physx_formats.episodes import EpisodeCopier, copy_stream
 from physx_formats.errors import ExchangeError
-from physx_formats.table import BLOCK, Advance
+from physx_formats.table import BLOCK, Advance, check_new
 
 Function: TypeAlias = "str | Callable[[Mapping[str, Array]], Any]"
 _ALL = View(hold_back=False)
@@ -92,9 +92,7 @@ def edit(
         SampleError: If values do not fit the types.
     """
     out = Path(out)
-    if out.exists() or not out.absolute().parent.is_dir():
-        why = "exists already" if out.exists() else "would be in a folder that does not exist"
-        raise ExchangeError(f"{out} {why}. Choose another path.")
+    check_new(out)
     if view.windows or view.weights or view.sources:
         raise ConfigError("Only what a View says of episodes, stride and folds chooses rows.")
     with (
@@ -104,38 +102,39 @@ def edit(
         names = list(modes or (name for name in source.modes if source.num_samples(name)))
         names = [name for name in names if name != EPISODES or not source.has_episodes]
         fields = _Fields(keep, drop, cast or {}, units or {}, rename or {})
-        done, draft = {}, Path(folder) / "dataset"
+        origin = {"dataset": Path(directory).resolve().name, "digest": _digest(source, names)}
         said = _said(view, part, drop_episodes, rows, derive) | fields.said()
-        origin = {
-            "dataset": Path(directory).resolve().name,
-            "digest": _digest(source, names),
-            **said,
-        }
+        done, draft = {}, Path(folder) / "dataset"
         with Dataset.create(draft, session="edit") as target:
             history = source.info.get("edits", [])
-            target.update_info(**{**source.info, "edits": [*history, origin]})
-            if source.has_episodes:
-                known = source.fields(EPISODES).values()
-                own = [field.name for field in TABLE_FIELDS]
-                once = [field for field in known if field.role == "episode"]
-                parameters = [f for f in known if f.role != "episode" and f.name not in own]
-                target.define_episodes(parameters, once)
+            target.update_info(**{**source.info, "edits": [*history, origin | said]})
+            _define_episodes(target, source)
             for name in names:
                 edited = _Mode(source, name, Path(folder))
                 if derive is not None:
-                    edited.derive(_function(derive), str(derive))
+                    edited.derive(*_function(derive))
                 numbers = edited.choose(view, part)
                 if rows is not None:
-                    numbers = edited.filter(_function(rows), str(rows), numbers)
-                if drop_episodes:
-                    numbers = edited.without(numbers, set(drop_episodes))
-                chooses = len(numbers) < edited.count
-                done[name] = edited.copy(
-                    target, fields.of(edited.fields), numbers, advance, with_failed=not chooses
-                )
+                    numbers = edited.filter(*_function(rows), numbers)
+                numbers = edited.without(numbers, drop_episodes)
+                chooses = part != "all" or bool(view.episodes or view.where)
+                failed = None if chooses else drop_episodes
+                done[name] = edited.copy(target, fields.of(edited.fields), numbers, advance, failed)
         fields.check_used()
         draft.rename(out)
     return done
+
+
+def _define_episodes(target: Dataset, source: Dataset) -> None:
+    """Define what is recorded of episodes as in another dataset, if it has any."""
+    if not source.has_episodes:
+        return
+    own = {field.name for field in TABLE_FIELDS}
+    known = [field for name, field in source.fields(EPISODES).items() if name not in own]
+    target.define_episodes(
+        [field for field in known if field.role != "episode"],
+        [field for field in known if field.role == "episode"],
+    )
 
 
 class _Fields:
@@ -302,8 +301,10 @@ class _Mode:
             )
         return numbers[keeps[numbers]]
 
-    def without(self, numbers: Index, episodes: set[int]) -> Index:
+    def without(self, numbers: Index, episodes: Collection[int]) -> Index:
         """Return those of some rows that do not belong to some episodes."""
+        if not episodes:
+            return numbers
         known = self._source.recorded_episodes(self._name)
         if known is None:
             raise ConfigError(
@@ -338,10 +339,18 @@ class _Mode:
         fields: Mapping[str, Field],
         numbers: Index,
         advance: Advance,
-        *,
-        with_failed: bool,
+        lost: Collection[int] | None,
     ) -> int:
-        """Store some rows with their records, and return their number."""
+        """Store some rows with their records, and return their number.
+
+        Args:
+            target: Receives them.
+            fields: The new fields by their old names.
+            numbers: The rows, ascending.
+            advance: Called with the number of bytes stored.
+            lost: Numbers of episodes of which no record is kept, not even that they have failed;
+                None: only those with rows have one.
+        """
         if not len(numbers):
             raise DatasetError(f'Nothing would be left of mode "{self._name}".')
         columns: Any = {
@@ -352,7 +361,7 @@ class _Mode:
             return copy_stream(target, self._name, own, columns, advance)
         table = self._source.fields(EPISODES)
         reasons = {failed[1:3]: failed[3] for failed in self._source.failed_episodes(self._name)}
-        records = _records_of(self._source.episode_table([self._name]), numbers, with_failed)
+        records = _records_of(self._source.episode_table([self._name]), numbers, lost)
         copier = EpisodeCopier(target, self._name, own, columns, table, advance, reasons)
         return copier.copy(records)
 
@@ -391,18 +400,19 @@ class _Column:
         return self._field.convert(values, axes=1)
 
 
-def _records_of(table: Batch, numbers: Index, with_failed: bool) -> Batch:
+def _records_of(table: Batch, numbers: Index, lost: Collection[int] | None) -> Batch:
     """Return the records of the episodes of some rows, with as many rows as these.
 
     Args:
         table: All records, in order.
         numbers: The rows, ascending.
-        with_failed: Whether episodes that have no rows at all are kept.
+        lost: See `_Mode.copy`.
     """
     ends = np.cumsum(table["rows"])
     entry = ends.searchsorted(numbers, "right")
     left = np.bincount(entry, minlength=len(ends))
-    whole = np.where(table["rows"] == 0, with_failed, left > 0)
+    stays = np.zeros(len(ends), bool) if lost is None else ~np.isin(table["episode"], sorted(lost))
+    whole = np.where(table["rows"] == 0, stays, left > 0)
     cut = (table["count"] > 1) & whole & (left < table["rows"])
     kept = np.flatnonzero(whole & ~cut)
     found = [(kept, table["episode"][kept], table["count"][kept], left[kept])]
@@ -419,11 +429,18 @@ def _records_of(table: Batch, numbers: Index, with_failed: bool) -> Batch:
     return records | changed | {"first_row": np.cumsum(rows[order]) - rows[order]}
 
 
-def _function(given: Function) -> Callable[[Mapping[str, Array]], Any]:
-    found: Callable[[Mapping[str, Array]], Any] = (
-        import_component("function", given) if isinstance(given, str) else given
-    )
-    return found
+def _function(given: Function) -> tuple[Callable[[Mapping[str, Array]], Any], str]:
+    """Return a function, and its name."""
+    if isinstance(given, str):
+        return import_component("function", given), given
+    return given, _name_of(given)
+
+
+def _name_of(given: Function) -> str:
+    """Return a function's name, which is the same in each process."""
+    if isinstance(given, str):
+        return given
+    return f"{given.__module__}:{getattr(given, '__qualname__', type(given).__qualname__)}"
 
 
 def _said(
@@ -444,7 +461,7 @@ def _said(
     if drop_episodes:
         found["drop_episodes"] = sorted(drop_episodes)
     functions = {"rows": rows, "derive": derive}
-    return found | {name: str(given) for name, given in functions.items() if given is not None}
+    return found | {name: _name_of(given) for name, given in functions.items() if given is not None}
 
 
 def _digest(source: Dataset, modes: Sequence[str]) -> str:

@@ -10,7 +10,7 @@ from physx_core.dataset import EPISODES, Dataset
 from physx_core.errors import ConfigError, PhysxError, listed
 from physx_formats.errors import ExchangeError
 from physx_formats.format import Format, all_formats, find_format
-from physx_formats.table import Advance, ExportOptions, Table
+from physx_formats.table import Advance, ExportOptions, Table, check_new
 
 _EPISODES = ("observations", "actions", "rewards", "fps", "task")
 
@@ -57,9 +57,7 @@ def export(
             f"{to} holds one mode. Choose one with modes (--mode on the command line): "
             f"{listed(table.mode for table in tables)}."
         )
-    if out.exists() or not out.absolute().parent.is_dir():
-        why = "exists already" if out.exists() else "would be in a folder that does not exist"
-        raise ExchangeError(f"{out} {why}. Choose another path.")
+    check_new(out)
     try:
         with tempfile.TemporaryDirectory(dir=out.absolute().parent, prefix=".export-") as folder:
             draft = Path(folder) / out.name

@@ -132,6 +132,13 @@ class Column(Protocol):
         ...
 
 
+def check_new(path: Path) -> None:
+    """Check that a file or folder can be created under a name."""
+    if path.exists() or not path.absolute().parent.is_dir():
+        why = "exists already" if path.exists() else "would be in a folder that does not exist"
+        raise ExchangeError(f"{path} {why}. Choose another path.")
+
+
 def check_size(path: Path, nbytes: int, limit: int) -> None:
     """Check that a file does not hold more than `limit` bytes before any of it is read."""
     if nbytes > limit:
