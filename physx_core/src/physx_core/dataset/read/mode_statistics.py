@@ -86,8 +86,8 @@ def count_sealed(
     statistics_file.load(directory, manifest)
     counted = []
     for partition in partitions:
-        have = (partition.running.get(name) for name in mode.counted_fields)
-        complete = all(s is not None and s.count == partition.rows for s in have)
+        have = ((partition.running.get(n), partition.rows_of(f)) for n, f in mode.counted_fields.items())
+        complete = all(s is not None and s.count == rows for s, rows in have)
         if partition.counted:
             continue
         if not (partition.checksums and complete):
