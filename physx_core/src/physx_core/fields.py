@@ -48,6 +48,8 @@ PTR = "_ptr"
 BATCH = "_batch"
 """What is added to the name of a free axis for that of the samples of a batch's entries."""
 
+_FREE = 'Values of any size need a free axis, which is defined before: shape=("node", 3)'
+
 _SMALL = 8192  # elements
 
 
@@ -215,7 +217,7 @@ class Field:
         try:
             array: Array = np.asarray(values)
         except ValueError as cause:
-            text = f"is ragged or malformed: {cause}"
+            text = f"is ragged or malformed: {cause}. {_FREE}"
         except NO_ARRAY as cause:
             error, text = FieldTypeError, f"is not convertible to an array: {cause}"
         else:
@@ -461,6 +463,8 @@ def first_not_finite(rows: Array) -> int | None:
 def _misfit(array: Array, dtype: np.dtype[Any]) -> str:
     """Return why a type cannot hold the values of an array; empty if it can."""
     kind = array.dtype.kind
+    if kind == "O":
+        return f"holds objects. {_FREE}"
     if kind not in _FITTING[dtype.kind]:
         return f"holds {array.dtype} but is defined as {dtype}, which cannot hold it"
     if dtype.kind in "iu" and kind != "b" and array.size:
