@@ -135,6 +135,13 @@ class Field:
         return (self.shape or ())[1 if self.free_axis else 0 :]
 
     @cached_property
+    def of_entries(self) -> Field:
+        """The field of an entry of the free axis; without one, the field itself."""
+        if not self.free_axis:
+            return self
+        return replace(self, shape=self.entry_shape, axes=self.axes[1:])
+
+    @cached_property
     def row_kind(self) -> tuple[tuple[int, ...], np.dtype[Any]]:
         """Shape and type of a row in an array of rows: with a free axis, an object, an array."""
         return ((), np.dtype(object)) if self.free_axis else (self.entry_shape, self.numpy_dtype)

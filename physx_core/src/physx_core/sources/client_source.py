@@ -195,8 +195,9 @@ class ClientSource(Source):
             if self._capacity < size:
                 self._capacity = size
                 self._out = {
-                    field.name: np.empty((size, *(field.shape or ())), field.dtype)
+                    field.name: np.empty((size, *shape), kind)
                     for field in self._table
+                    for shape, kind in [field.row_kind]
                 }
             self._group.wait(self._without_rows)
             self.rows = self._asked

@@ -123,5 +123,10 @@ def _joined(
         if not checked and (bad := first_not_finite(entries[name])) is not None:
             row = int(np.cumsum(counts).searchsorted(bad, "right"))
             raise field.not_finite(where=f" in row {row} of the block")
-        ends[field.free_axis + ENDS] = np.cumsum(counts).astype("<u8")
+        end = np.cumsum(counts).astype("<u8")
+        if not np.array_equal(ends.setdefault(field.free_axis + ENDS, end), end):
+            raise FieldShapeError(
+                f'field "{name}" has other sizes of the axis "{field.free_axis}" than the others.',
+                field=name,
+            )
     return entries | ends

@@ -29,8 +29,9 @@ from physx_core.errors import (
     UsageError,
     listed,
 )
-from physx_core.fields import NUMBERS, Field, is_finite
+from physx_core.fields import NUMBERS, PTR, Field, is_finite
 from physx_core.normalization import Normalization
+from physx_core.packing import join, pack, split
 from physx_core.pipelines.learning.components import create, create_network
 from physx_core.plugins import import_component
 from physx_core.plugins.networks import resolve_network
@@ -86,6 +87,7 @@ class Learner:
         self.network.set_device(config.device)
         self.optimization: Optimization | None = None
         self.fields: dict[str, Field] = {}
+        self._free: dict[str, Field] = {}  # those of batches, if one of them has a free axis
         self.group = Group()
         self.row_losses: Array = np.zeros(0)
         self._is_between_steps = False
@@ -130,6 +132,11 @@ class Learner:
         """
         self.fields = dict(fields)
         self.network.bind(fields)
+        self._free = {n: fields[n] for n in self.batch_fields if n in fields}
+        if not any(field.free_axis for field in self._free.values()):
+            self._free = {}
+        if self._free and self.group.size > 1:
+            raise ConfigError("Networks that read free axes are trained by one process.")
         self.normalize(normalization)
 
     def normalize(self, normalization: Mapping[str, Normalization]) -> None:
@@ -156,7 +163,38 @@ class Learner:
 
     def _predict_batch(self, batch: Batch) -> PredictedBatch:
         """Predict a batch in physical units that contains `batch_fields`."""
-        return PredictedBatch.of(self.network, self.transformation, self._read(batch))
+        packed, _ = self._pack(batch)
+        return PredictedBatch.of(self.network, self.transformation, self._read(packed))
+
+    def _pack(self, batch: Batch) -> tuple[Batch, dict[str, Index]]:
+        """Return a batch in which free axes are packed, and the sizes if they were not before."""
+        free, sizes = self._free, dict[str, Index]()
+        if not free or any(f.free_axis + PTR in batch for f in free.values() if f.free_axis):
+            return batch, sizes
+        found: Batch = {}
+        for name, values in batch.items():
+            field = free.get(name)
+            if field is None or not field.free_axis:
+                found[name] = values
+                continue
+            rows = [field.convert(each) for each in values]
+            found[name], counts = join(field, rows)
+            if not np.array_equal(sizes.setdefault(field.free_axis, counts), counts):
+                raise FieldShapeError(
+                    f'field "{name}" has other sizes of the axis "{field.free_axis}" than the '
+                    "fields before it.",
+                    field=name,
+                )
+        return pack({n: free[n] for n in found if n in free}, found, sizes), sizes
+
+    def _split(self, answer: Batch, sizes: Mapping[str, Index]) -> Batch:
+        """Return predictions row by row if the rows had the sizes of free axes."""
+        pairs = zip(self.network.pred_fields, self.network.opt_fields, strict=False)
+        axes = {name: self.fields[of].free_axis for name, of in pairs if of in self.fields}
+        return {
+            name: split(values, sizes[axes[name]]) if axes.get(name) in sizes else values
+            for name, values in answer.items()
+        }
 
     def _read_with_gradients(self, batch: Batch) -> Tensors:
         return self.network.with_gradients(self.network.numpy_to_tensor(batch))
@@ -258,7 +296,7 @@ class Learner:
         sums: dict[str, float] = {}
         count = 0.0
         for batch in batches:
-            share, size = batch, float(len(next(iter(batch.values()))))
+            share, size = batch, float(len(batch[self._counted(batch)]))
             if self.group.size > 1:
                 share, weight = self.group.share_of(batch)
                 size *= weight
@@ -270,6 +308,11 @@ class Learner:
         self.network.set_train()
         *totals, total = self.group.total([*sums.values(), count])
         return {name: value / total for name, value in zip(sums, totals, strict=True)}
+
+    def _counted(self, batch: Batch) -> str:
+        """Return the field whose length is the weight of a batch: rows, or a target's entries."""
+        targets = [name for name in self.network.opt_fields if name in batch]
+        return targets[0] if targets and self._free else next(iter(batch))
 
     def distributions(self) -> dict[str, Array]:
         """Return weights and gradients as arrays, ``weights/<name>`` and ``gradients/<name>``."""
@@ -335,7 +378,7 @@ class Learner:
             batch_size: Largest number of rows to predict at once.
         """
         network, rows = self.network, len(next(iter(batch.values())))
-        parts = [
+        parts = [self.predict_in_training(batch)] if self._free else [
             self.predict_in_training({n: v[first : first + batch_size] for n, v in batch.items()})
             for first in range(0, rows, batch_size)
         ]
@@ -353,6 +396,7 @@ class Learner:
             FieldShapeError: If the network fails because a field has the wrong shape.
         """
         network = self.network
+        batch, sizes = self._pack(batch)
         try:
             read = pick(batch, network.net_fields)
         except KeyError as error:
@@ -363,7 +407,8 @@ class Learner:
             ) from None
         try:
             inputs = network.numpy_to_tensor(read)
-            return network.tensor_to_numpy(predict(network, self.transformation, inputs))
+            answer = network.tensor_to_numpy(predict(network, self.transformation, inputs))
+            return self._split(answer, sizes) if sizes else answer
         except PhysxError:
             raise
         except Exception:  # from a library; other shapes are fine as long as the network takes them
@@ -385,8 +430,8 @@ class Learner:
     def _check_shapes(self, inputs: Batch, *, exactly: bool = False) -> None:
         for name in self.network.net_fields:
             values, field = inputs.get(name), self.fields.get(name)
-            if values is None or field is None:
-                continue
+            if values is None or field is None or field.free_axis:
+                continue  # what has a free axis is checked when it is packed
             if values.dtype.kind not in NUMBERS:
                 raise FieldTypeError(f'field "{name}" does not consist of numbers.', field=name)
             shape = values.shape[1:]

@@ -11,12 +11,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, TypedDict, cast
 
+import numpy as np
+
 from physx_core.components.parameter import Parameter
 from physx_core.components.scene.event import ACTIONS, Event
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
-from physx_core.fields import RESERVED, ROLES, Field, first_not_finite
+from physx_core.fields import RESERVED, ROLES, Field, first_not_finite, is_finite
 from physx_core.net.frames import MAX_PAYLOAD
 from physx_core.net.values import decode
+from physx_core.packing import check_sizes
 from physx_core.rows import ROW_FIELDS
 from physx_core.typing import Batch
 
@@ -102,7 +105,8 @@ def _is_field(plain: Any) -> bool:
         isinstance(dtype, str)
         and _DTYPE.fullmatch(dtype) is not None
         and isinstance(shape, list)
-        and all(type(size) is int for size in shape)
+        and all(type(size) is int or (not place and type(size) is str) for place, size in enumerate(shape))
+        and isinstance(plain.get("indexes", ""), str)
         and isinstance(plain.get("unit", ""), str)
         and plain.get("role", "training") in ROLES
     )
@@ -210,13 +214,20 @@ def check_values(block: Batch, fields: Sequence[Field], instance_id: int) -> Non
     Raises:
         NotFiniteError: If one is NaN or infinity.
     """
+    free = {field.name: field for field in fields if field.free_axis or field.indexes}
+    for row in range(len(block["step"])) if free else ():
+        check_sizes(free, {name: block[name][row] for name in free}, instance_id)
     for field in fields:
         values = block[field.name]
+        if field.free_axis:
+            values = np.concatenate(values.tolist()) if len(values) else np.zeros(0)
+            if not is_finite(values):
+                raise field.not_finite(instance_id=instance_id)
         kind = values.dtype.kind
         if kind == "b" and values.tobytes().translate(None, b"\0\1"):
             raise ConnectionRefusedByPeerError(
                 f'It sent rows whose field "{field.name}" is neither true nor false.'
             )
-        bad = first_not_finite(values) if kind in "fc" else None
+        bad = first_not_finite(values) if kind in "fc" and not field.free_axis else None
         if bad is not None:
             raise field.not_finite(instance_id=instance_id, step=int(block["step"][bad]))
