@@ -230,7 +230,7 @@ class Field:
         else:
             if array.ndim < axes:
                 text = "is a single value; rows have shape (n, *field shape)"
-            elif self.shape is not None and not self._is_shape(array.shape[axes:]):
+            elif self.shape is not None and not self.is_shape(array.shape[axes:]):
                 text = f"has shape {array.shape[axes:]} but is defined as {self.shape}"
             elif self.axes and array.ndim - axes != len(self.axes):
                 text = f"has shape {array.shape[axes:]} but the axes {self.axes}"
@@ -244,7 +244,7 @@ class Field:
             f'field "{self.name}" {text}.', field=self.name, instance_id=instance_id, step=step
         )
 
-    def _is_shape(self, shape: tuple[int, ...]) -> bool:
+    def is_shape(self, shape: tuple[int, ...]) -> bool:
         """Return whether a value may have a shape."""
         if self.free_axis:
             return len(shape) > 0 and shape[1:] == self.entry_shape
