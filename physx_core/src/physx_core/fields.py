@@ -448,7 +448,7 @@ def _as_field(item: Any, role: Role) -> Field:
 def is_finite(array: Array) -> bool:
     """Return whether an array contains neither NaN nor infinity."""
     if array.dtype.kind not in "fc":
-        return True
+        return array.dtype.kind != "O" or all(map(is_finite, array))
     # The sum shows it in one fast pass, unless it overflows. For small arrays the dot product is
     # faster; for large ones it would start threads, which costs more than it saves.
     if array.size <= _SMALL:
@@ -463,6 +463,8 @@ def first_not_finite(rows: Array) -> int | None:
     """Return the index of the first row that contains NaN or infinity; None: no row does."""
     if is_finite(rows):
         return None
+    if rows.dtype.kind == "O":
+        return next(row for row, value in enumerate(rows) if not is_finite(value))
     finite = np.isfinite(rows).reshape(len(rows), -1).all(axis=1)
     return int(np.argmin(finite))
 

@@ -185,8 +185,8 @@ class Prediction(Pipeline):
         }
         if self.step_id == 0:
             added = [
-                Field(name, values.shape[1:], values.dtype, role="additional")
-                for name, values in predicted.items()
+                Field(name, self.learner.predicted_shape(own, values), values[0].dtype, role="additional")
+                for (name, values), own in zip(predicted.items(), self.prediction, strict=True)
             ]
             dataset.define_fields("prediction", [*self.source.fields, *added])
         for row in range(self.source.instance_nb):

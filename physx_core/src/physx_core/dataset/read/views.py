@@ -15,7 +15,6 @@ from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.fields import Field
 from physx_core.typing import Array, Index
 
-
 _FREE_ROWS = 256
 
 

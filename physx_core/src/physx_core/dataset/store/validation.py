@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import re
 from typing import Any, TypeVar
-
-import numpy as np
 
 from physx_core.fields import ROLES, Field
 

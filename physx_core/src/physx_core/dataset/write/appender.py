@@ -11,7 +11,12 @@ from physx_core.dataset.store.episode_record import EpisodeRecord
 from physx_core.dataset.store.episode_table import EPISODES, TABLE_FIELDS, has_table, mode_index
 from physx_core.dataset.store.manifest import Mode
 from physx_core.dataset.write.recording import table_rows
-from physx_core.dataset.write.row_validation import check_rows, count_rows, infer_fields, stored_form
+from physx_core.dataset.write.row_validation import (
+    check_rows,
+    count_rows,
+    infer_fields,
+    stored_form,
+)
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import ConfigError, UsageError, listed
 from physx_core.fields import Field, check_together

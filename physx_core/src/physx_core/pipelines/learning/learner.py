@@ -29,9 +29,9 @@ from physx_core.errors import (
     UsageError,
     listed,
 )
-from physx_core.fields import NUMBERS, PTR, Field, is_finite
+from physx_core.fields import NUMBERS, PTR, Field, free_axes, is_finite
 from physx_core.normalization import Normalization
-from physx_core.packing import join, pack, split
+from physx_core.packing import join, pack, packed_fields, split
 from physx_core.pipelines.learning.components import create, create_network
 from physx_core.plugins import import_component
 from physx_core.plugins.networks import resolve_network
@@ -130,7 +130,8 @@ class Learner:
         Raises:
             FieldsMismatchError: If the network needs fields with other names or shapes.
         """
-        self.fields = dict(fields)
+        fields = {**fields, **packed_fields(free_axes(fields.values()))}
+        self.fields = fields
         self.network.bind(fields)
         self._free = {n: fields[n] for n in self.batch_fields if n in fields}
         if not any(field.free_axis for field in self._free.values()):
@@ -186,6 +187,13 @@ class Learner:
                     field=name,
                 )
         return pack({n: free[n] for n in found if n in free}, found, sizes), sizes
+
+    def predicted_shape(self, name: str, values: Array) -> tuple[Any, ...]:
+        """Return the shape of a predicted field, of which there are values by row."""
+        if not values.dtype.hasobject:
+            return values.shape[1:]
+        pairs = zip(self.network.pred_fields, self.network.opt_fields, strict=False)
+        return self.fields[dict(pairs)[name]].free_axis, *values[0].shape[1:]
 
     def _split(self, answer: Batch, sizes: Mapping[str, Index]) -> Batch:
         """Return predictions row by row if the rows had the sizes of free axes."""

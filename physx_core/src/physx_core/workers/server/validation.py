@@ -11,17 +11,15 @@ from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any, TypedDict, cast
 
-import numpy as np
-
 from physx_core.components.parameter import Parameter
 from physx_core.components.scene.event import ACTIONS, Event
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
-from physx_core.fields import RESERVED, ROLES, Field, first_not_finite, is_finite
+from physx_core.fields import RESERVED, ROLES, Field, first_not_finite
 from physx_core.net.frames import MAX_PAYLOAD
 from physx_core.net.values import decode
 from physx_core.packing import check_sizes
 from physx_core.rows import ROW_FIELDS
-from physx_core.typing import Batch
+from physx_core.typing import Array, Batch
 
 _DTYPE = re.compile(r"[<>|=]?[biufc]\d{1,2}")
 _MOST_PARAMETERS = 4096
@@ -208,6 +206,11 @@ def check_rows(block: Batch, fields: Sequence[Field], instance_id: int, last_ste
     return int(steps[-1])
 
 
+def _raw(values: Array) -> bytes:
+    """Return the bytes of values."""
+    return b"".join(each.tobytes() for each in values) if values.dtype.hasobject else values.tobytes()
+
+
 def check_values(block: Batch, fields: Sequence[Field], instance_id: int) -> None:
     """Check the values of received rows, as the client should have done before sending them.
 
@@ -219,15 +222,11 @@ def check_values(block: Batch, fields: Sequence[Field], instance_id: int) -> Non
         check_sizes(free, {name: block[name][row] for name in free}, instance_id)
     for field in fields:
         values = block[field.name]
-        if field.free_axis:
-            values = np.concatenate(values.tolist()) if len(values) else np.zeros(0)
-            if not is_finite(values):
-                raise field.not_finite(instance_id=instance_id)
         kind = values.dtype.kind
-        if kind == "b" and values.tobytes().translate(None, b"\0\1"):
+        if field.numpy_dtype.kind == "b" and _raw(values).translate(None, b"\0\1"):
             raise ConnectionRefusedByPeerError(
                 f'It sent rows whose field "{field.name}" is neither true nor false.'
             )
-        bad = first_not_finite(values) if kind in "fc" and not field.free_axis else None
+        bad = first_not_finite(values) if kind in "fcO" else None
         if bad is not None:
             raise field.not_finite(instance_id=instance_id, step=int(block["step"][bad]))

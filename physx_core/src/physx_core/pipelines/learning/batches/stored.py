@@ -10,9 +10,8 @@ import numpy as np
 from physx_core.config import EnvironmentConfig
 from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, DatasetError, UsageError, listed
-from physx_core.fields import Field, free_axes
+from physx_core.fields import Field
 from physx_core.normalization import Normalization
-from physx_core.packing import packed_fields
 from physx_core.pipelines.learning.data_record import training_view, unseen_parts
 from physx_core.pipelines.storage import other_samples
 from physx_core.results.judge import Judged
@@ -269,7 +268,6 @@ class StoredBatches:
     def fields(self) -> Mapping[str, Field]:
         """The stored fields by name, and windows of them."""
         stored = self.dataset.fields(self.mode) if self.mode in self.dataset else {}
-        stored = stored | packed_fields(free_axes(stored.values()))
         return stored | self._training.fields if self._view.windows else stored
 
     def normalization(self, *, recompute: bool = True) -> dict[str, Normalization]:
