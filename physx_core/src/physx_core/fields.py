@@ -360,18 +360,7 @@ def check_together(fields: Mapping[str, Field]) -> None:
             they differ in unit, or in a shape that statistics of both could have; if a free axis
             has the name of a field, or an axis is indexed that no field has.
     """
-    axes = free_axes(fields.values())
-    for axis in axes:
-        for name in (axis + suffix for suffix in (ENDS, PTR, BATCH)):
-            if name in fields:
-                raise ConfigError(f'Field "{name}" has a name that belongs to the axis "{axis}".')
-    is_known = all(field.shape is not None for field in fields.values())
-    for name, field in fields.items():
-        if field.indexes and field.indexes not in axes and is_known:
-            raise ConfigError(
-                f'Field "{name}" indexes the axis "{field.indexes}", but no field has it as a free '
-                f"axis.{nearest(field.indexes, axes)}"
-            )
+    _check_axes(fields)
     for name, field in fields.items():
         if not field.like:
             continue
@@ -386,6 +375,22 @@ def check_together(fields: Mapping[str, Field]) -> None:
             raise ConfigError(
                 f"{where}, but has the shape {field.shape}, which neither ends with "
                 f'{other.shape} nor has as many entries on a named axis "{CHANNEL}".'
+            )
+
+
+def _check_axes(fields: Mapping[str, Field]) -> None:
+    """Check names of free axes, and that indexed ones exist."""
+    axes = free_axes(fields.values())
+    for axis in axes:
+        for name in (axis + suffix for suffix in (ENDS, PTR, BATCH)):
+            if name in fields:
+                raise ConfigError(f'Field "{name}" has a name that belongs to the axis "{axis}".')
+    is_known = all(field.shape is not None for field in fields.values())
+    for name, field in fields.items():
+        if field.indexes and field.indexes not in axes and is_known:
+            raise ConfigError(
+                f'Field "{name}" indexes the axis "{field.indexes}", but no field has it as a free '
+                f"axis.{nearest(field.indexes, axes)}"
             )
 
 

@@ -77,7 +77,7 @@ class RowBuffer:
             field.name: field for field in known if is_free and (field.free_axis or field.indexes)
         }
         self._floating = [
-            (field, array) for _, array, _, _, field in self._slots if array.dtype.kind in "fc"
+            (field, array) for _, array, _, dtype, field in self._slots if dtype.kind in "fc"
         ]
         # A memoryview writes a number in half the time an array takes.
         self._numbers = [self._arrays[field.name].data for field in ROW_FIELDS if numbered]
@@ -125,10 +125,7 @@ class RowBuffer:
                 raise
             if type(value) is not np.ndarray or value.dtype is not dtype or value.shape != shape:
                 value = field.convert(value, instance_id=instance_id, step=step)
-                if field.free_axis:
-                    value = np.array(value)  # the array holds what is put there, not a copy
-                    if not is_finite(value):
-                        raise field.not_finite(instance_id=instance_id, step=step)
+                value = np.array(value) if field.free_axis else value  # the row holds it, no copy
             if finite and not is_finite(value):
                 raise field.not_finite(instance_id=instance_id, step=step)
             array[row] = value
@@ -217,7 +214,8 @@ def _allocate(fields: Sequence[Field], capacity: int) -> tuple[Batch, list[Array
     """
     shapes = {field.name: (capacity, *field.row_kind[0]) for field in fields}
     arrays = {field.name: np.empty(shapes[field.name], field.row_kind[1]) for field in fields}
-    blocks = []
+    floating = {field.name for field in fields if field.numpy_dtype.kind in "fc"}
+    blocks = [arrays[n] for n in arrays if n in floating and arrays[n].dtype.hasobject]
     for dtype in {array.dtype for array in arrays.values() if array.dtype.kind in "fc"}:
         names = [name for name, array in arrays.items() if array.dtype == dtype]
         ends = np.cumsum([arrays[name].size for name in names])

@@ -276,7 +276,9 @@ class Judge:
 
     def _is_reshaped(self, batches: Batches) -> bool:
         names = self._network.given
-        return self._sample.is_packed or any(batches.fields[n].shape != self._training.fields[n].shape for n in names)
+        return self._sample.is_packed or any(
+            batches.fields[n].shape != self._training.fields[n].shape for n in names
+        )
 
     def _nouns(self, batches: Batches) -> str:
         return " or ".join(dict.fromkeys(_NOUNS[noun] for noun in batches.group_nouns))

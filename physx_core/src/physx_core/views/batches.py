@@ -222,7 +222,7 @@ class Batches(Closeable):
         if of_window and stored.free_axis:
             raise ConfigError(
                 f'The window "{name}" has several rows of "{stored.name}", whose axis '
-                f'"{stored.free_axis}" may have another size in each: give each a window of its own.'
+                f'"{stored.free_axis}" may have another size in each: give each its own window.'
             )
         like = stored.name if stored.name != name else stored.like
         axes = ("time", *stored.axes) if stored.axes and of_window else stored.axes
@@ -279,8 +279,8 @@ class Batches(Closeable):
         for source, (slots, items) in zip(self._sources, drawn, strict=True):
             where = source.items.locate(items)
             for name, values in self._values(source, where).items() if len(slots) else ():
-                out = rows.setdefault(name, np.empty((stop - start, *values.shape[1:]), values.dtype))
-                out[slots] = values
+                empty = np.empty((stop - start, *values.shape[1:]), values.dtype)
+                rows.setdefault(name, empty)[slots] = values
         found: Batch = {}
         sizes: dict[str, Index] = {}
         for name, values in rows.items():

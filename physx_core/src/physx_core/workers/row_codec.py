@@ -94,7 +94,7 @@ def _unpack_free(payload: bytearray, fields: Sequence[Field], count: int) -> Bat
             continue
         sizes = take((count,), Field(field.free_axis, (), "<u8"), 8 * count)
         if len(sizes) and sizes.max() > len(payload):
-            raise ConnectionRefusedByPeerError(f'A client sent rows of {sizes.max()} entries.')
+            raise ConnectionRefusedByPeerError(f"A client sent rows of {sizes.max()} entries.")
         counts = sizes.astype(np.intp)
         total = int(counts.sum())
         entries = take((total, *field.entry_shape), field, total * field.nbytes)

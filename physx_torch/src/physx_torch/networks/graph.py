@@ -109,13 +109,17 @@ class GraphNetwork(TorchNetwork):
             if part != "edges":
                 counts[part] += math.prod(fields[name].entry_shape)
         targets = {name: fields[name] for name in self.opt_fields}
-        wrong = {n: f"shape {of.shape}" for n, of in targets.items() if of.free_axis != edges.indexes}
+        wrong = {
+            n: f"shape {of.shape}" for n, of in targets.items() if of.free_axis != edges.indexes
+        }
         if wrong:
             raise FieldsMismatchError(f"{type(self).__name__} predicts values of nodes", wrong)
         self._shapes = [of.entry_shape for of in targets.values()]
         outputs = sum(map(math.prod, self._shapes))
         found = counts["node"] + counts["sample"], counts["edge"], outputs
-        for option, own, value in zip(("nodes", "edges", "outputs"), self.sizes, found, strict=True):
+        for option, own, value in zip(
+            ("nodes", "edges", "outputs"), self.sizes, found, strict=True
+        ):
             if own != value:
                 text = f"is {own}, but the fields have {value} values"
                 raise FieldsMismatchError(f"{type(self).__name__} does not fit", {option: text})

@@ -86,8 +86,11 @@ def count_sealed(
     statistics_file.load(directory, manifest)
     counted = []
     for partition in partitions:
-        have = ((partition.running.get(n), partition.rows_of(f)) for n, f in mode.counted_fields.items())
-        complete = all(s is not None and s.count == rows for s, rows in have)
+        complete = all(
+            (found := partition.running.get(name)) is not None
+            and found.count == partition.rows_of(field)
+            for name, field in mode.counted_fields.items()
+        )
         if partition.counted:
             continue
         if not (partition.checksums and complete):

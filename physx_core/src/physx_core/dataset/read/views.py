@@ -21,7 +21,8 @@ _FREE_ROWS = 256
 class FieldView:
     """The rows of one field, indexed by a number, a slice, or an array of numbers or booleans.
 
-    Every result is a copy. Rows of a field with a free axis are an array of objects, one array each.
+    Every result is a copy. Rows of a field with a free axis are an array of objects, one array for
+    each row.
 
     Attributes:
         field: The field.

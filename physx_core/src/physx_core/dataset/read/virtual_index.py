@@ -2,11 +2,10 @@
 
 It holds ``/<mode>/<field>`` as virtual datasets that refer to the partitions in the same folder. If
 several sessions wrote the dataset, there is one index named after each, and each shows all rows.
-With a free axis ``node``, a field has the entries of all rows, those of row i from ``node_ptr[i]`` up
-to ``node_ptr[i + 1]``.
-The rows of a mode with episodes are in order of campaign and number; if they lie in too many pieces
-for a virtual dataset, the mode has no fields, and its attribute ``pieces`` says in how many.
-physx itself never reads them.
+With a free axis ``node``, a field has the entries of all rows, those of row i from ``node_ptr[i]``
+up to ``node_ptr[i + 1]``. The rows of a mode with episodes are in order of campaign and number; if
+they lie in too many pieces for a virtual dataset, the mode has no fields, and its attribute
+``pieces`` says in how many. physx itself never reads them.
 """
 
 from __future__ import annotations

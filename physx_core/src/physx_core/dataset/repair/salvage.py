@@ -47,8 +47,8 @@ def seal_without_damage(
             others = [(0, first), (last, count)]
             new.offsets[name], _ = copy(path, offset, target, new.identity(field), count, others)
             if name in mode.ends:
-                ends = read_ends(directory, field, partition)[start:stop] - begin[name.removesuffix(ENDS)]
-                _write(target, new.offsets[name], ends)
+                ends = read_ends(directory, field, partition)[start:stop]
+                _write(target, new.offsets[name], ends - begin[name.removesuffix(ENDS)])
     files.sync_folder(directory)
     copies = [new for _, new in pairs]
     keys = {new.key for new in copies}

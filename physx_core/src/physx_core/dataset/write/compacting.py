@@ -113,18 +113,18 @@ def _replace(
         stay = {name: _without(manifest.modes[name].partitions, old[name]) for name in orders}
         begin = {name: sum(partition.rows for partition in stay[name]) for name in orders}
         for name, order in orders.items():
-            rows = np.arange(begin[name], order.rows)
-            sizes = {a: _sizes(reader, name, a, order, rows) for a in manifest.modes[name].axes}
-            new[name] = _reserve(writer, manifest.modes, name, len(rows), sizes)
+            sizes = _sizes(reader, name, order, begin[name])
+            rows = order.rows - begin[name]
+            new[name] = _reserve(writer, manifest.modes, name, rows, sizes)
         own = {name: [*stay[name], *new[name]] for name in orders}
         table = compacted_records(writer, reader, orders, own)
-        own = free_axes(manifest.modes[EPISODES].fields.values())
-        sizes = {axis: lengths(table[names[0]]) for axis, names in own.items()}
+        axes = free_axes(manifest.modes[EPISODES].fields.values())
+        sizes = {axis: lengths(table[names[0]]) for axis, names in axes.items()}
         new[EPISODES] = _reserve(writer, manifest.modes, EPISODES, len(table["rows"]), sizes)
     try:
         for name in orders:
-            rows = _rows_of(reader, name, begin[name])
-            sealed[name] = list(_write(writer, new[name], rows))
+            read = _rows_of(reader, name, begin[name])
+            sealed[name] = list(_write(writer, new[name], read))
         sealed[EPISODES] = list(_write(writer, new[EPISODES], _rows_in(table)))
         files.sync_folder(store.directory)
         with store.change() as manifest:
@@ -139,11 +139,11 @@ def _replace(
     writer.recorder.load()
 
 
-def _sizes(reader: Reader, mode: str, axis: str, order: Order, rows: Index) -> Index:
-    """Return how many entries of a free axis some rows have."""
-    bounds, stored = reader.bounds(mode, axis), order.stored(rows)
-    found: Index = bounds[stored + 1] - bounds[stored]
-    return found
+def _sizes(reader: Reader, mode: str, order: Order, begin: int) -> dict[str, Index]:
+    """Return how many entries rows have, in order from row `begin` on, by free axis."""
+    if not reader.mode(mode).axes:
+        return {}
+    return reader.sizes(mode, order.stored(np.arange(begin, order.rows)))
 
 
 def _reserve(

@@ -80,9 +80,7 @@ def check_rows(
     """
     check_names(fields, rows)
     free = {name: field for name, field in fields.items() if field.free_axis}
-    several = {
-        name: [field.convert(value) for value in rows[name]] for name, field in free.items()
-    }
+    several = {name: [field.convert(value) for value in rows[name]] for name, field in free.items()}
     block = {
         name: np.ascontiguousarray(field.convert(rows[name], axes=1))
         for name, field in fields.items()
@@ -113,11 +111,10 @@ def stored_form(fields: Mapping[str, Field], rows: Batch) -> Batch:
     return fixed | _joined(free, {name: list(rows[name]) for name in free}, checked=True)
 
 
-def _joined(
-    free: Mapping[str, Field], rows: Mapping[str, list[Array]], *, checked: bool
-) -> Batch:
+def _joined(free: Mapping[str, Field], rows: Mapping[str, list[Array]], *, checked: bool) -> Batch:
     """Return the entries of rows with free axes end to end, and the end of each row's entries."""
-    entries, ends = {}, {}
+    entries: Batch = {}
+    ends: Batch = {}
     for name, field in free.items():
         entries[name], counts = join(field, rows[name])
         if not checked and (bad := first_not_finite(entries[name])) is not None:

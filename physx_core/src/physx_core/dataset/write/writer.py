@@ -130,8 +130,9 @@ class OpenPartition:
                 continue
             block = block[start:stop]
             if name in self._ends:
-                base, (begin, _) = self.partition.sizes[self._ends[name]], _entries(
-                    rows, self._ends[name], start, stop
+                base, (begin, _) = (
+                    self.partition.sizes[self._ends[name]],
+                    _entries(rows, self._ends[name], start, stop),
                 )
                 block = (block.astype(np.int64) + (base - begin)).astype("<u8")
             pieces.append((file, block, first, first + count))

@@ -386,10 +386,16 @@ class Learner:
             batch_size: Largest number of rows to predict at once.
         """
         network, rows = self.network, len(next(iter(batch.values())))
-        parts = [self.predict_in_training(batch)] if self._free else [
-            self.predict_in_training({n: v[first : first + batch_size] for n, v in batch.items()})
-            for first in range(0, rows, batch_size)
-        ]
+        parts = (
+            [self.predict_in_training(batch)]
+            if self._free
+            else [
+                self.predict_in_training(
+                    {n: v[first : first + batch_size] for n, v in batch.items()}
+                )
+                for first in range(0, rows, batch_size)
+            ]
+        )
         answer = concatenate(parts)
         pairs = zip(network.opt_fields, network.pred_fields, strict=False)
         predicted = {true: answer[name] for true, name in pairs if true in batch}

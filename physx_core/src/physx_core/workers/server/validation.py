@@ -103,7 +103,8 @@ def _is_field(plain: Any) -> bool:
         isinstance(dtype, str)
         and _DTYPE.fullmatch(dtype) is not None
         and isinstance(shape, list)
-        and all(type(size) is int or (not place and type(size) is str) for place, size in enumerate(shape))
+        and all(type(size) is int for size in shape[1:])
+        and {*map(type, shape[:1])} <= {int, str}
         and isinstance(plain.get("indexes", ""), str)
         and isinstance(plain.get("unit", ""), str)
         and plain.get("role", "training") in ROLES
@@ -208,7 +209,7 @@ def check_rows(block: Batch, fields: Sequence[Field], instance_id: int, last_ste
 
 def _raw(values: Array) -> bytes:
     """Return the bytes of values."""
-    return b"".join(each.tobytes() for each in values) if values.dtype.hasobject else values.tobytes()
+    return b"".join(each.tobytes() for each in (values if values.dtype.hasobject else [values]))
 
 
 def check_values(block: Batch, fields: Sequence[Field], instance_id: int) -> None:

@@ -4,8 +4,9 @@ It holds contiguous datasets: ``data`` (capacity, *field shape); the scalar ``ro
 committed rows; ``commits``, the records that show which rows have reached the disk; and
 ``digests``, those of the blocks of rows. If the field has a free axis, its rows are the entries of
 all samples, end to end; where those of each end is in a file of its own. Its attributes state what
-it is part of; ``header`` repeats that, with a digest of everything that never changes. h5py creates all of it once, in memory; after that, rows are written at known file offsets,
-so that HDF5 never runs while samples arrive, and h5py can open the file at any time.
+it is part of; ``header`` repeats that, with a digest of everything that never changes. h5py creates
+all of it once, in memory; after that, rows are written at known file offsets, so that HDF5 never
+runs while samples arrive, and h5py can open the file at any time.
 """
 
 from __future__ import annotations
