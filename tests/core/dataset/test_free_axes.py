@@ -299,7 +299,10 @@ def test_damaged_ends_of_a_free_axis_are_found(tmp_path):
 
 
 def test_episodes_with_meshes_are_compacted_and_merged(tmp_path):
-    mesh = [Field("vertex", ("vertex", 3)), Field("face", ("face", 3), int, indexes="vertex")]
+    mesh = [
+        Field("vertex", ("vertex", 3), role="episode"),
+        Field("face", ("face", 3), int, role="episode", indexes="vertex"),
+    ]
 
     def once(number):
         return {
