@@ -5,7 +5,8 @@ In an array of rows, a field with a free axis is an array of objects, one array 
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import itertools
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ import numpy as np
 from physx_core.errors import FieldShapeError
 from physx_core.fields import BATCH, PTR, Field
 from physx_core.typing import Array, Batch, Index
+
+_LONG = 100  # entries of a sample from which filling a slice is faster
 
 
 def split(values: Array, counts: Index) -> Array:
@@ -96,13 +99,45 @@ def check_sizes(
             )
 
 
-def pack(fields: Mapping[str, Field], rows: Mapping[str, Any], known: Mapping[str, Index]) -> Batch:
+class Scratch:
+    """Arrays of batches that are reused, each as long as the longest so far."""
+
+    def __init__(self) -> None:
+        self._known: dict[str, Array] = {}
+
+    def take(self, name: str, shape: tuple[int, ...], dtype: np.dtype[Any]) -> Array:
+        """Return an array of a shape, valid until the next one with this name."""
+        found = self._known.get(name)
+        if found is None or len(found) < shape[0]:
+            found = self._known[name] = np.empty((shape[0] * 5 // 4, *shape[1:]), dtype)
+        return found[: shape[0]]
+
+
+def _samples_of(ptr: Index, out: Array) -> Array:
+    """Return the sample of each entry."""
+    ends = ptr.tolist()
+    if len(out) < _LONG * len(ends):
+        return np.repeat(np.arange(len(ends) - 1), np.diff(ptr))
+    for sample, (start, end) in enumerate(itertools.pairwise(ends)):
+        out[start:end] = sample
+    return out
+
+
+def pack(
+    fields: Mapping[str, Field],
+    rows: Mapping[str, Any],
+    known: Mapping[str, Index],
+    named: Collection[str] | None = None,
+    scratch: Scratch | None = None,
+) -> Batch:
     """Return rows as a batch in which free axes are packed.
 
     Args:
         fields: The fields by name.
         rows: Those with a free axis as entries end to end, all others as rows; changed in place.
         known: Number of entries of each row, by free axis.
+        named: Which of the added fields are wanted besides ``node_ptr``; None: all.
+        scratch: Arrays to reuse; None: all are new.
 
     Returns:
         The fields, with numbers of entries counted from the first one of the batch, and for an
@@ -114,7 +149,11 @@ def pack(fields: Mapping[str, Field], rows: Mapping[str, Any], known: Mapping[st
         ptr = np.zeros(len(counts) + 1, np.int64)
         np.cumsum(counts, out=ptr[1:])
         found[axis + PTR] = ptr
-        found[axis + BATCH] = np.repeat(np.arange(len(counts)), counts)
+        name, shape, kind = axis + BATCH, (int(ptr[-1]),), np.dtype(np.int64)
+        if named is not None and name not in named:
+            continue
+        out = np.empty(shape, kind) if scratch is None else scratch.take(name, shape, kind)
+        found[name] = _samples_of(ptr, out)
     for name, field in fields.items():
         if field.indexes:
             shift = found[field.indexes + PTR][:-1]

@@ -10,7 +10,7 @@ from dataclasses import dataclass, field
 import numpy as np
 
 from physx_core.errors import ConfigError
-from physx_core.fields import BATCH
+from physx_core.fields import PTR
 from physx_core.results.errors import Errors, Target, compare
 from physx_core.results.metrics import Metric, Metrics
 from physx_core.results.result import EpisodeError, FieldResult, PartResult, RivalResult
@@ -317,7 +317,9 @@ class Judge:
     def _add(self, sums: Mapping[str, Errors], guesses: Batch, batch: Batch, groups: Index) -> None:
         for name, guess in guesses.items():
             if axis := self._training.fields[name].free_axis:
-                sums[name].add(guess, batch[name], groups[batch[axis + BATCH]], None)
+                sums[name].add(
+                    guess, batch[name], np.repeat(groups, np.diff(batch[axis + PTR])), None
+                )
                 continue
             truth, padded = batch[name], batch.get(f"{name}{PAD}")
             valid: Array | None = None

@@ -6,6 +6,7 @@ import contextlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -25,7 +26,7 @@ from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.errors import ConfigError, DatasetError, UsageError
 from physx_core.fields import Field, free_axes
 from physx_core.normalization import Measured, Normalization, Normalize, compute_normalization
-from physx_core.packing import join, pack, packed_fields
+from physx_core.packing import Scratch, join, pack, packed_fields
 from physx_core.statistics import RunningStatistics
 from physx_core.typing import Array, Batch, Index
 from physx_core.views.folds import Part
@@ -173,6 +174,8 @@ class Batches(Closeable):
         added = packed_fields(free_axes(stored.values()))
         wanted = list(names or self.view.windows or stored)
         self._names = [name for name in wanted if name in stored or name not in added]
+        self._all_names = None if names is None else list(names)
+        self._named = None if names is None else [name for name in names if name in added]
         self._windows = {name: window_of(self.view, name) for name in self._names}
         self._dtype, self._reuse = None if dtype is None else np.dtype(dtype), reuse
         self.fields: dict[str, Field] = {}
@@ -182,6 +185,7 @@ class Batches(Closeable):
         kinds = {n: (field.row_kind[0], self._kinds[n]) for n, field in self.fields.items()}
         self._axes = free_axes(self.fields.values())
         self.fields |= packed_fields(self._axes)
+        self._scratch = Scratch() if self._axes and reuse else None
         self._arrays = BatchArrays({} if self._axes else kinds, self.batch_size, reuse=reuse)
 
     def reading(self, fields: Sequence[str]) -> Batches:
@@ -289,23 +293,28 @@ class Batches(Closeable):
                 values, counts = join(field, values.tolist())
                 self._check_sizes(name, counts, sizes)
             found[name] = values.astype(self._kinds[name], copy=False)
-        return pack(self.fields, found, sizes)
+        return pack(self.fields, found, sizes, self._named)
 
     def _pack(self, source: Source, where: Located) -> Batch:
         """Return some items of a source as a batch in which free axes are packed."""
         fixed = {n: w for n, w in self._windows.items() if not self.fields[n].free_axis}
         found, sizes = self._values(source, where, fixed), dict[str, Index]()
+        scratch = self._scratch
         for name, window in self._windows.items():
             if name not in fixed:
-                rows = source.items.rows(where.items, window.at)[:, 0]
-                found[name], counts = source.rows.entries(window.field, rows, self._dtype)
+                if where.rows is not None:
+                    rows = where.rows + window.at[0]
+                else:
+                    rows = source.items.rows(where.items, window.at)[:, 0]
+                allocate = np.empty if scratch is None else partial(scratch.take, name)
+                found[name], counts = source.rows.entries(window.field, rows, self._dtype, allocate)
                 self._check_sizes(name, counts, sizes)
-        return pack(self.fields, {n: found[n] for n in self._kinds}, sizes)
+        return pack(self.fields, {n: found[n] for n in self._kinds}, sizes, self._named, scratch)
 
     def _check_sizes(self, name: str, counts: Index, sizes: dict[str, Index]) -> None:
         """Check that fields that share a free axis have the same sizes in a batch."""
         axis = self.fields[name].free_axis
-        if not np.array_equal(sizes.setdefault(axis, counts), counts):
+        if sizes.setdefault(axis, counts) is not counts and not np.array_equal(sizes[axis], counts):
             raise DatasetError(
                 f'"{name}" has other sizes of the axis "{axis}" than the fields before it: the '
                 "rows of its window have others. Read windows only where sizes stay."
@@ -564,7 +573,7 @@ class Batches(Closeable):
         data = None if self.view.sources else str(self._sources[0].dataset.directory)
         options = {
             "data": data, "mode": self._mode, "part": self.part, "snapshot": self.snapshot,
-            "fields": self._names, "dtype": self._dtype, "reuse": self._reuse,
+            "fields": self._all_names, "dtype": self._dtype, "reuse": self._reuse,
         }  # fmt: skip
         return _reopen, (self.view, self.batch_size, self.seed, options)
 

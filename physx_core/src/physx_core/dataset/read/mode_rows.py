@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -166,7 +166,11 @@ class ModeRows:
         return out
 
     def entries(
-        self, name: str, rows: Index, dtype: np.dtype[Any] | None = None
+        self,
+        name: str,
+        rows: Index,
+        dtype: np.dtype[Any] | None = None,
+        allocate: Callable[[tuple[int, ...], np.dtype[Any]], Array] = np.empty,
     ) -> tuple[Array, Index]:
         """Return the entries of some rows of a field with a free axis, end to end.
 
@@ -174,6 +178,7 @@ class ModeRows:
             name: Name of the field.
             rows: Row numbers, shape (n,).
             dtype: Type that floating-point fields are converted to; None: no conversion.
+            allocate: Returns an array of a shape and a type for the entries.
 
         Returns:
             The entries, and how many each row has, shape (n,).
@@ -183,7 +188,7 @@ class ModeRows:
         stored = rows if self.stored is None else self.stored(rows)
         starts = bounds[stored]
         counts = bounds[stored + 1] - starts
-        out = np.empty((int(counts.sum()), *field.entry_shape), field.converted_dtype(dtype))
+        out = allocate((int(counts.sum()), *field.entry_shape), field.converted_dtype(dtype))
         if not out.size:
             return out, counts
         if len(out) * field.nbytes < _SMALL_ROW * len(rows):
@@ -193,7 +198,11 @@ class ModeRows:
         return out, counts
 
     def packed(
-        self, names: Sequence[str], rows: Index, dtype: np.dtype[Any] | None = None
+        self,
+        names: Sequence[str],
+        rows: Index,
+        dtype: np.dtype[Any] | None = None,
+        named: Sequence[str] | None = None,
     ) -> Batch:
         """Return some rows as a batch in which free axes are packed: see `packing.pack`.
 
@@ -201,6 +210,7 @@ class ModeRows:
             names: Names of the fields.
             rows: Row numbers, shape (n,).
             dtype: Type that floating-point fields are converted to; None: no conversion.
+            named: See `packing.pack`.
         """
         fields, found, sizes = {name: self.fields[name] for name in names}, {}, {}
         for name, field in fields.items():
@@ -209,7 +219,7 @@ class ModeRows:
             else:
                 values = self.gather(name, rows)
                 found[name] = values.astype(field.converted_dtype(dtype), copy=False)
-        return pack(fields, found, sizes)
+        return pack(fields, found, sizes, named)
 
     def windows(self, name: str, first: Index, count: int) -> Array:
         """Return consecutive rows of a field from some rows on, shape (n, count, *field shape)."""

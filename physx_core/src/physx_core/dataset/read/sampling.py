@@ -22,7 +22,9 @@ from physx_core.dataset.read.shuffling import (
     make_order,
 )
 from physx_core.errors import ConfigError, DatasetError
+from physx_core.fields import free_axes
 from physx_core.normalization import Normalization
+from physx_core.packing import packed_fields
 from physx_core.typing import Batch
 
 
@@ -70,7 +72,11 @@ class BatchReader:
         if first < 0:
             raise ConfigError(f"first is {first} but cannot be negative.")
         reader = columns.reader
-        self._names = list(dict.fromkeys(reader.mode(mode).fields if fields is None else fields))
+        stored = reader.mode(mode).fields
+        added = packed_fields(free_axes(stored.values())).keys() - stored.keys()
+        self._named = None if fields is None else [name for name in fields if name in added]
+        wanted = stored if fields is None else [name for name in fields if name not in added]
+        self._names = list(dict.fromkeys(wanted))
         if not self._names:
             raise ConfigError("Batches need at least one field.")
         known = [reader.field(mode, name) for name in self._names]
@@ -110,7 +116,9 @@ class BatchReader:
                 for start in range(skipped * size, rows.count, size):
                     stop = min(start + size, rows.count)
                     if epoch is None:
-                        batch = rows.packed(self._names, order.items(start, stop), self._dtype)
+                        batch = rows.packed(
+                            self._names, order.items(start, stop), self._dtype, self._named
+                        )
                     else:
                         batch = self._arrays.take(stop - start)
                         epoch.fill(start, batch)

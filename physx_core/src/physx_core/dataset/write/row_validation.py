@@ -80,7 +80,7 @@ def check_rows(
     """
     check_names(fields, rows)
     free = {name: field for name, field in fields.items() if field.free_axis}
-    several = {name: [field.convert(value) for value in rows[name]] for name, field in free.items()}
+    several = {name: _converted(field, rows[name]) for name, field in free.items()}
     block = {
         name: np.ascontiguousarray(field.convert(rows[name], axes=1))
         for name, field in fields.items()
@@ -96,10 +96,40 @@ def check_rows(
         if bad is not None:
             raise fields[name].not_finite(where=f" in row {bad} of the block")
     count = next(iter(lengths.values()))
-    if free and not checked:
-        for row in range(count):
+    if not free:
+        return block, count
+    joined = _joined(free, several, checked=checked)
+    if not checked and not _fit(fields, block | joined):
+        for row in range(count):  # to name it
             check_sizes(fields, {n: values[row] for n, values in (block | several).items()})
-    return block | _joined(free, several, checked=checked), count
+    return block | joined, count
+
+
+def _converted(field: Field, rows: Any) -> list[Array]:
+    """Return rows of a field with a free axis, each as an array of its type."""
+    kind, shape = field.numpy_dtype, field.entry_shape
+    return [
+        value
+        if type(value) is np.ndarray and value.dtype is kind and value.shape[1:] == shape
+        and value.ndim else field.convert(value)
+        for value in rows
+    ]  # fmt: skip
+
+
+def _fit(fields: Mapping[str, Field], block: Batch) -> bool:
+    """Return whether all numbers of entries are of some that there are."""
+    for name, field in fields.items():
+        if not field.indexes:
+            continue
+        sizes = np.diff(block[field.indexes + ENDS].astype(np.intp), prepend=0)
+        if field.free_axis:
+            counts = np.diff(block[field.free_axis + ENDS].astype(np.intp), prepend=0)
+            sizes = np.repeat(sizes, counts)
+        values = block[name]
+        sizes = sizes.reshape(-1, *(1,) * (values.ndim - 1))
+        if ((values < 0) | (values >= sizes)).any():
+            return False
+    return True
 
 
 def stored_form(fields: Mapping[str, Field], rows: Batch) -> Batch:
@@ -122,8 +152,6 @@ def _joined(free: Mapping[str, Field], rows: Mapping[str, list[Array]], *, check
             raise field.not_finite(where=f" in row {row} of the block")
         end = np.cumsum(counts).astype("<u8")
         if not np.array_equal(ends.setdefault(field.free_axis + ENDS, end), end):
-            raise FieldShapeError(
-                f'field "{name}" has other sizes of the axis "{field.free_axis}" than the others.',
-                field=name,
-            )
+            row = int(np.argmax(end != ends[field.free_axis + ENDS]))
+            check_sizes(free, {each: values[row] for each, values in rows.items()})
     return entries | ends

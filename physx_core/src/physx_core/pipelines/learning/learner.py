@@ -186,7 +186,8 @@ class Learner:
                     "fields before it.",
                     field=name,
                 )
-        return pack({n: free[n] for n in found if n in free}, found, sizes), sizes
+        fields = {n: free[n] for n in found if n in free}
+        return pack(fields, found, sizes, self.network.net_fields), sizes
 
     def predicted_shape(self, name: str, values: Array) -> tuple[Any, ...]:
         """Return the shape of a predicted field, of which there are values by row."""
