@@ -213,13 +213,17 @@ class Field:
             step: The instance's step that set them, for the error.
 
         Returns:
-            An array of shape (*first axes, *field shape). It shares memory with `values` if that is
+            An array of shape (*first axes, *field shape), with a free axis an array of objects, one
+            array for each row. It shares memory with `values` if that is
             an array of the field's type.
 
         Raises:
             FieldShapeError: If the values are ragged or have another shape.
             FieldTypeError: If the field's type cannot hold the values.
         """
+        if self.free_axis and axes:  # rows of any size
+            rows = [self.convert(each, instance_id=instance_id, step=step) for each in values]
+            return np.fromiter(rows, object, len(rows))
         error: type[FieldShapeError | FieldTypeError] = FieldShapeError
         try:
             array: Array = np.asarray(values)
