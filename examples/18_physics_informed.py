@@ -14,11 +14,11 @@ from __future__ import annotations
 from functools import partial
 
 import torch
-from common import SEEDS, options
+from common import SEEDS, conclude, options
 from environments.double_pendulum import error, linear, measure, missing, pendulum
 from environments.double_pendulum_picture import draw
-from rivals import verdict
 
+from physx_core import Comparison
 from physx_torch import ForwardDynamics
 
 
@@ -72,7 +72,7 @@ def main() -> int:
         errors = {name: [error(way, unseen) for way in found] for name, found in ways.items()}
         if chosen.picture:
             draw(chosen.picture, real, model, law, NETWORK, ways[NETWORK][0])
-    return verdict(errors, NETWORK, small=chosen.small)
+    return conclude(Comparison(errors, NETWORK, networks=list(KINDS)), small=chosen.small)
 
 
 if __name__ == "__main__":

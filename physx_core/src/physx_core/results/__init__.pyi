@@ -1,5 +1,6 @@
 """Results: what a run found, and how good its network is, compared with predictions without one."""
 
+from .comparison import Comparison as Comparison
 from .result import Drift as Drift
 from .result import EpisodeError as EpisodeError
 from .result import FieldResult as FieldResult
