@@ -6,6 +6,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from statistics import fmean
 
+from physx_core.errors import UsageError
 from physx_core.results.result import Result
 
 
@@ -22,6 +23,9 @@ class Comparison:
         what: Name and unit of the errors.
         networks: The candidates that are networks; the others need no training.
         references: Candidates that need not be beaten, such as an exact model.
+
+    Raises:
+        UsageError: If a candidate has no errors, or there is nobody to beat.
     """
 
     errors: Mapping[str, Sequence[float]]
@@ -33,10 +37,10 @@ class Comparison:
     def __post_init__(self) -> None:
         for name in (self.subject, *self.networks, *self.references):
             if name not in self.errors:
-                raise ValueError(f"There are no errors of {name!r}, only of {list(self.errors)}.")
+                raise UsageError(f"There are no errors of {name!r}, only of {list(self.errors)}.")
         empty = [name for name, found in self.errors.items() if not len(found)]
         if empty or not self.rivals:
-            raise ValueError(f"There are no errors of {empty or 'a rival'}.")
+            raise UsageError(f"There are no errors of {empty or 'a rival'}.")
 
     @classmethod
     def of(
@@ -54,6 +58,7 @@ class Comparison:
             KeyError: If a network was not judged by that error.
         """
         part, field, name = error.split("/")
+        own = {candidate: [each[error] for each in of] for candidate, of in results.items()}
         found: dict[str, list[float]] = {}
         unit = ""
         for each in (each for of in results.values() for each in of):
@@ -62,7 +67,7 @@ class Comparison:
             for rival, of in judged.rivals.items():
                 if of.errors:
                     found.setdefault(rival, []).append(of.errors[name])
-        found |= {candidate: [each[error] for each in of] for candidate, of in results.items()}
+        found |= own
         if "accuracy" in name:
             found = {candidate: [1 - each for each in of] for candidate, of in found.items()}
             name = f"1 - {name}"
