@@ -54,27 +54,38 @@ def samples(session: Path, mode: str, *fields: str) -> list[np.ndarray]:
 
 
 def config(
-    network: str | type, given: str, wanted: str, epochs: int, lr: float, **arguments: Any
+    network: str | type,
+    given: str,
+    wanted: str,
+    epochs: int,
+    lr: float,
+    options: Mapping[str, Any] | None = None,
+    **arguments: Any,
 ) -> NetworkConfig:
     """Return a network's configuration: Adam, its learning rate falling to 0 over `epochs`."""
-    return NetworkConfig(
-        network,
-        network_kwargs={**arguments, "net_fields": given, "opt_fields": wanted},
-        loss="MSELoss",
-        optimizer="Adam",
-        lr=lr,
-        scheduler="CosineAnnealingLR",
-        scheduler_kwargs={"T_max": epochs},
-    )
+    known = {
+        "network_kwargs": {**arguments, "net_fields": given, "opt_fields": wanted},
+        "loss": "MSELoss",
+        "optimizer": "Adam",
+        "lr": lr,
+        "scheduler": "CosineAnnealingLR",
+        "scheduler_kwargs": {"T_max": epochs},
+    }
+    return NetworkConfig(network, **known | dict(options or {}))
 
 
 def trained(
-    session: Path, network: NetworkConfig, epochs: int, seed: int, **options: Any
+    session: Path,
+    network: NetworkConfig,
+    epochs: int,
+    seed: int,
+    normalize: bool = True,
+    **options: Any,
 ) -> Training:
     """Train a network on a session's samples; return the training, with its `learner` ready."""
     training = Training(
         network,
-        DatasetConfig(existing_dir=str(session), normalize=True),
+        DatasetConfig(existing_dir=str(session), normalize=normalize),
         session_dir=str(session / "networks"),
         epoch_nb=epochs,
         validation_every=0,

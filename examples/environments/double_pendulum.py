@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
 from common import linear_map
 
-from physx_core import plugins
+from physx_core import Dataset, plugins
 from physx_sim import JointSettings, Robot, Simulation, World
 
 JOINTS, VISCOUS, DRY = ("shoulder", "elbow"), np.array([0.3, 0.15]), np.array([0.2, 0.1])
+FIELDS = ("q", "v", "torque", "acceleration")
 Function = Callable[..., torch.Tensor]
 
 
@@ -36,6 +38,17 @@ def measure(simulation: Simulation, samples: int, seed: int) -> list[torch.Tenso
     q = torch.from_numpy(rng.uniform(-np.pi, np.pi, (samples, 2)))
     v, torque = torch.from_numpy(rng.uniform(-4, 4, (2, samples, 2)))
     return [q, v, torque, as_torch(simulation.forward_dynamics_batch)(q, v, torque)]
+
+
+def store(folder: Path, known: list[torch.Tensor], unseen: list[torch.Tensor]) -> Path:
+    """Store what `measure` returned, and what a network sees of it; return the session's folder."""
+    with Dataset.create(folder) as dataset:
+        for mode, samples in (("training", known), ("validation", unseen)):
+            q, v, torque, _ = samples
+            seen = torch.hstack([q.sin(), q.cos(), v, torque])
+            rows = {name: each.numpy() for name, each in zip(FIELDS, samples, strict=True)}
+            dataset.append(mode, {**rows, "seen": seen.numpy()})
+    return folder
 
 
 def missing(model: Simulation, samples: list[torch.Tensor]) -> torch.Tensor:
