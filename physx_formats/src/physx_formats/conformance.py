@@ -9,8 +9,9 @@ from typing import Any
 
 import numpy as np
 
-from physx_core import DataGeneration, Dataset, EnvironmentConfig
+from physx_core import DataGeneration, Dataset, EnvironmentConfig, Field
 from physx_core.errors import PhysxError
+from physx_core.toy import Spring
 from physx_formats.exporting import export
 from physx_formats.format import Format
 from physx_formats.importing import import_file
@@ -19,13 +20,27 @@ from physx_testing.report import NotApplicableError
 from physx_testing.subject import Check, Subject, expect
 
 _ROWS = 12
-_VALUES: dict[str, Any] = {"fps": 30, "task": "a task"}
+_VALUES: dict[str, Any] = {"fps": 30, "task": "a task", "points": "points"}
+
+
+class _Mesh(Spring):
+    """A spring whose ends are the points of a mesh."""
+
+    def init_database(self) -> None:
+        """Add the points to the fields."""
+        super().init_database()
+        self.define_additional_fields([Field("points", (2, 3), unit="m")])
+
+    def step(self) -> None:
+        """Add them to the row."""
+        super().step()
+        self.set_additional_data(points=np.eye(2, 3) * self.step_index)
 
 
 @contextlib.contextmanager
 def _rows(folder: Path) -> Iterator[Dataset]:
     """Yield a dataset with one trajectory of 12 rows of a spring."""
-    spring = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, seed=1)
+    spring = EnvironmentConfig(_Mesh, as_tcp_ip_client=False, seed=1)
     run = DataGeneration(
         spring, session_dir=str(folder), session_name="run", batch_nb=1, batch_size=_ROWS
     )
@@ -41,7 +56,7 @@ def _written(subject: Subject) -> Path:
     if form.write is None:
         raise NotApplicableError("nothing is exported to it")
     options = ExportOptions(**{name: _VALUES[name] for name in form.options if name in _VALUES})
-    place = subject.folder / "written"
+    place = subject.folder / f"written.{subject.reference.rpartition('/')[2]}"
     with _rows(subject.folder / "session") as dataset:
         done = export(dataset, subject.reference, place, options=options)
     expect(done == {"training": _ROWS}, f"it says that it has written {done}, not {_ROWS} rows")
@@ -58,7 +73,7 @@ def _begin_of(place: Path) -> bytes:
 def _writes(subject: Subject) -> None:
     place = _written(subject)
     expect(place.exists(), "there is no file or folder of the name that it was given")
-    left = {each.name for each in subject.folder.iterdir()} - {"written", "session"}
+    left = {each.name for each in subject.folder.iterdir()} - {place.name, "session"}
     expect(not left, f"it leaves {', '.join(sorted(left))} beside what it writes")
 
 

@@ -185,7 +185,8 @@ class Nearest(Rival):
 
     def predict(self, name: str, batch: Batch, common: Any) -> Array:
         """Return the values of the nearest samples."""
-        return self._sample.batch[name][common]
+        found: Array = self._sample.batch[name][common]
+        return found
 
 
 class Unchanged(Rival):
