@@ -9,9 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from physx_core import DataGeneration, Dataset, EnvironmentConfig, Field
+from physx_core import Dataset
 from physx_core.errors import PhysxError
-from physx_core.toy import Spring
 from physx_formats.exporting import export
 from physx_formats.format import Format
 from physx_formats.importing import import_file
@@ -23,30 +22,19 @@ _ROWS = 12
 _VALUES: dict[str, Any] = {"fps": 30, "task": "a task", "points": "points"}
 
 
-class _Mesh(Spring):
-    """A spring whose ends are the points of a mesh."""
-
-    def init_database(self) -> None:
-        """Add the points to the fields."""
-        super().init_database()
-        self.define_additional_fields([Field("points", (2, 3), unit="m")])
-
-    def step(self) -> None:
-        """Add them to the row."""
-        super().step()
-        self.set_additional_data(points=np.eye(2, 3) * self.step_index)
-
-
 @contextlib.contextmanager
 def _rows(folder: Path) -> Iterator[Dataset]:
-    """Yield a dataset with one trajectory of 12 rows of a spring."""
-    spring = EnvironmentConfig(_Mesh, as_tcp_ip_client=False, seed=1)
-    run = DataGeneration(
-        spring, session_dir=str(folder), session_name="run", batch_nb=1, batch_size=_ROWS
-    )
-    run.quiet = True
-    run.execute()
-    with Dataset.open(run.session.path) as dataset:
+    """Yield a dataset with one trajectory of 12 rows: a state, and a mesh that moves."""
+    step = np.arange(_ROWS)
+    state = np.stack([np.cos(step / 3), np.sin(step / 3)], axis=1)
+    rows = {
+        "state": state,
+        "points": state[:, None, :] * np.arange(1, 4)[:, None],
+        "episode": np.zeros(_ROWS, int),
+        "step": step,
+    }
+    with Dataset.create(folder) as dataset:
+        dataset.append("training", rows)
         yield dataset
 
 
@@ -82,7 +70,7 @@ def _reads_again(subject: Subject) -> None:
     if subject.make().open is None:
         raise NotApplicableError("nothing is imported from it")
     import_file(place, copy)
-    with Dataset.open(copy) as found, Dataset.open(subject.folder / "session/run") as wanted:
+    with Dataset.open(copy) as found, Dataset.open(subject.folder / "session") as wanted:
         for name, field in wanted.fields("training").items():
             expect(name in found.fields("training"), f'it loses the field "{name}"')
             one, other = (each["training"][name][:].reshape(_ROWS, -1) for each in (found, wanted))
