@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from physx_core import Dataset
+from physx_core.errors import ConfigError
 from physx_formats import ExportOptions, export
 
 pytestmark = pytest.mark.processes
@@ -28,6 +29,7 @@ def dataset(tmp_path):
         "image": rng.integers(0, 256, (ROWS, 4, 5, 3)).astype("u1"),
         "torque": rng.normal(size=(ROWS, 2)),
         "lever": rng.normal(size=ROWS),
+        "goal": rng.normal(size=2).repeat(ROWS).reshape(2, ROWS).T,
         "reward": rng.normal(size=ROWS).astype("f4"),
         "flag": rng.integers(0, 2, ROWS).astype("?"),
         "env_id": np.tile([1, 2], ROWS // 2).astype("i4"),
@@ -67,21 +69,43 @@ def test_xarray_opens_the_zarr_folder(dataset, tmp_path):
         assert list(tree.children) == ["training"]
 
 
-@pytest.mark.faults
-def test_lerobot_loads_its_format(dataset, tmp_path):
+def run_lerobot(tmp_path, program, *words):
+    """Run a program with LeRobot, and return what it printed."""
     library = Path(sys.prefix) / "lerobot"
     if not library.is_dir():
         assert not os.environ.get("CI"), f"{library} is missing: make test installs it"
         pytest.skip(f"LeRobot is not installed in {library}: make test installs it")
+    offline = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "home")}
+    variables = os.environ | offline | {"PYTHONPATH": str(library)}
+    command = [sys.executable, PROGRAMS / program, *words]
+    ended = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
+    assert not ended.returncode, ended.stderr
+    return ended.stdout
+
+
+@pytest.mark.faults
+def test_policies_of_lerobot_learn_from_its_format(dataset, tmp_path):
+    features = {
+        "observation.state": ["state", "lever"],
+        "observation.environment_state": ["torque"],
+        "action": ["torque"],
+    }
+    options = ExportOptions(features=features, fps=50)
+    with pytest.raises(ConfigError, match='The field "torque" is chosen more than once'):
+        export(dataset, "lerobot", tmp_path / "arm", options=options)
+    features["observation.environment_state"] = ["goal"]
+    export(dataset, "lerobot", tmp_path / "arm", options=options)
+    said = run_lerobot(tmp_path, "train_lerobot.py", tmp_path / "arm").splitlines()
+    assert [line.split()[0] for line in said] == ["act", "diffusion"]
+
+
+@pytest.mark.faults
+def test_lerobot_loads_its_format(dataset, tmp_path):
     options = ExportOptions(
         observations=["state"], actions=["torque", "lever"], rewards="reward", fps=50, task="swing"
     )
     assert export(dataset, "lerobot", tmp_path / "arm", options=options) == {"training": ROWS}
-    command = [sys.executable, PROGRAMS / "read_lerobot.py", tmp_path / "arm", tmp_path / "out.npz"]
-    offline = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "home")}
-    variables = os.environ | offline | {"PYTHONPATH": str(library)}
-    ended = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
-    assert not ended.returncode, ended.stderr
+    run_lerobot(tmp_path, "read_lerobot.py", tmp_path / "arm", tmp_path / "out.npz")
     stored = {name: values[:] for name, values in dataset["training"].items()}
     order = np.lexsort([stored["step"], stored["env_id"], stored["episode"]])
     rows = {name: values[order] for name, values in stored.items()}

@@ -12,7 +12,10 @@ from physx_formats.errors import ExchangeError
 from physx_formats.format import Format, all_formats, find_format
 from physx_formats.table import Advance, ExportOptions, Table, check_new
 
-_OPTIONS = ("observations", "actions", "rewards", "fps", "task", "points", "cells", "cell_type")
+_OPTIONS = (
+    *("observations", "actions", "rewards", "fps", "task", "features"),
+    *("points", "cells", "cell_type"),
+)
 
 
 def export(
@@ -84,7 +87,7 @@ def _choose_format(to: str, options: ExportOptions) -> Format:
             f'{to} has no compression "{options.compression}". It has: {listed(form.compressions)}.'
         )
     for name in _OPTIONS:
-        if getattr(options, name) not in ((), None) and name not in form.options:
+        if getattr(options, name) not in ((), None, {}) and name not in form.options:
             takers = [one for one, known in all_formats().items() if name in known.options]
             raise ConfigError(f"{name} is for {listed(takers)}, not for {to}.")
     if options.fps is not None and options.fps < 1:

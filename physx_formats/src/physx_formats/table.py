@@ -40,6 +40,8 @@ class ExportOptions:
         rewards: Field that is its rewards (likewise); None: minari has zeros, lerobot none.
         fps: Frames per second of simulated time (lerobot, which requires it, and vtkhdf).
         task: Description of the task (lerobot only).
+        features: Fields of a feature, by its name: "observation.state" (lerobot only). Those of
+            several fields are one vector.
         points: Field with the positions of the mesh's points, of rows or of episodes, shape
             (points, 1 to 3) (vtkhdf only, and required there).
         cells: Field with the numbers of each cell's points, shape (cells, points of each)
@@ -54,6 +56,7 @@ class ExportOptions:
     rewards: str | None = None
     fps: int | None = None
     task: str | None = None
+    features: Mapping[str, Sequence[str]] = field(default_factory=dict)
     points: str | None = None
     cells: str | None = None
     cell_type: str | None = None

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import tyro
@@ -49,6 +49,11 @@ class Export:
     """lerobot, vtkhdf: frames per second of simulated time; required for lerobot."""
     task: str | None = None
     """lerobot: description of the task."""
+    features: Annotated[dict[str, str], tyro.conf.arg(name="as", metavar="FEATURE=FIELDS")] = field(
+        default_factory=dict
+    )
+    """lerobot: fields of features, separated by commas: observation.state=q,v. Other observations
+    are then those that are named only."""
     points: str | None = None
     """vtkhdf: field with the positions of the mesh's points, of samples or episodes; required."""
     cells: str | None = None
@@ -67,6 +72,7 @@ def run(words: Sequence[str]) -> None:
         options.rewards,
         options.fps,
         options.task,
+        {name: of.split(",") for name, of in options.features.items()},
         options.points,
         options.cells,
         options.cell_type,
