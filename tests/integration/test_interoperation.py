@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from physx_core import Dataset
+from physx_core import Dataset, Field
 from physx_core.errors import ConfigError
 from physx_formats import ExportOptions, export
 
@@ -54,6 +54,26 @@ def test_pandas_reads_the_parquet_file(dataset, tmp_path):
         assert_array_equal(unnested(frame[name].to_numpy()), values[:])
     means = frame.groupby("env_id")["lever"].mean()
     assert means[1] == pytest.approx(dataset["training"]["lever"][:][::2].mean())
+
+
+@pytest.mark.filterwarnings("error")
+def test_xarray_finds_coordinates_units_and_episodes(tmp_path):
+    xarray = pytest.importorskip("xarray")
+    field = Field("u", (4, 2), unit="m/s", axes=("x", "channel"))
+    where = {"x": [0.0, 0.5, 1.0, 1.5], "y": [1.0]}
+    with Dataset.create(tmp_path / "set", info={"coordinates": where}) as dataset:
+        more = [Field("time", unit="s"), Field("episode", (), int), Field("step", (), int)]
+        dataset.define_fields("training", [field, *more])
+        u, time = np.arange(48.0).reshape(6, 4, 2), np.arange(6) / 10
+        episode, step = np.divmod(np.arange(6), 3)
+        dataset.append("training", {"u": u, "time": time, "episode": episode, "step": step})
+        export(dataset, "zarr", tmp_path / "rows.zarr")
+    with xarray.open_zarr(tmp_path / "rows.zarr", group="training") as found:
+        assert set(found.coords) == {"x", "time", "episode", "step"}
+        assert found["u"].attrs["units"] == "m/s" and found["u"].dims == ("sample", "x", "channel")
+        assert_array_equal(found["u"].sel(x=1.0).isel(channel=1), u[:, 2, 1])
+        last = found["u"].where(found["episode"] == 1, drop=True)
+        assert_array_equal(last["time"], time[3:])
 
 
 @pytest.mark.filterwarnings("error")
