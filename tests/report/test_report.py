@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 import base64
+import json
 import re
 from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from physx_core import (
     DataGeneration,
@@ -18,12 +20,14 @@ from physx_core import (
     Field,
     NetworkConfig,
     Parameter,
+    Result,
     Training,
     View,
     evaluate,
 )
 from physx_core.cli import main
 from physx_core.errors import SessionError
+from physx_core.results import PolicyResult, read_results, store_result
 from physx_report import Figure, Section, Table, Text, drawing, page, write_report
 from physx_report.errors import ReportError
 
@@ -127,6 +131,82 @@ def test_report_of_a_generation_says_what_was_simulated():
     assert "40 of 40 episodes" in told and "finished 40" in told
     assert "How often parameters, and durations in s, occurred" in told
     assert "physx generate --config sessions/data/config.toml" in told
+
+
+def test_report_of_a_policy_shows_rewards_by_seed_beside_actions_without_one(capsys):
+    environment = EnvironmentConfig("gym/Pendulum-v1", seed=0, as_tcp_ip_client=False)
+    with DataGeneration(
+        environment, batch_nb=1, batch_size=50, session_name="data", quiet=True
+    ) as run:
+        run.execute()
+    train(view=View(), reads="observation", learns="action")
+    words = ["evaluate", "sessions/net", "--env", "Pendulum-v1"]
+    assert main([*words, "--episodes", "8"]) == 0
+    assert "random actions: " in capsys.readouterr().out
+    assert main([*words, "--episodes", "2", "--rivals", "none", "--json"]) == 0
+    assert not json.loads(capsys.readouterr().out)["rivals"]
+    assert main(["evaluate", "sessions/net", "--env", "gym/Pendulum-v1", "--episodes", "8"]) == 0
+    found = read_results("sessions/net")["evaluation"]
+    assert {name: len(each.rewards) for name, each in found.policies.items()} == {
+        "Pendulum-v1": 2, "gym/Pendulum-v1": 8,
+    }  # fmt: skip
+    policy = found.policies["gym/Pendulum-v1"]
+    assert policy.seeds == tuple(range(10_000, 10_008))
+    assert policy.rivals.keys() == {"zero actions", "random actions"}
+    assert found["gym/Pendulum-v1/reward"] == np.mean(policy.rewards)
+    first = written("sessions/net")
+    told = text_of(first)
+    assert "gym/Pendulum-v1: mean reward" in told and "in an episode" in told
+    assert any(text.startswith("gym/Pendulum-v1. Reward of each") for text in captions(first))
+    assert "physx evaluate sessions/net --env gym/Pendulum-v1 --film sessions/net/film.webp" in told
+
+
+def test_the_film_of_an_evaluation_is_on_the_page():
+    generate(4)
+    Image.new("RGB", (8, 8)).save("sessions/data/film.webp")
+    rewards = {"seed": [1, 2], "reward": [0.0, 1.0]}
+    policy = PolicyResult.of("Swing-v0", "", "network_1", rewards, {}, film="film.webp")
+    store_result(
+        Path("sessions/data"),
+        Result("evaluation", "sessions/data", 1.0, policies={"Swing-v0": policy}),
+    )
+    assert 'src="data:image/webp;base64,' in written("sessions/data")
+    Path("sessions/data/film.webp").unlink()
+    assert "Its film: sessions/data/film.webp" in text_of(written("sessions/data"))
+
+
+def test_report_of_a_sweep_compares_its_trials():
+    generate(8)
+    Path("sweep.toml").write_text(
+        """
+        [study]
+        seeds = [0, 1]
+        [parameters]
+        training.batch_size = [8, 16]
+        [pipelines.linear.training]
+        epoch_nb = 2
+        [pipelines.linear.training.dataset]
+        existing_dir = "sessions/data"
+        [pipelines.linear.training.dataset.view.window]
+        past = { field = "state", at = 0 }
+        next = { field = "state", at = 1 }
+        [pipelines.linear.training.network]
+        network = "toy/linear"
+        network_kwargs = { net_fields = "past", opt_fields = "next" }
+        """
+    )
+    assert main(["sweep", "sweep.toml"]) == 0
+    found = read_results("studies/sweep")["sweep"].sweep
+    assert [dict(each.parameters) for each in found.settings] == [
+        {"training.batch_size": 8}, {"training.batch_size": 16},
+    ]  # fmt: skip
+    assert all(each.values.keys() == {"0", "1"} for each in found.settings)
+    first = written("studies/sweep")
+    told = text_of(first)
+    assert "Best: linear, batch_size" in told and "mean of 2 seeds" in told
+    assert any("of each trial by parameter" in text for text in captions(first))
+    assert "physx sweep studies/sweep/study.toml --study again" in told
+    assert written("studies/sweep", path="other.html") == first
 
 
 def test_equal_sessions_give_equal_pages_without_scripts():

@@ -13,7 +13,7 @@ from physx_report.section import Section
 
 def _blocks(run: Run) -> Iterator[Block]:
     result = run.results.get("evaluation")
-    if result is None:
+    if result is None or result.policies:
         return
     yield Text(list(result.summary))
     for name, rollout in result.rollouts.items():
