@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import base64
+import io
 import json
 import re
 from pathlib import Path
@@ -23,17 +24,42 @@ from physx_core import (
     Result,
     Training,
     View,
+    Visualizer,
     evaluate,
 )
 from physx_core.cli import main
 from physx_core.errors import SessionError
 from physx_core.results import PolicyResult, read_results, store_result
-from physx_report import Figure, Section, Table, Text, drawing, page, write_report
+from physx_report import Figure, Section, Table, Text, drawing, film, page, write_report
 from physx_report.errors import ReportError
 
 pytestmark = pytest.mark.slow
 
 WINDOWS = View(window={"past": ("state", 0), "next": ("state", 1)})
+
+
+class Painter(Visualizer):
+    """Draws a column of pixels for each object, whose height is where it is."""
+
+    @classmethod
+    def offscreen(cls, size):
+        return cls()
+
+    def open(self, run_name, session_dir, instance_nb):
+        self.places = {}
+
+    def events(self, instance_id, step, events):
+        for event in (one for several in events for one in several.each()):
+            if event.action == "remove":
+                del self.places[event.name]
+            elif "position" in event.values:
+                self.places[event.name] = event.values["position"]
+
+    def capture(self):
+        picture = np.zeros((256, 32, 3), np.uint8)
+        for column, place in enumerate(self.places.values()):
+            picture[: 128 + int(100 * place[0]), 8 * column : 8 * column + 8] = 255
+        return picture
 
 
 class Spring(Environment):
@@ -47,6 +73,9 @@ class Spring(Environment):
     def init_database(self):
         self.define_training_fields([Field("state", (2,), unit="<b>m")])
 
+    def init_visualization(self):
+        self.factory.add_sphere("mass", radius=0.1)
+
     def reset_parameters(self, stiffness):
         self.stiffness = stiffness
         self.state = np.array([self.rng.uniform(0.5, 1.0), 0.0])
@@ -56,6 +85,22 @@ class Spring(Environment):
         v -= 0.02 * self.stiffness * x
         self.state = np.array([x + 0.02 * v, v])
         self.set_training_data(state=self.state)
+        self.factory.update_sphere("mass", position=[self.state[0], 0, 0])
+
+
+class Angle(Spring):
+    """Draws what does not follow from its field by a factor."""
+
+    def step(self):
+        super().step()
+        self.factory.update_sphere("mass", position=[np.sin(3 * self.state[0]), 0, 0])
+
+
+class Drawing(Spring):
+    """Draws predictions itself."""
+
+    def apply_prediction(self, prediction):
+        self.factory.update_sphere("mass", position=[prediction["state"][0], 0, 0])
 
 
 @pytest.fixture(autouse=True)
@@ -63,8 +108,8 @@ def sessions(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
 
 
-def generate(episodes=40):
-    environment = EnvironmentConfig(Spring, as_tcp_ip_client=False, seed=1)
+def generate(episodes=40, kind=Spring):
+    environment = EnvironmentConfig(kind, as_tcp_ip_client=False, seed=1)
     with DataGeneration(environment, episodes=episodes, session_name="data", quiet=True) as run:
         run.execute()
 
@@ -105,6 +150,52 @@ def test_report_of_a_training_says_how_good_its_network_is_beside_its_rivals():
     assert "next. Error of each episode by parameter (validation)" in captions(written_page)
     assert re.search(r"network predicted [\d,]+ samples per s, their simulation generated", told)
     assert "physx train --config sessions/net/config.toml --session-name again" in told
+
+
+def films(written):
+    """Return the sizes and numbers of pictures of the films and pictures of a page."""
+    found = re.findall(r"data:image/webp;base64,([^\"]+)", written)
+    opened = [Image.open(io.BytesIO(base64.b64decode(each))) for each in found]
+    return [(each.size, getattr(each, "n_frames", 1)) for each in opened]
+
+
+def test_a_film_shows_predictions_beside_the_truth(monkeypatch):
+    monkeypatch.setattr(film, "_visualizers", lambda: [Visualizer, Painter])
+    generate()
+    train()
+    first = written("sessions/net", trust=True)
+    (size, count), *pictures = films(first)
+    assert size == (64, 256) and count > 6  # equal pictures in a row are one
+    assert pictures == [((64, 256), 1), ((64, 256), 1)]
+    known = [text for text in captions(first) if "left: truth; right: prediction" in text]
+    assert known[0].startswith("Film of the median episode") and "11 rows" in known[0]
+    assert known[1].startswith("Best episode") and known[2].startswith("Worst episode")
+    assert written("sessions/net", path="other.html", trust=True) == first
+    assert "There is no film: " in text_of(written("sessions/net"))  # its code is not trusted
+
+
+def test_a_page_says_why_there_is_no_film(monkeypatch):
+    monkeypatch.setattr(film, "_visualizers", lambda: [Painter])
+    generate(kind=Angle)
+    train()
+    told = text_of(written("sessions/net", trust=True))
+    assert "Predictions are not drawn: nothing that the environment draws" in told
+    monkeypatch.setattr(film, "_visualizers", list)
+    generate()
+    train("sessions/data_1")
+    told = text_of(written("sessions/net_1", trust=True))
+    assert "no plugin is installed that draws pictures without a display" in told
+
+
+def test_an_environment_that_draws_predictions_is_filmed(monkeypatch):
+    monkeypatch.setattr(film, "_visualizers", lambda: [Painter])
+    generate(kind=Drawing)
+    train(view=View(), reads="state", learns="state")
+    first = written("sessions/net", trust=True)
+    (size, count), *pictures = films(first)
+    assert size == (32, 256) and count > 6  # equal pictures in a row are one
+    assert pictures == [((32, 256), 1), ((32, 256), 1)]
+    assert "truth and prediction, as the environment draws them" in text_of(first)
 
 
 def energy(values):

@@ -13,6 +13,7 @@ def physx_report_sections() -> Components:
         "policy": "physx_report.sections.policy:SECTION",
         "quality": "physx_report.sections.quality:SECTION",
         "rollouts": "physx_report.sections.rollouts:SECTION",
+        "film": "physx_report.sections.film:SECTION",
         "episodes": "physx_report.sections.episodes:SECTION",
         "training": "physx_report.sections.training:SECTION",
         "samples": "physx_report.sections.samples:SECTION",

@@ -34,7 +34,7 @@ def measured(name: str, error: float, unit: str) -> str:
     """Return an error with its unit, shares in percent."""
     if name in SHARES:
         return f"{number(100 * error)} %"
-    own = unit if "," not in unit else "standard deviations"
+    own = unit if "," not in unit else "std"
     return f"{number(error)} {own}".rstrip()
 
 

@@ -24,7 +24,7 @@ def _rollout(name: str, of: RolloutResult) -> Iterator[Block]:
     notes = [f"{name}: {note}." for note in rollout_notes(of)]
     yield Text(notes, "verdict")
     several = "," in of.unit
-    unit = "standard deviations" if several else of.unit
+    unit = "std" if several else of.unit
     caption = (
         f"{name}. Error of predictions that are fed back, by row after the beginning of "
         f"{of.episodes} episodes ({of.part}); area: 80 % of the episodes"
