@@ -224,6 +224,31 @@ def test_report_of_a_generation_says_what_was_simulated():
     assert "physx generate --config sessions/data/config.toml" in told
 
 
+class Fragile(Spring):
+    """Breaks if it is stiff."""
+
+    def step(self):
+        if self.stiffness > 20:
+            raise ValueError("the spring breaks")
+        super().step()
+
+
+def test_report_of_a_generation_says_why_episodes_failed_and_shows_one(monkeypatch):
+    monkeypatch.setattr(film, "_visualizers", lambda: [Painter])
+    environment = EnvironmentConfig(Fragile, as_tcp_ip_client=False, seed=1)
+    options = {"episodes": 20, "max_failed": 20, "session_name": "data", "quiet": True}
+    with DataGeneration(environment, **options) as run:
+        run.execute()
+    first = written("sessions/data", trust=True)
+    told = text_of(first)
+    assert re.search(r"step\(\) at step 0: ValueError: the spring breaks [\d]+ [\d, ]+", told)
+    assert re.search(r"[\d,]+ samples per s", told)
+    [(size, count)] = films(first)
+    assert size == (32, 256) and count > 6
+    assert any(re.match(r"Episode \d+, 12 rows, as the environment", t) for t in captions(first))
+    assert written("sessions/data", path="other.html", trust=True) == first
+
+
 def test_report_of_a_policy_shows_rewards_by_seed_beside_actions_without_one(capsys):
     environment = EnvironmentConfig("gym/Pendulum-v1", seed=0, as_tcp_ip_client=False)
     with DataGeneration(
