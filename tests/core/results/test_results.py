@@ -23,7 +23,7 @@ from physx_core import (
     read_scalars,
 )
 from physx_core.errors import ConfigError, SessionError
-from physx_core.results import read_results
+from physx_core.results import PolicyResult, SettingResult, SweepResult, read_results
 from physx_core.toy import Linear
 
 RNG = np.random.default_rng(5)
@@ -531,3 +531,35 @@ def test_rivals_that_are_none_are_refused(rivals, reason):
     store(*noisy())
     with pytest.raises(ConfigError, match=reason):
         judged(planted(lambda x: x @ MAP), rivals=rivals)
+
+
+def test_a_policy_is_better_only_if_neither_chance_of_episodes_nor_of_signs_explains_it():
+    random = np.random.default_rng(0)
+    rewards = random.normal(size=12)
+    own = {"seed": range(12), "reward": rewards}
+    rivals = {
+        "worse": rewards - 1 - random.uniform(size=12),
+        "better": rewards + 2,
+        "the same": rewards,
+        "noise": rewards + random.normal(size=12),
+    }
+    found = PolicyResult.of("Swing-v0", "", "network_1", own, rivals)
+    assert [each.verdict for each in found.rivals.values()] == ["wins", "loses", "even", "even"]
+    assert found.interval[0] < found.values["reward"] < found.interval[1]
+    few = {name: values[:7] for name, values in own.items()}
+    found = PolicyResult.of("Swing-v0", "", "network_1", few, {"better": rewards[:7] + 2})
+    assert found.rivals["better"].verdict == "unknown" and found.interval is None
+    assert "too few to say: 7 episodes" in "\n".join(found.lines("Swing-v0"))
+
+
+def test_the_best_setting_of_a_sweep_has_a_number_for_each_seed():
+    settings = [
+        SettingResult("a", {"lr": 0.1}, {"0": 1.0, "1": 3.0}),
+        SettingResult("a", {"lr": 0.2}, {"0": 0.5}, {"1": "pruned"}),
+        SettingResult("a", {"lr": 0.3}, {"0": 3.0, "1": 3.0}),
+    ]
+    for goal, place in (("minimize", 0), ("maximize", 2)):
+        found = Result("sweep", "study", 1.0, sweep=SweepResult("loss", goal, settings))
+        assert found.sweep.best == settings[place] and found["best"] == settings[place].value
+    assert settings[0].spread == pytest.approx(2**0.5) and settings[1].spread is None
+    assert "1 other settings" in str(found)
