@@ -12,7 +12,7 @@ from physx_core.errors import FieldShapeError, FieldTypeError
 from physx_core.fields import ENDS, NO_ARRAY, NUMBERS, RESERVED, Field, first_not_finite
 from physx_core.packing import check_sizes, join
 from physx_core.rows import check_names
-from physx_core.typing import Array, Batch, Index
+from physx_core.typing import Array, Batch
 
 
 def infer_fields(values: Mapping[str, Any], axes: int = 1) -> list[Field]:
@@ -121,9 +121,9 @@ def _fit(fields: Mapping[str, Field], block: Batch) -> bool:
     for name, field in fields.items():
         if not field.indexes:
             continue
-        sizes: Index = np.diff(block[field.indexes + ENDS].astype(np.intp), prepend=0)
+        sizes: Any = np.diff(block[field.indexes + ENDS].astype(np.intp), prepend=0)
         if field.free_axis:
-            counts: Index = np.diff(block[field.free_axis + ENDS].astype(np.intp), prepend=0)
+            counts: Any = np.diff(block[field.free_axis + ENDS].astype(np.intp), prepend=0)
             sizes = np.repeat(sizes, counts)
         values = block[name]
         sizes = sizes.reshape(-1, *(1,) * (values.ndim - 1))
