@@ -472,6 +472,67 @@ def test_metrics_that_are_none_are_refused(metrics, reason):
         drifting(metrics=metrics).execute()
 
 
+# Rivals of the user -----------------------------------------------------------------------------
+
+
+def law(inputs):
+    """Know the law without a network."""
+    return inputs["x"] @ MAP
+
+
+def short(inputs):
+    return inputs["x"][:, :1]
+
+
+def broken(inputs):
+    return inputs["z"]
+
+
+def other(inputs):
+    return {"z": inputs["x"]}
+
+
+def test_a_rival_of_the_user_is_compared_like_any_other():
+    x, y = noisy()
+    store(x, y)
+    network = planted(lambda x: x @ MAP + 0.1)
+    Path("zero.py").write_text("def zero(inputs):\n    return {'y': 0 * inputs['x'][:, :2]}\n")
+    found = judged(network, rivals=["all", law, "zero.py:zero"])
+    said = verdicts(found)
+    assert (said["law"], said["zero"], said["mean"]) == ("loses", "wins", "wins")
+    of = found.parts["validation"].fields["y"].rivals
+    assert of["law"].errors["rmse"] == pytest.approx(0.3, rel=0.1)
+    only = judged(network, rivals=[law])
+    assert list(verdicts(only)) == ["law"]
+    alone = judged(network, rivals=[])
+    assert verdicts(alone) == {} and alone["error/y/rmse"] == found["error/y/rmse"]
+
+
+def test_a_rival_of_the_user_that_fails_is_named_and_the_others_are_compared():
+    store(*noisy())
+    found = judged(planted(lambda x: x @ MAP), rivals=[short, broken, other, law])
+    of = found.parts["validation"].fields["y"].rivals
+    assert "it returned the shape (50, 1) where the field has (50, 2)" in of["short"].why
+    assert "it failed: KeyError('z')" in of["broken"].why
+    assert of["other"].why == "it does not predict this field"
+    assert of["law"].errors and not of["short"].errors
+
+
+@pytest.mark.parametrize(
+    ("rivals", "reason"),
+    [
+        (["drag"], "name one as"),
+        ("nun", "name one as"),
+        ([law, law], "two functions"),
+        (["physx_core.toy:Lineer"], 'Did you mean "Linear"'),
+    ],
+)
+def test_rivals_that_are_none_are_refused(rivals, reason):
+    store(*noisy())
+    with pytest.raises(ConfigError, match=reason):
+        judged(planted(lambda x: x @ MAP), rivals=rivals)
+
+
 def test_a_policy_is_better_only_if_neither_chance_of_episodes_nor_of_signs_explains_it():
     random = np.random.default_rng(0)
     rewards = random.normal(size=12)

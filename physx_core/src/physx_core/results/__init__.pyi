@@ -1,5 +1,6 @@
 """Results: what a run found, and how good its network is, compared with predictions without one."""
 
+from .comparison import Comparison as Comparison
 from .policy import ActionsResult as ActionsResult
 from .policy import PolicyResult as PolicyResult
 from .result import Drift as Drift
