@@ -1,0 +1,9 @@
+"""How far physics engines agree on a task, and why they part."""
+
+from .agreement import Agreement as Agreement
+from .causes import Cause as Cause
+from .causes import Parting as Parting
+from .figures import Figure as Figure
+from .figures import Ranking as Ranking
+from .study import agree as agree
+from .version import __version__ as __version__
