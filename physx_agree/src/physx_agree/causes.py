@@ -11,7 +11,7 @@ class Cause:
     """Why two engines part, confirmed by an experiment.
 
     Attributes:
-        kind: ``"description"``, ``"above the engine"``; what engines hold: ``"mass"``, ``"inertia"``,
+        kind: ``"description"``, ``"above the engine"``; what engines hold: ``"mass"``,
             ``"armature"``, ``"gravity"``, ``"stiffness"``, ``"damping"``, ``"friction"`` of joints,
             ``"torque limit"``, ``"friction of contacts"``, ``"restitution"``; how they act:
             ``"limit"``, ``"contact gap"``, ``"recovery of penetration"``, ``"friction law"``,

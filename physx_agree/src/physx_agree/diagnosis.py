@@ -38,7 +38,9 @@ from physx_sim import World
 _DISSECTED = 24
 """Largest number of steps that are looked at one by one."""
 _EQUAL, _AWAY = 1e-9, 1e-6
-"""Differences of commands and states that count as none, and of positions that count as some."""
+"""Differences of commands that count as none, and of positions that count as some."""
+_BEGINNING = 200
+"""How many physics steps of an episode show what lies above the engine."""
 _MOVED = 0.5
 """Which part of a difference may remain when its cause is taken away."""
 _HELPS = 0.2
@@ -46,23 +48,27 @@ _HELPS = 0.2
 
 Make = Callable[[Any], gymnasium.Env[Any, Any]]
 """Makes the task on an engine."""
+Named = tuple[Any, str]
+"""Reference of an engine, and its name."""
 
 
 class Diagnosis:
     """Finds out why two engines part in an episode."""
 
     def __init__(
-        self, make: Make, engines: tuple[Any, Any], episode: Episode, seed: int
+        self, make: Make, engines: tuple[Named, Named], episode: Episode, seed: int
     ) -> None:
         """Prepare; nothing is simulated.
 
         Args:
             make: Makes the task on an engine.
-            engines: References of the engines.
+            engines: References of the engines, with their names.
             episode: The task's episode on the first of them.
             seed: Of the episode.
         """
-        self._make, self._engines, self._episode, self._seed = make, engines, episode, seed
+        self._make, self._episode, self._seed = make, episode, seed
+        self._engines = tuple(reference for reference, _ in engines)
+        self._names = engines[0][1], engines[1][1]
         self._causes: list[Cause] = []
         self._unconfirmed: list[str] = []
         self._at_first: dict[str, float] = {}
@@ -93,7 +99,7 @@ class Diagnosis:
             text = "the same steps; what differs by rounding grows"
             self._causes.append(Cause("sensitivity", text, 0.0, "no step from equal states parts"))
         return Parting(
-            (str(self._engines[0]), str(self._engines[1])),
+            self._names,
             self._seed,
             len(episode.moments),
             one.simulation.period,
@@ -102,8 +108,8 @@ class Diagnosis:
             max(self._at_first, key=lambda kind: self._at_first[kind], default=""),
             _median_and_largest(apart),
             _median_and_largest(self._floor.floor),
-            sorted(self._causes, key=lambda cause: -cause.share),
-            self._unconfirmed,
+            tuple(sorted(self._causes, key=lambda cause: -cause.share)),
+            tuple(self._unconfirmed),
             left,
             away,
             growth,
@@ -117,18 +123,18 @@ class Diagnosis:
         found = differences(above_the_engine(first), above_the_engine(second))
         first.close()
         replayed = self._replay(second)
-        wrong = _commands_part(self._episode, replayed)
+        gap, kept = _commands_apart(self._episode, replayed), list[Difference]()
         for difference in found:
-            changed = self._given([difference]) if wrong is not None else None
-            later = None if changed is None else _commands_part(self._episode, changed)
-            if changed is not None and (later is None or later > (wrong or 0)):
-                moved = "equal" if later is None else f"equal up to step {later}"
-                text = f"given to {self._engines[1]}, the commands to the joints are {moved}"
-                self._causes.append(Cause("above the engine", str(difference), 0.0, text))
-            else:
+            changed = self._given([*kept, difference]) if gap > 0.0 else None
+            less = np.inf if changed is None else _commands_apart(self._episode, changed)
+            if less > _MOVED * gap:
                 self._unconfirmed.append(str(difference))
-        if wrong is not None and not any(c.kind == "above the engine" for c in self._causes):
-            self._unconfirmed.append(f"commands to the joints from step {wrong} on")
+                continue
+            told = f"{100 * less / gap:.2g} % as far apart" if less else "equal"
+            text = f"given to {self._names[1]}, the commands to the joints are {told}"
+            self._causes.append(Cause("above the engine", str(difference), 0.0, text))
+            kept.append(difference)
+            gap = less
         return replayed
 
     def _replay(self, env: gymnasium.Env[Any, Any]) -> Episode:
@@ -308,14 +314,13 @@ class Diagnosis:
         return sum(rest) * scale
 
 
-def _commands_part(one: Episode, other: Episode) -> int | None:
-    """Return the first step whose commands differ although the states before are equal."""
-    for number, (first, second) in enumerate(zip(one.moments, other.moments, strict=False)):
-        if _far(first.commands, second.commands):
-            return number
-        if _far(first.positions, second.positions) or _far(first.velocities, second.velocities):
-            return None
-    return None
+def _commands_apart(one: Episode, other: Episode) -> float:
+    """Return how far the commands of two episodes are apart in their beginning, on average."""
+    pairs = list(zip(one.moments, other.moments, strict=False))[:_BEGINNING]
+    found = np.array([np.abs(first.commands - second.commands) for first, second in pairs])
+    size = 1.0 + float(np.abs([first.commands for first, _ in pairs]).max(initial=0.0))
+    mean = float(found.mean()) if found.size else 0.0
+    return mean if mean > _EQUAL * size else 0.0
 
 
 def _check_layouts(one: Laboratory, other: Laboratory) -> None:
@@ -325,11 +330,6 @@ def _check_layouts(one: Laboratory, other: Laboratory) -> None:
             f"The task has other joints or links on {other.engine} than on {one.engine}, so their "
             "states cannot be compared. Make it the same on all engines."
         )
-
-
-def _far(one: Vector, other: Vector) -> bool:
-    size = 1.0 + float(np.abs(one).max(initial=0.0))
-    return float(np.abs(one - other).max(initial=0.0)) > _EQUAL * size
 
 
 def _median_and_largest(values: Vector) -> tuple[float, float]:

@@ -11,9 +11,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from physx_agree.laboratory import Moment
 from physx_core.errors import ConfigError
 from physx_core.typing import Vector
-from physx_agree.laboratory import Moment
 from physx_gym import RobotEnv, robot_of
 from physx_sim import Simulation, State, World, with_rotors
 
@@ -42,25 +42,31 @@ class Episode:
     velocities: Vector
 
 
-def figures_of(
-    env: gymnasium.Env[Any, Any], act: Act, seed: int, metric: str
-) -> float:
+def figures_of(env: gymnasium.Env[Any, Any], act: Act, seed: int, metric: str) -> float:
     """Run an episode; return the sum of its rewards, its length, or the mean of an information."""
     observation, _ = env.reset(seed=seed)
     values: list[float] = []
     over = False
     while not over:
         observation, reward, terminated, truncated, info = env.step(act(observation))
-        if metric not in (RETURN, LENGTH) and metric not in info:
-            known = [name for name, value in info.items() if np.ndim(value) == 0]
-            raise ConfigError(
-                f'The information of steps has no "{metric}". Metrics of this task: '
-                f"{', '.join([RETURN, LENGTH, *known])}."
-            )
-        values.append({RETURN: reward, LENGTH: 1.0}.get(metric, info.get(metric)))
+        values.append(float(_measured(metric, reward, info)))
         over = terminated or truncated
-    total = math.fsum(map(float, values))
+    total = math.fsum(values)
     return total if metric in (RETURN, LENGTH) else total / len(values)
+
+
+def _measured(metric: str, reward: Any, info: dict[str, Any]) -> Any:
+    if metric == RETURN:
+        return reward
+    if metric == LENGTH:
+        return 1.0
+    if metric not in info:
+        known = [name for name, value in info.items() if np.ndim(value) == 0]
+        raise ConfigError(
+            f'The information of steps has no "{metric}". Metrics of this task: '
+            f"{', '.join([RETURN, LENGTH, *known])}."
+        )
+    return info[metric]
 
 
 def record(

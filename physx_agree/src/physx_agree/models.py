@@ -81,12 +81,12 @@ def force_differences(one: Simulation, other: Simulation, world: World) -> list[
     scale = max(float(np.abs([_bias(one, q, zero) for q in places]).max()), 1e-3)
     candidates = [*_gravity(one, world, places), *_springs(one, places)]
     found = _explain(still.ravel(), candidates, scale)
-    speeds = rng.uniform(-1.0, 1.0, (len(places), layout.nv))
-    moving = np.array([
-        _bias(other, q, v) - _bias(one, q, v) for q, v in zip(places, speeds, strict=True)
-    ])  # fmt: skip
-    largest = max(float(np.abs([_bias(one, *each) for each in zip(places, speeds, strict=True)]).max()), 1e-3)
-    return found + _explain((moving - still).ravel(), _resistances(one, speeds), largest)
+    speeds = list(rng.uniform(-1.0, 1.0, (len(places), layout.nv)))
+    own = np.array([_bias(one, q, v) for q, v in zip(places, speeds, strict=True)])
+    moving = np.array([_bias(other, q, v) for q, v in zip(places, speeds, strict=True)]) - own
+    scale = max(float(np.abs(own).max()), 1e-3)
+    resistances = list(_resistances(one, np.array(speeds)))
+    return found + _explain((moving - still).ravel(), resistances, scale)
 
 
 def _bias(simulation: Simulation, q: Vector, v: Vector) -> Vector:
@@ -129,7 +129,8 @@ def _inertias(
             lambda x, name=name, owner=owner: _scaled(name, owner, float(x[0])),  # type: ignore[misc]
         )
         yield _Candidate(
-            columns, lambda x, name=name: Held("inertia", f"center or moments of {name}")  # type: ignore[misc]
+            columns,
+            lambda x, name=name: Held("inertia", f"center or moments of {name}"),  # type: ignore[misc]
         )
 
 
@@ -167,9 +168,7 @@ def _resistances(one: Simulation, speeds: Vector) -> Iterator[_Candidate]:
             yield _Candidate(columns.reshape(-1, 1), _of_joint(kind, joint, unit))
 
 
-def bodies_of(
-    simulation: Simulation, world: World
-) -> list[tuple[str, RigidBody, tuple[str, str]]]:
+def bodies_of(simulation: Simulation, world: World) -> list[tuple[str, RigidBody, tuple[str, str]]]:
     """Return each link: its name in the layout, it, its robot's or object's name and its own."""
     found = []
     for movable in read_parts(world).movables:
@@ -180,7 +179,7 @@ def bodies_of(
 
 
 def _parameters(body: RigidBody) -> Vector:
-    """Return mass, first moments, and moments of inertia xx, xy, xz, yy, yz, zz about the origin."""
+    """Return mass, first moments, and moments xx, xy, xz, yy, yz, zz about the origin."""
     x = body.center
     inertia = body.inertia + body.mass * (x @ x * np.eye(3) - np.outer(x, x))
     return np.array([body.mass, *(body.mass * x), *inertia[np.triu_indices(3)]])
@@ -233,9 +232,7 @@ def _explain(residual: Vector, candidates: Sequence[_Candidate], scale: float) -
     return [each.held(part) for each, part in zip(chosen, parts, strict=True)]
 
 
-def _needed(
-    residual: Vector, chosen: list[_Candidate], enough: float
-) -> list[_Candidate]:
+def _needed(residual: Vector, chosen: list[_Candidate], enough: float) -> list[_Candidate]:
     """Return the chosen ones without those that later ones make superfluous."""
     limit = max(_NEARLY * _remaining(residual, chosen), enough) if chosen else 0.0
     for each in list(chosen):
@@ -315,7 +312,7 @@ def _more_of(
 ) -> Mapping[str, JointSettings]:
     [model] = [each.model for each in read_parts(world).movables if each.name == robot.name]
     [known] = [each for each in model.joints if each.name == joint]
-    settings = robot.joints.get(joint, JointSettings())
+    settings: Any = robot.joints.get(joint, JointSettings())
     more += float(getattr(known, kind))
     return {**robot.joints, joint: dataclasses.replace(settings, **{kind: more})}
 

@@ -8,6 +8,7 @@ how far an engine is from itself, if it repeats the step without what it remembe
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
@@ -50,7 +51,8 @@ class Floor:
         moments, recorded = episode.moments, episode.velocities
         masses = np.array([lab.simulation.mass_matrix(each.positions) for each in moments])
         repeated = np.array([lab.step(each).velocities for each in moments])
-        floor, size = norms(masses, repeated - recorded), norms(masses, recorded)
+        floor: Vector = norms(masses, repeated - recorded)
+        size: Vector = norms(masses, recorded)
         return cls(moments, masses, floor, FLOORS * floor + _ROUNDING * (1 + size))
 
     def apart(self, one: Laboratory, other: Laboratory, moments: Sequence[Moment]) -> Vector:
@@ -79,7 +81,7 @@ def norms(masses: Vector, differences: Vector) -> Vector:
 
 
 def _norm(mass: Vector, difference: Vector) -> float:
-    return float(np.sqrt(max(difference @ mass @ difference, 0.0)))
+    return math.sqrt(max(float(difference @ mass @ difference), 0.0))
 
 
 # Through what -----------------------------------------------------------------------------------
@@ -162,7 +164,9 @@ class Anatomy:
                 before, both = after, clear
         return found | self._in_the_air(labs, self._clear(both), before)
 
-    def _in_the_air(self, labs: Sequence[Laboratory], both: Both, before: float) -> dict[str, float]:
+    def _in_the_air(
+        self, labs: Sequence[Laboratory], both: Both, before: float
+    ) -> dict[str, float]:
         """Split what is left where nothing touches: limits that contacts hid, smooth motion."""
         found = {}
         changed = self._off_limits(both)
@@ -224,7 +228,8 @@ class Anatomy:
             mine = _of_bodies(contacts, bodies)
             return float(contacts["depth"][mine].max(initial=0.0))
 
-        if not any(depth(part.bodies) > _TOUCHES for part in layout.parts.values() if part.floating):
+        free = [part.bodies for part in layout.parts.values() if part.floating]
+        if not any(depth(bodies) > _TOUCHES for bodies in free):
             return None
         first, second = (self._lifted(moment, depth) for moment in both)
         return first, second

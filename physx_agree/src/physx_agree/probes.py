@@ -9,13 +9,13 @@ from __future__ import annotations
 
 import dataclasses
 from collections import defaultdict
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 import numpy as np
 
 from physx_agree.laboratory import Laboratory
-from physx_agree.models import Held
+from physx_agree.models import Held, Repair
 from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
 from physx_sim import Part, Simulation, World
@@ -27,6 +27,8 @@ _SETTLING, _SLIDING, _FALLING = 0.3, 0.1, 0.3
 """How long each part of a probe takes, in s."""
 _SPEED, _SLOWEST = 1.0, 0.1
 """At which speed bodies slide and fall, and above which a point counts as sliding, in m/s."""
+_STEADY = 0.9
+"""Cosine of the angle by which a sliding point may turn in a step."""
 _LIFT = 0.02
 """How far above its first place a body falls from, in m."""
 _FRICTION, _RESTITUTION = 0.03, 0.05
@@ -41,7 +43,7 @@ def friction_differences(one: Laboratory, other: Laboratory) -> list[Held]:
         ratio = second[pair] / max(first[pair], 1e-9)
         if abs(ratio - 1.0) > _FRICTION:
             text = f"friction of {' on '.join(pair)}: {first[pair]:.3g} | {second[pair]:.3g}"
-            found.append(Held("friction of contacts", text, _scaling("friction", pair, ratio)))
+            found.append(Held("friction of contacts", text, _sliding(pair, ratio)))
     return sorted(found, key=lambda held: held.text)
 
 
@@ -53,36 +55,48 @@ def restitution_differences(one: Laboratory, other: Laboratory) -> list[Held]:
         e, e_other = first[pair], second[pair]
         if abs(e - e_other) > _RESTITUTION:
             text = f"restitution of {' on '.join(pair)}: {e:.2g} | {e_other:.2g}"
-            ratio = e_other / e if min(e, e_other) > _RESTITUTION else e_other * np.inf
-            found.append(Held("restitution", text, _scaling("restitution", pair, ratio, e)))
+            found.append(Held("restitution", text, _bouncing(pair, e, e_other)))
     return sorted(found, key=lambda held: held.text)
 
 
-def _scaling(option: str, pair: Pair, ratio: float, value: float = 0.0) -> Any:
-    """Return a repair that divides an option of both bodies, or of the first of them, by a ratio.
-
-    A contact uses the smaller friction, but the product of the restitutions. An infinite ratio
-    stands for a restitution that only one engine has.
-    """
-    changed = pair if option == "friction" else pair[:1]
-
-    def new(thing: Any) -> Any:
-        if thing is None or getattr(thing, "name", "ground") not in changed:
-            return thing
-        now = getattr(thing, option)
-        return dataclasses.replace(
-            thing, **{option: now / ratio if np.isfinite(ratio) else max(value, 0.0)}
-        )
+def _sliding(pair: Pair, ratio: float) -> Repair:
+    """Return what divides the friction of both bodies by a ratio; a contact uses the smaller."""
 
     def repair(one: World, other: World) -> tuple[World, World]:
-        return one, dataclasses.replace(
-            other,
-            robots=[new(each) for each in other.robots],
-            objects=[new(each) for each in other.objects],
-            ground=new(other.ground),
-        )
+        return one, _changed(other, pair, lambda thing: {"friction": thing.friction / ratio})
 
     return repair
+
+
+def _bouncing(pair: Pair, e: float, e_other: float) -> Repair:
+    """Return what gives the first body of the engine that bounces less more restitution."""
+    low, high = sorted((e, e_other))
+
+    def more(thing: Any) -> dict[str, float]:
+        return {"restitution": thing.restitution * high / low if thing.restitution else high}
+
+    def repair(one: World, other: World) -> tuple[World, World]:
+        if e < e_other:
+            return _changed(one, pair[:1], more), other
+        return one, _changed(other, pair[:1], more)
+
+    return repair
+
+
+def _changed(
+    world: World, names: Sequence[str], changes: Callable[[Any], dict[str, float]]
+) -> World:
+    def new(thing: Any) -> Any:
+        if thing is None or getattr(thing, "name", "ground") not in names:
+            return thing
+        return dataclasses.replace(thing, **changes(thing))
+
+    return dataclasses.replace(
+        world,
+        robots=[new(each) for each in world.robots],
+        objects=[new(each) for each in world.objects],
+        ground=new(world.ground),
+    )
 
 
 # Experiments ------------------------------------------------------------------------------------
@@ -97,7 +111,6 @@ def frictions(lab: Laboratory) -> dict[Pair, float]:
             simulation.step(_count(simulation, _SETTLING))
             _push(simulation, part, _SPEED * np.array(direction))
             for _ in range(_count(simulation, _SLIDING)):
-                simulation.step(1)
                 for pair, ratio in _ratios(simulation):
                     found[pair].append(ratio)
     return {pair: float(np.median(ratios)) for pair, ratios in found.items() if len(ratios) > 1}
@@ -119,7 +132,8 @@ def restitutions(lab: Laboratory) -> dict[Pair, float]:
             forces = (contacts["force"] * contacts["normal"]).sum(axis=1)
             if len(forces) and forces.max() > 0:
                 hit = contacts[int(forces.argmax())]
-                before = _relative(simulation, hit, q, v) @ hit["normal"]
+                fall = simulation.period * np.array(lab.world.gravity)
+                before = (_relative(simulation, hit, q, v) + fall) @ hit["normal"]
                 now = simulation.velocities()
                 after = _relative(simulation, hit, q, now) @ hit["normal"]
                 if before < -0.5 * _SPEED:
@@ -153,15 +167,18 @@ def _push(simulation: Simulation, part: Part, velocity: Vector) -> None:
 
 
 def _ratios(simulation: Simulation) -> Iterator[tuple[Pair, float]]:
-    """Yield the ratio of tangential to normal force at each sliding point."""
+    """Step, and yield the ratio of tangential to normal force at each point that keeps sliding."""
+    ends = [(simulation.positions(), simulation.velocities())]
+    simulation.step(1)
+    ends.append((simulation.positions(), simulation.velocities()))
     contacts = simulation.contacts()
     forces = (contacts["force"] * contacts["normal"]).sum(axis=1)
-    q, v = simulation.positions(), simulation.velocities()
     for contact, force in zip(contacts, forces, strict=True):
         normal, total = contact["normal"], contact["force"]
-        slip = _relative(simulation, contact, q, v)
-        slip = slip - (slip @ normal) * normal
-        if force > 0.05 * forces.max() > 0 and np.linalg.norm(slip) > _SLOWEST:
+        slips = [_relative(simulation, contact, *end) for end in ends]
+        before, after = (slip - (slip @ normal) * normal for slip in slips)
+        slides = before @ after > _STEADY * np.linalg.norm(before) * np.linalg.norm(after)
+        if slides and np.linalg.norm(after) > _SLOWEST and force > 0.05 * forces.max() > 0:
             yield _pair(simulation, contact), float(np.linalg.norm(total - force * normal) / force)
 
 

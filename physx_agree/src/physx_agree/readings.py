@@ -15,7 +15,7 @@ from physx_core.errors import PhysxError
 from physx_sim import Layout
 
 _PLAIN = (bool, int, float, str, type(None), np.generic)
-_ENGINE = ("backend", "engine", "_engine")
+_ENGINE = (".backend", ".engine")
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,11 @@ def differences(one: Mapping[str, Any], other: Mapping[str, Any]) -> list[Differ
     """Return what differs between flat descriptions."""
     names = dict.fromkeys([*one, *other])
     pairs = {name: (one.get(name, MISSING), other.get(name, MISSING)) for name in names}
-    return [Difference(name, pair) for name, pair in pairs.items() if not _same(*pair)]
+    return [
+        Difference(name, pair)
+        for name, pair in pairs.items()
+        if not (_same(*pair) or name.endswith(_ENGINE))
+    ]
 
 
 def flat(thing: Any, path: str = "") -> dict[str, Any]:
@@ -82,12 +86,11 @@ def above_the_engine(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     simulator = robot_below(env).simulator
     simulator.prepare()
     periods = simulator.control_period, simulator.observe_period
-    found = {"periods.control": periods[0], "periods.observe": periods[1]}
+    found: dict[str, Any] = {"periods.control": periods[0], "periods.observe": periods[1]}
     found |= flat(simulator.motors, "motors") | flat(simulator.sensors, "sensors")
     for name, owner in owners(env).items():
-        attributes = {key: value for key, value in vars(owner).items() if key not in _ENGINE}
         found[name] = type(owner).__qualname__
-        found |= flat(attributes, name)
+        found |= flat(vars(owner), name)
     return found
 
 
@@ -103,9 +106,7 @@ def owners(env: gymnasium.Env[Any, Any]) -> dict[str, Any]:
     return found
 
 
-def give(
-    env: gymnasium.Env[Any, Any], difference: Difference
-) -> gymnasium.Env[Any, Any] | None:
+def give(env: gymnasium.Env[Any, Any], difference: Difference) -> gymnasium.Env[Any, Any] | None:
     """Give a task the first of two values; return the task, or None if that is impossible.
 
     Args:
@@ -125,7 +126,7 @@ def give(
     except PhysxError:
         return None
     known = owners(env)
-    if owner not in known or value is MISSING and option:
+    if owner not in known or (value is MISSING and option):
         return None
     if value is MISSING:
         return _without(env, known[owner])
@@ -135,9 +136,7 @@ def give(
     return env
 
 
-def _without(
-    env: gymnasium.Env[Any, Any], wrapper: Any
-) -> gymnasium.Env[Any, Any] | None:
+def _without(env: gymnasium.Env[Any, Any], wrapper: Any) -> gymnasium.Env[Any, Any] | None:
     """Return a task without one of its wrappers."""
     if not isinstance(wrapper, gymnasium.Wrapper):
         return None

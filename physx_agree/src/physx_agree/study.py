@@ -87,11 +87,15 @@ def agree(
         episode = record(first, next(iter(makers.values()))(first)(seeds[0]), seeds[0], steps)
     finally:
         first.close()
+    labels = list(zip(engines, names, strict=True))
     partings = [
-        Diagnosis(make, (engines[0], engine), episode, seeds[0]).parting() for engine in engines[1:]
+        Diagnosis(make, (labels[0], each), episode, seeds[0]).parting() for each in labels[1:]
     ]
     label = task if isinstance(task, str) else getattr(task, "__qualname__", str(task))
-    return Agreement(label, metric, names, seeds, figures, rankings(figures), partings)
+    ranked = tuple(rankings(figures))
+    return Agreement(
+        label, metric, tuple(names), tuple(seeds), tuple(figures), ranked, tuple(partings)
+    )
 
 
 def _values(
@@ -111,10 +115,11 @@ def _makers(policies: Sequence[str] | Policies, trust: bool) -> dict[str, Maker]
         return {RANDOM: _random}
     if isinstance(policies, Mapping):
         return {name: _whatever_the_seed(make) for name, make in policies.items()}
-    return {
-        path: _whatever_the_seed(lambda env, path=path: Policy(path, env, trust=trust).act)
-        for path in policies
-    }
+    return {path: _whatever_the_seed(_network(path, trust)) for path in policies}
+
+
+def _network(path: str, trust: bool) -> Callable[[gymnasium.Env[Any, Any]], Act]:
+    return lambda env: Policy(path, env, trust=trust).act
 
 
 def _whatever_the_seed(make: Callable[[gymnasium.Env[Any, Any]], Act]) -> Maker:
@@ -136,7 +141,7 @@ def _random(env: gymnasium.Env[Any, Any]) -> Callable[[int], Act]:
 
 def _names(engines: Sequence[Any]) -> list[str]:
     """Return different names of engines."""
-    names = [each if isinstance(each, str) else type(each).__name__ for each in engines]
+    names = [each if isinstance(each, str) else each.__name__ for each in engines]
     return [
         name if names.index(name) == place else f"{name} ({names[: place + 1].count(name)})"
         for place, name in enumerate(names)

@@ -61,7 +61,9 @@ def parting_text(parting: Parting) -> list[str]:
     told = f"{first} and {second}: {parting.parted} of {parting.steps} physics steps part them"
     if parting.first is not None:
         at = f"{parting.first} ({parting.first * parting.period:.4g} s)"
-        told += f", the first is step {at}{', through ' if parting.through else ''}{parting.through}"
+        told += (
+            f", the first is step {at}{', through ' if parting.through else ''}{parting.through}"
+        )
     apart, floor = parting.apart, parting.floor
     found = [
         f"{told}.",
@@ -70,7 +72,9 @@ def parting_text(parting: Parting) -> list[str]:
     ]
     if parting.away is not None:
         rate = "" if parting.growth is None else f", growing by {parting.growth:.2g} per s"
-        found.append(f"Under the same actions they are 1e-6 apart after {parting.away:.4g} s{rate}.")
+        found.append(
+            f"Under the same actions they are 1e-6 apart after {parting.away:.4g} s{rate}."
+        )
     return found
 
 
@@ -79,11 +83,16 @@ def unexplained_text(parting: Parting) -> str:
     return f"{100 * parting.unexplained:.2g} % unexplained"
 
 
+def percent(share: float) -> str:
+    """Return a share as text; what lies above the engine or only in probes has none."""
+    return f"{100 * share:.0f} %" if share >= 0.005 else "-"
+
+
 def _parting_lines(parting: Parting) -> Iterator[str]:
     for text in parting_text(parting):
         yield from textwrap.wrap(text, _WIDTH)
     for cause in parting.causes:
-        share = f"{100 * cause.share:.0f} %" if cause.share >= 0.005 else "-"
+        share = percent(cause.share)
         told = f"{cause.kind}: {cause.text} [{cause.confirmed}]"
         begin = f"  {share:>5}  "
         yield from textwrap.wrap(
