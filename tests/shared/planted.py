@@ -37,10 +37,12 @@ def planted(engine: str, change: Callable[[World], World]) -> type[Backend]:
 class Stagger(RobotEnv):
     """An ant that falls onto the ground and staggers under torques held for five steps."""
 
-    def __init__(self, *, backend: Any = "dart", world: World | None = None) -> None:
+    def __init__(
+        self, *, backend: Any = "dart", world: World | None = None, duration: float = 0.75
+    ) -> None:
         ground = Ground(friction=0.8)
         world = world or World([Robot("ant", fixed_base=False)], PERIOD, ground=ground)
-        super().__init__(Simulator(world, backend=backend, sensors=()), 5 * PERIOD, 2.0)
+        super().__init__(Simulator(world, backend=backend, sensors=()), 5 * PERIOD, duration)
 
     def _sample_state(self) -> tuple[np.ndarray, np.ndarray]:
         q = self.simulator.place_on_ground(self._neutral())
@@ -167,8 +169,26 @@ class Rewarded(Stagger):
         return 0.0
 
 
-class Free(Stagger):
-    """A robot without ground."""
+class Chain(Stagger):
+    """Six rods in a row, which fall from the side and move chaotically."""
+
+    def __init__(self, **options: Any) -> None:
+        super().__init__(**options, duration=8.0)
 
     def _sample_state(self) -> tuple[np.ndarray, np.ndarray]:
-        return self._neutral() + 0.5, np.zeros(len(self.robot_state.v))
+        return np.array([2.0, *np.zeros(5)]), np.zeros(6)
+
+
+def chain(path: Path) -> Path:
+    """Write a file of a chain of rods; return it."""
+    links = ['<link name="rod0"/>']
+    for number in range(1, 7):
+        links.append(
+            f'<joint name="joint{number}" type="continuous"><parent link="rod{number - 1}"/>'
+            f'<child link="rod{number}"/><origin xyz="0 0 {0.0 if number == 1 else -0.2}"/>'
+            f'<axis xyz="0 1 0"/></joint><link name="rod{number}"><inertial>'
+            '<origin xyz="0 0 -0.1"/><mass value="0.5"/><inertia ixx="0.002" iyy="0.002" '
+            'izz="0.0002" ixy="0" ixz="0" iyz="0"/></inertial></link>'
+        )
+    path.write_text(f'<robot name="chain">{"".join(links)}</robot>', encoding="utf-8")
+    return path

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import warnings
-from collections.abc import Iterator
-from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
 
@@ -101,13 +99,3 @@ class Laboratory(Closeable):
     def close(self) -> None:
         """Free the simulation."""
         self.simulation.close()
-
-
-@contextmanager
-def laboratories(*labs: Laboratory) -> Iterator[tuple[Laboratory, ...]]:
-    """Close laboratories at the end."""
-    try:
-        yield labs
-    finally:
-        for lab in labs:
-            lab.close()

@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from physx_agree.episodes import Episode
-from physx_agree.laboratory import Laboratory, Moment, Outcome, laboratories
+from physx_agree.laboratory import Laboratory, Moment, Outcome
 from physx_core.typing import Records, Vector
 from physx_sim import World
 
@@ -120,14 +120,15 @@ class Anatomy:
             gap: How much deeper the same bodies are on the second engine, in m.
         """
         self._labs, self._gap = (one, other), gap
-        self._smooth: tuple[Laboratory, Laboratory] | None = None
+        self._made: dict[str, tuple[Laboratory, Laboratory]] = {}
 
     def __enter__(self) -> Anatomy:
         return self
 
     def __exit__(self, *ignored: object) -> None:
-        for lab in self._smooth or ():
-            lab.close()
+        for labs in self._made.values():
+            for lab in labs:
+                lab.close()
 
     def shares(self, moment: Moment) -> dict[str, float]:
         """Return how much of the difference after a step each cause makes, in sqrt(J)."""
@@ -147,7 +148,7 @@ class Anatomy:
         return found | rest
 
     def _of_worlds(
-        self, labs: tuple[Laboratory, ...], both: Both, before: float
+        self, labs: tuple[Laboratory, Laboratory], both: Both, before: float
     ) -> dict[str, float]:
         found = {}
         if self._contacts(labs, both):
@@ -165,7 +166,7 @@ class Anatomy:
         return found | self._in_the_air(labs, self._clear(both), before)
 
     def _in_the_air(
-        self, labs: Sequence[Laboratory], both: Both, before: float
+        self, labs: tuple[Laboratory, Laboratory], both: Both, before: float
     ) -> dict[str, float]:
         """Split what is left where nothing touches: limits that contacts hid, smooth motion."""
         found = {}
@@ -179,15 +180,15 @@ class Anatomy:
             found[INTEGRATOR], before = before - after, after
         return found | {UNEXPLAINED: before}
 
-    def _apart(self, labs: Sequence[Laboratory], both: Both) -> float:
+    def _apart(self, labs: tuple[Laboratory, Laboratory], both: Both) -> float:
         mass = labs[0].simulation.mass_matrix(both[0].positions)
         first, second = self._outcomes(labs, both)
         return _norm(mass, second.velocities - first.velocities)
 
-    def _outcomes(self, labs: Sequence[Laboratory], both: Both) -> list[Outcome]:
+    def _outcomes(self, labs: tuple[Laboratory, Laboratory], both: Both) -> list[Outcome]:
         return [lab.step(moment) for lab, moment in zip(labs, both, strict=True)]
 
-    def _contacts(self, labs: Sequence[Laboratory], both: Both) -> bool:
+    def _contacts(self, labs: tuple[Laboratory, Laboratory], both: Both) -> bool:
         return any(len(outcome.contacts) for outcome in self._outcomes(labs, both))
 
     def _off_limits(self, both: Both) -> Both | None:
@@ -248,19 +249,27 @@ class Anatomy:
         return moment.but(positions=q)
 
     def _frictionless(self) -> tuple[Laboratory, Laboratory]:
-        if self._smooth is None:
-            first, second = (lab.with_world(_slippery(lab.world)) for lab in self._labs)
-            self._smooth = first, second
-        return self._smooth
+        return self._changed("frictionless", self._labs, _slippery)
 
-    def _in_half_steps(self, labs: Sequence[Laboratory], both: Both) -> float:
+    def _changed(
+        self, how: str, labs: tuple[Laboratory, Laboratory], change: Callable[[World], World]
+    ) -> tuple[Laboratory, Laboratory]:
+        """Return laboratories with changed worlds, which are built once."""
+        key = f"{how} {self._labs.index(labs[0]) if labs[0] in self._labs else 'changed'}"
+        if key not in self._made:
+            first, second = (lab.with_world(change(lab.world)) for lab in labs)
+            self._made[key] = first, second
+        return self._made[key]
+
+    def _in_half_steps(self, labs: tuple[Laboratory, Laboratory], both: Both) -> float:
         """Return the difference after two steps of half the period."""
-        period = 0.5 * labs[0].simulation.period
-        halved = [lab.with_world(dataclasses.replace(lab.world, period=period)) for lab in labs]
-        with laboratories(*halved) as (first, second):
-            mass = first.simulation.mass_matrix(both[0].positions)
-            ends = first.step(both[0], 2).velocities, second.step(both[1], 2).velocities
-        return _norm(mass, ends[1] - ends[0])
+        first, second = self._changed("halved", labs, _halved)
+        mass = first.simulation.mass_matrix(both[0].positions)
+        return _norm(mass, second.step(both[1], 2).velocities - first.step(both[0], 2).velocities)
+
+
+def _halved(world: World) -> World:
+    return dataclasses.replace(world, period=0.5 * world.period)
 
 
 def _slippery(world: World) -> World:

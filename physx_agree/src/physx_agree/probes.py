@@ -25,8 +25,9 @@ Pair = tuple[str, str]
 
 _SETTLING, _SLIDING, _FALLING = 0.3, 0.1, 0.3
 """How long each part of a probe takes, in s."""
-_SPEED, _SLOWEST = 1.0, 0.1
-"""At which speed bodies slide and fall, and above which a point counts as sliding, in m/s."""
+_SPEED, _SLOWEST = 2.0, 1.0
+"""At which speed bodies slide and fall, and above which a point counts as sliding, in m/s: where
+contacts are soft, friction at lower speeds is not all that it can be."""
 _STEADY = 0.9
 """Cosine of the angle by which a sliding point may turn in a step."""
 _LIFT = 0.02
