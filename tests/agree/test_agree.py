@@ -10,8 +10,9 @@ import planted
 import pytest
 from planted import Stagger, late_on, plants
 
-from physx_agree import Agreement, agree, read, store
+from physx_agree import Agreement, agree, read_agreement, store_agreement
 from physx_agree.figures import Figure, interval_of, rankings, student
+from physx_core import DataGeneration, DatasetConfig, EnvironmentConfig, NetworkConfig, Training
 from physx_core.cli import main
 from physx_core.errors import ConfigError, SessionError
 from physx_report import write_report
@@ -198,12 +199,12 @@ def command(monkeypatch, tmp_path, capsys):
 
 def test_the_command_prints_80_columns_and_keeps_its_result(command, tmp_path):
     text = command("--engines", "dart", "pinocchio", "--output", "kept")
-    assert store("again", read("kept")) is None
-    assert read("again") == read("kept")
+    assert store_agreement("again", read_agreement("kept")) is None
+    assert read_agreement("again") == read_agreement("kept")
     lines = text.splitlines()
     assert max(map(len, lines)) <= 80
     assert "0 of" in text and "physics steps part them" in text
-    kept = read("kept")
+    kept = read_agreement("kept")
     assert isinstance(kept, Agreement)
     assert lines[: len(str(kept).splitlines())] == str(kept).splitlines()
     page = write_report("kept").read_text()
@@ -216,10 +217,30 @@ def test_the_command_prints_json(command):
     assert [each["engine"] for each in found["figures"]] == ["dart", "mujoco"]
 
 
+@pytest.mark.processes
+def test_the_command_ranks_trained_policies(command, tmp_path):
+    options = {"session_dir": str(tmp_path), "quiet": True}
+    task = EnvironmentConfig(
+        f"gym/{TASK.partition(':')[2]}", {"continuous": True}, as_tcp_ip_client=False, seed=0
+    )
+    DataGeneration(task, session_name="data", batch_nb=1, batch_size=50, **options).execute()
+    fields = {"net_fields": "observation", "opt_fields": "action"}
+    for name in ("one", "two"):
+        network = NetworkConfig("toy/linear", network_kwargs=fields)
+        data = DatasetConfig(str(tmp_path / "data"))
+        Training(network, data, session_name=name, epoch_nb=1, batch_size=50, **options).execute()
+    policies = ("--policy", "one", "--policy", "two", "--env-kwargs", "continuous=True")
+    found = json.loads(command("--engines", "dart", "pinocchio", "--json", *policies))
+    assert [each["policy"] for each in found["figures"]] == ["one", "one", "two", "two"]
+    [ranking] = found["rankings"]
+    assert sorted(ranking["policies"]) == ["one", "two"]
+    assert ranking["margins"]["dart"] == ranking["margins"]["pinocchio"]
+
+
 def test_a_damaged_result_says_so(command, tmp_path):
     command("--engines", "dart", "dart", "--output", "kept")
     place = tmp_path / "kept" / "agreement.json"
-    assert read(tmp_path) is None
+    assert read_agreement(tmp_path) is None
     place.write_text(place.read_text().replace('"partings"', '"parting"'))
     with pytest.raises(SessionError, match="damaged"):
-        read("kept")
+        read_agreement("kept")

@@ -238,6 +238,13 @@ def test_report_writes_a_page(python, add, run):
 
 
 @pytest.mark.faults
+def test_agree_says_which_engine_is_missing(python, add, run):
+    add("physx_agree")
+    missing = run(*PHYSX, "agree", "physx_gym:physx/Cartpole-v0", python=python, ok=False)
+    assert missing.returncode == 1 and "physx_dart" in missing.stderr
+
+
+@pytest.mark.faults
 def test_remote_works_with_the_core_alone(python, add, run, tmp_path):
     add("physx_remote")
     (tmp_path / "program.py").write_text(SERVE)

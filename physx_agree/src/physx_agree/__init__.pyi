@@ -5,7 +5,7 @@ from .causes import Cause as Cause
 from .causes import Parting as Parting
 from .figures import Figure as Figure
 from .figures import Ranking as Ranking
-from .stored import read as read
-from .stored import store as store
+from .stored import read_agreement as read_agreement
+from .stored import store_agreement as store_agreement
 from .study import agree as agree
 from .version import __version__ as __version__

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import textwrap
 from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
+from physx_agree import wording
 from physx_agree.causes import Parting
 from physx_agree.figures import Figure, Ranking
 
@@ -44,6 +46,15 @@ class Agreement:
         return json.dumps(self.to_plain(), indent=1)
 
     def __str__(self) -> str:
-        from physx_agree.wording import lines_of
-
-        return "\n".join(lines_of(self))
+        head = f"{self.task}: {self.metric} of {len(self.seeds)} episodes"
+        lines = [
+            *textwrap.wrap(f"{head}, seeds {wording.span(self.seeds)}", wording.WIDTH),
+            "",
+            *wording.columns([wording.HEAD, *map(wording.row_of, self.figures)]),
+        ]
+        for ranking in self.rankings:
+            text = wording.ranking_text(ranking)
+            lines += ["", *textwrap.wrap(text, wording.WIDTH, subsequent_indent="  ")]
+        for parting in self.partings:
+            lines += ["", *wording.parting_lines(parting)]
+        return "\n".join(lines)

@@ -10,7 +10,7 @@ from physx_report import Run, Section, Table, Text
 
 
 def _blocks(run: Run) -> Iterator[Text | Table]:
-    found = stored.read(run.path)
+    found = stored.read_agreement(run.path)
     if found is None:
         return
     yield Text([

@@ -16,7 +16,7 @@ KIND = "agreement"
 _LARGEST = 2**24
 
 
-def store(session: str | Path, agreement: Agreement, seconds: float = 0.0) -> None:
+def store_agreement(session: str | Path, agreement: Agreement, seconds: float = 0.0) -> None:
     """Keep an agreement in a session's folder, which is made if it does not exist.
 
     Args:
@@ -36,7 +36,7 @@ def store(session: str | Path, agreement: Agreement, seconds: float = 0.0) -> No
     store_result(folder, Result(KIND, folder.name, seconds, str(agreement).splitlines()))
 
 
-def read(session: str | Path) -> Agreement | None:
+def read_agreement(session: str | Path) -> Agreement | None:
     """Return a session's agreement; None if it has none.
 
     Raises:

@@ -1,28 +1,15 @@
-"""Wording: an agreement as text of 80 columns."""
+"""Wording: figures, rankings and partings as text of 80 columns."""
 
 from __future__ import annotations
 
 import textwrap
 from collections.abc import Iterator, Sequence
 
-from physx_agree.agreement import Agreement
 from physx_agree.causes import Parting
 from physx_agree.figures import Figure, Interval, Ranking
 
-_WIDTH = 80
-
-
-def lines_of(agreement: Agreement) -> list[str]:
-    """Return an agreement as lines of at most 80 columns."""
-    seeds = agreement.seeds
-    head = f"{agreement.task}: {agreement.metric} of {len(seeds)} episodes, seeds {span(seeds)}"
-    found = [*textwrap.wrap(head, _WIDTH), ""]
-    found += columns([HEAD, *map(row_of, agreement.figures)])
-    for ranking in agreement.rankings:
-        found += ["", *textwrap.wrap(ranking_text(ranking), _WIDTH, subsequent_indent="  ")]
-    for parting in agreement.partings:
-        found += ["", *_parting_lines(parting)]
-    return found
+WIDTH = 80
+"""Longest line, in columns."""
 
 
 def span(seeds: Sequence[int]) -> str:
@@ -88,28 +75,29 @@ def percent(share: float) -> str:
     return f"{100 * share:.0f} %" if share >= 0.005 else "-"
 
 
-def _parting_lines(parting: Parting) -> Iterator[str]:
+def parting_lines(parting: Parting) -> Iterator[str]:
+    """Yield where and why two engines part, as lines."""
     for text in parting_text(parting):
-        yield from textwrap.wrap(text, _WIDTH)
+        yield from textwrap.wrap(text, WIDTH)
     for cause in parting.causes:
         share = percent(cause.share)
         told = f"{cause.kind}: {cause.text} [{cause.confirmed}]"
         begin = f"  {share:>5}  "
         yield from textwrap.wrap(
-            told, _WIDTH, initial_indent=begin, subsequent_indent=" " * len(begin),
+            told, WIDTH, initial_indent=begin, subsequent_indent=" " * len(begin),
             break_on_hyphens=False,
         )  # fmt: skip
     if parting.parted:
         yield f"         {unexplained_text(parting)}"
     for text in parting.unconfirmed:
         told = f"differs without moving a step: {text}"
-        yield from textwrap.wrap(told, _WIDTH, initial_indent="  ", subsequent_indent="    ")
+        yield from textwrap.wrap(told, WIDTH, initial_indent="  ", subsequent_indent="    ")
 
 
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:
     """Return rows as lines with aligned columns; the first cells are shortened to fit."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
-    first = max(8, widths[0] - max(0, sum(widths) + 2 * len(widths) - 2 - _WIDTH))
+    first = max(8, widths[0] - max(0, sum(widths) + 2 * len(widths) - 2 - WIDTH))
     found = []
     for cell, *cells in rows:
         short = cell if len(cell) <= first else f"...{cell[3 - first :]}"

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from physx_agree import agree, store
+from physx_agree import agree, store_agreement
 from physx_core.cli import argument_registry, show
 from physx_core.errors import ConfigError
 
@@ -62,6 +62,6 @@ def run(words: Sequence[str]) -> None:
     )
     show(found.to_json() if options.json else found)
     if options.output is not None:
-        store(options.output, found, time.monotonic() - begin)
+        store_agreement(options.output, found, time.monotonic() - begin)
         if not options.json:
             show(f"\nresult: {options.output}; physx report {options.output} makes a page of it")
