@@ -48,7 +48,7 @@ class Parting:
         unconfirmed: What differs too, but moved no step.
         unexplained: Share of all differences that no cause explains; 0 if no step parts.
         away: When the episodes, under the same actions, are 1e-6 rad or m apart, in s; None: never.
-        growth: Rate at which they move apart, in 1/s; None: too few steps to say.
+        growth: Rate at which they move apart, in 1/s; None: too few steps to say, or they do not.
     """
 
     engines: tuple[str, str]

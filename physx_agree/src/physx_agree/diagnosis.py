@@ -72,6 +72,7 @@ class Diagnosis:
         self._causes: list[Cause] = []
         self._unconfirmed: list[str] = []
         self._at_first: dict[str, float] = {}
+        self._after: dict[Laboratory, Vector] = {}
         self._first: int | None = None
 
     def parting(self) -> Parting:
@@ -176,9 +177,9 @@ class Diagnosis:
             values = getattr(first, field.name), getattr(second, field.name)
             found = differences(*(flat(value, f"world.{field.name}") for value in values))
             if found:
-                world = dataclasses.replace(self._labs[1].world, **{field.name: values[0]})
                 text = "; ".join(map(str, found))
-                self._try(Held("description", text, lambda one, _, world=world: (one, world)))  # type: ignore[misc]
+                held = Held("description", text, _same(field.name))
+                self._repair(held, lambda before: "")
 
     def _compare_torque_limits(self) -> None:
         layouts = [lab.simulation.layout for lab in self._labs]
@@ -189,12 +190,10 @@ class Diagnosis:
             self._moments = [
                 each.but(commands=np.clip(each.commands, -most, most)) for each in self._moments
             ]
+            self._after.clear()
             text = "; ".join(map(str, torques))
             self._settle(Held("torque limit", text), "")
         self._limits = [str(each) for each in found if each not in torques]
-
-    def _try(self, held: Held) -> None:
-        self._repair(held, lambda before: "")
 
     def _repair(self, held: Held, moves: Callable[[tuple[Laboratory, ...]], str]) -> None:
         """Take a difference away; keep it as a cause if anything moves.
@@ -279,7 +278,12 @@ class Diagnosis:
     # How the engines act --------------------------------------------------------------------
 
     def _measure(self) -> Vector:
-        return self._floor.apart(*self._labs, self._moments)
+        """Return how far the engines are apart after each step, shape (steps,), in sqrt(J)."""
+        for lab in self._labs:
+            if lab not in self._after:
+                self._after[lab] = np.array([lab.step(each).velocities for each in self._moments])
+        first, second = (self._after[lab] for lab in self._labs)
+        return norms(self._floor.masses, second - first)
 
     def _dissect(self) -> float:
         """Look at steps one by one for what is left; return the unexplained share."""
@@ -291,7 +295,6 @@ class Diagnosis:
         one, other = self._labs
         moments = self._moments
         gap = gap_between(one, other, moments[:: max(1, len(moments) // 100)])
-        found = []
         with Anatomy(one, other, gap) as anatomy:
             found = [anatomy.shares(moments[k]) for k in chosen]
         whole = sum(sum(each.values()) for each in found) or 1.0
@@ -312,6 +315,15 @@ class Diagnosis:
         named = {cause.kind for cause in self._causes} & TEXTS.keys()
         rest = [value for each in found for kind, value in each.items() if kind not in named]
         return sum(rest) * scale
+
+
+def _same(field: str) -> models.Repair:
+    """Return what gives the second world a field of the first."""
+
+    def repair(one: World, other: World) -> tuple[World, World]:
+        return one, dataclasses.replace(other, **{field: getattr(one, field)})
+
+    return repair
 
 
 def _commands_apart(one: Episode, other: Episode) -> float:
@@ -348,4 +360,4 @@ def _trajectories(one: Episode, other: Episode) -> tuple[float | None, float | N
     if len(growing) < 10:
         return away, None
     rate = np.polyfit(times[growing], np.log(distances[growing]), 1)[0]
-    return away, float(rate)
+    return away, float(rate) if rate > 0 else None

@@ -34,13 +34,11 @@ class Floor:
     """What an engine makes of each step of an episode when it repeats it, shape (steps, ...) each.
 
     Attributes:
-        moments: What the steps begin with.
         masses: Mass matrices.
         floor: How far the first engine is from itself without its memory, in sqrt(J).
         bound: Up to which difference a step does not part engines, in sqrt(J).
     """
 
-    moments: Sequence[Moment]
     masses: Vector
     floor: Vector
     bound: Vector
@@ -53,20 +51,7 @@ class Floor:
         repeated = np.array([lab.step(each).velocities for each in moments])
         floor: Vector = norms(masses, repeated - recorded)
         size: Vector = norms(masses, recorded)
-        return cls(moments, masses, floor, FLOORS * floor + _ROUNDING * (1 + size))
-
-    def apart(self, one: Laboratory, other: Laboratory, moments: Sequence[Moment]) -> Vector:
-        """Return how far two engines are apart after each step, shape (steps,), in sqrt(J).
-
-        Neither remembers earlier steps.
-
-        Args:
-            one: The first engine, possibly with repairs.
-            other: The second engine, likewise.
-            moments: What the steps begin with.
-        """
-        ends = [np.array([lab.step(each).velocities for each in moments]) for lab in (one, other)]
-        return norms(self.masses, ends[1] - ends[0])
+        return cls(masses, floor, FLOORS * floor + _ROUNDING * (1 + size))
 
 
 def norms(masses: Vector, differences: Vector) -> Vector:

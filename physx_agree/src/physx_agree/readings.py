@@ -56,7 +56,7 @@ def flat(thing: Any, path: str = "") -> dict[str, Any]:
 
 def _walk(thing: Any, path: str) -> Iterator[tuple[str, Any]]:
     if dataclasses.is_dataclass(thing):
-        yield f"{path}.", type(thing).__name__
+        yield path, type(thing).__name__
         for field in dataclasses.fields(thing):
             yield from _walk(getattr(thing, field.name), f"{path}.{field.name}")
     elif isinstance(thing, Mapping):

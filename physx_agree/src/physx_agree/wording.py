@@ -67,7 +67,7 @@ def parting_text(parting: Parting) -> list[str]:
 
 def unexplained_text(parting: Parting) -> str:
     """Return how much no cause explains."""
-    return f"{100 * parting.unexplained:.2g} % unexplained"
+    return f"{100 * parting.unexplained:.1f} % unexplained"
 
 
 def percent(share: float) -> str:
