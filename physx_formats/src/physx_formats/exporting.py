@@ -62,7 +62,7 @@ def export(
             f"{listed(table.mode for table in tables)}."
         )
     free = [f.name for table in tables for f in table.fields.values() if f.free_axis]
-    if free:
+    if free and not form.free_axes:
         raise ExchangeError(
             f"{to} holds rows of one size, but these fields have a free axis: {listed(free)}. Read "
             "them from the dataset's HDF5 files, or leave them out with `physx edit`."
