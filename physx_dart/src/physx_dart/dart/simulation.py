@@ -7,7 +7,7 @@ position and velocity limits, servos, and Coulomb friction are constraints of it
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import dartpy
@@ -16,10 +16,16 @@ from dartpy import constraint
 from dartpy.simulation import CollisionDetectorType
 
 from physx_core.errors import UnknownOptionError, listed
+from physx_core.rotations import to_matrix
 from physx_core.typing import Records, Vector
 from physx_dart.dart.bonds import bonded
 from physx_dart.dart.contacts import ContactReader
-from physx_dart.dart.loading import attach_shapes, static_skeleton
+from physx_dart.dart.loading import (
+    attach_shapes,
+    attach_static,
+    place_skeleton,
+    static_skeleton,
+)
 from physx_dart.dart.skeleton import DartRobot
 from physx_sim import FEATURES, Simulation, World
 from physx_sim.engines import (
@@ -82,6 +88,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
         "exact_restore": "not with the detector `dart` and an iterative solver",
         "isotropic_friction": "not with the solver `dantzig`",
         "joint_wrenches": "not while anything is attached",
+        "moving_statics": "a surface that moves along itself pushes what touches its ends",
         "mimic": "what contacts, limits and servos change is corrected in the next step",
     }
 
@@ -112,7 +119,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
         bodies = [body for robot in robots for body in robot.bodies]
         bodies += [skeleton.getBodyNode(0) for skeleton in self._statics]
         self._nodes, self._bonds = bodies, dict[int, tuple[Bond, Any]]()
-        immobile = [[each.getBodyNode(0)] for each in self._statics]
+        immobile = [[body] for body in bodies[len(bodies) - len(self._statics) :]]
         immobile += [robot.bodies for robot in robots if not robot.movable.moves]
         _disable_contacts(self._world, immobile)
         if world.contacts == "static":
@@ -169,6 +176,29 @@ class DartSimulation(RobotSimulation[DartRobot]):
         self._world.setGravity(list(gravity))
         for robot in self._robots:
             robot.change_gravity(gravity)
+
+    def change_parts(self, before: Parts) -> None:
+        """Take over masses, friction, and ground."""
+        for robot, old, new in zip(self._robots, before.movables, self.parts.movables, strict=True):
+            if new is not old:
+                robot.change(new)
+        for skeleton, was, static in zip(
+            self._statics, before.statics, self.parts.statics, strict=False
+        ):
+            if static is not was:
+                attach_static(skeleton.getBodyNode(0), static)
+
+    def hide(self, bodies: Sequence[int]) -> None:
+        """Let only bodies that are not among these touch."""
+        for place, node in enumerate(self._nodes):
+            node.setCollidable(place not in bodies)
+
+    def place_static(self, static: int, pose: Vector, velocity: Vector, surface: Vector) -> None:
+        """Place a static body for the next step."""
+        if self._statics:
+            moved = velocity.copy()
+            moved[:3] += to_matrix(pose[3:]) @ surface
+            place_skeleton(self._statics[static], pose, moved)
 
     def bind(self, number: int, bond: Bond) -> None:
         """Hold two bodies together until `unbind`."""
