@@ -66,7 +66,7 @@ class Scenery:
     def moving(self) -> list[int]:
         """Return the static bodies that move, or whose surfaces do."""
         moves = self.velocities.any(axis=1) | self.surfaces.any(axis=1)
-        return list(map(int, moves.nonzero()[0]))
+        return list(map(int, np.flatnonzero(moves)))
 
     def advance(self, place: int, period: float) -> None:
         """Move a static body for a time, in s."""
