@@ -14,10 +14,10 @@ import numpy as np
 from physx_core.errors import UnknownOptionError
 from physx_core.typing import Records, Vector
 from physx_mujoco.algorithms import MujocoAlgorithms
+from physx_mujoco.contact_rows import ContactRows
 from physx_mujoco.drives import Drives
 from physx_mujoco.model import SPARE, ModelBuilder, WorldModel, quaternion_of
 from physx_mujoco.robot import MujocoRobot, Running
-from physx_mujoco.scenery import MovingScenery
 from physx_sim import CONTACT, FEATURES, Simulation, World
 from physx_sim.engines import (
     RK4_LACKS,
@@ -91,8 +91,8 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
             MujocoRobot(movable, part, self._world.bodies[part.bodies], self._running)
             for movable, part in zip(parts.movables, layout.parts.values(), strict=True)
         ]
-        self._prescribed = MovingScenery(self._world, data)
-        self._drives = Drives(layout, self._running, self._prescribed.step)
+        self._contact_rows = ContactRows(self._world, data)
+        self._drives = Drives(layout, self._running, self._contact_rows.step)
         self._touches = model.geom_contype.copy(), model.geom_conaffinity.copy()
         super().__init__(parts, robots, () if world.integrator == "euler" else RK4_LACKS)
 
@@ -125,13 +125,17 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
 
     def _run(self, n: int) -> None:
         running, data = self._running, self._running.data
-        if self._drives.idle:
+        if self._drives.idle and not self._contact_rows.active:
             if n > 1:
                 mujoco.mj_step(running.model, data, n - 1)
             running.positions[:], running.velocities[:] = data.qpos, data.qvel
-            self._prescribed.step()
-        else:
-            for _ in range(n):
+            mujoco.mj_step(running.model, data)
+            return
+        for _ in range(n):
+            if self._drives.idle:
+                running.positions[:], running.velocities[:] = data.qpos, data.qvel
+                self._contact_rows.step()
+            else:
                 self._drives.step()
 
     def change_gravity(self, gravity: tuple[float, ...]) -> None:
@@ -156,7 +160,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
     def place_static(self, static: int, pose: Vector, velocity: Vector, surface: Vector) -> None:
         """Place a static body for the next step."""
         if len(self._world.statics):
-            self._prescribed.place(static, pose, velocity, surface)
+            self._contact_rows.place(static, pose, velocity, surface)
 
     def bind(self, number: int, bond: Bond) -> None:
         """Hold two bodies together until `unbind`.
@@ -192,6 +196,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
     def clear_warm_start(self) -> None:
         """Make the state alone determine what follows."""
         self._running.data.qacc_warmstart[:] = 0.0
+        self._contact_rows.expect_depth()
 
     def read_contacts(self) -> Records:
         """Return the contacts of the last physics step."""
@@ -216,7 +221,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         """Free the world; further calls do nothing."""
         if not self._closed:
             super().close()
-            del self._running, self._drives, self._prescribed, self._world
+            del self._running, self._drives, self._contact_rows, self._world
 
 
 def _set_options(model: mujoco.MjModel, world: World) -> None:
@@ -228,3 +233,4 @@ def _set_options(model: mujoco.MjModel, world: World) -> None:
     option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10.0
     option.iterations = world.iterations or option.iterations
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    option.enableflags |= mujoco.mjtEnableBit.mjENBL_SPECULATIVE

@@ -38,7 +38,7 @@ from physx_sim.engines.changes import Changes, Scenery, motion_of
 from physx_sim.engines.checks import LayoutChecks, integer
 from physx_sim.engines.engine import RobotEngine
 from physx_sim.engines.influences import Hooks, Wrenches
-from physx_sim.engines.models.parts import Parts, layout_of
+from physx_sim.engines.models.parts import Parts, layout_of, warn_once
 from physx_sim.engines.models.reach import Reach
 from physx_sim.engines.rays import Caster
 from physx_sim.engines.reactions import Reactions
@@ -48,6 +48,8 @@ _FASTEST = 1e8
 """Speed, in m/s or rad/s, above which a state counts as no longer finite."""
 _NOTHING = np.zeros(0), np.zeros(0, CONTACT)
 """What is measured before the first step."""
+_DEEP = 5e-3
+"""Depth, in m, above which a contact in the first step from a state is reported."""
 _BLOCK = 64
 """Physics steps between checks of the state."""
 
@@ -215,11 +217,14 @@ class RobotSimulation(Simulation, Generic[Engine]):
             return
         while n > 0:
             block = n if n < _BLOCK else _BLOCK
+            if not self._stepped:
+                block = 1
             self.advance(block)
             n -= block
             self._frame += block
-            self._stepped = True
             self._check_finite()
+            if not self._stepped:
+                self._check_start()
 
     def _step_watched(self, n: int) -> None:
         self._stepping = True
@@ -237,13 +242,27 @@ class RobotSimulation(Simulation, Generic[Engine]):
                 self._carry_on()
                 n -= block
                 self._frame += block
-                self._stepped = True
                 self._check_finite()
+                if not self._stepped:
+                    self._check_start()
         finally:
             self._stepping = False
             self._watch()
             if not self._closed and not len(self._wrenches):
                 self._release()
+
+    def _check_start(self) -> None:
+        """Name bodies that are inside others when the first step from a state is made."""
+        self._stepped = True
+        if "contacts" not in self.features:
+            return
+        contacts = self.read_contacts()
+        for first, second in contacts[["body_a", "body_b"]][contacts["depth"] > _DEEP].tolist():
+            names = self.layout.names
+            warn_once(
+                f'"{names[first]}" started more than {1e3 * _DEEP:.0f} mm inside '
+                f'"{names[second]}". Engines push it out slowly; let it start elsewhere.'
+            )
 
     def _carry_on(self) -> None:
         """Move static bodies on, and leave hidden ones where they are."""

@@ -1,4 +1,7 @@
-"""Static bodies that move as prescribed, which MuJoCo only knows as bodies that jump."""
+"""Contacts of which MuJoCo knows too little: with bodies that move as prescribed, and deep ones.
+
+A step is split where MuJoCo has found the contacts but not yet solved for their forces.
+"""
 
 from __future__ import annotations
 
@@ -9,9 +12,12 @@ from physx_core.rotations import to_matrix
 from physx_core.typing import Vector
 from physx_mujoco.model import LAG, WorldModel
 
+_FASTEST_RETURN = 0.1
+"""Maximum speed, in m/s, at which contacts are pushed out: otherwise deep ones would jump."""
 
-class MovingScenery:
-    """The static bodies that move, and steps in which they push and drag what they touch.
+
+class ContactRows:
+    """Steps in which static bodies push and drag, and deep contacts do not jump.
 
     Args:
         world: The world.
@@ -21,6 +27,16 @@ class MovingScenery:
     def __init__(self, world: WorldModel, data: mujoco.MjData) -> None:
         self._world, self._data = world, data
         self._moving: dict[int, Vector] = {}
+        self._deep = True
+
+    @property
+    def active(self) -> bool:
+        """Whether steps differ from MuJoCo's own."""
+        return self._deep or bool(self._moving)
+
+    def expect_depth(self) -> None:
+        """Note that a state was set, in which contacts may be deep."""
+        self._deep = True
 
     def place(self, static: int, pose: Vector, velocity: Vector, surface: Vector) -> None:
         """Place a static body for the next step, as in `RobotSimulation.place_static`."""
@@ -43,12 +59,23 @@ class MovingScenery:
     def step(self) -> None:
         """Simulate a physics step."""
         model, data = self._world.model, self._data
-        if not self._moving:
+        if not self.active:
             mujoco.mj_step(model, data)
             return
         mujoco.mj_step1(model, data)
-        self._push()
+        if self._deep:
+            self._limit_depth()
+        if self._moving:
+            self._push()
         mujoco.mj_step2(model, data)
+
+    def _limit_depth(self) -> None:
+        """Let contacts appear only so deep as they may return."""
+        most = _FASTEST_RETURN * (LAG - 1) * self._world.model.opt.timestep
+        contact, data = self._data.contact, self._data
+        rows = contact.efc_address[(contact.dist < -most) & (contact.efc_address >= 0)]
+        data.efc_pos[rows] = -most
+        self._deep = len(rows) > 0
 
     def _push(self) -> None:
         """Let contacts know the speeds at which moving bodies approach.
