@@ -14,7 +14,6 @@ from __future__ import annotations
 import numpy as np
 from common import generate, options
 from environments.cloud import Cloud, network
-from rivals import relative_error
 
 from physx_core import (
     Dataset,
@@ -67,8 +66,9 @@ def main() -> None:
     with Dataset.open(session.path) as dataset:
         recorded = dataset["prediction"]
         right, guesses = recorded["ground_truth"][:], recorded["prediction"][:]
-    print(f"{len(right)} new clouds:\n  the network is {relative_error(guesses, right):.1%} off,")
-    print(f"  always the same spread {relative_error(0 * right + right.mean(axis=0), right):.1%}")
+    far, same = (np.linalg.norm(g - right, axis=1).mean() for g in (guesses, right.mean(axis=0)))
+    print(f"{len(right)} new clouds:\n  the network is {far:.4f} m off,")
+    print(f"  always the same spread {same:.4f} m")
     if asked.picture:
         [recording] = session.path.glob("*.rrd")
         render_picture(recording, asked.picture, (900, 360))

@@ -12,14 +12,12 @@ from __future__ import annotations
 
 import sys
 
-import numpy as np
-from common import SEEDS, generate, learned, options, samples
-from environments.cloud import POINTS, Cloud, network
+from common import compared, conclude, generate, options, samples
+from environments.cloud import POINTS, IndependentCloud, network
 from matplotlib.figure import Figure
 from networks.deep_set import DeepSet
-from rivals import linear_map, relative_error, verdict
 
-from physx_core import NetworkConfig
+from physx_core import Comparison, NetworkConfig
 
 WIDTH = 64
 OWN = NetworkConfig(
@@ -44,26 +42,20 @@ def draw(path, right, guesses) -> None:
 def main() -> int:
     asked = options(__doc__).parse_args()
     rows, epochs = (300, 3) if asked.small else (20_000, 12)
-    stored = generate(Cloud, rows, asked.session_dir, num_clients=2)
-    inputs, outputs = samples(stored, "training", "input", "ground_truth")
-    clouds, right = samples(stored, "validation", "input", "ground_truth")
-
-    def trained(config: NetworkConfig) -> list[np.ndarray]:
-        return [learned(stored, config, "input", epochs, seed, batch_size=64) for seed in SEEDS]
-
-    guesses = {"linear map": [linear_map(inputs, outputs)(clouds)]}
+    stored = generate(IndependentCloud, rows, asked.session_dir, num_clients=2)
+    networks = {}
     for width in (32, 97, 256):
         count = width**2 + (3 * POINTS + 5) * width + 3
-        guesses[f"FC, {count} parameters"] = trained(network(width))
+        networks[f"FC, {count} parameters"] = network(width), epochs
     count = sum(each.numel() for each in DeepSet(WIDTH, 3).parameters())
-    guesses[own := f"deep set, {count} parameters"] = trained(OWN)
-    errors = {
-        name: [relative_error(guess, right) for guess in found] for name, found in guesses.items()
-    }
+    networks[f"deep set, {count} parameters"] = OWN, epochs
+    results, guesses = compared(stored, networks, "input", batch_size=64)
     if asked.picture:
-        names = ["linear map", list(guesses)[2], own]
-        draw(asked.picture, right, {name: guesses[name][0] for name in names})
-    return verdict(errors, own, small=asked.small, networks=[n for n in errors if "FC" in n])
+        (right,) = samples(stored, "validation", "ground_truth")
+        names = [list(guesses)[k] for k in (0, 1, 3)]
+        draw(asked.picture, right, {name: guesses[name] for name in names})
+    comparison = Comparison.of(results, "error/ground_truth/relative_l2")
+    return conclude(comparison, small=asked.small)
 
 
 if __name__ == "__main__":

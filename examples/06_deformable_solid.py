@@ -11,14 +11,12 @@ then runs in the environment: orange, over the solver's gray beam and linear ela
 """
 
 import sys
-import time
 
 import numpy as np
-from common import SEEDS, config, generate, learned, options, samples
-from environments.beam import Beam
-from rivals import linear_map, relative_error, verdict
+from common import SEEDS, compared, conclude, config, generate, options, samples
+from environments.beam import Beam, Timed
 
-from physx_core import EnvironmentConfig, NetworkConfig, Prediction
+from physx_core import Comparison, EnvironmentConfig, NetworkConfig
 from physx_rerun import render_picture
 
 OWN = "linear elasticity + FC 256"
@@ -27,37 +25,26 @@ GRID |= {"border_mode": "same", "two_sublayers": False, "positions": True}  # on
 
 
 def networks(epochs):
-    """Yield each network's name, kind, target, epochs and arguments."""
+    """Return each network's configuration and number of epochs, by name."""
+    made = {}
     for name, width in (("FC 128", 128), ("FC 512", 512), (OWN, 256)):
-        wanted = "correction" if name == OWN else "displacement"
-        yield name, "torch/fc", wanted, epochs, {"layers": [768, width, width, 768]}
-    yield "linear elasticity + UNet", "torch/unet", "correction", epochs // 2, GRID
+        sizes = {"layers": [768, width, width, 768], "activation": "SiLU"}
+        made[name] = config("torch/fc", "forces", target(name), epochs, 2e-3, **sizes), epochs
+    epochs //= 2
+    unet = config("torch/unet", "forces", "correction", epochs, 2e-3, activation="SiLU", **GRID)
+    return made | {"linear elasticity + UNet": (unet, epochs)}
 
 
-class Timed(Prediction):
-    """Records each push's deflection and the CPU s of solver, linear elasticity and network."""
-
-    found = ()
-
-    def sample_end(self):
-        begin = time.thread_time()
-        self.learner.predict(self.batch)
-        seconds = *self.batch["seconds"][0], time.thread_time() - begin
-        self.found += ((np.linalg.norm(self.batch["displacement"]), *seconds),)
+def target(name):
+    """Return what a network learns."""
+    return "correction" if "elasticity" in name else "displacement"
 
 
 def main():
     chosen = options(__doc__).parse_args()
     session = generate(Beam, 40 if chosen.small else 1600, chosen.session_dir, num_clients=2)
-    known = samples(session, "training", "forces", "displacement")
-    given, exact, missing = samples(session, "validation", "forces", "displacement", "correction")
-    linear = exact - missing
-    guesses = {"linear elasticity": [linear], "ridge regression": [linear_map(*known)(given)]}
-    for name, kind, wanted, epochs, arguments in networks(4 if chosen.small else 40):
-        network = config(kind, "forces", wanted, epochs, 2e-3, activation="SiLU", **arguments)
-        base = linear if wanted == "correction" else 0
-        own = [{"seed": seed, "session_name": f"{name} {seed}"} for seed in SEEDS]
-        guesses[name] = [base + learned(session, network, "forces", epochs, **o) for o in own]
+    exact, missing = samples(session, "validation", "displacement", "correction")
+    results, guesses = compared(session, networks(4 if chosen.small else 40), "forces")
     recording = {"visualizer": "rerun", "visualizer_kwargs": {"path": f"{session}/beam.rrd"}}
     beam = EnvironmentConfig(Beam, as_tcp_ip_client=False, seed=1, **recording)
     place = {"session_dir": f"{session}/networks", "session_name": f"{OWN} {SEEDS[0]}"}
@@ -68,10 +55,17 @@ def main():
         render_picture(f"{session}/beam.rrd", chosen.picture, (900, 450), at=step)
     text = "{:.1f} by finite elements, {:.2f} by linear elasticity, {:.2f} more for its correction"
     print("ms of the CPU for a push:", text.format(*1e3 * np.median(shown.found, 0)[1:]))
-    worst = {n: max(map(relative_error, g[0][:, None], exact[:, None])) for n, g in guesses.items()}
-    print(f"worst push: linear elasticity {worst['linear elasticity']:.0%}, {OWN} {worst[OWN]:.0%}")
-    errors = {n: [relative_error(each, exact) for each in all] for n, all in guesses.items()}
-    return verdict(errors, OWN, small=chosen.small, networks=[name for name, *_ in networks(0)])
+    flat = (each.reshape(len(each), -1) for each in (exact, missing, missing - guesses[OWN]))
+    size, *off = (np.linalg.norm(each, axis=1) for each in flat)
+    worst = (f"{(each / size).max():.0%}" for each in off)
+    print(f"worst push: linear elasticity {next(worst)}, {OWN} {next(worst)}")
+    alone = results["FC 128"][0]
+    errors = {n: [alone[f"error/displacement/{n}/rmse"]] for n in ("mean", "linear map")}
+    errors["linear elasticity"] = [float(np.sqrt((missing**2).mean()))]
+    for name, found in results.items():
+        errors[name] = [each[f"error/{target(name)}/rmse"] for each in found]
+    compare = Comparison(errors, OWN, "displacement: rmse in mm", list(results))
+    return conclude(compare, small=chosen.small)
 
 
 if __name__ == "__main__":

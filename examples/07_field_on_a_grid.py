@@ -13,11 +13,12 @@ from pathlib import Path
 
 import neuralop
 import numpy as np
-import rivals
 import torch
-from common import SEEDS, config, generate, learned, options, samples
+from common import compared, conclude, config, generate, options, samples
 from environments.vortices import POINTS, Vortices
 from matplotlib.figure import Figure
+
+from physx_core import Comparison
 
 
 class FNO(neuralop.models.FNO):
@@ -44,30 +45,27 @@ def main() -> int:
     asked = options(__doc__).parse_args()
     count, epochs = (100, 2) if asked.small else (1000, 15)
     session = generate(Vortices, count, asked.session_dir, as_tcp_ip_client=False)
-    now, later = samples(session, "validation", "now", "later")
-    linear = rivals.linear_map(*samples(session, "training", "now", "later"))(now)
     grid = {"in_channels": 1, "out_channels": 1, "hidden_channels": 16, "n_layers": 3}
     unet = {"nb_dims": 2, "nb_output_channels": 1, "nb_first_layer_channels": 12, "nb_steps": 2}
-    networks = {
-        "FNO": (f"{__file__}:FNO", {"n_modes": [12, 12], **grid}),
-        "UNet": ("torch/unet", {**unet, "border_mode": "same", "activation": "SiLU"}),
-    }
+    kinds = {}
     for width in (128, 512):
         layers = [POINTS**2, width, width, POINTS**2]
-        networks[f"FC {width}"] = "torch/fc", {"layers": layers, "activation": "SiLU"}
-    guesses = {"nothing changes": [now], "linear map": [linear]}
-    for name, (kind, arguments) in networks.items():
-        made = config(kind, "now", "later", epochs, lr=4e-3, **arguments)
-        guesses[name] = [learned(session, made, "now", epochs, seed) for seed in SEEDS]
-    if asked.picture:
-        shown = {name: guesses[name][0] for name in ("linear map", "UNet", "FNO")}
-        shown = {"given": now, "exact": later, **shown, "error of the FNO": shown["FNO"] - later}
-        draw(asked.picture, {name: field[:2] for name, field in shown.items()})
-    errors = {
-        name: [rivals.relative_error(each, later) for each in found]
-        for name, found in guesses.items()
+        kinds[f"FC {width}"] = "torch/fc", {"layers": layers, "activation": "SiLU"}
+    kinds["UNet"] = "torch/unet", {**unet, "border_mode": "same", "activation": "SiLU"}
+    kinds["FNO"] = f"{__file__}:FNO", {"n_modes": [12, 12], **grid}
+    networks = {
+        name: (config(kind, "now", "later", epochs, lr=4e-3, **arguments), epochs)
+        for name, (kind, arguments) in kinds.items()
     }
-    return rivals.verdict(errors, "FNO", small=asked.small)
+    results, guesses = compared(session, networks, "now")
+    if asked.picture:
+        now, later = samples(session, "validation", "now", "later")
+        del guesses["FC 128"]
+        missed = guesses["FNO"] - later
+        shown = {"given": now, "exact": later, **guesses, "error of the FNO": missed}
+        draw(asked.picture, {name: field[:2] for name, field in shown.items()})
+    comparison = Comparison.of(results, "error/later/relative_l2")
+    return conclude(comparison, small=asked.small)
 
 
 if __name__ == "__main__":

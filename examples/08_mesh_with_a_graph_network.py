@@ -13,10 +13,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
-import rivals
-from common import SEEDS, config, generate, learned, options, samples
+from common import compared, conclude, config, generate, options, samples
 from environments.plate import Plate, mesh
 from matplotlib.figure import Figure
+
+from physx_core import Comparison
 
 
 def draw(picture: Path, fields: dict[str, np.ndarray]) -> None:
@@ -36,33 +37,36 @@ def draw(picture: Path, fields: dict[str, np.ndarray]) -> None:
     figure.savefig(picture, dpi=80)
 
 
+def nothing_changes(given: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the temperature as it was."""
+    return given["before"][..., :1]
+
+
 def main() -> int:
     """Compare the networks; the exit status tells whether the graph network beats all others."""
     asked = options(__doc__).parse_args()
     count, epochs = (100, 2) if asked.small else (1000, 20)
     session = generate(Plate, count, asked.session_dir, as_tcp_ip_client=False)
     before, after = samples(session, "validation", "before", "after")
-    linear = rivals.linear_map(*samples(session, "training", "before", "after"))(before)
-    guesses = {"nothing changes": [before[..., :1]], "linear map": [linear]}
-    networks = {"graph network": ("networks.heat:HeatNetwork", {"channels": 32, "steps": 8}, 1e-2)}
+    kinds = {}
     for width in (128, 512):
         layers = [before[0].size, width, width, after[0].size]
-        networks[f"FC {width}"] = "torch/fc", {"layers": layers, "activation": "SiLU"}, 2e-3
-    for name, (kind, arguments, lr) in networks.items():
-        made = config(kind, "before", "after", epochs, lr=lr, **arguments)
-        guesses[name] = [learned(session, made, "before", epochs, seed) for seed in SEEDS]
+        kinds[f"FC {width}"] = "torch/fc", {"layers": layers, "activation": "SiLU"}, 2e-3
+    kinds["graph network"] = "networks.heat:HeatNetwork", {"channels": 32, "steps": 8}, 1e-2
+    networks = {
+        name: (config(kind, "before", "after", epochs, lr=lr, **arguments), epochs)
+        for name, (kind, arguments, lr) in kinds.items()
+    }
+    results, guesses = compared(session, networks, "before", ["all", nothing_changes])
     if asked.picture:
-        guess = guesses["graph network"][0]
+        guess = guesses["graph network"]
         shown = {"temperature, K": before[..., 0], "conductivity, m²/s": before[..., 1]}
         shown |= {"exact": after[..., 0], "graph network": guess[..., 0]}
         shown |= {"its error": (guess - after)[..., 0]}
-        shown |= {"error of the linear map": (linear - after)[..., 0]}
+        shown |= {"error of FC 512": (guesses["FC 512"] - after)[..., 0]}
         draw(asked.picture, {name: field[:2] for name, field in shown.items()})
-    errors = {
-        name: [rivals.relative_error(each, after) for each in found]
-        for name, found in guesses.items()
-    }
-    return rivals.verdict(errors, "graph network", small=asked.small)
+    comparison = Comparison.of(results, "error/after/relative_l2")
+    return conclude(comparison, small=asked.small)
 
 
 if __name__ == "__main__":

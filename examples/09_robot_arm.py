@@ -14,7 +14,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from common import SEEDS, config, generate, options, samples, trained
+from common import SEEDS, conclude, config, generate, linear_map, options, samples, trained
 from environments.arm import (
     SHOWN,
     TRAJECTORIES,
@@ -24,9 +24,8 @@ from environments.arm import (
     predicted,
     tracking_error,
 )
-from rivals import linear_map, verdict
 
-from physx_core import EnvironmentConfig, NetworkConfig, Prediction
+from physx_core import Comparison, EnvironmentConfig, NetworkConfig, Prediction
 from physx_dart import DartArm
 
 ALONE, NETWORK, EXACT = "PD alone", "PD + network, width 256", "PD + exact model"
@@ -70,9 +69,9 @@ def main() -> int:
             follow(f"PD + network, width {width}", predicted(training.learner))
     follow(EXACT, "model")
     draw(show(session, training.session.name, steps), chosen.picture, steps)
-    kinds = {"networks": [n for n in errors if "network" in n], "references": [EXACT]}
-    form = {"what": "error in mrad", "form": ".3f", "small": chosen.small}
-    return verdict(errors, NETWORK, alone=ALONE, **kinds, **form)
+    networks = [name for name in errors if "network" in name]
+    comparison = Comparison(errors, NETWORK, "error in mrad", networks, references=[EXACT])
+    return conclude(comparison, small=chosen.small)
 
 
 if __name__ == "__main__":

@@ -14,10 +14,9 @@ import sys
 
 import gymnasium
 import numpy as np
-from common import SEEDS, options
+from common import SEEDS, TOO_SMALL, options
 from matplotlib.figure import Figure
 from ppo import SETTINGS, train
-from rivals import TOO_SMALL
 
 from physx_gym import Policy
 from physx_gym.cli.evaluate import evaluate, summary

@@ -14,12 +14,11 @@ from __future__ import annotations
 import sys
 
 import numpy as np
-from common import SEEDS, generate, learned, options, samples
+from common import SEEDS, conclude, generate, linear_map, options, samples, trained
 from environments.heat import CELLS, FRAMES, Heat
 from environments.heat_picture import draw
-from rivals import linear_map, table, verdict
 
-from physx_core import Dataset, EnvironmentConfig, NetworkConfig, Training
+from physx_core import Comparison, Dataset, EnvironmentConfig, NetworkConfig, Training
 
 BATCH, VIEWS, WIDTH = 32, 8, 128
 
@@ -62,17 +61,18 @@ def main() -> int:
     note("a linear map", linear_map(*samples(session, "training", "input", "temperature"))(given))
     for seed in seeds:
         for width in (WIDTH, 4 * WIDTH):
-            guess = learned(session, network(width), "input", VIEWS, seed, batch_size=BATCH)
+            learner = trained(session, network(width), VIEWS, seed, batch_size=BATCH).learner
+            (guess,) = learner.predict_in_training({"input": given}).values()
             note(f"stored first, {width} wide", guess)
         for sampler in ("physx/uniform", "physx/active"):
             sets, guess = online(sampler, rows, seed, folder, given)
             found.append((sampler, sets, note(sampler, guess)))
-    table({name: [mean for mean, _ in each] for name, each in errors.items()}, "mean error")
-    tails = {name: [tail for _, tail in each] for name, each in errors.items()}
-    lost = verdict(tails, "physx/active", small=chosen.small, what="99 % of errors are below")
+    means, tails = ({n: [pair[k] for pair in e] for n, e in errors.items()} for k in (0, 1))
+    print(f"\n{Comparison(means, 'physx/active', 'mean error').table}")
     if chosen.picture:
         draw(chosen.picture, found[-2:], given)
-    return lost
+    comparison = Comparison(tails, "physx/active", "99 % of errors are below")
+    return conclude(comparison, small=chosen.small)
 
 
 if __name__ == "__main__":

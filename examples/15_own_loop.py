@@ -15,13 +15,14 @@ from __future__ import annotations
 import sys
 
 import numpy as np
-from common import SEEDS, config, learned, options, samples
+from common import compared, conclude, config, options, samples
 from matplotlib.figure import Figure
-from rivals import linear_map, relative_error, verdict
 
-from physx_core import Dataset
+from physx_core import Comparison, Dataset
 
 FREQUENCY, STEPS = np.sqrt(9.81), 200  # small swings at 1 m, in rad/s; steps per second
+TURN = np.array([[np.cos(FREQUENCY), -np.sin(FREQUENCY) * FREQUENCY],
+                 [np.sin(FREQUENCY) / FREQUENCY, np.cos(FREQUENCY)]])  # fmt: skip
 
 
 def swing(state: np.ndarray) -> np.ndarray:
@@ -32,6 +33,11 @@ def swing(state: np.ndarray) -> np.ndarray:
         angle += velocity / STEPS
         velocity -= 0.5 / STEPS * FREQUENCY**2 * np.sin(angle)
     return np.stack([angle, velocity], axis=1)
+
+
+def theory_of_small_swings(given: dict[str, np.ndarray]) -> np.ndarray:
+    """Return the state one second later if the sine of the angle were the angle."""
+    return given["state"] @ TURN
 
 
 def draw(path, state, later) -> None:
@@ -53,24 +59,20 @@ def main() -> int:
             state = rng.uniform([-2.5, -3.0], [2.5, 3.0], (100, 2))
             mode = "validation" if block % 5 == 4 or block == blocks - 1 else "training"
             dataset.append(mode, {"state": state, "later": swing(state)})
-    inputs, outputs = samples(folder, "training", "state", "later")
-    state, right = samples(folder, "validation", "state", "later")
 
-    turn = np.array([[np.cos(FREQUENCY), -np.sin(FREQUENCY) * FREQUENCY],
-                     [np.sin(FREQUENCY) / FREQUENCY, np.cos(FREQUENCY)]])  # fmt: skip
-    guesses = {"nothing changes": [state], "theory of small swings": [state @ turn]}
-    guesses["linear map"] = [linear_map(inputs, outputs)(state)]
+    networks = {}
     for width in (8, 16, 64):
         sizes = {"layers": [2, width, width, 2], "activation": "Tanh"}
-        net = config("torch/fc", "state", "later", epochs, 0.01, **sizes)
-        tries = [learned(folder, net, "state", epochs, seed, batch_size=128) for seed in SEEDS]
-        guesses[f"FC, width {width}"] = tries
-    errors = {name: [relative_error(g, right) for g in found] for name, found in guesses.items()}
+        made = config("torch/fc", "state", "later", epochs, 0.01, **sizes)
+        networks[f"FC, width {width}"] = made, epochs
+    rivals = ["all", theory_of_small_swings]
+    results, guesses = compared(folder, networks, "state", rivals, batch_size=128)
     if asked.picture:
-        names = ("theory of small swings", "FC, width 64")
-        draw(asked.picture, state, {"exact": right} | {name: guesses[name][0] for name in names})
-    networks = [name for name in errors if "FC" in name]
-    return verdict(errors, "FC, width 64", small=asked.small, networks=networks)
+        state, right = samples(folder, "validation", "state", "later")
+        theory = theory_of_small_swings({"state": state})
+        shown = {"exact": right, "theory of small swings": theory}
+        draw(asked.picture, state, shown | {"FC, width 64": guesses["FC, width 64"]})
+    return conclude(Comparison.of(results, "error/later/relative_l2"), small=asked.small)
 
 
 if __name__ == "__main__":

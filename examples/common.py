@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -10,15 +11,18 @@ import numpy as np
 import torch
 
 from physx_core import (
+    Comparison,
     DataGeneration,
     Dataset,
     DatasetConfig,
     EnvironmentConfig,
     NetworkConfig,
+    Result,
     Training,
 )
 
 SEEDS = (0, 1, 2)
+TOO_SMALL = "Too small to judge: this run only shows that it works. Without --small it compares."
 
 
 def options(doc: str) -> argparse.ArgumentParser:
@@ -50,45 +54,94 @@ def samples(session: Path, mode: str, *fields: str) -> list[np.ndarray]:
 
 
 def config(
-    network: str | type, given: str, wanted: str, epochs: int, lr: float, **arguments: Any
+    network: str | type,
+    given: str,
+    wanted: str,
+    epochs: int,
+    lr: float,
+    options: Mapping[str, Any] | None = None,
+    **arguments: Any,
 ) -> NetworkConfig:
     """Return a network's configuration: Adam, its learning rate falling to 0 over `epochs`."""
-    return NetworkConfig(
-        network,
-        network_kwargs={**arguments, "net_fields": given, "opt_fields": wanted},
-        loss="MSELoss",
-        optimizer="Adam",
-        lr=lr,
-        scheduler="CosineAnnealingLR",
-        scheduler_kwargs={"T_max": epochs},
-    )
+    known = {
+        "network_kwargs": {**arguments, "net_fields": given, "opt_fields": wanted},
+        "loss": "MSELoss",
+        "optimizer": "Adam",
+        "lr": lr,
+        "scheduler": "CosineAnnealingLR",
+        "scheduler_kwargs": {"T_max": epochs},
+    }
+    return NetworkConfig(network, **known | dict(options or {}))
 
 
 def trained(
-    session: Path, network: NetworkConfig, epochs: int, seed: int, **options: Any
+    session: Path,
+    network: NetworkConfig,
+    epochs: int,
+    seed: int,
+    normalize: bool = True,
+    **options: Any,
 ) -> Training:
     """Train a network on a session's samples; return the training, with its `learner` ready."""
     training = Training(
         network,
-        DatasetConfig(existing_dir=str(session), normalize=True),
+        DatasetConfig(existing_dir=str(session), normalize=normalize),
         session_dir=str(session / "networks"),
         epoch_nb=epochs,
         validation_every=0,
-        rivals="none",
         seed=seed,
         quiet=True,
-        **{"batch_size": 32, **options},
+        **{"batch_size": 32, "rivals": [], **options},
     )
     with training:
         training.execute()
     return training
 
 
-def learned(
-    session: Path, network: NetworkConfig, given: str, epochs: int, seed: int, **options: Any
-) -> np.ndarray:
-    """Train a network on a session's samples; return its predictions for the validation samples."""
-    learner = trained(session, network, epochs, seed, **options).learner
-    (tested,) = samples(session, "validation", given)
-    (guess,) = learner.predict_in_training({given: tested}).values()
-    return guess
+def compared(
+    session: Path,
+    networks: Mapping[str, tuple[NetworkConfig, int]],
+    given: str,
+    rivals: Sequence[str | Callable[..., Any]] = ("all",),
+    **options: Any,
+) -> tuple[dict[str, list[Result]], dict[str, np.ndarray]]:
+    """Train networks on a session's samples with each of `SEEDS`.
+
+    Args:
+        session: The session's folder.
+        networks: Configuration and number of epochs of each network, by name.
+        given: The network's input.
+        rivals: See `Training.rivals`; they are the same for all networks.
+        options: Further options of trainings.
+
+    Returns:
+        The result for each seed, and the first seed's predictions for the validation samples, both
+        by the network's name.
+    """
+    (tested,), results, guesses = samples(session, "validation", given), {}, {}
+    for name, (network, epochs) in networks.items():
+        tried = []
+        for seed in SEEDS:
+            own = {"rivals": [] if results or tried else rivals, **options}
+            training = trained(session, network, epochs, seed, session_name=f"{name} {seed}", **own)
+            tried.append(training.result)
+            if name not in guesses:
+                (guesses[name],) = training.learner.predict_in_training({given: tested}).values()
+        results[name] = tried
+    return results, guesses
+
+
+def conclude(comparison: Comparison, *, small: bool) -> int:
+    """Print a comparison; return 0 if the network wins, or the run is too small to judge."""
+    print(f"\n{comparison.table}\n\n{TOO_SMALL}" if small else f"\n{comparison}")
+    return int(not (small or comparison.wins))
+
+
+def linear_map(inputs: np.ndarray, outputs: np.ndarray) -> Callable[[np.ndarray], np.ndarray]:
+    """Fit a linear map by least squares, from samples of shape (rows, ...) each."""
+    best = np.linalg.lstsq(_columns(inputs), outputs.reshape(len(outputs), -1), rcond=None)[0]
+    return lambda given: (_columns(given) @ best).reshape(-1, *outputs.shape[1:])
+
+
+def _columns(values: np.ndarray) -> np.ndarray:
+    return np.column_stack([values.reshape(len(values), -1), np.ones(len(values))])

@@ -5,7 +5,7 @@ import time
 import numpy as np
 from environments.beam_solver import GRID, ElasticBeam, NoEquilibriumError
 
-from physx_core import Environment, Field
+from physx_core import Environment, Field, Prediction
 
 GREATEST_FORCE = 100.0  # N; some pushes this strong move its end by most of its length
 COLORS = {"linear elasticity": "dodgerblue", "network": "orange"}
@@ -75,3 +75,15 @@ class Beam(Environment):
         places, vectors = self.rest + self.exact.reshape(-1, 3) / 1e3, self.forces.reshape(-1, 3)
         self.factory.update_arrows("forces", positions=places, vectors=0.1 * vectors)
         self.factory.update_scalars("error", errors / np.linalg.norm(self.exact))
+
+
+class Timed(Prediction):
+    """Records each push's deflection and the CPU s of solver, linear elasticity and network."""
+
+    found = ()
+
+    def sample_end(self):
+        begin = time.thread_time()
+        self.learner.predict(self.batch)
+        seconds = *self.batch["seconds"][0], time.thread_time() - begin
+        self.found += ((np.linalg.norm(self.batch["displacement"]), *seconds),)

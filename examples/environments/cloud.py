@@ -65,6 +65,12 @@ class Cloud(Environment):
         self.factory.update_lines("guess", positions=list(guess))
 
 
+class IndependentCloud(Cloud):
+    """Each cloud is an episode of its own, which depends on none before it."""
+
+    independent_episodes, episode_steps = True, 1
+
+
 def network(width: int = 128) -> NetworkConfig:
     """Return fully connected layers that predict the spread from the coordinates of all points."""
     return NetworkConfig(

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 import torch
-from rivals import linear_map, relative_error
+from common import linear_map
 
-from physx_core import plugins
+from physx_core import Dataset, plugins
 from physx_sim import JointSettings, Robot, Simulation, World
 
 JOINTS, VISCOUS, DRY = ("shoulder", "elbow"), np.array([0.3, 0.15]), np.array([0.2, 0.1])
+FIELDS = ("q", "v", "torque", "acceleration")
 Function = Callable[..., torch.Tensor]
 
 
@@ -38,6 +40,17 @@ def measure(simulation: Simulation, samples: int, seed: int) -> list[torch.Tenso
     return [q, v, torque, as_torch(simulation.forward_dynamics_batch)(q, v, torque)]
 
 
+def store(folder: Path, known: list[torch.Tensor], unseen: list[torch.Tensor]) -> Path:
+    """Store what `measure` returned, and what a network sees of it; return the session's folder."""
+    with Dataset.create(folder) as dataset:
+        for mode, samples in (("training", known), ("validation", unseen)):
+            q, v, torque, _ = samples
+            seen = torch.hstack([q.sin(), q.cos(), v, torque])
+            rows = {name: each.numpy() for name, each in zip(FIELDS, samples, strict=True)}
+            dataset.append(mode, {**rows, "seen": seen.numpy()})
+    return folder
+
+
 def missing(model: Simulation, samples: list[torch.Tensor]) -> torch.Tensor:
     """Return the torques that a model lacks in samples, shape (n, 2), from its inverse dynamics."""
     q, v, torque, acceleration = (each.numpy() for each in samples)
@@ -54,4 +67,5 @@ def linear(given: list[torch.Tensor], wanted: torch.Tensor) -> Function:
 def error(acceleration: Function, samples: list[torch.Tensor]) -> float:
     """Return the relative error of computed accelerations for samples."""
     *given, exact = samples
-    return relative_error(acceleration(*given).detach().numpy(), exact.numpy())
+    guess = acceleration(*given).detach()
+    return float(((guess - exact).norm(dim=1) / exact.norm(dim=1)).mean())

@@ -13,6 +13,7 @@ from matplotlib.figure import Figure
 from physx_sim import Simulation
 
 PERIOD, STEPS = 5e-3, 1000
+NAME = "network in the model"
 STYLES = ({"color": "black", "lw": 4, "alpha": 0.3}, {"color": "tab:orange"}, {"color": "tab:blue"})
 
 
@@ -40,21 +41,21 @@ def plot(axis: Any, x: Any, curves: dict[str, Any]) -> None:
 
 
 def draw(
-    path: Path, real: Simulation, model: Function, law: Function, name: str, learned: Any
+    path: Path, real: Simulation, model: Function, law: Function, network: Function, way: Function
 ) -> None:
     """Draw friction laws over speed, and how the elbow swings after its release.
 
-    `learned` is a `functools.partial` that computes accelerations; its first argument is the law.
+    `network` predicts what the model lacks, and `way` the accelerations that follow.
     """
     figure = Figure((11, 3.4), layout="constrained")
     axes: Any = figure.subplots(1, 3)
     v = torch.linspace(-4, 4, 401).double()[:, None].expand(-1, 2)
-    laws = {"truth": friction(v), "linear law": law(v), name: learned.args[0](v).detach()}
+    laws = {"truth": friction(v), "linear law": law(v), NAME: network(v).detach()}
     for joint, title in enumerate(JOINTS):
         plot(axes[joint], v[:, joint], {name: torque[:, joint] for name, torque in laws.items()})
         axes[joint].set(title=f"friction of the {title}", xlabel="speed [rad/s]", ylabel="[N m]")
     truth = as_torch(real.forward_dynamics_batch)
-    ways = {"truth": truth, "model without friction": model, name: learned}
+    ways = {"truth": truth, "model without friction": model, NAME: way}
     swings = {name: swing(way)[:, 1] for name, way in ways.items()}
     plot(axes[2], PERIOD * np.arange(STEPS), swings)
     axes[2].set(

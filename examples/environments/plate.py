@@ -34,6 +34,7 @@ class Plate(Environment):
     leaves the plate.
     """
 
+    independent_episodes, episode_steps = True, 1
     STEPS, PERIOD = 10, 1e-3  # implicit steps, and the length of each in s
     LENGTH = 0.15  # over which temperature and conductivity vary, in m
 

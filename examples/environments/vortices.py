@@ -17,6 +17,7 @@ class Vortices(Environment):
     in a periodic square of 1 m, with Fourier modes, the upper third dropped, and Runge-Kutta steps.
     """
 
+    independent_episodes, episode_steps = True, 1
     STEPS, PERIOD = 10, 0.1  # steps per sample, and the length of each in s
     VISCOSITY = 5e-4  # m2/s
 
@@ -29,8 +30,8 @@ class Vortices(Environment):
         self.spectrum = np.exp(-self.squares / (2 * (2 * np.pi * SIZE) ** 2)) * (self.squares > 0)
 
     def init_database(self) -> None:
-        fields = [Field(name, (POINTS, POINTS, 1), unit="1/s") for name in ("now", "later")]
-        self.define_training_fields(fields)
+        of = {"shape": (POINTS, POINTS, 1), "axes": ("x", "y", "channel"), "unit": "1/s"}
+        self.define_training_fields([Field("now", **of), Field("later", like="now", **of)])
 
     def change(self, modes: np.ndarray) -> np.ndarray:
         """Return how fast the modes of the vorticity change, shape (POINTS, POINTS)."""

@@ -122,7 +122,7 @@ def test_the_gallery_is_what_the_examples_say():
 
 def test_the_gallery_has_everything_there_is():
     there = {path.stem for path in EXAMPLES.iterdir() if not path.name.startswith((".", "_"))}
-    shared = {"common", "rivals", "ppo", "environments", "networks", "requirements"}
+    shared = {"common", "ppo", "environments", "networks", "requirements"}
     assert there - shared == set(gallery.names())
 
 

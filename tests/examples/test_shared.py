@@ -1,4 +1,4 @@
-"""What the examples share: the cloud, the network for it, and the rivals of networks."""
+"""What the examples share: the cloud, the network for it, and how networks are judged."""
 
 import sys
 
@@ -15,7 +15,7 @@ def beside_the_examples(root, monkeypatch):
     monkeypatch.syspath_prepend(str(root / "examples"))
     yield
     for name in set(sys.modules) - before:
-        if name.partition(".")[0] in ("common", "rivals", "environments", "networks"):
+        if name.partition(".")[0] in ("common", "environments", "networks"):
             del sys.modules[name]
 
 
@@ -48,24 +48,29 @@ def test_the_deep_set_depends_on_neither_place_nor_order():
     torch.testing.assert_close(again, said, rtol=1e-4, atol=1e-5)
 
 
-def test_a_linear_map_is_found_exactly_and_its_error_is_relative():
-    from rivals import linear_map, relative_error
+def test_a_linear_map_is_found_exactly():
+    from common import linear_map
 
     rng = np.random.default_rng(0)
     inputs, turn = rng.normal(size=(200, 2, 3)), rng.normal(size=(6, 4))
     outputs = (inputs.reshape(200, 6) @ turn + 1).reshape(200, 2, 2)
     guess = linear_map(inputs[:150], outputs[:150])(inputs[150:])
-    assert relative_error(guess, outputs[150:]) < 1e-6
-    assert relative_error(1.5 * outputs, outputs) == pytest.approx(0.5)
+    np.testing.assert_allclose(guess, outputs[150:], rtol=1e-9)
 
 
-def test_the_worst_network_has_to_beat_the_best_rival(capsys):
-    from rivals import verdict
+@pytest.mark.parametrize("wide", [0.1, 900.0])
+def test_a_small_run_is_not_judged(wide, capsys):
+    from common import conclude
 
-    rivals = {"cheap": [0.2], "cheaper": [0.5]}
-    assert verdict({**rivals, "network": [0.1, 0.15]}, "network") == 0
-    assert verdict({**rivals, "network": [0.1, 0.25]}, "network") == 1
-    assert "best rival, cheap" in capsys.readouterr().out
+    from physx_core import Comparison
+
+    compared = Comparison({"linear map": [1.0], "wide": [wide]}, "wide")
+    assert conclude(compared, small=True) == 0
+    out = capsys.readouterr().out
+    assert out.splitlines()[-1].startswith("Too small to judge: ")
+    assert "linear map" in out and "times" not in out
+    assert conclude(compared, small=False) == int(wide > 1)
+    assert "best rival, linear map" in capsys.readouterr().out
 
 
 def test_samples_to_test_with_are_others_than_those_to_learn_from(tmp_path):

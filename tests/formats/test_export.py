@@ -316,7 +316,7 @@ def test_invalid_exports_are_rejected(everything, tmp_path):
         export(everything, "npz", out, options=ExportOptions(compression="zip"))
     with pytest.raises(ConfigError, match="actions is for .*minari.*, not for npz"):
         export(everything, "npz", out, options=ExportOptions(actions=["f8_0"]))
-    with pytest.raises(ConfigError, match="fps is for lerobot, not for minari"):
+    with pytest.raises(ConfigError, match="fps is for lerobot, vtkhdf, not for minari"):
         export(everything, "minari", out, options=ExportOptions(fps=3))
     with pytest.raises(ConfigError, match="give it with fps"):
         export(everything, "lerobot", out)

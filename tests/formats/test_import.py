@@ -112,13 +112,13 @@ def test_a_folder_of_other_things_is_left_alone(folder, tmp_path):
 
 def test_files_that_cannot_be_imported(folder, tmp_path):
     (tmp_path / "empty").touch()
-    (tmp_path / "a.csv").write_text("x, y\n1, 2\n")
+    (tmp_path / "a.txt").write_text("x, y\n1, 2\n")
     (tmp_path / "a.npz").write_bytes(b"PK but no zip")
     (tmp_path / "a.h5").write_bytes(b"\x89HDF\r\n\x1a\n and no more")
     np.savez(tmp_path / "none.npz")
     for name, message in {
         "empty": "is of no known format",
-        "a.csv": "is of no known format",
+        "a.txt": "is of no known format",
         "b.npz": "There is no file",
         "a.npz": "not a valid npz",
         "a.h5": "as HDF5",

@@ -140,7 +140,7 @@ RECORDS = {
         "SensorState",
         "RobotInfo",
     ),
-    *("UrdfShape", "Episode", "StepperState", "Result", "Trial", "Normalization"),
+    *("UrdfShape", "Episode", "StepperState", "Result", "Comparison", "Trial", "Normalization"),
     *("CollisionShape", "Joint", "MovableBody", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
     "Bond",
     *("Kind", "Format", "Table", "Section", "RolloutResult", "Unseen"),

@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 from numpy.testing import assert_array_equal
 
-from physx_core import Dataset
+from physx_core import Dataset, Field
+from physx_core.errors import ConfigError
 from physx_formats import ExportOptions, export
 
 pytestmark = pytest.mark.processes
@@ -28,6 +29,7 @@ def dataset(tmp_path):
         "image": rng.integers(0, 256, (ROWS, 4, 5, 3)).astype("u1"),
         "torque": rng.normal(size=(ROWS, 2)),
         "lever": rng.normal(size=ROWS),
+        "goal": rng.normal(size=2).repeat(ROWS).reshape(2, ROWS).T,
         "reward": rng.normal(size=ROWS).astype("f4"),
         "flag": rng.integers(0, 2, ROWS).astype("?"),
         "env_id": np.tile([1, 2], ROWS // 2).astype("i4"),
@@ -55,6 +57,26 @@ def test_pandas_reads_the_parquet_file(dataset, tmp_path):
 
 
 @pytest.mark.filterwarnings("error")
+def test_xarray_finds_coordinates_units_and_episodes(tmp_path):
+    xarray = pytest.importorskip("xarray")
+    field = Field("u", (4, 2), unit="m/s", axes=("x", "channel"))
+    where = {"x": [0.0, 0.5, 1.0, 1.5], "y": [1.0]}
+    with Dataset.create(tmp_path / "set", info={"coordinates": where}) as dataset:
+        more = [Field("time", unit="s"), Field("episode", (), int), Field("step", (), int)]
+        dataset.define_fields("training", [field, *more])
+        u, time = np.arange(48.0).reshape(6, 4, 2), np.arange(6) / 10
+        episode, step = np.divmod(np.arange(6), 3)
+        dataset.append("training", {"u": u, "time": time, "episode": episode, "step": step})
+        export(dataset, "zarr", tmp_path / "rows.zarr")
+    with xarray.open_zarr(tmp_path / "rows.zarr", group="training") as found:
+        assert set(found.coords) == {"x", "time", "episode", "step"}
+        assert found["u"].attrs["units"] == "m/s" and found["u"].dims == ("sample", "x", "channel")
+        assert_array_equal(found["u"].sel(x=1.0).isel(channel=1), u[:, 2, 1])
+        last = found["u"].where(found["episode"] == 1, drop=True)
+        assert_array_equal(last["time"], time[3:])
+
+
+@pytest.mark.filterwarnings("error")
 def test_xarray_opens_the_zarr_folder(dataset, tmp_path):
     xarray = pytest.importorskip("xarray")
     export(dataset, "zarr", tmp_path / "rows.zarr")
@@ -67,21 +89,43 @@ def test_xarray_opens_the_zarr_folder(dataset, tmp_path):
         assert list(tree.children) == ["training"]
 
 
-@pytest.mark.faults
-def test_lerobot_loads_its_format(dataset, tmp_path):
+def run_lerobot(tmp_path, program, *words):
+    """Run a program with LeRobot, and return what it printed."""
     library = Path(sys.prefix) / "lerobot"
     if not library.is_dir():
         assert not os.environ.get("CI"), f"{library} is missing: make test installs it"
         pytest.skip(f"LeRobot is not installed in {library}: make test installs it")
+    offline = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "home")}
+    variables = os.environ | offline | {"PYTHONPATH": str(library)}
+    command = [sys.executable, PROGRAMS / program, *words]
+    ended = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
+    assert not ended.returncode, ended.stderr
+    return ended.stdout
+
+
+@pytest.mark.faults
+def test_policies_of_lerobot_learn_from_its_format(dataset, tmp_path):
+    features = {
+        "observation.state": ["state", "lever"],
+        "observation.environment_state": ["torque"],
+        "action": ["torque"],
+    }
+    options = ExportOptions(features=features, fps=50)
+    with pytest.raises(ConfigError, match='The field "torque" is chosen more than once'):
+        export(dataset, "lerobot", tmp_path / "arm", options=options)
+    features["observation.environment_state"] = ["goal"]
+    export(dataset, "lerobot", tmp_path / "arm", options=options)
+    said = run_lerobot(tmp_path, "train_lerobot.py", tmp_path / "arm").splitlines()
+    assert [line.split()[0] for line in said] == ["act", "diffusion"]
+
+
+@pytest.mark.faults
+def test_lerobot_loads_its_format(dataset, tmp_path):
     options = ExportOptions(
         observations=["state"], actions=["torque", "lever"], rewards="reward", fps=50, task="swing"
     )
     assert export(dataset, "lerobot", tmp_path / "arm", options=options) == {"training": ROWS}
-    command = [sys.executable, PROGRAMS / "read_lerobot.py", tmp_path / "arm", tmp_path / "out.npz"]
-    offline = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "home")}
-    variables = os.environ | offline | {"PYTHONPATH": str(library)}
-    ended = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
-    assert not ended.returncode, ended.stderr
+    run_lerobot(tmp_path, "read_lerobot.py", tmp_path / "arm", tmp_path / "out.npz")
     stored = {name: values[:] for name, values in dataset["training"].items()}
     order = np.lexsort([stored["step"], stored["env_id"], stored["episode"]])
     rows = {name: values[order] for name, values in stored.items()}

@@ -27,6 +27,7 @@ from .pipelines import Prediction as Prediction
 from .pipelines import Replay as Replay
 from .pipelines import Training as Training
 from .pipelines import evaluate as evaluate
+from .results import Comparison as Comparison
 from .results import Result as Result
 from .version import __version__ as __version__
 from .views import Batches as Batches

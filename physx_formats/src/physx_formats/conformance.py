@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from physx_core import DataGeneration, Dataset, EnvironmentConfig
+from physx_core import Dataset
 from physx_core.errors import PhysxError
 from physx_formats.exporting import export
 from physx_formats.format import Format
@@ -19,19 +19,22 @@ from physx_testing.report import NotApplicableError
 from physx_testing.subject import Check, Subject, expect
 
 _ROWS = 12
-_VALUES: dict[str, Any] = {"fps": 30, "task": "a task"}
+_VALUES: dict[str, Any] = {"fps": 30, "task": "a task", "points": "points"}
 
 
 @contextlib.contextmanager
 def _rows(folder: Path) -> Iterator[Dataset]:
-    """Yield a dataset with one trajectory of 12 rows of a spring."""
-    spring = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, seed=1)
-    run = DataGeneration(
-        spring, session_dir=str(folder), session_name="run", batch_nb=1, batch_size=_ROWS
-    )
-    run.quiet = True
-    run.execute()
-    with Dataset.open(run.session.path) as dataset:
+    """Yield a dataset with one trajectory of 12 rows: a state, and a mesh that moves."""
+    step = np.arange(_ROWS)
+    state = np.stack([np.cos(step / 3), np.sin(step / 3)], axis=1)
+    rows = {
+        "state": state,
+        "points": state[:, None, :] * np.arange(1, 4)[:, None],
+        "episode": np.zeros(_ROWS, int),
+        "step": step,
+    }
+    with Dataset.create(folder) as dataset:
+        dataset.append("training", rows)
         yield dataset
 
 
@@ -41,7 +44,7 @@ def _written(subject: Subject) -> Path:
     if form.write is None:
         raise NotApplicableError("nothing is exported to it")
     options = ExportOptions(**{name: _VALUES[name] for name in form.options if name in _VALUES})
-    place = subject.folder / "written"
+    place = subject.folder / f"written.{subject.reference.rpartition('/')[2]}"
     with _rows(subject.folder / "session") as dataset:
         done = export(dataset, subject.reference, place, options=options)
     expect(done == {"training": _ROWS}, f"it says that it has written {done}, not {_ROWS} rows")
@@ -58,7 +61,7 @@ def _begin_of(place: Path) -> bytes:
 def _writes(subject: Subject) -> None:
     place = _written(subject)
     expect(place.exists(), "there is no file or folder of the name that it was given")
-    left = {each.name for each in subject.folder.iterdir()} - {"written", "session"}
+    left = {each.name for each in subject.folder.iterdir()} - {place.name, "session"}
     expect(not left, f"it leaves {', '.join(sorted(left))} beside what it writes")
 
 
@@ -67,7 +70,7 @@ def _reads_again(subject: Subject) -> None:
     if subject.make().open is None:
         raise NotApplicableError("nothing is imported from it")
     import_file(place, copy)
-    with Dataset.open(copy) as found, Dataset.open(subject.folder / "session/run") as wanted:
+    with Dataset.open(copy) as found, Dataset.open(subject.folder / "session") as wanted:
         for name, field in wanted.fields("training").items():
             expect(name in found.fields("training"), f'it loses the field "{name}"')
             one, other = (each["training"][name][:].reshape(_ROWS, -1) for each in (found, wanted))

@@ -12,7 +12,10 @@ from physx_formats.errors import ExchangeError
 from physx_formats.format import Format, all_formats, find_format
 from physx_formats.table import Advance, ExportOptions, Table, check_new
 
-_EPISODES = ("observations", "actions", "rewards", "fps", "task")
+_OPTIONS = (
+    *("observations", "actions", "rewards", "fps", "task", "features"),
+    *("points", "cells", "cell_type"),
+)
 
 
 def export(
@@ -32,7 +35,8 @@ def export(
         dataset: The dataset.
         to: Name of the format, such as ``npz``, or its reference, such as ``mine/columns``.
         out: The file, or the folder for zarr, minari and lerobot. It must not exist.
-        modes: Names of the modes; empty: all that have rows. Parquet, minari and lerobot hold one.
+        modes: Names of the modes; empty: all that have rows. Parquet, csv, vtkhdf, minari and
+            lerobot hold one.
             ``episodes`` are the records of independent episodes, with their parameters: one for
             each, whose ``first_row`` is the number of its first row in its mode. The other formats
             have them beside the rows if no modes are named.
@@ -82,8 +86,8 @@ def _choose_format(to: str, options: ExportOptions) -> Format:
         raise ConfigError(
             f'{to} has no compression "{options.compression}". It has: {listed(form.compressions)}.'
         )
-    for name in _EPISODES:
-        if getattr(options, name) not in ((), None) and name not in form.options:
+    for name in _OPTIONS:
+        if getattr(options, name) not in ((), None, {}) and name not in form.options:
             takers = [one for one, known in all_formats().items() if name in known.options]
             raise ConfigError(f"{name} is for {listed(takers)}, not for {to}.")
     if options.fps is not None and options.fps < 1:

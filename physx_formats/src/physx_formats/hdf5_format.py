@@ -16,6 +16,7 @@ from physx_core.dataset import rows_per_block
 from physx_core.typing import Array
 from physx_formats.errors import ExchangeError
 from physx_formats.format import Format
+from physx_formats.layouts import read_layout
 from physx_formats.table import Column, ExportOptions, Notes, Table, encode_notes
 
 COMPRESSIONS = {"none": None, "gzip": "gzip", "lzf": "lzf"}
@@ -119,7 +120,7 @@ class Hdf5Column:
 
 @contextlib.contextmanager
 def open_columns(path: Path, limit: int) -> Iterator[tuple[dict[str, Column], Notes]]:
-    """Open a file; yield its datasets by path and the notes in its attributes.
+    """Open a file; yield its datasets by path, or as its layout has them, and notes.
 
     The sizes that the datasets claim are checked when they are chosen.
     """
@@ -130,6 +131,8 @@ def open_columns(path: Path, limit: int) -> Iterator[tuple[dict[str, Column], No
             file = files.enter_context(h5py.File(path, "r"))
             columns = dict(_columns(path, file, "", set(), itertools.count()))
             notes = Notes.parse(file.attrs.get("physx", "{}"))
+            if not notes.modes and (found := read_layout(path, file)) is not None:
+                columns, notes = found
         except ExchangeError:
             raise
         except _UNREADABLE as error:

@@ -1,4 +1,4 @@
-"""Imports rows from a NumPy archive, an ordinary HDF5 file, or a DeepPhysX dataset."""
+"""Imports rows from files of other formats: each recognizes its own."""
 
 from __future__ import annotations
 
@@ -44,8 +44,9 @@ def import_file(
     with their records are stored as such, after all campaigns that the dataset has.
 
     Args:
-        path: A NumPy archive (npz), an HDF5 file or a DeepPhysX database, of any name; the folder
-            of a DeepPhysX dataset or session; or what the formats of other plugins recognize.
+        path: A NumPy archive (npz), an HDF5, Parquet or safetensors file or a DeepPhysX database,
+            of any name; a file ``*.csv``; the folder of a DeepPhysX dataset or session; or what the
+            formats of other plugins recognize.
         directory: The dataset's folder. Rows are appended if the dataset exists.
         mode: Mode for the rows, regardless of the mode in the file; for a file with several modes,
             the one to import. None: the modes that the file names, or else ``training``.

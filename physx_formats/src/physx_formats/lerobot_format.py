@@ -1,6 +1,7 @@
 """LeRobot's dataset format, version 3: Parquet files with the episodes of a mode in sequence.
 
 A row is a frame: ``observation.*``, ``action``, ``next.reward``, and ``info.*`` for other fields.
+LeRobot's own policies need ``observation.state``, one vector, which several fields may be.
 """
 
 from __future__ import annotations
@@ -16,13 +17,13 @@ from typing import Any
 import numpy as np
 
 from physx_core.dataset import Episode
-from physx_core.errors import ConfigError
+from physx_core.errors import ConfigError, listed
 from physx_core.fields import Field
 from physx_core.statistics import RunningStatistics
 from physx_core.typing import Array, Batch
 from physx_formats.errors import ExchangeError
 from physx_formats.format import Format
-from physx_formats.roles import Roles
+from physx_formats.roles import OBSERVATION, Roles
 from physx_formats.table import ExportOptions, Table, encode_notes, import_library
 
 VERSION = "v3.0"
@@ -32,6 +33,7 @@ _FILE_MEGABYTES = 100
 _MOST_AXES = 5
 _DESCRIBED = 2**14
 """Number of components whose statistics are kept in memory before they are written."""
+_NAMED = ("action", "next.reward", "next.done", "next.success")
 _COUNTERS = {"frame_index": "i8", "episode_index": "i8", "index": "i8", "task_index": "i8"}
 
 
@@ -71,7 +73,7 @@ def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
     import_library("pyarrow.parquet", "Exporting to LeRobot", "lerobot")
     pandas = import_library("pandas", "Exporting to LeRobot", "lerobot")
     task = options.task or "simulate"
-    features = _features(table, Roles.choose(table, options))
+    features = _features(table, Roles.choose(table, options), options.features)
     episodes = table.trajectories
     with _Writer(out, features, options.fps, task) as writer:
         for number, episode in enumerate(episodes):
@@ -98,16 +100,24 @@ def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
     return 0
 
 
-def _features(table: Table, roles: Roles) -> list[_Feature]:
-    """Return the columns of the frames by the roles of the fields."""
+def _features(table: Table, roles: Roles, named: Mapping[str, Sequence[str]]) -> list[_Feature]:
+    """Return the columns of the frames by the roles of the fields, and those that are named."""
     fields = table.fields
-    features = [_Feature(f"observation.{name}", (fields[name],)) for name in roles.observations]
-    if len(features) == 1:
+    features = [_Feature(f"{OBSERVATION}{name}", (fields[name],)) for name in roles.observations]
+    if len(features) == 1 and not named:
         features = [_Feature("observation.state", features[0].fields)]
     if roles.actions:
         features.append(_Feature("action", tuple(fields[name] for name in roles.actions)))
     if roles.rewards:
         features.append(_Feature("next.reward", (fields[roles.rewards],)))
+    for name, of in named.items():
+        if not (name.startswith(OBSERVATION) or name in _NAMED):
+            raise ConfigError(
+                f'LeRobot has no feature "{name}". It has: {listed(_NAMED)}, {OBSERVATION}NAME.'
+            )
+        if not of or any(each.name == name for each in features):
+            raise ConfigError(f'The feature "{name}" has {"two lots of" if of else "no"} fields.')
+        features.append(_Feature(name, tuple(fields[each] for each in of)))
     used = {of.name for feature in features for of in feature.fields}
     features += [_Feature(f"info.{n}", (of,)) for n, of in fields.items() if n not in used]
     for feature in features:
@@ -126,7 +136,8 @@ def _check(feature: _Feature) -> None:
         len(of.shape or (1,)) > 1 or of.dtype != feature.dtype for of in feature.fields
     ):
         raise ExchangeError(
-            f"A LeRobot action is one vector: the fields {names} must be vectors of the same type."
+            f'A LeRobot feature is one vector: the fields {names} of "{feature.name}" must be '
+            "vectors of the same type."
         )
 
 
@@ -266,4 +277,6 @@ def _summary(found: RunningStatistics) -> Mapping[str, Any]:
     return {name: value.tolist() for name, value in values.items()} | {"count": [found.count]}
 
 
-FORMAT = Format(write=write, options=("observations", "actions", "rewards", "fps", "task"))
+FORMAT = Format(
+    write=write, options=("observations", "actions", "rewards", "fps", "task", "features")
+)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import io
 import math
+import shlex
 import sys
 import zipfile
 import zlib
@@ -136,6 +137,7 @@ def open_columns(path: Path, limit: int) -> Iterator[tuple[dict[str, Column], No
             source = files.enter_context(_ArchiveFile(path))
             archive = files.enter_context(zipfile.ZipFile(source))
             source.longest = sys.maxsize
+            _refuse_torch(path, archive)
             check_size(path, sum(item.file_size for item in archive.infolist()), limit)
             damaged = archive.testzip()  # before any of it is stored
             if damaged is not None:
@@ -149,6 +151,18 @@ def open_columns(path: Path, limit: int) -> Iterator[tuple[dict[str, Column], No
         except _DAMAGE as error:
             raise ExchangeError(f"{path} is not a valid npz archive: {error}.") from error
         yield columns, notes
+
+
+def _refuse_torch(path: Path, archive: zipfile.ZipFile) -> None:
+    if any(name.endswith("/data.pkl") for name in archive.namelist()):
+        out = shlex.quote(str(path.with_suffix(".safetensors")))
+        raise ExchangeError(
+            f"{path} is a file of PyTorch, whose objects are pickled. Convert it, if it holds a "
+            "table of tensors, and import that file:\n"
+            'python -c "import sys, torch; from safetensors.torch import save_file; '
+            f'save_file(torch.load(sys.argv[1], weights_only=True), sys.argv[2])" '
+            f"{shlex.quote(str(path))} {out}"
+        )
 
 
 FORMAT = Format(

@@ -6,7 +6,9 @@ NumPy type.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import contextlib
+import math
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -15,11 +17,13 @@ import numpy as np
 from physx_core.fields import Field
 from physx_core.typing import Array
 from physx_formats.errors import ExchangeError
-from physx_formats.format import Format
+from physx_formats.format import Columns, Format
 from physx_formats.table import (
     BLOCK,
     ExportOptions,
+    Notes,
     Table,
+    check_size,
     encode_notes,
     import_library,
 )
@@ -85,4 +89,85 @@ def _array(arrow: Any, kind: Any, values: Array) -> Any:
     return array.cast(kind)
 
 
-FORMAT = Format(write=write, compressions=COMPRESSIONS)
+class _Column:
+    """A column of a file, read sequentially; see `Column`."""
+
+    unit = ""
+
+    def __init__(self, path: Path, file: Any, field: Any) -> None:
+        kind, shape = field.type, []
+        while hasattr(kind, "list_size"):
+            shape.append(kind.list_size)
+            kind = kind.value_type
+        self._file, self._name, self._left = file, field.name, np.empty((0, *shape))
+        self._batches: Iterator[Any] | None = None
+        self.shape, self.problem = (file.metadata.num_rows, *shape), ""
+        known = field.metadata or {}
+        self.dtype = np.dtype(np.uint8)
+        try:
+            self.dtype = np.dtype(kind.to_pandas_dtype())
+        except NotImplementedError:
+            self.problem = f'"{field.name}" of {path} holds {kind}.'
+        if "list" in str(kind):
+            self.problem = f'"{field.name}" of {path} holds lists of different lengths.'
+        elif self.dtype.kind not in "biuf":
+            self.problem = self.problem or f'"{field.name}" of {path} holds {kind}.'
+        self._is_complex = known.get(b"dtype", b"").startswith(b"complex") and shape[-1:] == [2]
+        if self._is_complex:
+            self.shape = self.shape[:-1]
+            self.dtype = np.result_type(self.dtype, np.complex64)
+        self.unit = known.get(b"unit", b"").decode(errors="replace")
+        self._path = path
+
+    def read(self, start: int, count: int) -> Array:
+        """Return the next rows."""
+        if self._batches is None:
+            self._batches = self._file.iter_batches(columns=[self._name])
+        parts = [self._left]
+        while sum(map(len, parts)) < count:
+            parts.append(self._values(next(self._batches).column(0)))
+        rows = np.concatenate(parts) if len(parts[0]) else np.concatenate(parts[1:])
+        found, self._left = rows[:count], rows[count:]
+        return found
+
+    def _values(self, array: Any) -> Array:
+        """Return a batch of the column as rows."""
+        flat = array
+        while True:
+            if flat.null_count:
+                raise ExchangeError(f'"{self._name}" of {self._path} has rows without a value.')
+            if not hasattr(flat.type, "list_size"):
+                break
+            flat = flat.flatten()
+        values: Array = flat.to_numpy(zero_copy_only=False)
+        if self._is_complex:
+            values = np.ascontiguousarray(values).view(self.dtype)
+        return values.reshape(-1, *self.shape[1:])
+
+
+@contextlib.contextmanager
+def open_columns(path: Path, limit: int) -> Iterator[tuple[Columns, Notes]]:
+    """Open a file; yield its columns by name and the notes in its metadata."""
+    arrow = import_library("pyarrow", "Importing Parquet", "parquet")
+    parquet = import_library("pyarrow.parquet", "Importing Parquet", "parquet")
+    try:
+        file = parquet.ParquetFile(path)
+    except (arrow.ArrowInvalid, OSError) as error:
+        raise ExchangeError(f"{path} is not a valid Parquet file: {error}.") from error
+    with file:
+        schema = file.schema_arrow
+        columns: Columns = {field.name: _Column(path, file, field) for field in schema}
+        sizes = (math.prod(each.shape) * each.dtype.itemsize for each in columns.values())
+        check_size(path, sum(sizes), limit)
+        try:
+            yield columns, Notes.parse((schema.metadata or {}).get(b"physx", b""))
+        except (arrow.ArrowInvalid, OSError) as error:
+            raise ExchangeError(f"{path} is damaged: {error}.") from error
+
+
+FORMAT = Format(
+    write=write,
+    compressions=COMPRESSIONS,
+    recognizes=lambda path, begin: begin.startswith(b"PAR1"),
+    open=open_columns,
+)

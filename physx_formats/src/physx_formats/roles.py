@@ -8,6 +8,9 @@ from dataclasses import dataclass
 from physx_core.errors import ConfigError, listed, nearest
 from physx_formats.table import ExportOptions, Table
 
+OBSERVATION = "observation."
+"""Beginning of the names of features that are observations."""
+
 
 @dataclass(frozen=True)
 class Roles:
@@ -29,7 +32,8 @@ class Roles:
     def choose(cls, table: Table, options: ExportOptions) -> Roles:
         """Complete the user's choice."""
         observations, actions, rewards = options.observations, options.actions, options.rewards
-        chosen = [*observations, *actions, *([] if rewards is None else [rewards])]
+        named = [name for fields in options.features.values() for name in fields]
+        chosen = [*observations, *actions, *([] if rewards is None else [rewards]), *named]
         for name in chosen:
             if name not in table.fields:
                 raise ConfigError(
@@ -40,6 +44,8 @@ class Roles:
                 raise ConfigError(f'The field "{name}" is chosen more than once.')
         if rewards is not None and table.fields[rewards].shape != ():
             raise ConfigError(f'The reward "{rewards}" is not a single number.')
+        if any(name.startswith(OBSERVATION) for name in options.features):
+            return cls(observations, actions, rewards, entries=True)
         rest = [n for n, f in table.fields.items() if f.role == "training" and n not in chosen]
         if not observations and not rest:
             raise ConfigError("No field is left for the observations.")

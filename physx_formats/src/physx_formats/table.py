@@ -38,8 +38,16 @@ class ExportOptions:
             empty: all training fields without another role.
         actions: Fields that are its actions (likewise).
         rewards: Field that is its rewards (likewise); None: minari has zeros, lerobot none.
-        fps: Frames per second of simulated time (lerobot only, and required there).
+        fps: Frames per second of simulated time (lerobot, which requires it, and vtkhdf).
         task: Description of the task (lerobot only).
+        features: Fields of a feature, by its name: "observation.state" (lerobot only). Those of
+            several fields are one vector.
+        points: Field with the positions of the mesh's points, of rows or of episodes, shape
+            (points, 1 to 3) (vtkhdf only, and required there).
+        cells: Field with the numbers of each cell's points, shape (cells, points of each)
+            (vtkhdf only); None: each point is a cell.
+        cell_type: Name of their type (vtkhdf only); None: by their number of points, of 4 a quad in
+            the plane, else a tetra.
     """
 
     compression: str = "none"
@@ -48,6 +56,10 @@ class ExportOptions:
     rewards: str | None = None
     fps: int | None = None
     task: str | None = None
+    features: Mapping[str, Sequence[str]] = field(default_factory=dict)
+    points: str | None = None
+    cells: str | None = None
+    cell_type: str | None = None
 
     def __post_init__(self) -> None:
         checks.store_declared("", self)

@@ -1,6 +1,7 @@
 """Writes what a run found to one HTML page."""
 
 from .blocks import Figure as Figure
+from .blocks import Picture as Picture
 from .blocks import Table as Table
 from .blocks import Text as Text
 from .page import write_report as write_report

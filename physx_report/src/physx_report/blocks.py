@@ -50,4 +50,23 @@ class Figure:
     caption: str
 
 
-Block: TypeAlias = Text | Table | Figure
+@dataclass(frozen=True)
+class Picture:
+    """A picture of pixels, or a film.
+
+    Attributes:
+        content: The file: WebP, GIF or PNG; animated ones are films.
+        caption: What it shows.
+    """
+
+    content: bytes
+    caption: str
+
+    @property
+    def mime(self) -> str:
+        """The type of the file; empty if browsers do not show it as a picture."""
+        known = {b"RIFF": "image/webp", b"GIF8": "image/gif", b"\x89PNG": "image/png"}
+        return known.get(self.content[:4], "")
+
+
+Block: TypeAlias = Text | Table | Figure | Picture

@@ -41,7 +41,7 @@ def _is_drawn(subject: Subject) -> None:
 def _changes_nothing(subject: Subject) -> None:
     path = _session(subject.folder)
     before = {each: each.read_bytes() for each in path.rglob("*") if each.is_file()}
-    with Run(path) as run, unchanged():
+    with unchanged(), Run(path) as run:  # which closes what it opens
         list(subject.make().blocks(run))
     now = {each: each.read_bytes() for each in path.rglob("*") if each.is_file()}
     expect(now == before, "it changes files of the session")

@@ -12,7 +12,7 @@ from jinja2 import Environment, PackageLoader, StrictUndefined
 
 from physx_core import files
 from physx_core.errors import PhysxError, SessionError
-from physx_report.blocks import Block, Figure, Table, Text
+from physx_report.blocks import Block, Figure, Picture, Table, Text
 from physx_report.errors import ReportError
 from physx_report.run import Run
 from physx_report.section import Section, all_sections
@@ -84,11 +84,16 @@ def _plain(blocks: Iterable[Block]) -> list[tuple[str, Any]]:
             case Table():
                 found.append(("table", block))
             case Figure():
-                content = base64.b64encode(block.svg.encode()).decode()
-                found.append(("figure", (content, block.caption)))
+                found.append(_image("image/svg+xml", block.svg.encode(), block.caption))
+            case Picture(mime=mime) if mime:
+                found.append(_image(mime, block.content, block.caption))
             case _:
                 raise ReportError(f"A section of a report has {block!r}, which is no block.")
     return found
+
+
+def _image(mime: str, content: bytes, caption: str) -> tuple[str, Any]:
+    return "image", (f"data:{mime};base64,{base64.b64encode(content).decode()}", caption)
 
 
 @cache

@@ -12,6 +12,7 @@ from physx_core.config import read_toml
 from physx_core.errors import DatasetError, SessionError
 from physx_core.pipelines import Unseen, open_unseen
 from physx_core.results import read_results
+from physx_report.film import Camera
 
 
 class Run(Closeable):
@@ -77,6 +78,15 @@ class Run(Closeable):
         if self.training is None or not self.training.parts:
             return None
         return self._opened.enter_context(open_unseen(self.path, trust=self.trust))
+
+    @cached_property
+    def camera(self) -> Camera:
+        """Takes pictures of what environments draw.
+
+        Raises:
+            PhysxError: If no plugin can.
+        """
+        return self._opened.enter_context(Camera())
 
     def close(self) -> None:
         """Close what was opened; calling it again does nothing."""

@@ -20,8 +20,8 @@ class Section:
     Attributes:
         title: Its title.
         blocks: Returns what it consists of; nothing if it does not apply to a run.
-        rank: Sections come in the order of this number: quality 10, rollouts 15, episodes 20,
-            training 30, samples 40, origin 90.
+        rank: Sections come in the order of this number: sweep 5, quality 10, policy 12,
+            rollouts 15, film 18, episodes 20, training 30, samples 40, origin 90.
     """
 
     title: str

@@ -25,12 +25,17 @@ def number(value: float) -> str:
     return f"{value:.3g}"
 
 
-def measured(name: str, value: float, unit: str) -> str:
+def value(given: object) -> str:
+    """Return the value of an option."""
+    return f"{given:.4g}" if isinstance(given, float) else str(given)
+
+
+def measured(name: str, error: float, unit: str) -> str:
     """Return an error with its unit, shares in percent."""
     if name in SHARES:
-        return f"{number(100 * value)} %"
-    own = unit if "," not in unit else "standard deviations"
-    return f"{number(value)} {own}".rstrip()
+        return f"{number(100 * error)} %"
+    own = unit if "," not in unit else "std"
+    return f"{number(error)} {own}".rstrip()
 
 
 def flat(table: Mapping[str, Any], start: str = "") -> dict[str, str]:

@@ -12,6 +12,7 @@ import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import Self
 
 import rerun as rr
 
@@ -105,6 +106,11 @@ class RerunVisualizer(Visualizer):
         self._changes: dict[int, Changes] = {}
         self._dashboard = Dashboard(self._rows)
         self._positions: dict[str, int] = {}
+
+    @classmethod
+    def offscreen(cls, size: tuple[int, int]) -> Self:
+        """Return one for pictures: see `Visualizer.offscreen`."""
+        return cls(mode="offscreen", save=False, picture_size=size)
 
     def _check_options(self) -> None:
         addresses = self._given_addresses()

@@ -55,6 +55,10 @@ def complete(request, capsys):
     return propose
 
 
+FORMATS = ["npz", "parquet", "csv", "safetensors", "vtkhdf", "minari", "lerobot", "zarr"]
+FORMATS += ["hdf5-single"]
+
+
 @pytest.mark.parametrize(
     ("words", "found"),
     [
@@ -89,8 +93,8 @@ def after(capsys):
     [
         ("completion", ["bash", "zsh"]),
         ("new", ["backend", "environment", "network", "plugin", "visualizer"]),
-        ("export --to", ["npz", "parquet", "minari", "lerobot", "zarr", "hdf5-single"]),
-        ("export --to =", ["npz", "parquet", "minari", "lerobot", "zarr", "hdf5-single"]),
+        ("export --to", FORMATS),
+        ("export --to =", FORMATS),
         ("train --on-nan", ["stop", "continue"]),
         ("train --checkpoint-every", ["epoch"]),
         ("train --network.optimizer-kwargs a=1 b=2 --on-nan", ["stop", "continue"]),

@@ -23,7 +23,7 @@ from physx_core import (
     read_scalars,
 )
 from physx_core.errors import ConfigError, SessionError
-from physx_core.results import read_results
+from physx_core.results import PolicyResult, SettingResult, SweepResult, read_results
 from physx_core.toy import Linear
 
 RNG = np.random.default_rng(5)
@@ -470,3 +470,96 @@ def test_metrics_that_are_none_are_refused(metrics, reason):
     store(*noisy())
     with pytest.raises(ConfigError, match=reason):
         drifting(metrics=metrics).execute()
+
+
+# Rivals of the user -----------------------------------------------------------------------------
+
+
+def law(inputs):
+    """Know the law without a network."""
+    return inputs["x"] @ MAP
+
+
+def short(inputs):
+    return inputs["x"][:, :1]
+
+
+def broken(inputs):
+    return inputs["z"]
+
+
+def other(inputs):
+    return {"z": inputs["x"]}
+
+
+def test_a_rival_of_the_user_is_compared_like_any_other():
+    x, y = noisy()
+    store(x, y)
+    network = planted(lambda x: x @ MAP + 0.1)
+    Path("zero.py").write_text("def zero(inputs):\n    return {'y': 0 * inputs['x'][:, :2]}\n")
+    found = judged(network, rivals=["all", law, "zero.py:zero"])
+    said = verdicts(found)
+    assert (said["law"], said["zero"], said["mean"]) == ("loses", "wins", "wins")
+    of = found.parts["validation"].fields["y"].rivals
+    assert of["law"].errors["rmse"] == pytest.approx(0.3, rel=0.1)
+    only = judged(network, rivals=[law])
+    assert list(verdicts(only)) == ["law"]
+    alone = judged(network, rivals=[])
+    assert verdicts(alone) == {} and alone["error/y/rmse"] == found["error/y/rmse"]
+
+
+def test_a_rival_of_the_user_that_fails_is_named_and_the_others_are_compared():
+    store(*noisy())
+    found = judged(planted(lambda x: x @ MAP), rivals=[short, broken, other, law])
+    of = found.parts["validation"].fields["y"].rivals
+    assert "it returned the shape (50, 1) where the field has (50, 2)" in of["short"].why
+    assert "it failed: KeyError('z')" in of["broken"].why
+    assert of["other"].why == "it does not predict this field"
+    assert of["law"].errors and not of["short"].errors
+
+
+@pytest.mark.parametrize(
+    ("rivals", "reason"),
+    [
+        (["drag"], "name one as"),
+        ("nun", "name one as"),
+        ([law, law], "two functions"),
+        (["physx_core.toy:Lineer"], 'Did you mean "Linear"'),
+    ],
+)
+def test_rivals_that_are_none_are_refused(rivals, reason):
+    store(*noisy())
+    with pytest.raises(ConfigError, match=reason):
+        judged(planted(lambda x: x @ MAP), rivals=rivals)
+
+
+def test_a_policy_is_better_only_if_neither_chance_of_episodes_nor_of_signs_explains_it():
+    random = np.random.default_rng(0)
+    rewards = random.normal(size=12)
+    own = {"seed": range(12), "reward": rewards}
+    rivals = {
+        "worse": rewards - 1 - random.uniform(size=12),
+        "better": rewards + 2,
+        "the same": rewards,
+        "noise": rewards + random.normal(size=12),
+    }
+    found = PolicyResult.of("Swing-v0", "", "network_1", own, rivals)
+    assert [each.verdict for each in found.rivals.values()] == ["wins", "loses", "even", "even"]
+    assert found.interval[0] < found.values["reward"] < found.interval[1]
+    few = {name: values[:7] for name, values in own.items()}
+    found = PolicyResult.of("Swing-v0", "", "network_1", few, {"better": rewards[:7] + 2})
+    assert found.rivals["better"].verdict == "unknown" and found.interval is None
+    assert "too few to say: 7 episodes" in "\n".join(found.lines("Swing-v0"))
+
+
+def test_the_best_setting_of_a_sweep_has_a_number_for_each_seed():
+    settings = [
+        SettingResult("a", {"lr": 0.1}, {"0": 1.0, "1": 3.0}),
+        SettingResult("a", {"lr": 0.2}, {"0": 0.5}, {"1": "pruned"}),
+        SettingResult("a", {"lr": 0.3}, {"0": 3.0, "1": 3.0}),
+    ]
+    for goal, place in (("minimize", 0), ("maximize", 2)):
+        found = Result("sweep", "study", 1.0, sweep=SweepResult("loss", goal, settings))
+        assert found.sweep.best == settings[place] and found["best"] == settings[place].value
+    assert settings[0].spread == pytest.approx(2**0.5) and settings[1].spread is None
+    assert "1 other settings" in str(found)

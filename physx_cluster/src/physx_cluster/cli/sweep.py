@@ -95,7 +95,8 @@ def _report(study: Any, folder: Path) -> None:
     for line in summary(study):
         _say(line)
     _say(f"table: {folder / TABLE}")
-    _say(f"next: physx sweep {shlex.quote(str(folder))} --status")
+    place = shlex.quote(str(folder))
+    _say(f"next: physx sweep {place} --status, physx report {place}")
     if study.best() is None:
         raise StudyError(
             f"No trial of {folder} is complete with all seeds. The end of each trial's output.txt "

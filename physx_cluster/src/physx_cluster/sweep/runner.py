@@ -12,8 +12,8 @@ from physx_cluster.sweep.definition import Definition
 from physx_cluster.sweep.executors.executor import Executor, Job
 from physx_cluster.sweep.plan import Plan
 from physx_cluster.sweep.results import FAILED, FAILURE, OUTPUT, Failure, Result, Trial
-from physx_cluster.sweep.study import Study
-from physx_core import files, plugins
+from physx_cluster.sweep.study import TABLE, Study
+from physx_core import files, plugins, results
 from physx_core.errors import PhysxError
 
 Say = Callable[[str], None]
@@ -43,13 +43,28 @@ def run_study(definition: Definition, folder: Path, say: Say, start: Start | Non
                 "can run at the same time, those of a batch "
                 f"(study.batch = {definition.study.batch})"
             )
-        with _Workers(study, start or _start_executor, say, plan.total) as workers:
-            while batch := plan.next_batch():
-                for trial in batch:
-                    study.prepare(trial)
-                workers.run(batch)
-                plan.tell(study.results)
+        begin = time.monotonic()
+        try:
+            with _Workers(study, start or _start_executor, say, plan.total) as workers:
+                while batch := plan.next_batch():
+                    for trial in batch:
+                        study.prepare(trial)
+                    workers.run(batch)
+                    plan.tell(study.results)
+        finally:
+            _store(study, plan.total, time.monotonic() - begin)
     return study
+
+
+def _store(study: Study, total: int, seconds: float) -> None:
+    """Keep in the study's folder what the trials have found so far."""
+    summary = [f"{len(study.results)} of {total} trials have a result"]
+    places = {"table": str(study.folder / TABLE)}
+    found = study.result()
+    result = results.Result(
+        "sweep", str(study.folder), seconds, summary, sweep=found, places=places
+    )
+    results.store_result(study.folder, result)
 
 
 def _start_executor(definition: Definition) -> Executor:

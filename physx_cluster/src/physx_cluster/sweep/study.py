@@ -6,9 +6,8 @@ import csv
 import io
 import json
 import math
-import statistics
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -22,6 +21,7 @@ from physx_cluster.sweep.results import COMPLETE, LOCK, TRIAL, Result, Trial
 from physx_core import Closeable, files
 from physx_core.config import read_toml
 from physx_core.errors import PhysxError
+from physx_core.results import SettingResult, SweepResult
 
 STUDY, TABLE = "study.toml", "trials.csv"
 _LOCK = "study.lock"
@@ -188,19 +188,34 @@ class Study(Closeable):
                 "the trials' folders; the same command resumes the sweep."
             ) from None
 
+    def result(self) -> SweepResult:
+        """Return what the trials have found so far, by setting, in the order of the trials."""
+        settings: dict[tuple[str, int], SettingResult] = {}
+        for number, trial in sorted(self.trials.items()):
+            key, result = (trial.pipeline, trial.setting), self.results.get(number)
+            known = settings.get(key) or SettingResult(trial.pipeline, dict(trial.values))
+            values, others, seed = dict(known.values), dict(known.others), str(trial.seed)
+            if result is not None and result.state == COMPLETE and not math.isnan(result.value):
+                values[seed] = result.value
+            else:
+                others[seed] = _why_without(result)
+            folders = [*known.folders, trial.name]
+            settings[key] = replace(known, values=values, others=others, folders=folders)
+        for key, each in settings.items():
+            left = {str(seed) for seed in self.definition.study.seeds}
+            left -= {*each.values, *each.others}
+            others = {**each.others, **dict.fromkeys(sorted(left), _why_without(None))}
+            settings[key] = replace(each, others=others)
+        goal: Any = "minimize" if self.definition.sign > 0 else "maximize"
+        return SweepResult(self.definition.study.result, goal, list(settings.values()))
+
     def best(self) -> Best | None:
         """Return the setting with the best result; None if none is complete for all seeds."""
-        groups: dict[tuple[str, int], list[Trial]] = {}
-        for trial in self.trials.values():
-            groups.setdefault((trial.pipeline, trial.setting), []).append(trial)
-        found = []
-        for trials in groups.values():
-            results = [self.results.get(trial.number) for trial in trials]
-            done = [each for each in results if each is not None and each.state == COMPLETE]
-            if len(done) == len(self.definition.study.seeds):
-                found.append(Best(tuple(trials), statistics.fmean(each.value for each in done)))
-        sound = [each for each in found if not math.isnan(each.value)]
-        return min(sound, key=lambda each: self.definition.sign * each.value, default=None)
+        best = self.result().best
+        if best is None:
+            return None
+        trials = (trial for _, trial in sorted(self.trials.items()))
+        return Best(tuple(each for each in trials if each.name in best.folders), best.value)
 
     def is_running(self, trial: Trial) -> bool:
         """Return whether a process is working on a trial."""
@@ -247,6 +262,13 @@ def earlier_results(folder: Path, trial: Trial) -> Iterator[Result | None]:
 def is_study(folder: Path) -> bool:
     """Return whether a folder contains a study."""
     return (folder / STUDY).is_file()
+
+
+def _why_without(result: Result | None) -> str:
+    """Return why a trial has no number to compare."""
+    if result is None:
+        return "not finished"
+    return result.error or (result.state if result.state != COMPLETE else "not a number")
 
 
 def _text(value: Any) -> str:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Self
 
 from physx_core.closeable import Closeable
 
@@ -111,6 +111,17 @@ class Observer(Closeable):
 
 class Visualizer(Observer):
     """An observer that draws the events of the environments' factories."""
+
+    @classmethod
+    def offscreen(cls, size: tuple[int, int]) -> Self | None:
+        """Return one whose `capture` draws without a display; None if there is none.
+
+        Reports draw films and pictures with it.
+
+        Args:
+            size: Width and height of the pictures in pixels.
+        """
+        return None
 
     def capture(self) -> Array | None:
         """Return a picture, shape (height, width, 3), uint8; None if pictures are not supported."""

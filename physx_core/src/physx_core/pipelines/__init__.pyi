@@ -10,5 +10,6 @@ from .learning.unseen import Unseen as Unseen
 from .learning.unseen import open_unseen as open_unseen
 from .pipeline import Pipeline as Pipeline
 from .prediction import Prediction as Prediction
+from .redrawing import Redrawing as Redrawing
 from .replay import Replay as Replay
 from .training import Training as Training

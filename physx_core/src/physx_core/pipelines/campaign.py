@@ -47,7 +47,7 @@ class Campaign:
     @staticmethod
     def count(dataset: Dataset, mode: str) -> int:
         """Return how many campaigns a mode of a dataset has."""
-        return sum(each.mode == mode for each in _recorded(dataset))
+        return sum(each.mode == mode for each in recorded_campaigns(dataset))
 
     def store_rejected(
         self,
@@ -67,7 +67,7 @@ class Campaign:
             records: Records of the episodes that they belong to, the last part of each last.
             episode_fields: What each episode has once.
         """
-        campaign, numbers = _recorded(dataset).index(self), rows["episode"]
+        campaign, numbers = recorded_campaigns(dataset).index(self), rows["episode"]
         begins = np.flatnonzero(np.diff(numbers, prepend=-1))
         counts, found = np.diff(begins, append=len(numbers)).tolist(), []
         for number, count in zip(numbers[begins].tolist(), counts, strict=True):
@@ -98,7 +98,7 @@ class Campaign:
             seed: Seed of the episodes.
             parameters: The parameters that the environment defines.
         """
-        known, number = _recorded(dataset), cls.count(dataset, mode)
+        known, number = recorded_campaigns(dataset), cls.count(dataset, mode)
         described = describe_environment(config, run_seed)
         described["parameters"] = _plain(parameters)
         campaign = cls(mode, number, described, seed)
@@ -115,7 +115,7 @@ class Campaign:
         Raises:
             ConfigError: If there is none, or its episodes would have other rows.
         """
-        known = [each for each in _recorded(dataset) if each.mode == mode]
+        known = [each for each in recorded_campaigns(dataset) if each.mode == mode]
         if not known:
             raise ConfigError(
                 f'{dataset.directory} has no episodes of the mode "{mode}" to go on with: leave '
@@ -230,7 +230,7 @@ class Campaign:
         known = dataset.recorded_episodes(WRONG) if WRONG in dataset.modes else None
         if known is None:
             return
-        campaign = _recorded(dataset).index(self)
+        campaign = recorded_campaigns(dataset).index(self)
         numbers = set(known.episode[(known.campaign == campaign) & (known.rows > 0)].tolist())
         gone = [replace(each, campaign=campaign) for each in records if each.episode in numbers]
         if gone:
@@ -242,7 +242,12 @@ def _plain(parameters: Sequence[Parameter]) -> Any:
     return json.loads(json.dumps([each.to_dict() for each in parameters]))
 
 
-def _recorded(dataset: Dataset) -> list[Campaign]:
+def recorded_campaigns(dataset: Dataset) -> list[Campaign]:
+    """Return the campaigns of a dataset, of all modes, in order.
+
+    Raises:
+        DatasetError: If their description is damaged.
+    """
     try:
         return [Campaign(**each) for each in dataset.info.get(CAMPAIGNS, ())]
     except TypeError as error:

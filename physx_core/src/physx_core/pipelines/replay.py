@@ -166,7 +166,11 @@ class Replay(NewSessionPipeline):
 
 
 def recorded_environment(
-    dataset: Dataset, given: Any = None, *, trust: bool = False
+    dataset: Dataset,
+    given: Any = None,
+    *,
+    trust: bool = False,
+    info: Mapping[str, Any] | None = None,
 ) -> dict[str, Any]:
     """Return the options of the environment that a dataset was generated with.
 
@@ -175,13 +179,14 @@ def recorded_environment(
         given: The environment that the user named; None: the dataset's. If it is a different one,
             the dataset's options do not apply.
         trust: Whether the dataset may name any class.
+        info: Describes the environment; None: the dataset's info, which describes the last one.
 
     Raises:
         ConfigError: If the dataset does not name its environment.
         UntrustedReferenceError: If it names code that is not a component of an installed plugin, or
             a program.
     """
-    info: Mapping[str, Any] = dataset.info
+    info = dataset.info if info is None else info
     recorded = info.get("environment")
     if given is not None and not is_recorded_as(given, recorded):
         return {}

@@ -32,6 +32,7 @@ from physx_core.pipelines.learning.judging import (
     Judging,
     Judgment,
     find_metrics,
+    find_rivals,
 )
 from physx_core.pipelines.learning.learner import Learner
 from physx_core.pipelines.learning.opening import DataOpening, join_group, open_dataset
@@ -163,10 +164,13 @@ class Training(NewSessionPipeline):
     the loss after which to stop; None: never. The last network is kept in addition to "best"."""
     min_improvement: float = at_least(0, 0.0)
     """Smallest decrease below the best loss that counts as an improvement."""
-    rivals: str = field(default="all", metadata={"choices": ("all", "none")})
-    """Whether the network is judged at the end: "all" measures its errors on the samples that were
-    held back, and those of predictions that need no network, which get a tenth of the training's
-    time: the mean, no change, a linear map, and the nearest sample; "none" does not."""
+    rivals: str | Sequence[str | Callable[..., Any]] = "all"
+    """What the network is compared with at the end, on the samples that were held back: "all" are
+    predictions that need no network, which get a tenth of the training's time: the mean, no change,
+    a linear map, and the nearest sample. Your own are named as "script.py:function" or
+    "package.module:function": ["all", "script.py:theory"]; a function gets the network's inputs in
+    physical units by name, shape (rows, ...) each, and returns the prediction, or a table of them
+    by the name of the true field. []: only the network's own errors; "none": these neither."""
     on_nan: str = field(default="stop", metadata={"choices": ("stop", "continue")})
     """What to do if a loss, gradient, or parameter is NaN or infinite: "stop" with an error and the
     previous checkpoint, or "continue" and ignore it."""
@@ -445,7 +449,7 @@ class Training(NewSessionPipeline):
 
     def _judge(self) -> None:
         """Measure how good the network is, unless that is not wanted."""
-        if self._is_main and self.rivals != "none":
+        if self._is_main and self._judging.judges:
             self._judgment = self._judging.judge(self._duration, self._decided)
 
     @property
@@ -628,7 +632,7 @@ class Training(NewSessionPipeline):
         if start.checkpoint is not None and start.session is not None:
             self._check_resumed(start.session.path)
         buffer = self._create_buffer()
-        metrics = find_metrics(self.metrics)
+        metrics, rivals = find_metrics(self.metrics), find_rivals(self.rivals)
         network_class.set_seed(self._resumed.seed)
         self.learner = Learner(self.network_config, trains=True, stops_at_nan=self.on_nan == "stop")
         existing = start.config.existing_dir
@@ -667,7 +671,7 @@ class Training(NewSessionPipeline):
             self._unrolling.check(self.data.stored, self.learner.transformation)
         validates = self.validation_every > 0 and self.data.stored.has_validation
         of = self.learner, self.data.stored
-        self._judging = Judging(*of, self.monitor, metrics, validates=validates)
+        self._judging = Judging(*of, self.monitor, metrics, rivals, validates=validates)
         if start.checkpoint is not None and start.environment is None and self._is_main:
             fixed, folder = self._resumed.snapshots, self.data.dataset.directory
             data = self._resumed.data, self.data.stored.datasets, start.config.mode, fixed

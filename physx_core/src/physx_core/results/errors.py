@@ -9,7 +9,7 @@ from typing import Any, Literal
 import numpy as np
 
 from physx_core.fields import Field
-from physx_core.results.result import Interval
+from physx_core.results.wording import Interval
 from physx_core.typing import Array, Index
 
 ERRORS = ("rmse", "relative_l2", "max", "accuracy", "balanced_accuracy")
@@ -288,3 +288,31 @@ def compare(network: Errors, rival: Errors, unit: str) -> dict[str, Any]:
     if abs(ratio - 1) < _SAME or is_chance(own - other):
         verdict = "even"
     return {"verdict": verdict, "ratio": ratio, "interval": interval, "why": ""}
+
+
+def mean_interval(values: Sequence[float]) -> Interval | None:
+    """Return the 95 % interval of the mean of a number over episodes; None: too few episodes."""
+    if len(values) < FEWEST:
+        return None
+    [sums] = drawn_sums(np.asarray(values, np.float64))
+    low, high = (np.quantile(sums, (0.025, 0.975)) / len(values)).tolist()
+    return low, high
+
+
+def compare_rewards(policy: Sequence[float], rival: Sequence[float]) -> dict[str, Any]:
+    """Compare the rewards of two policies in the same episodes; see `ActionsResult`.
+
+    Returns:
+        ``verdict``, ``difference``, ``interval`` and ``why``.
+    """
+    differences = np.asarray(policy, np.float64) - np.asarray(rival, np.float64)
+    mean, count = float(differences.mean()), len(differences)
+    if count < FEWEST:
+        why = f"too few to say: {count} episodes, fewer than {FEWEST}"
+        return {"verdict": "unknown", "difference": mean, "interval": None, "why": why}
+    [sums] = drawn_sums(differences)
+    low, high = (np.quantile(sums, (_LEVEL / 2, 1 - _LEVEL / 2)) / count).tolist()
+    verdict = "wins" if low > 0 else "loses" if high < 0 else "even"
+    if not mean or is_chance(differences):
+        verdict = "even"
+    return {"verdict": verdict, "difference": mean, "interval": (low, high), "why": ""}

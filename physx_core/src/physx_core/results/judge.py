@@ -17,6 +17,8 @@ from physx_core.results.rivals import (
     Mean,
     Nearest,
     NotRunError,
+    Own,
+    Predict,
     Rival,
     TooSlowError,
     Unchanged,
@@ -28,6 +30,7 @@ from physx_core.views.batches import PAD, Batches
 
 MEAN, CLASS, LINEAR = "mean", "most frequent class", "linear map"
 UNCHANGED, NEAREST = "nothing changes", "nearest neighbor"
+DEFAULT = (MEAN, UNCHANGED, LINEAR, NEAREST)
 _COMPARED = 5_000
 """Number of samples on which rivals are compared; of more, batches at equal distances are."""
 _ALIKE = 0.5
@@ -108,7 +111,11 @@ class Judge:
     """
 
     def __init__(
-        self, network: Predictor, training: Batches, metrics: Mapping[str, Metric] | None = None
+        self,
+        network: Predictor,
+        training: Batches,
+        metrics: Mapping[str, Metric] | None = None,
+        rivals: Mapping[str, Predict | None] | None = None,
     ) -> None:
         """Read some of the samples that the network learns from.
 
@@ -116,8 +123,11 @@ class Judge:
             network: The network.
             training: Batches of these samples.
             metrics: Further errors by name.
+            rivals: Who else predicts, by name: a user's function, or None for one of `DEFAULT`;
+                None: all of these.
         """
         self._network, self._metrics = network, metrics or {}
+        self._wanted = dict.fromkeys(DEFAULT) if rivals is None else rivals
         with training.reading(network.names) as self._training:
             self._sample = TrainingSample(self._training, network.given)
         fields, batch = self._training.fields, self._sample.batch
@@ -152,8 +162,12 @@ class Judge:
         """
         self._seconds, self._clock = max(_LEAST_SECONDS, seconds * _SHARE), clock
         self._deadline = clock() + self._seconds
+        self._rivals = {
+            name: Own(function, self._network.given)
+            for name, function in self._wanted.items() if function is not None
+        }  # fmt: skip
         sources: dict[str, tuple[str, int | None]] = {}
-        for name in self._targets:
+        for name in self._targets if UNCHANGED in self._wanted else ():
             try:
                 sources[name] = same_quantity(name, self._network.given, self._training)
             except NotRunError as error:
@@ -165,10 +179,10 @@ class Judge:
         }
         if sources:
             self._rivals[UNCHANGED] = Unchanged(sources)
-        for rival, make in makers.items():
+        for rival in (name for name in makers if name in self._wanted):
             try:
                 self._check(0)
-                self._rivals[rival] = make()
+                self._rivals[rival] = makers[rival]()
             except NotRunError as error:
                 self._drop(rival, error)
 
@@ -220,8 +234,8 @@ class Judge:
         other = copy(self)
         other._targets = {name: of.at(batches.fields[name]) for name, of in self._targets.items()}
         why = "it learned from samples of another shape"
-        other._rivals = {n: r for n, r in self._rivals.items() if n == UNCHANGED}
         gone = (MEAN, LINEAR, NEAREST)
+        other._rivals = {n: r for n, r in self._rivals.items() if n not in gone}
         other._why = {**self._why, **{(n, f): why for n in gone for f in self._targets}}
         return other
 
@@ -300,8 +314,13 @@ class Judge:
                 self._drop(name, error)
                 del self._rivals[name]
                 continue
-            fields = [each for each in self._targets if (name, each) not in self._why]
-            guesses = {each: rival.predict(each, batch, common) for each in fields}
+            guesses = {}
+            for each in self._targets:
+                try:
+                    if (name, each) not in self._why:
+                        guesses[each] = rival.predict(each, batch, common)
+                except NotRunError as error:
+                    self._why[name, each] = str(error)
             self._add(sums[name], guesses, batch, groups)
 
     def _add(self, sums: Mapping[str, Errors], guesses: Batch, batch: Batch, groups: Index) -> None:
@@ -326,7 +345,7 @@ class Judge:
             for label, k in places.items()
         } if len(order) > 2 else {}  # fmt: skip
         rivals = {}
-        for rival in (MEAN, UNCHANGED, LINEAR, NEAREST):
+        for rival in self._wanted:
             why = self._why.get((rival, name), "")
             if rival == NEAREST and not part.is_apart:
                 why = _NEIGHBORS

@@ -7,15 +7,15 @@ import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal, TypeAlias
+from typing import Any, Literal
 
-Verdict: TypeAlias = Literal["wins", "loses", "even", "unknown"]
-Interval: TypeAlias = tuple[float, float]
+from physx_core.results.policy import PolicyResult
+from physx_core.results.sweep import SweepResult
+from physx_core.results.wording import WORDS, Interval, Verdict, between, number, percent, plain
 
 _SHOWN_PARAMETERS = 4
 _WIDEST = 10
 """Largest number of classes whose confusion is shown."""
-_WORDS = {"wins": "better", "loses": "WORSE", "even": "no clear difference"}
 
 
 @dataclass(frozen=True)
@@ -36,7 +36,7 @@ class EpisodeError:
         """The episode in words."""
         known = self.about
         given = list(known.get("parameters", {}).items())
-        shown = [f"{name} {_plain(value)}" for name, value in given[:_SHOWN_PARAMETERS]]
+        shown = [f"{name} {plain(value)}" for name, value in given[:_SHOWN_PARAMETERS]]
         more = ["..."] if len(given) > len(shown) else []
         words = [f"{known.get('number', '?')}", f"({', '.join(shown + more)})" if shown else ""]
         return " ".join(word for word in words if word)
@@ -189,13 +189,15 @@ class Result:
 
     Attributes:
         kind: The pipeline: "training", "data_generation", "prediction" or "replay"; or
-            "evaluation".
-        session: Folder of the session.
+            "evaluation", or "sweep".
+        session: Folder of the session, or of the study.
         seconds: Duration in s.
         summary: What was done, in lines.
         numbers: Losses and rates by name, with units in the names: see `values`.
         parts: The network's errors on the parts "validation" and "test", as far as they exist.
         rollouts: How good predictions are that are fed back, by predicted field.
+        policies: How good the network is as a policy, by environment and engine.
+        sweep: What the trials of a sweep have found; None: it is none.
         why: Why the network was not judged; empty if it was.
         places: Where things are, by what they are.
     """
@@ -207,6 +209,8 @@ class Result:
     numbers: Mapping[str, float] = field(default_factory=dict)
     parts: Mapping[str, PartResult] = field(default_factory=dict)
     rollouts: Mapping[str, RolloutResult] = field(default_factory=dict)
+    policies: Mapping[str, PolicyResult] = field(default_factory=dict)
+    sweep: SweepResult | None = None
     why: str = ""
     places: Mapping[str, str] = field(default_factory=dict)
 
@@ -216,7 +220,9 @@ class Result:
 
         The errors of a rival are ``error/FIELD/RIVAL/NAME``; the user's own ones ``metric/NAME``
         and ``test/metric/NAME``. ``rollout/FIELD/`` has ``rmse``, the error at the last row, and as
-        numbers of rows ``doubles`` and ``loses``: see `RolloutResult`.
+        numbers of rows ``doubles`` and ``loses``: see `RolloutResult`. The mean reward of an
+        episode is ``reward``, after the name of the environment and engine if there are several;
+        ``best`` that of the best setting of a sweep.
         """
         found = dict(self.numbers)
         for part, judged in self.parts.items():
@@ -235,7 +241,11 @@ class Result:
             for key, row in (("doubles", rollout.doubles), ("loses", rollout.loses)):
                 if row is not None:
                     found[f"rollout/{name}/{key}"] = row
-        return found
+        for name, policy in self.policies.items():
+            start = f"{name}/" if len(self.policies) > 1 else ""
+            found |= {f"{start}{key}": value for key, value in policy.values.items()}
+        best = None if self.sweep is None else self.sweep.best
+        return found if best is None else {**found, "best": best.value}
 
     def __getitem__(self, name: str) -> float:
         """Return one of `values`."""
@@ -246,8 +256,8 @@ class Result:
 
     def to_plain(self) -> dict[str, Any]:
         """Return all of it as plain data; numbers that do not exist are None."""
-        plain: dict[str, Any] = _finite(dataclasses.asdict(self))
-        return plain
+        found: dict[str, Any] = _finite(dataclasses.asdict(self))
+        return found
 
     def to_json(self) -> str:
         """Return all of it as JSON; numbers that do not exist are null."""
@@ -261,6 +271,9 @@ class Result:
             found += _part_lines(name, part)
         for name, rollout in self.rollouts.items():
             found += _rollout_lines(name, rollout)
+        for name, policy in self.policies.items():
+            found += policy.lines(name)
+        found += [] if self.sweep is None else self.sweep.lines
         if self.why:
             found.append(f"not judged: {self.why}")
         return found
@@ -288,8 +301,11 @@ class Result:
                 found += [f"<p>{escape(line)}</p>" for line in _details(of)]
             notes = [*_metrics(part), *_missing(part), *([part.why] if part.why else [])]
             found += [f"<p>{escape(line)}</p>" for line in notes]
-        for name, rollout in self.rollouts.items():
-            told = "\n".join(_rollout_lines(name, rollout))
+        blocks = [list(_rollout_lines(name, rollout)) for name, rollout in self.rollouts.items()]
+        blocks += [policy.lines(name) for name, policy in self.policies.items()]
+        blocks += [] if self.sweep is None else [self.sweep.lines]
+        for lines in blocks:
+            told = "\n".join(lines)
             found.append(f"<pre>{escape(told)}</pre>")
         if self.why:
             found.append(f"<p>not judged: {escape(self.why)}</p>")
@@ -304,8 +320,8 @@ def _heading(name: str, part: PartResult) -> str:
 def _part_lines(name: str, part: PartResult) -> Iterator[str]:
     yield _heading(name, part)
     for label, of in part.fields.items():
-        between = f", 95 % interval {_between(of.interval)}" if of.interval else ""
-        yield f"  {label}: {_shown(of.errors, of.unit)}{between}"
+        told = f", 95 % interval {between(of.interval)}" if of.interval else ""
+        yield f"  {label}: {_shown(of.errors, of.unit)}{told}"
         rows = list(_rival_rows(of))
         width = max([len(rival) for rival, _, _ in rows], default=0)
         for rival, errors, told in rows:
@@ -318,7 +334,7 @@ def _part_lines(name: str, part: PartResult) -> Iterator[str]:
 
 def _metrics(part: PartResult) -> Iterator[str]:
     for name, value in part.metrics.items():
-        yield f"{name}: {_number(value)}, the mean over {part.episodes:,} episodes"
+        yield f"{name}: {number(value)}, the mean over {part.episodes:,} episodes"
 
 
 def _rollout_lines(name: str, of: RolloutResult) -> Iterator[str]:
@@ -326,8 +342,8 @@ def _rollout_lines(name: str, of: RolloutResult) -> Iterator[str]:
     yield f"{name}, predictions fed back: {of.episodes} episodes ({of.part}), {of.rows[-1]:,} rows"
     head = ["after row", f"rmse {unit}".rstrip(), "80 % of the episodes", "if nothing changes"]
     cells = [head, *([
-        f"{of.rows[k]:,}", _number(of.errors[k]), f"{_number(of.low[k])} to {_number(of.high[k])}",
-        _number(of.unchanged[k]),
+        f"{of.rows[k]:,}", number(of.errors[k]), f"{number(of.low[k])} to {number(of.high[k])}",
+        number(of.unchanged[k]),
     ] for k in of.shown)]  # fmt: skip
     widths = [max(map(len, column)) for column in zip(*cells, strict=True)]
     for row in cells:
@@ -335,12 +351,12 @@ def _rollout_lines(name: str, of: RolloutResult) -> Iterator[str]:
         yield f"  {'  '.join(padded)}"
     yield f"  {'; '.join(rollout_notes(of))}"
     if of.episode_errors:
-        each = (f"{n} {e.text}: {_number(e.error)} {unit}" for n, e in of.episode_errors.items())
+        each = (f"{n} {e.text}: {number(e.error)} {unit}" for n, e in of.episode_errors.items())
         yield f"  episodes: {', '.join(map(str.rstrip, each))}"
     for label, drift in of.invariants.items():
         yield (
-            f"  {label} moves by {_number(drift.prediction[-1])} in the predictions, by "
-            f"{_number(drift.truth[-1])} in the simulation, after row {of.rows[-1]:,}"
+            f"  {label} moves by {number(drift.prediction[-1])} in the predictions, by "
+            f"{number(drift.truth[-1])} in the simulation, after row {of.rows[-1]:,}"
         )
 
 
@@ -370,20 +386,20 @@ def _rival_rows(of: FieldResult) -> Iterator[tuple[str, str, str]]:
         if rival.verdict == "unknown":
             yield name, errors, rival.why
             continue
-        ratio = "" if math.isnan(rival.ratio) else f", {_number(rival.ratio)} times the error"
-        between = f" ({_between(rival.interval)})" if ratio and rival.interval else ""
-        yield name, errors, f"{_WORDS[rival.verdict]}{ratio}{between}"
+        ratio = "" if math.isnan(rival.ratio) else f", {number(rival.ratio)} times the error"
+        limits = f" ({between(rival.interval)})" if ratio and rival.interval else ""
+        yield name, errors, f"{WORDS[rival.verdict]}{ratio}{limits}"
 
 
 def _details(of: FieldResult) -> Iterator[str]:
     if of.by_component:
-        each = ", ".join(f"{_number(value)} {unit}".strip() for value, unit in of.by_component)
+        each = ", ".join(f"{number(value)} {unit}".strip() for value, unit in of.by_component)
         yield f"rmse by component: {each}"
     if of.near_zero:
         yield f"{of.near_zero} episodes have no relative error, as the truth is nearly zero"
     if of.episodes:
         unit = _one_unit(of.unit) if of.kind == "real" else ""
-        form = _number if of.kind == "real" else _percent
+        form = number if of.kind == "real" else percent
         each = ", ".join(
             f"{name} {episode.text}: {form(episode.error)} {unit}".rstrip()
             for name, episode in of.episodes.items()
@@ -400,31 +416,15 @@ def _shown(errors: Mapping[str, float], unit: str) -> str:
     words = []
     for name, value in errors.items():
         if name in ("accuracy", "balanced_accuracy", "relative_l2"):
-            words.append(f"{name} {_percent(value)}")
+            words.append(f"{name} {percent(value)}")
         else:
-            words.append(f"{name} {_number(value)} {own}".rstrip())
+            words.append(f"{name} {number(value)} {own}".rstrip())
     return ", ".join(words)
 
 
 def _one_unit(unit: str) -> str:
     """Return a unit; of components of several units, that in which their errors are added up."""
     return unit if "," not in unit else "std"
-
-
-def _number(value: float) -> str:
-    return f"{value:.3g}"
-
-
-def _percent(value: float) -> str:
-    return f"{value * 100:.3g} %"
-
-
-def _between(interval: Interval | None) -> str:
-    return "" if interval is None else f"{_number(interval[0])} to {_number(interval[1])}"
-
-
-def _plain(value: Any) -> str:
-    return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 
 def _finite(value: Any) -> Any:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 
@@ -14,6 +15,10 @@ from physx_core.views.batches import Batches
 
 Check = Callable[[float], None]
 """Raises `TooSlowError` if there is less time left than so many s."""
+
+Predict = Callable[[Batch], "Batch | Array"]
+"""A user's rival: it gets the network's inputs by name, in physical units, shape (rows, ...) each,
+and returns predictions by the name of the true field, or those of the only one."""
 
 _FEWEST_ROWS = 32
 _WIDEST = 1500
@@ -50,12 +55,12 @@ class Rival(ABC):
         """
         self._sample, self._targets, self._check = sample, targets, check
 
-    def prepare(self, batch: Batch) -> Array:
+    def prepare(self, batch: Batch) -> Any:
         """Return what is common to the predictions of all fields of a batch."""
-        return np.zeros(0)
+        return None
 
     @abstractmethod
-    def predict(self, name: str, batch: Batch, common: Array) -> Array:
+    def predict(self, name: str, batch: Batch, common: Any) -> Array:
         """Return the prediction of a field, shape (rows, *field shape)."""
 
 
@@ -74,7 +79,7 @@ class Mean(Rival):
                 counts = [(values == label).sum(axis=0) for label in target.classes]
                 self._values[name] = target.classes[np.argmax(counts, axis=0)]
 
-    def predict(self, name: str, batch: Batch, common: Array) -> Array:
+    def predict(self, name: str, batch: Batch, common: Any) -> Array:
         """Return the mean, or the most frequent class."""
         return np.broadcast_to(self._values[name], batch[name].shape)
 
@@ -136,7 +141,7 @@ class Linear(Rival):
         inputs = self._sample.read(batch)
         return inputs if self._known is None else inputs @ self._known.T
 
-    def predict(self, name: str, batch: Batch, common: Array) -> Array:
+    def predict(self, name: str, batch: Batch, common: Any) -> Array:
         """Return what the map predicts."""
         weights, mean = self._maps[name]
         return _from_numbers(self._targets[name], common @ weights + mean, batch[name].shape)
@@ -178,9 +183,10 @@ class Nearest(Rival):
             found.append((inputs[first : first + 64] @ self._known).argmin(axis=1))
         return np.concatenate(found)
 
-    def predict(self, name: str, batch: Batch, common: Array) -> Array:
+    def predict(self, name: str, batch: Batch, common: Any) -> Array:
         """Return the values of the nearest samples."""
-        return self._sample.batch[name][common]
+        found: Array = self._sample.batch[name][common]
+        return found
 
 
 class Unchanged(Rival):
@@ -190,12 +196,38 @@ class Unchanged(Rival):
         """Keep which input is the same quantity as each predicted field: see `same_quantity`."""
         self._sources = sources
 
-    def predict(self, name: str, batch: Batch, common: Array) -> Array:
+    def predict(self, name: str, batch: Batch, common: Any) -> Array:
         """Return the last value."""
         given, place = self._sources[name]
         values = batch[given] if place is None else batch[given][:, place]
         extra = batch[name].ndim - values.ndim
         return np.broadcast_to(values[(slice(None), *(None,) * extra)], batch[name].shape)
+
+
+class Own(Rival):
+    """What a user's function of the network's inputs predicts."""
+
+    def __init__(self, function: Predict, given: Sequence[str]) -> None:
+        """Keep the function, and the names of its inputs."""
+        self._function, self._given = function, given
+
+    def prepare(self, batch: Batch) -> Any:
+        """Return what the function returns."""
+        try:
+            return self._function({name: batch[name] for name in self._given})
+        except Exception as error:  # the network is stored: a run must not fail for its result
+            raise NotRunError(f"it failed: {error!r}") from error
+
+    def predict(self, name: str, batch: Batch, common: Any) -> Array:
+        """Return the field's part of it."""
+        if isinstance(common, Mapping) and name not in common:
+            raise NotRunError("it does not predict this field")
+        found: Array = np.asarray(common[name] if isinstance(common, Mapping) else common)
+        if found.shape != batch[name].shape:
+            raise NotRunError(
+                f"it returned the shape {found.shape} where the field has {batch[name].shape}"
+            )
+        return found
 
 
 def same_quantity(name: str, given: Sequence[str], batches: Batches) -> tuple[str, int | None]:

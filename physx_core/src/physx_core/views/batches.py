@@ -52,6 +52,7 @@ class Batches(Closeable):
         batch_size: Number of items in a batch; the last of an epoch may have fewer.
         seed: Seed of the orders.
         part: Which part of the view.
+        mode: Mode of the rows.
         snapshot: The rows of each source when the batches were opened, by its folder as the view
             names it; "" if it names none.
         num_items: Number of items in an epoch.
@@ -100,8 +101,8 @@ class Batches(Closeable):
             raise ConfigError("The data are given twice: leave out View.sources, or `data`.")
         if not view.sources and data is None:
             raise ConfigError("View.sources names no data: add a folder with its share.")
-        self.view, self.batch_size, self.seed, self.part = view, batch_size, seed, part
-        self._mode = mode
+        self.view, self.batch_size, self.seed = view, batch_size, seed
+        self.part, self.mode = part, mode
         self._opened = contextlib.ExitStack()
         given = {None: 1.0} if data is not None else view.sources
         others = beside._sources if beside is not None else [None] * len(given)
@@ -138,7 +139,7 @@ class Batches(Closeable):
                 folder = dataset.directory
                 raise ConfigError(f"The snapshot has no rows of the source {name or folder}.")
             known = Snapshot(*snapshot[name or ""])
-        return Source(self.view, dataset, self._mode, self.part, known, beside)
+        return Source(self.view, dataset, self.mode, self.part, known, beside)
 
     def _count(self, shares: Array) -> int:
         """Return the number of items of an epoch, and find out which source has which of them."""
@@ -156,7 +157,7 @@ class Batches(Closeable):
             empty = self._sources[int(np.argmin(counts))]
             raise DatasetError(
                 f'There is nothing to read for the part "{self.part}" in '
-                f'{empty.dataset.directory}: mode "{self._mode}" has {empty.rows.count} rows in '
+                f'{empty.dataset.directory}: mode "{self.mode}" has {empty.rows.count} rows in '
                 f"{empty.trajectories[1]} trajectories, of which the view takes "
                 f"{empty.trajectories[0]}, and no window fits into one."
             )
@@ -203,7 +204,7 @@ class Batches(Closeable):
         first = self._sources[0]
         if window.field not in first.rows.fields:
             raise DatasetError(
-                f'Mode "{self._mode}" of {first.dataset.directory} has no field "{window.field}".'
+                f'Mode "{self.mode}" of {first.dataset.directory} has no field "{window.field}".'
             )
         stored = first.rows.fields[window.field]
         for other in self._sources[1:]:
@@ -424,7 +425,7 @@ class Batches(Closeable):
     def digest(self) -> str:
         """Digest of all that the batches depend on, besides the values of the rows."""
         known = {name: tuple(each) for name, each in self.snapshot.items()}
-        bound = to_plain(self.view), known, self._mode, self.part, self.batch_size, self.seed
+        bound = to_plain(self.view), known, self.mode, self.part, self.batch_size, self.seed
         return blake2b(repr(bound).encode(), digest_size=8).hexdigest()
 
     def normalization(self, normalize: Normalize = True) -> dict[str, Normalization]:
@@ -500,7 +501,7 @@ class Batches(Closeable):
         """Let another process open the data for itself, as they are here."""
         data = None if self.view.sources else str(self._sources[0].dataset.directory)
         options = {
-            "data": data, "mode": self._mode, "part": self.part, "snapshot": self.snapshot,
+            "data": data, "mode": self.mode, "part": self.part, "snapshot": self.snapshot,
             "fields": self._names, "dtype": self._dtype, "reuse": self._reuse,
         }  # fmt: skip
         return _reopen, (self.view, self.batch_size, self.seed, options)

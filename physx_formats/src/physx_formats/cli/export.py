@@ -1,9 +1,9 @@
-"""``physx export``: export a dataset as npz, Parquet, Minari, LeRobot, Zarr, or one HDF5 file."""
+"""``physx export``: write a dataset as a file or folder of another format."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Annotated
 
 import tyro
@@ -19,7 +19,8 @@ class Export:
     """Write a dataset's samples as one file or folder of another format.
 
     npz: NumPy. hdf5-single: one plain HDF5 file with MODE/FIELD. parquet: columns, for pandas,
-    polars, and databases. zarr: chunked arrays, for xarray. minari: episodes for offline
+    polars, and databases. csv: text. safetensors: arrays. zarr: chunked arrays, for xarray.
+    vtkhdf: a mesh and its fields over time, for ParaView. minari: episodes for offline
     reinforcement learning. lerobot: episodes for imitation learning, in version 3 of LeRobot's
     format.
     """
@@ -29,10 +30,11 @@ class Export:
     out: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="OUT")]
     """The file to create, or the folder for zarr, minari, and lerobot."""
     to: str
-    """The format: "npz", "parquet", "minari", "lerobot", "zarr", "hdf5-single", or one of another
-    plugin."""
+    """The format: "npz", "parquet", "csv", "safetensors", "vtkhdf", "minari", "lerobot", "zarr",
+    "hdf5-single", or one of another plugin."""
     mode: tuple[str, ...] = ()
-    """Modes to export; by default all that have samples. Parquet, minari, and lerobot take one."""
+    """Modes to export; by default all that have samples. Parquet, csv, vtkhdf, minari, and lerobot
+    take one."""
     compression: str = "none"
     """npz: deflate; parquet: snappy, gzip, zstd, lz4, brotli; zarr: zstd, gzip, blosc;
     hdf5-single: gzip, lzf."""
@@ -44,9 +46,20 @@ class Export:
     rewards: str | None = None
     """minari, lerobot: reward field; by default minari's rewards are 0."""
     fps: int | None = None
-    """lerobot: frames per second of simulated time; required."""
+    """lerobot, vtkhdf: frames per second of simulated time; required for lerobot."""
     task: str | None = None
     """lerobot: description of the task."""
+    features: Annotated[dict[str, str], tyro.conf.arg(name="as", metavar="FEATURE=FIELDS")] = field(
+        default_factory=dict
+    )
+    """lerobot: fields of features, separated by commas: observation.state=q,v. Other observations
+    are then those that are named only."""
+    points: str | None = None
+    """vtkhdf: field with the positions of the mesh's points, of samples or episodes; required."""
+    cells: str | None = None
+    """vtkhdf: field with the numbers of each cell's points; by default each point is a cell."""
+    cell_type: str | None = None
+    """vtkhdf: type of the cells, such as "quad"; by default after their number of points."""
 
 
 def run(words: Sequence[str]) -> None:
@@ -59,6 +72,10 @@ def run(words: Sequence[str]) -> None:
         options.rewards,
         options.fps,
         options.task,
+        {name: of.split(",") for name, of in options.features.items()},
+        options.points,
+        options.cells,
+        options.cell_type,
     )
     bar = ProgressBar()
     with Dataset.open(options.directory) as dataset:

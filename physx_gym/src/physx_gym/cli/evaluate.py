@@ -2,19 +2,25 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
 import math
-from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
-from typing import Annotated, Any
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+from typing import Annotated, Any, Literal
 
 import gymnasium
 import numpy as np
 import tyro
+from gymnasium import spaces
 
+from physx_core import checkpoint
 from physx_core.cli import argument_registry, show, show_table
 from physx_core.components import Evaluation
-from physx_core.errors import ConfigError
+from physx_core.errors import ConfigError, SessionError
+from physx_core.results import PolicyResult, Result, read_results, store_result
 from physx_gym.bridge.make_env import make_env
 from physx_gym.bridge.plain import PlainEnv
 from physx_gym.bridge.policy import Policy
@@ -25,11 +31,16 @@ SPEED = "x_velocity"
 """Name, in information, of the velocity in the direction of walking, in m/s."""
 SUCCESS = "is_success"
 """Name, in information, of whether the goal of a task is reached."""
+_LAST = -1
 
 
 @dataclass
 class Evaluate:
-    """Run episodes under a saved policy, and report rewards, lengths, speeds and success."""
+    """Run episodes under a saved policy, and report rewards, lengths, speeds and success.
+
+    They are compared with those of actions that are zero, and of random ones. The session keeps the
+    result, one for each environment and engine.
+    """
 
     policy: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="POLICY")]
     """Session or checkpoint of the policy's network."""
@@ -43,6 +54,8 @@ class Evaluate:
     """Seed of the first episode; each further episode adds 1."""
     env_kwargs: dict[str, Any] = field(default_factory=dict)
     """Further options of the environment."""
+    rivals: Literal["all", "none"] = "all"
+    """Whether to run the same episodes with zero and with random actions as well."""
     json: bool = False
     """Print JSON with the figures of each episode instead of a table."""
     replay: str | None = None
@@ -60,24 +73,63 @@ def run(words: Sequence[str]) -> None:
     if options.episodes < 1:
         raise ConfigError(f"--episodes is {options.episodes} but must be at least 1.")
     backend = {} if options.backend is None else {"backend": options.backend}
+    begin = time.monotonic()
     env = make_env(options.env, options.env_kwargs | backend)
     try:
         act = Policy(options.policy, env, trust=options.trust).act
         seeds = range(options.seed, options.seed + options.episodes)
         found, recording = _evaluate_all(env, act, seeds, options)
+        film = options.film and replay(recording, record_video_path=options.film)
+        rivals = {} if options.rivals == "none" else rewards_without_policy(env, seeds)
+        result = _result(options, found, rivals, film)
+        _store(Path(options.policy), result, time.monotonic() - begin)
         if options.json:
             given = {"env": options.env, "backend": options.backend, "policy": options.policy}
-            show(json.dumps(given | {"summary": summary(found), "episodes": found}))
+            known = {name: asdict(each) for name, each in result.rivals.items()}
+            figures = {"summary": summary(found), "episodes": found, "rivals": known}
+            show(json.dumps(given | figures))
         else:
             where = "" if options.backend is None else f" on {options.backend}"
             show(f"{options.env}{where}: {len(found)} episodes, seeds {seeds[0]} to {seeds[-1]}\n")
             print_table(summary(found))
+            for line in result.lines("")[1:]:
+                show(line.strip())
         if options.replay is not None:
             show(f"recording: {replay(recording, path=options.replay)}")
-        if options.film is not None:
-            show(f"film: {replay(recording, record_video_path=options.film)}")
+        if film:
+            show(f"film: {film}")
     finally:
         env.close()
+
+
+def _result(
+    options: Evaluate,
+    episodes: Sequence[dict[str, float]],
+    rivals: Mapping[str, Sequence[float]],
+    film: str | Path | None,
+) -> PolicyResult:
+    session, place = Path(options.policy).resolve(), Path(film).resolve() if film else None
+    if place is not None and place.is_relative_to(session):  # wherever the session goes
+        place = place.relative_to(session)
+    figures = {name: [episode[name] for episode in episodes] for name in episodes[0]}
+    network = checkpoint.find(Path(options.policy), None, _LAST).path.name
+    return PolicyResult.of(
+        options.env, options.backend or "", network, figures, rivals, film=str(place or "")
+    )  # fmt: skip
+
+
+def _store(session: Path, found: PolicyResult, seconds: float) -> None:
+    """Keep a result in its session, beside those of the same network on other engines."""
+    if not (session / "network").is_dir():  # a checkpoint's own folder
+        return
+    name = f"{found.environment} on {found.backend}" if found.backend else found.environment
+    with contextlib.suppress(SessionError):  # of somebody else, who may only read it
+        former = read_results(session).get("evaluation")
+        known = {} if former is None else dict(former.policies)
+        known = {label: each for label, each in known.items() if each.network == found.network}
+        policies = dict(sorted({**known, name: found}.items()))
+        result = Result("evaluation", str(session), seconds, policies=policies)
+        store_result(session, result)
 
 
 def evaluate(
@@ -112,6 +164,43 @@ def evaluate(
             figures["success"] = float(info[SUCCESS])
         found.append(figures)
     return found
+
+
+def rewards_without_policy(
+    env: gymnasium.Env[Any, Any], seeds: Sequence[int]
+) -> dict[str, list[float]]:
+    """Return the rewards of episodes with zero and with random actions, by the actions' name.
+
+    Args:
+        env: The environment.
+        seeds: Seeds of the episodes, and of the random actions.
+    """
+    zero = _zero(env.action_space)
+    acts = {"zero actions": lambda _: zero, "random actions": lambda _: env.action_space.sample()}
+    found: dict[str, list[float]] = {name: [] for name in acts}
+    for name, act in acts.items():
+        for seed in seeds:
+            env.action_space.seed(seed)
+            found[name].append(evaluate(env, act, [seed])[0]["reward"])
+    return found
+
+
+def _zero(space: gymnasium.Space[Any]) -> Any:
+    """Return the action nearest to zero, or the first of several choices."""
+    match space:
+        case spaces.Box():
+            return np.clip(np.zeros(space.shape, space.dtype), space.low, space.high)
+        case spaces.Discrete() | spaces.MultiDiscrete():
+            return space.start
+        case spaces.MultiBinary():
+            return np.zeros(space.shape, space.dtype)
+        case spaces.Dict():
+            return {name: _zero(part) for name, part in space.items()}
+        case spaces.Tuple():
+            return tuple(map(_zero, space))
+        case _:
+            space.seed(0)
+            return space.sample()
 
 
 def summary(episodes: Sequence[dict[str, float]]) -> dict[str, dict[str, float]]:

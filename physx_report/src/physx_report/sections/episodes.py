@@ -109,7 +109,7 @@ def _pictures(unseen: Unseen, part: str, judged: PartResult) -> Iterator[Block]:
         drawn = {
             f"{which.capitalize()} episode: {_described(episode, of)}": pair
             for which, episode in known.items()
-            if (pair := _compared(unseen, batches, name, _items(rows, episode.about)))
+            if (pair := _compared(unseen, batches, name, items_of(rows, episode.about)))
         }
         if not drawn:
             continue
@@ -144,7 +144,7 @@ def _compared(
     return true[name].astype(float), predicted[name].astype(float)
 
 
-def _items(rows: Array, about: Mapping[str, Any]) -> Array:
+def items_of(rows: Array, about: Mapping[str, Any]) -> Array:
     """Return the items of an episode.
 
     Args:

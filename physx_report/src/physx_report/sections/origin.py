@@ -24,6 +24,11 @@ def _blocks(run: Run) -> Iterator[Block]:
             file = shlex.quote(str(Path(run.path) / "config.toml"))
             again = f"physx {_COMMANDS[kind]} --config {file} --session-name again"
             yield Text([again], "code")
+    if "sweep" in run.results:
+        study = run.path / "study.toml"
+        if study.is_file():
+            yield Text(study.read_text(errors="replace").splitlines(), "code")
+        yield Text([f"physx sweep {shlex.quote(str(study))} --study again"], "code")
     info = run.path / "info.txt"
     lines = info.read_text(errors="replace").splitlines() if info.is_file() else []
     versions = [line for line in lines if "physx-core " in line and ", " in line]

@@ -31,6 +31,10 @@ def _blocks(run: Run) -> Iterator[Block]:
             yield _table(label, of)
             yield from _components(label, of)
             yield from _confusion(label, of)
+        if part.metrics:
+            rows = [[label, wording.number(value)] for label, value in part.metrics.items()]
+            caption = f"Your own errors, means over {part.episodes:,} episodes ({name})"
+            yield Table(["metric", "mean"], rows, caption)
 
 
 def _verdict(label: str, of: FieldResult) -> str:

@@ -13,7 +13,7 @@ from physx_report.section import Section
 
 def _blocks(run: Run) -> Iterator[Block]:
     result = run.results.get("evaluation")
-    if result is None:
+    if result is None or result.policies:
         return
     yield Text(list(result.summary))
     for name, rollout in result.rollouts.items():
@@ -24,7 +24,7 @@ def _rollout(name: str, of: RolloutResult) -> Iterator[Block]:
     notes = [f"{name}: {note}." for note in rollout_notes(of)]
     yield Text(notes, "verdict")
     several = "," in of.unit
-    unit = "standard deviations" if several else of.unit
+    unit = "std" if several else of.unit
     caption = (
         f"{name}. Error of predictions that are fed back, by row after the beginning of "
         f"{of.episodes} episodes ({of.part}); area: 80 % of the episodes"

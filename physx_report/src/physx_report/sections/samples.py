@@ -2,19 +2,24 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterator
 
 import numpy as np
 
-from physx_core import Dataset
+from physx_core import Dataset, Result
 from physx_core.dataset import EPISODES, EpisodeStatus
+from physx_core.errors import PhysxError
+from physx_core.pipelines import Redrawing
 from physx_report import drawing, wording
-from physx_report.blocks import Block, Figure, Table, Text
+from physx_report.blocks import Block, Figure, Picture, Table, Text
+from physx_report.film import MOST, as_file, redraw
 from physx_report.run import Run
 from physx_report.section import Section
 
+_FEW = 10
 _MOST = 12
-"""Largest number of parameters that are drawn, and of fields of an episode."""
+"""Largest number of parameters that are drawn, of fields of an episode, and of reasons."""
 _RECORDS = {"mode_index", "campaign", "episode", "count", "first_row", "rows", "part", "status"}
 
 
@@ -22,7 +27,7 @@ def _blocks(run: Run) -> Iterator[Block]:
     result, dataset = run.results.get("data_generation"), run.dataset
     if result is None or dataset is None:
         return
-    yield Text(list(result.summary), "verdict")
+    yield Text([*result.summary, *_rates(result)], "verdict")
     modes = [mode for mode in dataset.modes if mode != EPISODES and dataset.num_samples(mode)]
     rows = [
         [
@@ -39,8 +44,68 @@ def _blocks(run: Run) -> Iterator[Block]:
     yield Table(["mode", "field", "shape", "type", "unit", "samples"], rows, "Samples")
     if EPISODES in dataset.modes:
         yield from _campaign(dataset, modes)
+        yield from _failures(dataset, modes)
     for mode in modes[:1]:
+        yield from _film(run, dataset, mode)
         yield from _distributions(dataset, mode)
+
+
+def _rates(result: Result) -> list[str]:
+    """Say how fast the simulation was."""
+    rate = result.numbers.get("generated samples per s")
+    return [] if rate is None else [f"{rate:,.3g} samples per s, on the machine of the run"]
+
+
+def _failures(dataset: Dataset, modes: list[str]) -> Iterator[Block]:
+    """Say why episodes have failed."""
+    reasons: dict[str, list[str]] = {}
+    for mode in modes:
+        for each in dataset.failed_episodes(mode):
+            reason = each.reason.partition("\n")[0] or "unknown"
+            reasons.setdefault(reason, []).append(str(each.episode))
+    ordered = sorted(reasons.items(), key=lambda item: -len(item[1]))
+    rows = [
+        [reason, f"{len(numbers):,}", ", ".join(numbers[:_FEW]) + ", ..." * (len(numbers) > _FEW)]
+        for reason, numbers in ordered[:_MOST]
+    ]
+    left = f"; {len(ordered) - _MOST} other reasons" if len(ordered) > _MOST else ""
+    if rows:
+        yield Table(["reason", "episodes", "which"], rows, f"Failed episodes{left}")
+
+
+def _film(run: Run, dataset: Dataset, mode: str) -> Iterator[Block]:
+    """Show the first rows as their environment draws them."""
+    rows, told = _first_rows(dataset, mode)
+    try:
+        with (
+            warnings.catch_warnings(action="ignore"),  # of environments that draw nothing
+            Redrawing(dataset, mode, trust=run.trust) as simulation,
+        ):
+            film = redraw(simulation, rows, {}, {}, {})
+            if not any(film.frames):
+                return
+            pictures = film.pictures(run.camera, range(len(rows)))
+        yield Picture(as_file(pictures), f"{told}, as the environment draws them")
+    except PhysxError as error:
+        yield Text([f"There are no pictures: {str(error).rstrip('.')}."])
+
+
+def _first_rows(dataset: Dataset, mode: str) -> tuple[list[int], str]:
+    """Return the rows of the first episode, or the first ones of a stream, and what they are."""
+    count, known = dataset.num_samples(mode), dataset.recorded_episodes(mode)
+    if known is not None and len(known.rows) and known.rows.max() > 1:
+        first = int(np.flatnonzero(known.rows > 1)[0])
+        begin, size = int(known.first[first]), int(known.rows[first])
+        if known.numbers[first] == 1 and known.episode[first] >= 0:
+            chosen = np.unique(np.linspace(begin, begin + size - 1, MOST).astype(int)).tolist()
+            told = f"{len(chosen)} of {size} rows" if len(chosen) < size else f"{size} rows"
+            return chosen, f"Episode {int(known.episode[first])}, {told}"
+    some = np.arange(min(count, 16 * MOST))
+    if "env_id" in dataset.fields(mode):
+        owners = np.asarray(dataset[mode]["env_id"][: len(some)])
+        some = some[owners == owners[0]]
+    chosen = some[:MOST].tolist()
+    return chosen, f"The first {len(chosen)} rows of an instance"
 
 
 def _campaign(dataset: Dataset, modes: list[str]) -> Iterator[Block]:
@@ -62,7 +127,7 @@ def _campaign(dataset: Dataset, modes: list[str]) -> Iterator[Block]:
     values = {n: v[np.isfinite(v)] for n, v in values.items() if np.isfinite(v).sum() > 1}
     shown = dict(list(values.items())[:_MOST])
     if shown:
-        yield _histograms(shown, "How often parameters, and durations in s, occurred")
+        yield _histograms(shown, "How often parameters, and durations in s, occurred", "episodes")
 
 
 def _distributions(dataset: Dataset, mode: str) -> Iterator[Block]:
@@ -78,15 +143,16 @@ def _distributions(dataset: Dataset, mode: str) -> Iterator[Block]:
     flat = {name: each[np.isfinite(each)].ravel() for name, each in values.items()}
     flat = {name: each for name, each in flat.items() if len(each)}
     if flat:
-        yield _histograms(flat, f"Values of {len(chosen):,} samples")
+        told = f"Values of {len(chosen):,} of {count:,} samples"
+        yield _histograms(flat, f"{told}, at equal distances", "values")
         rows = [
             [name, *map(wording.number, (v.mean(), v.std(), v.min(), v.max()))]
             for name, v in flat.items()
         ]
-        yield Table(["field", "mean", "deviation", "smallest", "largest"], rows, "Values")
+        yield Table(["field", "mean", "deviation", "smallest", "largest"], rows, told)
 
 
-def _histograms(values: dict[str, np.ndarray], caption: str) -> Figure:
+def _histograms(values: dict[str, np.ndarray], caption: str, what: str) -> Figure:
     columns = min(4, len(values))
     rows = -(-len(values) // columns)
     with drawing.figure(caption, rows, columns, height=1.7) as (found, axes):
@@ -95,6 +161,8 @@ def _histograms(values: dict[str, np.ndarray], caption: str) -> Figure:
             place.set_xlabel(name)
         for place in axes[len(values) :]:
             place.set_axis_off()
+        for place in axes[::columns]:
+            place.set_ylabel(what)
     return found[0]
 
 

@@ -12,8 +12,9 @@ from physx_core.pipelines.learning.learner import Learner
 from physx_core.plugins import import_component
 from physx_core.results import PartResult
 from physx_core.results.errors import ERRORS, as_loss
-from physx_core.results.judge import Judge, Predictor
+from physx_core.results.judge import DEFAULT, Judge, Predictor
 from physx_core.results.metrics import Metric
+from physx_core.results.rivals import Predict
 
 
 @dataclass(frozen=True)
@@ -51,6 +52,7 @@ class Judging:
 
     Attributes:
         measures: Whether errors are measured in each validation.
+        judges: Whether the network is judged at the end.
     """
 
     def __init__(
@@ -59,6 +61,7 @@ class Judging:
         stored: StoredBatches,
         monitor: str | None,
         metrics: Mapping[str, Metric],
+        rivals: Mapping[str, Predict | None] | None,
         *,
         validates: bool,
     ) -> None:
@@ -69,14 +72,16 @@ class Judging:
             stored: The samples.
             monitor: See `Training.monitor`.
             metrics: See `find_metrics`.
+            rivals: See `find_rivals`.
             validates: Whether there are validations.
 
         Raises:
             ConfigError: If there is not.
         """
         self.measures = validates and bool(monitor or metrics)
+        self.judges = rivals is not None
         self._learner, self._stored, self._monitor = learner, stored, monitor
-        self._metrics = metrics
+        self._metrics, self._rivals = metrics, rivals
         self._judge: Judge | None = None
         if monitor is not None:
             self._check_monitor(monitor, validates=validates)
@@ -99,7 +104,8 @@ class Judging:
 
     def _begin(self) -> Judge:
         if self._judge is None:
-            self._judge = Judge(predictor_of(self._learner), self._stored.training, self._metrics)
+            of = predictor_of(self._learner), self._stored.training
+            self._judge = Judge(*of, self._metrics, self._rivals)
         return self._judge
 
     def measure(self) -> dict[str, float]:
@@ -155,22 +161,40 @@ def find_metrics(given: Sequence[Any]) -> dict[str, Metric]:
     Raises:
         ConfigError: If one does not exist, is no function, or has the name of another.
     """
-    found: dict[str, Metric] = {}
+    return _find_functions("metric", given, "predictions and true values")
+
+
+def find_rivals(given: str | Sequence[Any]) -> dict[str, Predict | None] | None:
+    """Return the rivals that `Training.rivals` names, as in `Judge`; None if there is no judging.
+
+    Raises:
+        ConfigError: If one does not exist, is no function, or has the name of another.
+    """
+    given = [given] if isinstance(given, str) else given
+    if list(given) == ["none"]:
+        return None
+    own = [each for each in given if each != "all"]
+    found: dict[str, Predict | None] = dict.fromkeys(DEFAULT if "all" in given else ())
+    return found | _find_functions("rival", own, 'the inputs (nor "all" or "none")')
+
+
+def _find_functions(kind: str, given: Sequence[Any], of: str) -> dict[str, Any]:
+    option, found = f"Training.{kind}s", {}
     for each in given:
-        metric = each
+        function = each
         if isinstance(each, str):
             try:
-                metric = import_component("metric", each) if ":" in each else None
+                function = import_component(kind, each) if ":" in each else None
             except ComponentNotFoundError as error:
                 known = nearest(error.name, error.known)
-                raise ConfigError(f'There is no metric "{each}".{known}') from error
-        name = getattr(metric, "__name__", "")
-        if not callable(metric) or not name:
+                raise ConfigError(f'There is no {kind} "{each}".{known}') from error
+        name = getattr(function, "__name__", "")
+        if not callable(function) or not name:
             raise ConfigError(
-                f"Training.metrics names {each!r}, which is no function of predictions and true "
-                'values: name one as "package.module:function" or "script.py:function".'
+                f"{option} names {each!r}, which is no function of {of}: "
+                'name one as "package.module:function" or "script.py:function".'
             )
         if name in found:
-            raise ConfigError(f"Training.metrics has two functions with the name {name}.")
-        found[name] = metric
+            raise ConfigError(f"{option} has two functions with the name {name}.")
+        found[name] = function
     return found

@@ -1,0 +1,193 @@
+"""Redrawing: draws stored rows again, with the environment that generated them."""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physx_core.closeable import Closeable
+from physx_core.components.scene.event import Event
+from physx_core.config import EnvironmentConfig, from_plain
+from physx_core.dataset import Dataset
+from physx_core.errors import DatasetError, UsageError
+from physx_core.pipelines.campaign import recorded_campaigns
+from physx_core.pipelines.generation import Generation
+from physx_core.pipelines.pipeline import derive_seed
+from physx_core.pipelines.replay import recorded_environment
+from physx_core.pipelines.services import RunServices
+from physx_core.pipelines.storage import STREAMS
+from physx_core.typing import Sample
+from physx_core.workers.instance import Instance, instance_arguments
+
+_LONGEST = 60.0
+"""How long an environment may take, in s."""
+
+
+class Redrawing(Closeable):
+    """Draws stored rows again, with the environment that generated them, in this process.
+
+    The environment simulates them again: independent episodes by their numbers, the others from the
+    beginning of their stream. Each row is compared with the stored one, bit by bit, so that nothing
+    else is drawn in its place. Nothing is stored.
+
+    Attributes:
+        takes_predictions: Whether the environment has got predictions, as it defines
+            `Environment.apply_prediction`; then it draws them itself.
+    """
+
+    def __init__(self, dataset: Dataset, mode: str, *, trust: bool = False) -> None:
+        """Find out what generated the rows.
+
+        Args:
+            dataset: The dataset.
+            mode: The mode of the rows.
+            trust: Whether to import whatever code the dataset names.
+
+        Raises:
+            UntrustedReferenceError: If the environment is code that is not trusted.
+            ConfigError: If the dataset does not name its environment.
+        """
+        self._dataset, self._mode, self._trust = dataset, mode, trust
+        self._events: list[Event] = []
+        self._instance: Instance | None = None
+        self._episodes = dataset.recorded_episodes(mode)
+        self._streams = Generation.find(dataset.info, STREAMS)
+        described: Mapping[str, Any] = dataset.info
+        if self._episodes is None and self._streams is not None:
+            known = self._streams.environment.items()
+            described = {name: value for name, value in known if value is not None}
+        self._config = from_plain(
+            EnvironmentConfig, recorded_environment(dataset, trust=trust, info=described)
+        )
+        self.takes_predictions = False
+
+    def frames(
+        self, rows: Sequence[int], predict: Callable[[int], Sample | None] | None = None
+    ) -> Iterator[list[Event]]:
+        """Yield what the environment has drawn since the last of some rows, for each of them.
+
+        Args:
+            rows: Numbers of rows in the mode, ascending; of streams, those of one instance.
+            predict: Returns the prediction for a row, in physical units, or None if there is none;
+                the environment gets it if it defines `Environment.apply_prediction`.
+
+        Raises:
+            PhysxError: If the environment fails, takes too long, or makes other rows.
+        """
+        begin = time.monotonic()
+        steps = self._numbers(rows) if self._is_numbered(rows) else self._stream(rows)
+        wanted = set(rows)
+        for row, sample in steps:
+            if time.monotonic() - begin > _LONGEST:
+                raise UsageError(f"to simulate these rows again takes longer than {_LONGEST:g} s")
+            self._compare(row, sample)
+            if predict is not None:
+                self._apply(predict(row))
+            if row in wanted:
+                events, self._events = self._events, []
+                yield events
+
+    def close(self) -> None:
+        """Close the environment."""
+        instance, self._instance = self._instance, None
+        if instance is not None:
+            instance.close()
+
+    def _apply(self, prediction: Sample | None) -> None:
+        instance = self._instance
+        if prediction is not None and instance is not None and not instance.ignores_predictions:
+            self.takes_predictions = True
+            instance.apply(prediction)
+
+    def _is_numbered(self, rows: Sequence[int]) -> bool:
+        """Return whether rows are of independent episodes."""
+        known = self._episodes
+        return known is not None and known.episode[self._entry(rows[0])] >= 0
+
+    def _entry(self, row: int) -> int:
+        """Return the number of the record of a row's episode."""
+        known = self._episodes
+        assert known is not None
+        return int(np.where((known.rows > 0) & (known.first <= row), known.first, -1).argmax())
+
+    def _open(self, number: int, seed: Sequence[int]) -> Instance:
+        """Return an instance that draws; the events are kept."""
+        if self._instance is None:
+            folder = self._dataset.directory
+            instance = Instance(**instance_arguments(self._config, number, seed, False))
+            self._instance = instance
+            instance.open(_Drawing(folder, self._show), draw=True)
+        return self._instance
+
+    def _show(self, instance_id: int, step: int, events: list[Event]) -> None:
+        self._events += events
+
+    def _numbers(self, rows: Sequence[int]) -> Iterator[tuple[int, Sample]]:
+        """Simulate the episodes of rows; yield all rows up to the last of each, and their data."""
+        known, last = self._episodes, -1
+        assert known is not None
+        campaigns = [each for each in recorded_campaigns(self._dataset) if each.mode == self._mode]
+        for row in rows:
+            if row <= last:
+                continue
+            entry = self._entry(row)
+            of = int(known.campaign[entry])
+            if of >= len(campaigns):
+                raise DatasetError(f"{self._dataset.directory} does not say what made row {row}.")
+            instance = self._open(1, campaigns[of].seed)
+            first, number = int(known.first[entry]), int(known.episode[entry])
+            if known.numbers[entry] > 1:
+                first, number = row, number + row - first
+            names = [parameter.name for parameter in instance.parameters]
+            values = {n: self._dataset.episode_values(self._mode, n, first)[0] for n in names}
+            instance.begin(number, values)
+            end = max(each for each in rows if self._entry(each) == entry)
+            end = row if known.numbers[entry] > 1 else end
+            for last in range(first, end + 1):
+                yield last, instance.step()
+
+    def _stream(self, rows: Sequence[int]) -> Iterator[tuple[int, Sample]]:
+        """Simulate the stream of rows; yield all of them up to the last, and their data."""
+        streams = self._streams
+        if streams is None or streams.mode != self._mode or rows[0] < streams.first:
+            raise UsageError("the dataset does not say how these rows were generated")
+        count = self._config.num_clients
+        place = (rows[0] - streams.first) % count
+        seed = derive_seed(streams.seed, self._mode, streams.offset)
+        instance = self._open(place + 1, seed)
+        for row in range(streams.first + place, rows[-1] + 1, count):
+            yield row, instance.step()
+
+    def _compare(self, row: int, sample: Sample) -> None:
+        """Check that a row is the stored one."""
+        stored = self._dataset[self._mode]
+        for name, value in sample.items():
+            known = np.asarray(stored[name][row])
+            if not np.array_equal(np.asarray(value, known.dtype).reshape(known.shape), known):
+                raise UsageError(
+                    f'simulated again, row {row} has another "{name}": the environment, its '
+                    "engine or a library has changed, or it takes random numbers of its own"
+                )
+
+
+class _Drawing(RunServices):
+    """Answers an environment that draws: what was saved in its run is there, nothing is stored."""
+
+    def __init__(self, folder: Path, show: Callable[[int, int, list[Event]], None]) -> None:
+        super().__init__(folder, show, None)
+        self._saved: dict[int, dict[str, Any]] = {}
+
+    def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
+        """Keep values."""
+        self._saved[instance_id] = {**self._saved.get(instance_id, {}), **values}
+
+    def load_parameters(self, instance_id: int) -> dict[str, Any]:
+        """Return what was saved, by the run that made the rows if it is not new."""
+        with contextlib.suppress(KeyError):
+            return dict(self._saved[instance_id])
+        return super().load_parameters(instance_id)

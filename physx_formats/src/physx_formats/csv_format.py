@@ -1,0 +1,136 @@
+"""CSV: the rows of one mode as text, one column per number.
+
+A column is named after its field, the place of the number in arrays, and the unit:
+``position[0][2] [m]``. Text holds no types: columns of integers become int64, of ``true`` and
+``false`` bool, and all others float64. The decimal numbers are exact.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import itertools
+import re
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from physx_core.fields import Field
+from physx_core.typing import Array
+from physx_formats.errors import ExchangeError
+from physx_formats.format import Columns, Format
+from physx_formats.table import BLOCK, ExportOptions, Notes, Table, check_size, import_library
+
+_MOST_COLUMNS = 10_000
+_NAME = re.compile(r"(?P<name>.*?)(?P<place>(\[\d+\])*)(\s+\[(?P<unit>[^\[\]]*)\])?")
+
+
+def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
+    """Write the rows of one mode."""
+    (table,) = tables
+    arrow = import_library("pyarrow", "Exporting to CSV", "csv")
+    csv = import_library("pyarrow.csv", "Exporting to CSV", "csv")
+    names = [name for field in table.fields.values() for name in _names(field)]
+    if len(names) > _MOST_COLUMNS:
+        raise ExchangeError(
+            f"A CSV file would have {len(names):,} columns. Choose another format, or fewer fields "
+            "(physx edit --keep)."
+        )
+    with out.open("wb") as file:
+        options = csv.WriteOptions(include_header=True)
+        for block in table.blocks(BLOCK):
+            columns = [column for values in block.values() for column in _columns(values)]
+            csv.write_csv(arrow.table(columns, names=names), file, options)
+            options = csv.WriteOptions(include_header=False)
+    return 0
+
+
+def _names(field: Field) -> Iterator[str]:
+    if field.numpy_dtype.kind == "c":
+        raise ExchangeError(
+            f'CSV has no equivalent of {field.numpy_dtype}, the type of the field "{field.name}".'
+        )
+    shape = field.shape or ()
+    units = [each.strip() for each in field.unit.split(",")]
+    for place in itertools.product(*map(range, shape)):
+        own = units[place[0]] if len(shape) == 1 and len(units) == shape[0] else field.unit
+        index = "".join(f"[{each}]" for each in place)
+        yield f"{field.name}{index}{f' [{own}]' if own else ''}"
+
+
+def _columns(values: Array) -> Iterator[Array]:
+    if values.dtype.kind == "f":
+        values = values.astype(np.float64)  # the decimal number is then the exact one
+    yield from np.ascontiguousarray(values.reshape(len(values), -1).T)
+
+
+class _Column:
+    """Columns that are one field; see `Column`."""
+
+    def __init__(
+        self, path: Path, name: str, table: Any, parts: dict[tuple[int, ...], Any]
+    ) -> None:
+        """Arrange columns.
+
+        Args:
+            path: The file, for messages.
+            name: Name of the field.
+            table: The file's columns.
+            parts: Number and unit of each column, by its place in the field.
+        """
+        size = () if () in parts else tuple(max(each) + 1 for each in zip(*parts, strict=True))
+        self.shape = (table.num_rows, *size)
+        arrays = [table.column(parts[place][0]) for place in sorted(parts)]
+        kinds = [np.dtype(each.type.to_pandas_dtype()) for each in arrays]
+        self.dtype, self.problem = np.result_type(*kinds), ""
+        units = [parts[place][1] for place in sorted(parts)]
+        self.unit = units[0] if len(set(units)) == 1 else ", ".join(units)
+        missing = next((each for each in arrays if each.null_count), None)
+        if len(parts) != np.prod(size, dtype=int):
+            self.problem = f'The columns of "{name}" in {path} leave out places of {size}.'
+        elif any(kind.kind not in "biuf" for kind in kinds):
+            self.problem = (
+                f'"{name}" of {path} holds text. Choose what to import with fields (--fields on '
+                "the command line)."
+            )
+        elif missing is not None:
+            row = next(k for k, each in enumerate(missing) if not each.is_valid)
+            self.problem = f'"{name}" of {path} has no number in row {row}.'
+        self._arrays = arrays
+
+    def read(self, start: int, count: int) -> Array:
+        """Return the next rows."""
+        parts = [each.slice(start, count).to_numpy() for each in self._arrays]
+        return np.stack(parts, axis=-1).astype(self.dtype).reshape(-1, *self.shape[1:])
+
+
+@contextlib.contextmanager
+def open_columns(path: Path, limit: int) -> Iterator[tuple[Columns, Notes]]:
+    """Open a file; yield its columns by field."""
+    import_library("pyarrow", "Importing CSV", "csv")
+    csv = import_library("pyarrow.csv", "Importing CSV", "csv")
+    check_size(path, path.stat().st_size, limit)
+    convert = csv.ConvertOptions(null_values=["", "NA", "null"], strings_can_be_null=True)
+    try:
+        table = csv.read_csv(path, convert_options=convert)
+    except (ValueError, OSError) as error:
+        raise ExchangeError(f"{path} is not a valid CSV file: {error}.") from error
+    fields: dict[str, dict[tuple[int, ...], tuple[int, str]]] = {}
+    for number, title in enumerate(table.column_names):
+        found = _NAME.fullmatch(title.strip())
+        assert found is not None  # any text matches
+        place = tuple(int(each) for each in re.findall(r"\d+", found["place"]))
+        parts = fields.setdefault(found["name"], {})
+        if place in parts or any(len(each) != len(place) for each in parts):
+            raise ExchangeError(f'{path} has several columns for the same place of "{title}".')
+        parts[place] = number, found["unit"] or ""
+    yield {name: _Column(path, name, table, parts) for name, parts in fields.items()}, Notes()
+
+
+FORMAT = Format(
+    write=write,
+    recognizes=lambda path, begin: path.suffix.lower() == ".csv",
+    open=open_columns,
+)
+"""CSV files have nothing that identifies them but their name."""
