@@ -27,7 +27,7 @@ class ContactRows:
     def __init__(self, world: WorldModel, data: mujoco.MjData) -> None:
         self._world, self._data = world, data
         self._moving: dict[int, Vector] = {}
-        self._deep = True
+        self.expect_depth()
 
     @property
     def active(self) -> bool:
@@ -36,7 +36,8 @@ class ContactRows:
 
     def expect_depth(self) -> None:
         """Note that a state was set, in which contacts may be deep."""
-        self._deep = True
+        # With this integrator there are none, and its steps cannot be split.
+        self._deep = self._world.model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
 
     def place(self, static: int, pose: Vector, velocity: Vector, surface: Vector) -> None:
         """Place a static body for the next step, as in `RobotSimulation.place_static`."""
