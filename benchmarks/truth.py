@@ -389,12 +389,13 @@ CASES: dict[str, Case] = {
 ERROR = 0.01
 """Largest relative error of a case that is not named here."""
 LIMITS: dict[str, float] = {
+    "plate that swings sideways": 0.015,
     "creep at 95 % of friction, µm/s": 1.0,
     "creep on a height field, µm/s": 10.0,
     "1000 kg on 1 kg, mm": 0.1,
     "Euler's disk, growth of energy": 0.0,
 }
-"""Largest values of cases whose number is no relative error."""
+"""Largest values of other cases; that of a plate is what tells slipping from giving way."""
 KNOWN: dict[tuple[str, str], float] = {
     ("bouncing ball", "dart"): 0.02,
     ("plate that swings sideways", "mujoco"): 0.05,
