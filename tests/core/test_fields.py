@@ -30,7 +30,7 @@ def test_types_without_a_fixed_plain_layout_are_rejected(dtype):
         Field("x", (1,), dtype)
 
 
-@pytest.mark.parametrize("shape", [(-1,), (1.5,), ("a",)])
+@pytest.mark.parametrize("shape", [(-1,), (1.5,), (2, "a")])
 def test_malformed_shapes_are_rejected(shape):
     with pytest.raises(ConfigError, match="shape"):
         Field("x", shape)

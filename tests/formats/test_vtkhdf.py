@@ -113,6 +113,81 @@ def test_points_without_cells_are_a_cloud(tmp_path):
         assert links.tolist() == list(range(6)) and kinds == {1}
 
 
+def mesh_of(nodes):
+    """Return a strip of triangles over some nodes."""
+    return RNG.normal(size=(nodes, 2)), np.arange(nodes - 2)[:, None] + np.arange(3)
+
+
+def test_meshes_of_any_size_come_one_after_another(tmp_path):
+    sizes, fields = (3, 7, 5, 4), [
+        Field("x", ("node", 2)), Field("mesh", ("cell", 3), int, indexes="node"),
+        Field("u", ("node", 2)), Field("heat", ("cell",)), Field("wrong", ("probe",)),
+    ]  # fmt: skip
+    meshes = [mesh_of(size) for size in sizes]
+    rows = {
+        "x": [x for x, _ in meshes], "mesh": [cells for _, cells in meshes],
+        "u": [RNG.normal(size=(size, 2)) for size in sizes],
+        "heat": [RNG.normal(size=size - 2) for size in sizes],
+        "wrong": [np.zeros(size) for size in sizes],
+    }  # fmt: skip
+    options = ExportOptions(points="x", cells="mesh")
+    with Dataset.create(tmp_path / "set") as dataset:
+        dataset.define_fields("training", fields)
+        dataset.append("training", rows)
+        with pytest.warns(UserWarning, match="wrong are left out|wrong is left out"):
+            export(dataset, "vtkhdf", tmp_path / "out.vtkhdf", options=options)
+    steps = list(read(tmp_path / "out.vtkhdf"))
+    assert len(steps) == len(sizes)
+    for k, (time, points, cells, kinds, by_point, by_cell) in enumerate(steps):
+        assert time == k and kinds == {5}
+        np.testing.assert_array_equal(points[:, :2], rows["x"][k])
+        np.testing.assert_array_equal(cells, rows["mesh"][k].reshape(-1))
+        np.testing.assert_array_equal(by_point["u"][:, :2], rows["u"][k])
+        np.testing.assert_array_equal(by_cell["heat"], rows["heat"][k])
+
+
+class Strip(Environment):
+    """A strip of triangles of which each episode has another number."""
+
+    independent_episodes, episode_steps = True, 2
+
+    def create(self):
+        self.size = 3
+
+    def init_database(self):
+        self.define_training_fields([Field("u", ("node",))])
+        mesh = Field("mesh", ("cell", 3), int, indexes="node")
+        self.define_episode_fields([Field("nodes", ("node", 2)), mesh])
+
+    def reset_parameters(self):
+        self.size = int(self.rng.integers(3, 9))
+        cells = np.arange(self.size - 2)[:, None] + np.arange(3)
+        self.set_episode_data(nodes=self.rng.normal(size=(self.size, 2)), mesh=cells)
+
+    def step(self):
+        self.set_training_data(u=self.rng.normal(size=self.size))
+
+
+def test_episodes_have_meshes_of_any_size(tmp_path):
+    run = DataGeneration(
+        EnvironmentConfig(Strip, as_tcp_ip_client=False, seed=0), episodes=5,
+        session_dir=str(tmp_path), session_name="run", quiet=True,
+    )  # fmt: skip
+    run.execute()
+    options = ExportOptions(points="nodes", cells="mesh")
+    with Dataset.open(run.session.path) as dataset:
+        with pytest.warns(UserWarning, match="left out"):
+            export(dataset, "vtkhdf", tmp_path / "out.vtkhdf", options=options)
+        once = dataset.episode_table(["training"])
+        place, u = np.repeat(np.arange(len(once["rows"])), once["rows"]), dataset["training"]["u"]
+        steps = list(read(tmp_path / "out.vtkhdf"))
+        assert len(steps) == 10 and len({len(points) for _, points, *_ in steps}) > 2
+        for k, (_, points, cells, _, by_point, _) in enumerate(steps):
+            np.testing.assert_array_equal(points[:, :2], once["nodes"][place[k]])
+            np.testing.assert_array_equal(cells, once["mesh"][place[k]].reshape(-1))
+            np.testing.assert_array_equal(by_point["u"], u[k])
+
+
 @pytest.mark.parametrize(
     ("options", "reason"),
     [

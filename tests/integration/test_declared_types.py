@@ -139,6 +139,7 @@ RECORDS = {
     *("UrdfShape", "Episode", "StepperState", "Result", "Comparison", "Trial", "Normalization"),
     *("CollisionShape", "Joint", "MovableBody", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
     "Bond",
+    *("Agreement", "Cause", "Figure", "Parting", "Ranking"),
     *("Kind", "Format", "Table", "Section", "RolloutResult", "Unseen"),
 }
 ABSTRACT = {"Attachment", "Pipeline", "RaySensor", "Sensor"}

@@ -39,6 +39,17 @@ NO_ARRAY = (ValueError, TypeError, OverflowError, RuntimeError)
 CHANNEL = "channel"
 """Name of the axis whose entries are different quantities, such as the components of a velocity."""
 
+ENDS = "_ends"
+"""What is added to the name of a free axis for that of the file where its rows' entries end."""
+
+PTR = "_ptr"
+"""What is added to the name of a free axis for that of the first entries of a batch's samples."""
+
+BATCH = "_batch"
+"""What is added to the name of a free axis for that of the samples of a batch's entries."""
+
+_FREE = 'Values of any size need a free axis, which is defined before: shape=("node", 3)'
+
 _SMALL = 8192  # elements
 
 
@@ -48,7 +59,9 @@ class Field:
 
     Attributes:
         name: Name, a Python identifier.
-        shape: Shape of one sample's value. None: taken from the first sample.
+        shape: Shape of one sample's value. None: taken from the first sample. The first axis may
+            have a name instead of a size, as in ``("node", 3)``: it is *free*, of any size in each
+            sample, the same for all fields with this axis. Its values are *entries*.
         dtype: NumPy type: any plain boolean, integer, floating-point, or complex type.
         unit: Unit of the values, for example ``"N m"``; empty for dimensionless numbers.
         role: ``training`` for data that networks read, ``episode`` for what a whole independent
@@ -58,22 +71,26 @@ class Field:
             all but ``"channel"``, so they fit values of any resolution.
         like: Name of the field that is the same quantity, with the same unit: this one is
             normalized by its statistics. Empty: it is a quantity of its own.
+        indexes: Name of the free axis whose entries the values are numbers of, from 0 in each
+            sample, as the nodes of an edge are: where samples are joined, they are shifted.
     """
 
     name: str
-    shape: tuple[int, ...] | None = None
+    shape: tuple[Any, ...] | None = None
     dtype: DTypeLike = "float64"
     unit: str = ""
     role: Role = "training"
     axes: tuple[str, ...] = ()
     like: str = ""
+    indexes: str = ""
 
     def __post_init__(self) -> None:
         """Check the name, and normalize shape and type.
 
         Raises:
             ConfigError: If the name is not an identifier, the shape is invalid, the type is not a
-                plain one, or the axes have other names than identifiers, or too many or too few.
+                plain one, or the axes have other names than identifiers, or too many or too few,
+                or an axis other than the first one is free.
         """
         if not isinstance(self.name, str) or not self.name.isidentifier():
             raise ConfigError(f"A field's name must be a Python identifier, not {self.name!r}.")
@@ -95,6 +112,11 @@ class Field:
             raise ConfigError(
                 f'Field "{self.name}": like is {self.like!r} but must be the name of a field.'
             )
+        if self.indexes and (self.numpy_dtype.kind not in "iu" or not self.indexes.isidentifier()):
+            raise ConfigError(
+                f'Field "{self.name}": indexes is {self.indexes!r} and the type {dtype}, but it '
+                "must be the name of a free axis, and the type an integer."
+            )
 
     @cached_property
     def numpy_dtype(self) -> np.dtype[Any]:
@@ -102,9 +124,32 @@ class Field:
         return np.dtype(self.dtype)
 
     @cached_property
+    def free_axis(self) -> str:
+        """Name of the free axis; empty if there is none."""
+        first = self.shape[0] if self.shape else 0
+        return first if isinstance(first, str) else ""
+
+    @cached_property
+    def entry_shape(self) -> tuple[int, ...]:
+        """Shape of an entry of the free axis; without one, that of a sample's value."""
+        return (self.shape or ())[1 if self.free_axis else 0 :]
+
+    @cached_property
+    def of_entries(self) -> Field:
+        """The field of an entry of the free axis; without one, the field itself."""
+        if not self.free_axis:
+            return self
+        return replace(self, shape=self.entry_shape, axes=self.axes[1:])
+
+    @cached_property
+    def row_kind(self) -> tuple[tuple[int, ...], np.dtype[Any]]:
+        """Shape and type of a row in an array of rows: with a free axis, an object, an array."""
+        return ((), np.dtype(object)) if self.free_axis else (self.entry_shape, self.numpy_dtype)
+
+    @cached_property
     def nbytes(self) -> int:
-        """Size of one sample's value in bytes; 0 while the shape is unknown."""
-        count = math.prod(self.shape) if self.shape is not None else 0
+        """Size of an entry, or without a free axis a value, in bytes; 0: the shape is unknown."""
+        count = math.prod(self.entry_shape) if self.shape is not None else 0
         return count * self.numpy_dtype.itemsize
 
     @property
@@ -114,23 +159,27 @@ class Field:
 
     @property
     def pooled(self) -> tuple[int, ...]:
-        """The axes that its statistics are pooled over: of several named ones, not the channels."""
+        """The axes of an entry that its statistics are pooled over, besides a free axis.
+
+        Of several named ones, these are all but the channels.
+        """
         if len(self.axes) < 2 or not self.shape or 0 in self.shape:
             return ()
-        return tuple(place for place, name in enumerate(self.axes) if name != CHANNEL)
+        axes = self.axes[1 if self.free_axis else 0 :]
+        return tuple(place for place, name in enumerate(axes) if name != CHANNEL)
 
     @property
     def statistics_shape(self) -> tuple[int, ...]:
-        """Shape of its statistics: that of a value, but 1 for the axes they are pooled over."""
+        """Shape of its statistics: that of an entry, but 1 for the axes they are pooled over."""
         return self.pooled_shape(self.pooled)
 
     def pooled_shape(self, axes: tuple[int, ...]) -> tuple[int, ...]:
-        """Return the shape of a value, but 1 for some axes."""
-        return tuple(1 if i in axes else n for i, n in enumerate(self.shape or ()))
+        """Return the shape of an entry, but 1 for some axes."""
+        return tuple(1 if i in axes else n for i, n in enumerate(self.entry_shape))
 
     def is_resolution(self, shape: tuple[int, ...]) -> bool:
         """Return whether a shape differs from its own only in the axes that are `pooled`."""
-        own = self.shape or ()
+        own = self.entry_shape
         sizes = enumerate(zip(own, shape, strict=False))
         return len(own) == len(shape) and all(
             here == there or axis in self.pooled for axis, (here, there) in sizes
@@ -164,24 +213,28 @@ class Field:
             step: The instance's step that set them, for the error.
 
         Returns:
-            An array of shape (*first axes, *field shape). It shares memory with `values` if that is
+            An array of shape (*first axes, *field shape), with a free axis an array of objects, one
+            array for each row. It shares memory with `values` if that is
             an array of the field's type.
 
         Raises:
             FieldShapeError: If the values are ragged or have another shape.
             FieldTypeError: If the field's type cannot hold the values.
         """
+        if self.free_axis and axes:  # rows of any size
+            rows = [self.convert(each, instance_id=instance_id, step=step) for each in values]
+            return np.fromiter(rows, object, len(rows))
         error: type[FieldShapeError | FieldTypeError] = FieldShapeError
         try:
             array: Array = np.asarray(values)
         except ValueError as cause:
-            text = f"is ragged or malformed: {cause}"
+            text = f"is ragged or malformed: {cause}. {_FREE}"
         except NO_ARRAY as cause:
             error, text = FieldTypeError, f"is not convertible to an array: {cause}"
         else:
             if array.ndim < axes:
                 text = "is a single value; rows have shape (n, *field shape)"
-            elif self.shape is not None and array.shape[axes:] != self.shape:
+            elif self.shape is not None and not self.is_shape(array.shape[axes:]):
                 text = f"has shape {array.shape[axes:]} but is defined as {self.shape}"
             elif self.axes and array.ndim - axes != len(self.axes):
                 text = f"has shape {array.shape[axes:]} but the axes {self.axes}"
@@ -194,6 +247,12 @@ class Field:
         raise error(
             f'field "{self.name}" {text}.', field=self.name, instance_id=instance_id, step=step
         )
+
+    def is_shape(self, shape: tuple[int, ...]) -> bool:
+        """Return whether a value may have a shape."""
+        if self.free_axis:
+            return len(shape) > 0 and shape[1:] == self.entry_shape
+        return shape == self.shape
 
     def not_finite(
         self, *, instance_id: int = 0, step: int = -1, where: str = ""
@@ -223,6 +282,8 @@ class Field:
             plain["axes"] = list(self.axes)
         if self.like:
             plain["like"] = self.like
+        if self.indexes:
+            plain["indexes"] = self.indexes
         return plain
 
     @classmethod
@@ -237,23 +298,29 @@ class Field:
             role=plain.get("role", "training"),
             axes=tuple(plain.get("axes", ())),
             like=plain.get("like", ""),
+            indexes=plain.get("indexes", ""),
         )
 
 
-def _shape(name: str, given: Any) -> tuple[int, ...]:
-    """Return a shape: a size, or several."""
+def _shape(name: str, given: Any) -> tuple[Any, ...]:
+    """Return a shape: a size, or several; the first one may be the name of a free axis."""
     where = f'Field "{name}": shape'
     try:
-        sizes = tuple(given)
+        sizes = (given,) if isinstance(given, str) else tuple(given)
     except TypeError:
         sizes = (given,)
-    shape = tuple(checks.integer(where, size) for size in sizes)
+    free = sizes[:1] if sizes and isinstance(sizes[0], str) else ()
+    if free and not free[0].isidentifier():
+        raise ConfigError(f"{where} is {given!r}, but a free axis has an identifier as its name.")
+    if any(isinstance(size, str) for size in sizes[1:]):
+        raise ConfigError(f"{where} is {given!r}, but only the first axis can be free.")
+    shape = tuple(checks.integer(where, size) for size in sizes[len(free) :])
     if min(shape, default=0) < 0:
         raise ConfigError(f"{where} is {given!r} but must not be negative.")
-    return shape
+    return (*free, *shape)
 
 
-def _axes(name: str, given: Any, shape: tuple[int, ...] | None) -> tuple[str, ...]:
+def _axes(name: str, given: Any, shape: tuple[Any, ...] | None) -> tuple[str, ...]:
     """Return the names of axes: one, or several."""
     try:
         names = (given,) if isinstance(given, str) else tuple(given)
@@ -266,19 +333,38 @@ def _axes(name: str, given: Any, shape: tuple[int, ...] | None) -> tuple[str, ..
         raise ConfigError(f"{where} {names} have the same name twice.")
     if names and shape is not None and len(names) != len(shape):
         raise ConfigError(f"{where} are {names}, but its shape is {shape}: name each of its axes.")
+    if names and shape and isinstance(shape[0], str) and names[0] != shape[0]:
+        raise ConfigError(f"{where} are {names}, but the first one is free: call it {shape[0]!r}.")
     return names
 
 
-def check_quantities(fields: Mapping[str, Field]) -> None:
-    """Check the fields that are the same quantity as another one: see `Field.like`.
+def ends_fields(fields: Iterable[Field]) -> dict[str, Field]:
+    """Return the fields that say where each row's entries end in its partition, by name."""
+    names = [axis + ENDS for axis in free_axes(fields)]
+    return {name: Field(name, (), "uint64", role="additional") for name in names}
+
+
+def free_axes(fields: Iterable[Field]) -> dict[str, list[str]]:
+    """Return the free axes of fields, each with the names of the fields that have it."""
+    found: dict[str, list[str]] = {}
+    for field in fields:
+        if field.free_axis:
+            found.setdefault(field.free_axis, []).append(field.name)
+    return found
+
+
+def check_together(fields: Mapping[str, Field]) -> None:
+    """Check what fields say of one another: see `Field.like`, `Field.indexes` and `Field.shape`.
 
     Args:
         fields: All fields of a mode by name.
 
     Raises:
-        ConfigError: If the other one does not exist or is itself like a third one, or they differ
-            in unit, or in a shape that statistics of both could have.
+        ConfigError: If the field that one is like does not exist or is itself like a third one, or
+            they differ in unit, or in a shape that statistics of both could have; if a free axis
+            has the name of a field, or an axis is indexed that no field has.
     """
+    _check_axes(fields)
     for name, field in fields.items():
         if not field.like:
             continue
@@ -296,12 +382,29 @@ def check_quantities(fields: Mapping[str, Field]) -> None:
             )
 
 
+def _check_axes(fields: Mapping[str, Field]) -> None:
+    """Check names of free axes, and that indexed ones exist."""
+    axes = free_axes(fields.values())
+    for axis in axes:
+        for name in (axis + suffix for suffix in (ENDS, PTR, BATCH)):
+            if name in fields:
+                raise ConfigError(f'Field "{name}" has a name that belongs to the axis "{axis}".')
+    is_known = all(field.shape is not None for field in fields.values())
+    for name, field in fields.items():
+        if field.indexes and field.indexes not in axes and is_known:
+            raise ConfigError(
+                f'Field "{name}" indexes the axis "{field.indexes}", but no field has it as a free '
+                f"axis.{nearest(field.indexes, axes)}"
+            )
+
+
 def _is_like(field: Field, other: Field) -> bool:
     """Return whether statistics of one field can be those of another one."""
     if field.shape is None or other.shape is None:
         return True
-    if field.shape[len(field.shape) - len(other.shape) :] == other.shape:
-        return len(field.shape) >= len(other.shape)
+    own, wanted = field.entry_shape, other.entry_shape
+    if own[len(own) - len(wanted) :] == wanted:
+        return len(own) >= len(wanted)
     return bool(field.axes and other.axes) and _channels(field) == _channels(other)
 
 
@@ -354,7 +457,7 @@ def _as_field(item: Any, role: Role) -> Field:
 def is_finite(array: Array) -> bool:
     """Return whether an array contains neither NaN nor infinity."""
     if array.dtype.kind not in "fc":
-        return True
+        return array.dtype.kind != "O" or all(map(is_finite, array))
     # The sum shows it in one fast pass, unless it overflows. For small arrays the dot product is
     # faster; for large ones it would start threads, which costs more than it saves.
     if array.size <= _SMALL:
@@ -369,6 +472,8 @@ def first_not_finite(rows: Array) -> int | None:
     """Return the index of the first row that contains NaN or infinity; None: no row does."""
     if is_finite(rows):
         return None
+    if rows.dtype.kind == "O":
+        return next(row for row, value in enumerate(rows) if not is_finite(value))
     finite = np.isfinite(rows).reshape(len(rows), -1).all(axis=1)
     return int(np.argmin(finite))
 
@@ -376,6 +481,8 @@ def first_not_finite(rows: Array) -> int | None:
 def _misfit(array: Array, dtype: np.dtype[Any]) -> str:
     """Return why a type cannot hold the values of an array; empty if it can."""
     kind = array.dtype.kind
+    if kind == "O":
+        return f"holds objects. {_FREE}"
     if kind not in _FITTING[dtype.kind]:
         return f"holds {array.dtype} but is defined as {dtype}, which cannot hold it"
     if dtype.kind in "iu" and kind != "b" and array.size:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
@@ -294,7 +294,7 @@ def _fitted(values: Array, by: str, field: Field, of: Field) -> Array:
     if by == "channel":
         place = (field if CHANNEL in field.axes else of).axes
         values = values.reshape(-1, *(1,) * (len(place) - 1 - place.index(CHANNEL)))
-    shape: Any = field.shape or ()
+    shape = field.entry_shape
     try:
         fits = np.broadcast_shapes(values.shape, shape) == shape
     except ValueError:

@@ -17,6 +17,7 @@ from physx_core.errors import (
     nearest,
 )
 from physx_core.fields import NO_ARRAY, Field, first_not_finite, is_finite
+from physx_core.packing import check_sizes
 from physx_core.typing import Array, Batch, Sample
 
 ROW_FIELDS = (
@@ -29,6 +30,8 @@ and step."""
 
 _BLOCK_NBYTES = 2**20
 _BLOCK_ROWS = 4096
+_ENTRIES = 256
+"""How many entries of a free axis a row may have, to choose the size of blocks."""
 
 
 class RowBuffer:
@@ -55,7 +58,9 @@ class RowBuffer:
         """
         self.fields = [*fields, *ROW_FIELDS] if numbered else list(fields)
         if capacity is None:
-            row_nbytes = sum(field.nbytes for field in self.fields)
+            row_nbytes = sum(
+                field.nbytes * (_ENTRIES if field.free_axis else 1) for field in self.fields
+            )
             capacity = max(1, min(_BLOCK_ROWS, _BLOCK_NBYTES // max(1, row_nbytes)))
         self.capacity = capacity
         self.count = 0
@@ -67,6 +72,10 @@ class RowBuffer:
             (field.name, self._arrays[field.name], field.shape, field.numpy_dtype, field)
             for field in known
         ]
+        is_free = any(field.free_axis for field in known)
+        self._free = {
+            field.name: field for field in known if is_free and (field.free_axis or field.indexes)
+        }
         self._floating = [
             (field, array) for _, array, _, dtype, field in self._slots if dtype.kind in "fc"
         ]
@@ -116,9 +125,13 @@ class RowBuffer:
                 raise
             if type(value) is not np.ndarray or value.dtype is not dtype or value.shape != shape:
                 value = field.convert(value, instance_id=instance_id, step=step)
+                value = np.array(value) if field.free_axis else value  # the row holds it, no copy
             if finite and not is_finite(value):
                 raise field.not_finite(instance_id=instance_id, step=step)
             array[row] = value
+        if self._free:
+            values = {name: self._arrays[name][row] for name in self._free}
+            check_sizes(self._free, values, instance_id, step)
         if self._numbers and episode is not None:
             env_ids, episodes, steps = self._numbers
             env_ids[row] = instance_id
@@ -199,9 +212,10 @@ def _allocate(fields: Sequence[Field], capacity: int) -> tuple[Batch, list[Array
     Returns:
         Field name to array, and the blocks, which show in one pass whether all rows are finite.
     """
-    shapes = {field.name: (capacity, *(field.shape or ())) for field in fields}
-    arrays = {field.name: np.empty(shapes[field.name], field.dtype) for field in fields}
-    blocks = []
+    shapes = {field.name: (capacity, *field.row_kind[0]) for field in fields}
+    arrays = {field.name: np.empty(shapes[field.name], field.row_kind[1]) for field in fields}
+    floating = {field.name for field in fields if field.numpy_dtype.kind in "fc"}
+    blocks = [arrays[n] for n in arrays if n in floating and arrays[n].dtype.hasobject]
     for dtype in {array.dtype for array in arrays.values() if array.dtype.kind in "fc"}:
         names = [name for name, array in arrays.items() if array.dtype == dtype]
         ends = np.cumsum([arrays[name].size for name in names])

@@ -61,6 +61,12 @@ def export(
             f"{to} holds one mode. Choose one with modes (--mode on the command line): "
             f"{listed(table.mode for table in tables)}."
         )
+    free = [f.name for table in tables for f in table.fields.values() if f.free_axis]
+    if free and not form.free_axes:
+        raise ExchangeError(
+            f"{to} holds rows of one size, but these fields have a free axis: {listed(free)}. Read "
+            "them from the dataset's HDF5 files, or leave them out with `physx edit`."
+        )
     check_new(out)
     try:
         with tempfile.TemporaryDirectory(dir=out.absolute().parent, prefix=".export-") as folder:

@@ -31,6 +31,7 @@ class Format:
         compressions: Names of its compressions, "none" first.
         several: Whether one file can hold several modes.
         options: Names of the episode options that it takes: see `ExportOptions`.
+        free_axes: Whether it holds rows of any size.
         recognizes: Returns whether a path is a file or folder of this format, from its first 8
             bytes; those of a folder are empty. File names do not matter.
         open: Opens a file that holds at most this number of bytes, and yields its arrays by name,
@@ -41,6 +42,7 @@ class Format:
     compressions: Collection[str] = ("none",)
     several: bool = False
     options: Collection[str] = ()
+    free_axes: bool = False
     recognizes: Callable[[Path, bytes], bool] = _never
     open: Callable[[Path, int], AbstractContextManager[tuple[Columns, Notes]]] | None = None
 

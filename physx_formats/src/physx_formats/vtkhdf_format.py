@@ -1,13 +1,16 @@
 """VTKHDF: one file with a mesh, its fields, and a time step for each row, for ParaView and VTK.
 
-The file is HDF5, in version 2.2 of the format. Meshes and fields of the same number of points share
-one unstructured grid; a mesh that episodes store once is stored once for each.
+The file is HDF5, in version 2.2 of the format: one unstructured grid, whose points, cells and data
+lie end to end, with the offsets of each step. A mesh that episodes store once is stored once for
+each. On free axes, meshes have any size.
 """
 
 from __future__ import annotations
 
+import itertools
+import math
 import warnings
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -22,7 +25,7 @@ from physx_core.fields import Field
 from physx_core.typing import Array, Index
 from physx_formats.errors import ExchangeError
 from physx_formats.format import Format
-from physx_formats.table import ExportOptions, Table
+from physx_formats.table import BLOCK, ExportOptions, Table
 
 VERSION = (2, 2)
 CELLS = {
@@ -32,6 +35,9 @@ CELLS = {
 """Number of the cell type in VTK, and its number of points."""
 _GUESSED = {1: "vertex", 2: "line", 3: "triangle", 5: "pyramid", 6: "wedge", 8: "hexahedron"}
 _SPACE = 3
+_CHUNK = 2**18
+_FREE_ROWS = 16
+"""Rows of any size that are read at once."""
 
 
 @dataclass(frozen=True)
@@ -40,13 +46,25 @@ class _Mesh:
 
     Attributes:
         field: The field.
-        blocks: Yields its values, each with the number of the first.
-        place: Which of its values each row has, shape (rows,).
+        table: Where its values are.
+        place: Which of them each row has, shape (rows,); it never falls.
     """
 
     field: Field
-    blocks: Iterator[tuple[int, Array]]
+    table: Table
     place: Index
+
+    def values(self, *, by_row: bool) -> Iterator[Array]:
+        """Yield each value, or that of each row."""
+        if not by_row:
+            yield from _each(self.field, self.table)
+            return
+        last = -1
+        found = _each(self.field, self.table)
+        for place in self.place:
+            while last < place:
+                value, last = next(found), last + 1
+            yield value
 
 
 def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
@@ -60,43 +78,124 @@ def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
         )
     (table,) = found.values()
     points = _find(table, episodes, "points", options.points)
-    count = (points.field.shape or (0,))[0]
     cells = None if options.cells is None else _find(table, episodes, "cells", options.cells)
     kind, by_cell = _cell_type(options, points.field, None if cells is None else cells.field)
-    number = count if cells is None else (cells.field.shape or (0,))[0]
-    meshes = [each.field.name for each in (points, cells) if each is not None]
-    data = _share(table, {"PointData": count, "CellData": number}, meshes)
     with h5py.File(out, "w") as file:
         root = file.create_group("VTKHDF", track_order=True)
         root.attrs["Version"] = np.array(VERSION)
         root.attrs.create("Type", np.bytes_("UnstructuredGrid"))
-        sizes = {"Points": count, "Cells": number, "ConnectivityIds": number * by_cell}
-        for name, size in sizes.items():
-            root[f"NumberOf{name}"] = np.array([size], np.int64)
-        _copy(root, "Points", points, _as_vectors)
-        if cells is None:
-            root["Connectivity"] = np.arange(count, dtype=np.int64)
-        else:
-            _copy(root, "Connectivity", cells, lambda values: _checked(values, count, cells.field))
-        root["Offsets"] = np.arange(number + 1, dtype=np.int64) * by_cell
-        root["Types"] = np.full(number, kind, np.uint8)
-        steps = _steps(root, table, options.fps)
-        for name, values in {
-            "PointOffsets": points.place * count,
-            "CellOffsets": np.zeros((table.rows, 1), np.int64),
-            "ConnectivityIdOffsets": (
-                np.zeros((table.rows, 1), np.int64) if cells is None
-                else cells.place[:, None] * (number * by_cell)
-            ),
-        }.items():  # fmt: skip
-            steps[name] = values
-        for place, names in data.items():
-            size = sizes["Points" if place == "PointData" else "Cells"]
+        parts = _write_meshes(root, points, cells, kind, by_cell)
+        steps = root.create_group("Steps")
+        steps.attrs["NSteps"] = table.rows
+        times = np.arange(table.rows, dtype=np.float64)
+        steps["Values"] = times / options.fps if options.fps else times
+        steps["NumberOfParts"] = np.ones(table.rows, np.int64)
+        steps["PartOffsets"] = parts.place
+        steps["PointOffsets"] = parts.starts("Points")
+        for name in ("Cell", "ConnectivityId"):
+            steps[f"{name}Offsets"] = parts.starts(f"{name}s")[:, None]
+        meshes = {each.field.name: each for each in (points, cells) if each is not None}
+        for place, names in _share(table, points, cells, set(meshes)).items():
+            sizes = parts.sizes["Points" if place == "PointData" else "Cells"][parts.place]
             for name in names:
-                rows = _Mesh(table.fields[name], table.column(name), np.arange(table.rows))
-                _copy(root, f"{place}/{name}", rows, _as_data)
-                steps[f"{place}Offsets/{name}"] = rows.place * size
+                stored = _Growing(root, f"{place}/{name}")
+                for row, values in enumerate(_each(table.fields[name], table)):
+                    data = _as_data(values)
+                    if len(data) != sizes[row]:
+                        raise ExchangeError(
+                            f'"{name}" has {len(data)} values in row {row}, but the mesh '
+                            f"{sizes[row]}."
+                        )
+                    stored.append(data)
+                stored.close()
+                steps[f"{place}Offsets/{name}"] = np.cumsum(sizes) - sizes
     return 0
+
+
+@dataclass(frozen=True)
+class _Parts:
+    """The meshes of a file.
+
+    Attributes:
+        sizes: Numbers of points, cells and ends of cells of each mesh, by what they are.
+        place: The mesh of each row.
+    """
+
+    sizes: Mapping[str, Index]
+    place: Index
+
+    def starts(self, what: str) -> Index:
+        """Return how many points, cells or ends of cells are before the mesh of each row."""
+        found: Index = (np.cumsum(self.sizes[what]) - self.sizes[what])[self.place]
+        return found
+
+
+def _write_meshes(root: Any, points: _Mesh, cells: _Mesh | None, kind: int, by_cell: int) -> _Parts:
+    """Write each mesh: of each episode, or of each row if points or cells change with it."""
+    same = cells is None or np.array_equal(points.place, cells.place)
+    count = int(points.place.max(initial=-1)) + 1 if same else len(points.place)
+    sizes = {name: np.empty(count, np.int64) for name in ("Points", "Cells", "ConnectivityIds")}
+    names = ("Points", "Connectivity", "Offsets", "Types")
+    at, links, ends, types = (_Growing(root, name) for name in names)
+    others = itertools.repeat(None) if cells is None else cells.values(by_row=not same)
+    meshes = zip(range(count), points.values(by_row=not same), others, strict=False)
+    for part, nodes, corners in meshes:
+        at.append(_as_vectors(nodes))
+        if corners is None or cells is None:
+            corners = np.arange(len(nodes))[:, None]
+        else:
+            _check(corners, len(nodes), cells.field)
+        links.append(corners.reshape(-1).astype(np.int64))
+        ends.append(np.arange(len(corners) + 1, dtype=np.int64) * by_cell)
+        types.append(np.full(len(corners), kind, np.uint8))
+        for name, size in (("Points", len(nodes)), ("Cells", len(corners))):
+            sizes[name][part] = size
+        sizes["ConnectivityIds"][part] = corners.size
+    for stored in (at, links, ends, types):
+        stored.close()
+    for name, of in sizes.items():
+        root[f"NumberOf{name}"] = of
+    return _Parts(sizes, points.place if same else np.arange(count))
+
+
+class _Growing:
+    """An array of a file that grows; what is added is kept until it is worth writing."""
+
+    def __init__(self, root: Any, name: str) -> None:
+        self._root, self._name = root, name
+        self._stored: Any = None
+        self._waiting: list[Array] = []
+
+    def append(self, values: Array) -> None:
+        """Add entries to the end."""
+        self._waiting.append(values)
+        if sum(each.nbytes for each in self._waiting) > BLOCK:
+            self.close()
+
+    def close(self) -> None:
+        """Write what was kept."""
+        if not self._waiting:
+            return
+        values, self._waiting = np.concatenate(self._waiting), []
+        if self._stored is None:
+            shape = values.shape[1:]
+            rows = max(1, _CHUNK // max(1, values.itemsize * math.prod(shape)))
+            self._stored = self._root.create_dataset(
+                self._name,
+                (0, *shape),
+                values.dtype,
+                maxshape=(None, *shape),
+                chunks=(rows, *shape),
+            )
+        end = len(self._stored)
+        self._stored.resize(end + len(values), axis=0)
+        self._stored[end:] = values
+
+
+def _each(field: Field, table: Table) -> Iterator[Array]:
+    """Yield the value of each row."""
+    for _, block in table.column(field.name, _FREE_ROWS if field.free_axis else None):
+        yield from block
 
 
 def _find(table: Table, episodes: Table | None, what: str, name: str | None) -> _Mesh:
@@ -114,7 +213,7 @@ def _find(table: Table, episodes: Table | None, what: str, name: str | None) -> 
             f"{listed(own | once)}."
         )
     if name in own:
-        return _Mesh(own[name], table.column(name), np.arange(table.rows))
+        return _Mesh(own[name], table, np.arange(table.rows))
     assert episodes is not None
     mine = np.flatnonzero(episodes.view["mode_index"][:] == MODES.index(table.mode))
     place = np.repeat(mine, episodes.view["rows"][:][mine])
@@ -123,7 +222,7 @@ def _find(table: Table, episodes: Table | None, what: str, name: str | None) -> 
             f"{len(place)} rows have records of episodes, but the mode has {table.rows}: rows "
             f'without a record have no "{name}".'
         )
-    return _Mesh(once[name], episodes.column(name), place)
+    return _Mesh(once[name], episodes, place)
 
 
 def _cell_type(options: ExportOptions, points: Field, cells: Field | None) -> tuple[int, int]:
@@ -147,13 +246,19 @@ def _cell_type(options: ExportOptions, points: Field, cells: Field | None) -> tu
     return CELLS[name]
 
 
-def _share(table: Table, sizes: Mapping[str, int], meshes: Sequence[str]) -> dict[str, list[str]]:
+def _share(
+    table: Table, points: _Mesh, cells: _Mesh | None, meshes: Collection[str]
+) -> dict[str, list[str]]:
     """Return the fields that are data of points or of cells; tell which are neither."""
+    sizes = {"PointData": points.field.shape}
+    sizes["CellData"] = (points if cells is None else cells).field.shape
     found: dict[str, list[str]] = {place: [] for place in sizes}
     left = []
     for name, field in table.fields.items():
         shape = field.shape or ()
-        place = next((each for each, size in sizes.items() if shape[:1] == (size,)), None)
+        place = next(
+            (p for p, size in sizes.items() if shape and shape[:1] == (size or ())[:1]), None
+        )
         if name in meshes:
             continue
         if place is None or field.numpy_dtype.kind not in "biuf":
@@ -169,52 +274,33 @@ def _share(table: Table, sizes: Mapping[str, int], meshes: Sequence[str]) -> dic
     return found
 
 
-def _steps(root: Any, table: Table, fps: int | None) -> Any:
-    """Write when each row is: in s if there are frames per s, else by its number."""
-    steps = root.create_group("Steps")
-    steps.attrs["NSteps"] = table.rows
-    times = np.arange(table.rows, dtype=np.float64)
-    steps["Values"] = times / fps if fps else times
-    steps["PartOffsets"] = np.zeros(table.rows, np.int64)
-    steps["NumberOfParts"] = np.ones(table.rows, np.int64)
-    return steps
-
-
-def _copy(root: Any, name: str, mesh: _Mesh, convert: Any) -> None:
-    """Write all values of a field, end to end."""
-    stored, last = None, int(mesh.place.max(initial=0)) + 1
-    for start, block in mesh.blocks:
-        values = convert(block[: max(0, last - start)])
-        size = values.shape[0] // max(1, min(len(block), last - start))
-        if stored is None:
-            stored = root.create_dataset(name, (last * size, *values.shape[1:]), values.dtype)
-        stored[start * size : start * size + len(values)] = values
-
-
 def _as_vectors(values: Array) -> Array:
     """Return points of 1 to 3 numbers as points in space, shape (points, 3)."""
-    flat = values.reshape(-1, values.shape[-1])
-    kind = np.result_type(flat.dtype, np.float32)
-    return np.pad(flat, ((0, 0), (0, _SPACE - flat.shape[1]))).astype(kind, copy=False)
+    kind = np.result_type(values.dtype, np.float32)
+    return np.pad(values, ((0, 0), (0, _SPACE - values.shape[1]))).astype(kind, copy=False)
 
 
 def _as_data(values: Array) -> Array:
     """Return a number or several for each point, shape (points,) or (points, numbers)."""
     if values.dtype.kind == "b":
         values = values.astype(np.uint8)
-    flat = values.reshape(values.shape[0] * values.shape[1], -1)
+    flat = values.reshape(len(values), -1)
     if flat.shape[1] == 1:
         return flat[:, 0]
     return np.pad(flat, ((0, 0), (0, 1))) if flat.shape[1] == 2 else flat
 
 
-def _checked(values: Array, count: int, field: Field) -> Array:
-    if values.min(initial=0) < 0 or values.max(initial=0) >= count:
+def _check(corners: Array, count: int, field: Field) -> None:
+    if corners.size and (corners.min() < 0 or corners.max() >= count):
         raise ExchangeError(
-            f'"{field.name}" names points from {values.min()} to {values.max()}, but there are '
+            f'"{field.name}" names points from {corners.min()} to {corners.max()}, but there are '
             f"{count}, numbered from 0."
         )
-    return values.reshape(-1).astype(np.int64)
 
 
-FORMAT = Format(write=write, several=True, options=("points", "cells", "cell_type", "fps"))
+FORMAT = Format(
+    write=write,
+    several=True,
+    options=("points", "cells", "cell_type", "fps"),
+    free_axes=True,
+)

@@ -11,6 +11,7 @@ def physx_networks() -> dict[str, str]:
     return {
         "fc": "physx_torch.networks.fc:FC",
         "encoder_decoder": "physx_torch.networks.encoder_decoder:EncoderDecoder",
+        "graph": "physx_torch.networks.graph:GraphNetwork",
         "module": "physx_torch.networks.module_network:ModuleNetwork",
         "unet": "physx_torch.networks.unet:UNet",
     }

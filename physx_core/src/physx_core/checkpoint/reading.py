@@ -327,7 +327,7 @@ def _read_normalization(
     for place, array in unpack(content).items():
         name, part = place.split("/")
         arrays.setdefault(name, {})[part] = array
-    return {n: Normalization.from_arrays(own, fields[n].shape or ()) for n, own in arrays.items()}
+    return {n: Normalization.from_arrays(own, fields[n].entry_shape) for n, own in arrays.items()}
 
 
 def _check_file(path: Path, name: str, written: Mapping[str, Any], content: bool) -> None:

@@ -31,7 +31,7 @@ from physx_core.dataset.write.compacting import compact
 from physx_core.dataset.write.delegation import Delegation
 from physx_core.dataset.write.merging import add_partitions, drop_partition
 from physx_core.dataset.write.opening import WriterOptions, create, extend
-from physx_core.dataset.write.updating import check_update
+from physx_core.dataset.write.updating import check_unchanged, check_update
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError, UsageError
 from physx_core.fields import Field
@@ -249,7 +249,8 @@ class Dataset(EpisodeReading, Closeable):
                 the normalization to use. False by default.
 
         Returns:
-            An iterator over batches: field name to array of shape (samples, *field shape).
+            An iterator over batches: field name to array of shape (samples, *field shape). Free
+            axes are packed: see `physx_core.packing.pack`; `reuse` then makes no difference.
 
         Raises:
             DatasetError: If there is no such mode or field, or the mode has no samples.
@@ -386,8 +387,8 @@ class Dataset(EpisodeReading, Closeable):
 
         Args:
             mode: Name of the mode. If it has no fields yet, they are inferred from the rows.
-            rows: Field name to array of shape (n, *field shape), all fields of the mode.
-                Accepts what `Field.convert` accepts.
+            rows: Field name to array of shape (n, *field shape), all fields of the mode; with a
+                free axis, n arrays. Accepts what `Field.convert` accepts.
             checked: Whether the rows are known to be finite, as those of a `Source` are: arrays of
                 the fields' types are then stored without checking their values again.
 
@@ -556,8 +557,8 @@ class Dataset(EpisodeReading, Closeable):
                 one number; any of the mode's fields.
 
         Raises:
-            SampleError: If a field is unknown, or rows have the wrong shape, type or number, or
-                hold NaN or infinity. Nothing is changed.
+            SampleError: If a field is unknown, or rows have the wrong shape, type or number, other
+                sizes of free axes than before, or hold NaN or infinity. Nothing is changed.
             IndexError: If there are no such rows.
             DatasetError: If the disk fails, or a partition is damaged.
             UsageError: If the dataset is closed, open for reading only, or shared.
@@ -570,6 +571,7 @@ class Dataset(EpisodeReading, Closeable):
         values = check_update(fields, numbers, rows, single=single)
         order = self._reader.order(mode)
         numbers = numbers if order is None else order.stored(numbers)
+        check_unchanged(fields, values, self._reader.sizes(mode, numbers))
         with files.storing(f"{len(numbers)} updated rows of mode {mode!r}"):
             writer.update(mode, numbers, values)
 

@@ -184,9 +184,10 @@ class Prediction(Pipeline):
             for name, values in self.prediction.items()
         }
         if self.step_id == 0:
+            shapes = map(self.learner.predicted_shape, self.prediction, predicted.values())
             added = [
-                Field(name, values.shape[1:], values.dtype, role="additional")
-                for name, values in predicted.items()
+                Field(name, shape, values[0].dtype, role="additional")
+                for (name, values), shape in zip(predicted.items(), shapes, strict=True)
             ]
             dataset.define_fields("prediction", [*self.source.fields, *added])
         for row in range(self.source.instance_nb):

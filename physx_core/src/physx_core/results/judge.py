@@ -9,6 +9,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from physx_core.errors import ConfigError
+from physx_core.fields import PTR
 from physx_core.results.errors import Errors, Target, compare
 from physx_core.results.metrics import Metric, Metrics
 from physx_core.results.result import EpisodeError, FieldResult, PartResult, RivalResult
@@ -132,7 +134,7 @@ class Judge:
             self._sample = TrainingSample(self._training, network.given)
         fields, batch = self._training.fields, self._sample.batch
         self._targets = {
-            name: Target.of(fields[name], batch[name], network.losses.get(name, ""))
+            name: Target.of(fields[name].of_entries, batch[name], network.losses.get(name, ""))
             for name in network.pairs
         }
         self._rivals: dict[str, Rival] = {}
@@ -182,6 +184,8 @@ class Judge:
         for rival in (name for name in makers if name in self._wanted):
             try:
                 self._check(0)
+                if self._sample.is_packed and rival != MEAN:
+                    raise NotRunError("samples have different sizes")
                 self._rivals[rival] = makers[rival]()
             except NotRunError as error:
                 self._drop(rival, error)
@@ -197,7 +201,7 @@ class Judge:
             metrics = self._begin_metrics(reading)
             for number in range(len(reading)):
                 batch, where = reading[number], reading.groups(number)
-                guesses = self._predict(batch, missing)
+                guesses = self._predict(batch, len(where), missing)
                 self._add(sums, guesses, batch, where)
                 if metrics is not None:
                     metrics.add(guesses, batch, where)
@@ -212,6 +216,8 @@ class Judge:
     def _begin_metrics(self, batches: Batches) -> Metrics | None:
         if not self._metrics:
             return None
+        if self._sample.is_packed:
+            raise ConfigError("Metrics of fields with free axes are not supported: leave them out.")
         counts = np.zeros(batches.num_groups, np.intp)
         for number in range(len(batches)):
             np.add.at(counts, batches.groups(number), 1)
@@ -232,7 +238,9 @@ class Judge:
         if all(self._training.fields[name].shape == shape for name, shape in shapes.items()):
             return self
         other = copy(self)
-        other._targets = {name: of.at(batches.fields[name]) for name, of in self._targets.items()}
+        other._targets = {
+            name: of.at(batches.fields[name].of_entries) for name, of in self._targets.items()
+        }
         why = "it learned from samples of another shape"
         gone = (MEAN, LINEAR, NEAREST)
         other._rivals = {n: r for n, r in self._rivals.items() if n not in gone}
@@ -256,7 +264,7 @@ class Judge:
                 inputs = self._sample.read(batch)
                 steps += float(np.square(np.diff(inputs, axis=0)).sum())
                 spread += 2.0 * (inputs.size - inputs.shape[1])
-            guesses = self._predict(batch, missing)
+            guesses = self._predict(batch, len(where), missing)
             self._add(whole, guesses, batch, where)
             if metrics is not None:
                 metrics.add(guesses, batch, where)
@@ -282,17 +290,19 @@ class Judge:
 
     def _is_reshaped(self, batches: Batches) -> bool:
         names = self._network.given
-        return any(batches.fields[n].shape != self._training.fields[n].shape for n in names)
+        return self._sample.is_packed or any(
+            batches.fields[n].shape != self._training.fields[n].shape for n in names
+        )
 
     def _nouns(self, batches: Batches) -> str:
         return " or ".join(dict.fromkeys(_NOUNS[noun] for noun in batches.group_nouns))
 
-    def _predict(self, batch: Batch, missing: dict[str, str]) -> Batch:
+    def _predict(self, batch: Batch, rows: int, missing: dict[str, str]) -> Batch:
         """Return the network's predictions by true field; keep why there are none of some."""
         begin = time.monotonic()
         answer, found = self._network.predict(batch), {}
         self._predicting += time.monotonic() - begin
-        self._predicted += len(next(iter(batch.values())))
+        self._predicted += rows
         for name, predicted in self._network.pairs.items():
             guess = self._targets[name].decode(answer[predicted])
             if guess is not None:
@@ -325,6 +335,11 @@ class Judge:
 
     def _add(self, sums: Mapping[str, Errors], guesses: Batch, batch: Batch, groups: Index) -> None:
         for name, guess in guesses.items():
+            if axis := self._training.fields[name].free_axis:
+                sums[name].add(
+                    guess, batch[name], np.repeat(groups, np.diff(batch[axis + PTR])), None
+                )
+                continue
             truth, padded = batch[name], batch.get(f"{name}{PAD}")
             valid: Array | None = None
             if padded is not None:

@@ -6,6 +6,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from physx_core.fields import free_axes
 from physx_core.typing import Array, Batch, Index
 from physx_core.views.batches import Batches
 
@@ -19,6 +20,7 @@ class TrainingSample:
     Attributes:
         batch: The samples, field name to array of shape (rows, *field shape).
         groups: The trajectory of each, as a number, shape (rows,).
+        is_packed: Whether free axes are packed, so that there are no `inputs` of equal sizes.
         inputs: What rivals read, shape (rows, columns): the network's inputs in one row, each
             column shifted to the mean 0 and scaled to the deviation 1.
     """
@@ -30,15 +32,20 @@ class TrainingSample:
             batches: The batches of the training.
             given: Names of the network's inputs.
         """
-        width = sum(int(np.prod(field.shape or ())) for field in batches.fields.values())
+        width = sum(int(np.prod(field.entry_shape)) for field in batches.fields.values())
+        self.is_packed = bool(free_axes(batches.fields.values()))
         rows = max(1, min(_ROWS, _VALUES // max(1, width), batches.num_items))
         count = min(len(batches), -(-rows // batches.batch_size))
         chosen = np.unique(np.linspace(0, len(batches) - 1, count).astype(int)).tolist()
         parts = [{n: v.copy() for n, v in batches[number].items()} for number in chosen]
         names = list(parts[0])
-        self.batch: Batch = {n: np.concatenate([p[n] for p in parts])[:rows] for n in names}
+        most = None if self.is_packed else rows
+        self.batch: Batch = {n: np.concatenate([p[n] for p in parts])[:most] for n in names}
         self.groups: Index = np.concatenate([batches.groups(n) for n in chosen])[:rows]
         self._given = list(given)
+        if self.is_packed:
+            self.inputs = np.zeros((len(self.groups), 0))
+            return
         self.inputs = self._flat(self.batch)
         self._mean, spread = self.inputs.mean(axis=0), self.inputs.std(axis=0)
         self._scale = np.where(spread > 0, spread, 1.0)

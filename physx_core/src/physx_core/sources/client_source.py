@@ -195,8 +195,9 @@ class ClientSource(Source):
             if self._capacity < size:
                 self._capacity = size
                 self._out = {
-                    field.name: np.empty((size, *(field.shape or ())), field.dtype)
+                    field.name: np.empty((size, *shape), kind)
                     for field in self._table
+                    for shape, kind in [field.row_kind]
                 }
             self._group.wait(self._without_rows)
             self.rows = self._asked
@@ -266,8 +267,9 @@ class ClientSource(Source):
             # The position of the instance's first row in the batch.
             start = (number - 1 - self._first) % self.instance_nb
             rows = {
-                name: np.asarray(values)[start : size : self.instance_nb]
+                name: part.tolist() if part.dtype.hasobject else part  # the arrays of a free axis
                 for name, values in batch.items()
+                for part in [np.asarray(values)[start : size : self.instance_nb]]
             }
             count = len(range(start, size, self.instance_nb))
             if count:

@@ -6,6 +6,7 @@ import contextlib
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from hashlib import blake2b
 from pathlib import Path
 from typing import Any
@@ -23,8 +24,9 @@ from physx_core.dataset.read.shuffling import ItemOrder, key_of
 from physx_core.dataset.store.definitions import compare_fields
 from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.errors import ConfigError, DatasetError, UsageError
-from physx_core.fields import Field
+from physx_core.fields import Field, free_axes
 from physx_core.normalization import Measured, Normalization, Normalize, compute_normalization
+from physx_core.packing import Scratch, join, pack, packed_fields
 from physx_core.statistics import RunningStatistics
 from physx_core.typing import Array, Batch, Index
 from physx_core.views.folds import Part
@@ -169,15 +171,23 @@ class Batches(Closeable):
 
     def _choose(self, names: Sequence[str] | None, dtype: DTypeLike | None, *, reuse: bool) -> None:
         """Choose what a batch contains."""
-        self._names = list(names or self.view.windows or self._sources[0].rows.fields)
+        stored = self._sources[0].rows.fields
+        added = packed_fields(free_axes(stored.values()))
+        wanted = list(names or self.view.windows or stored)
+        self._names = [name for name in wanted if name in stored or name not in added]
+        self._all_names = None if names is None else list(names)
+        self._named = None if names is None else [name for name in names if name in added]
         self._windows = {name: window_of(self.view, name) for name in self._names}
         self._dtype, self._reuse = None if dtype is None else np.dtype(dtype), reuse
         self.fields: dict[str, Field] = {}
         for name in self._names:
             self.fields |= self._described(name)
         self._kinds = {n: field.converted_dtype(self._dtype) for n, field in self.fields.items()}
-        kinds = {n: (field.shape or (), self._kinds[n]) for n, field in self.fields.items()}
-        self._arrays = BatchArrays(kinds, self.batch_size, reuse=reuse)
+        kinds = {n: (field.row_kind[0], self._kinds[n]) for n, field in self.fields.items()}
+        self._axes = free_axes(self.fields.values())
+        self.fields |= packed_fields(self._axes)
+        self._scratch = Scratch() if self._axes and reuse else None
+        self._arrays = BatchArrays({} if self._axes else kinds, self.batch_size, reuse=reuse)
 
     def reading(self, fields: Sequence[str]) -> Batches:
         """Return the same batches, of other fields; they share the open files."""
@@ -214,6 +224,11 @@ class Batches(Closeable):
                 {window.field: stored},
             )
         of_window = () if window.is_single else (len(window.at),)
+        if of_window and stored.free_axis:
+            raise ConfigError(
+                f'The window "{name}" has several rows of "{stored.name}", whose axis '
+                f'"{stored.free_axis}" may have another size in each: give each its own window.'
+            )
         like = stored.name if stored.name != name else stored.like
         axes = ("time", *stored.axes) if stored.axes and of_window else stored.axes
         axes = axes if len(set(axes)) == len(axes) else ()
@@ -231,6 +246,8 @@ class Batches(Closeable):
     def __getitem__(self, number: int) -> Batch:
         """Return a batch: field name to array of shape (items, *field shape).
 
+        Free axes are packed: see `physx_core.packing.pack`.
+
         Args:
             number: Its number, from 0; those of each epoch follow those of the one before.
 
@@ -241,6 +258,8 @@ class Batches(Closeable):
         epoch, start, stop = self._place(number)
         for source in self._sources:
             source.rows.check()
+        if self._axes:
+            return self._packed(epoch, start, stop)
         if self._is_plain:
             batch = self._arrays.take(stop - start)
             self._begin(epoch).fill(start, batch)
@@ -255,6 +274,52 @@ class Batches(Closeable):
             for name, values in self._values(source, where).items() if len(slots) else ():
                 batch[name][slots] = values
         return batch
+
+    def _packed(self, epoch: int, start: int, stop: int) -> Batch:
+        """Return a batch in which free axes are packed: see `packing.pack`."""
+        if len(self._sources) == 1:
+            return self._pack(self._sources[0], self._next(epoch, start, stop))
+        rows: Batch = {}
+        drawn = self._drawn(epoch, start, stop)
+        for source, (slots, items) in zip(self._sources, drawn, strict=True):
+            where = source.items.locate(items)
+            for name, values in self._values(source, where).items() if len(slots) else ():
+                empty = np.empty((stop - start, *values.shape[1:]), values.dtype)
+                rows.setdefault(name, empty)[slots] = values
+        found: Batch = {}
+        sizes: dict[str, Index] = {}
+        for name, values in rows.items():
+            field = self.fields[name]
+            if field.free_axis:
+                values, counts = join(field, values.tolist())
+                self._check_sizes(name, counts, sizes)
+            found[name] = values.astype(self._kinds[name], copy=False)
+        return pack(self.fields, found, sizes, self._named)
+
+    def _pack(self, source: Source, where: Located) -> Batch:
+        """Return some items of a source as a batch in which free axes are packed."""
+        fixed = {n: w for n, w in self._windows.items() if not self.fields[n].free_axis}
+        found, sizes = self._values(source, where, fixed), dict[str, Index]()
+        scratch = self._scratch
+        for name, window in self._windows.items():
+            if name not in fixed:
+                if where.rows is not None:
+                    rows = where.rows + window.at[0]
+                else:
+                    rows = source.items.rows(where.items, window.at)[:, 0]
+                allocate = np.empty if scratch is None else partial(scratch.take, name)
+                found[name], counts = source.rows.entries(window.field, rows, self._dtype, allocate)
+                self._check_sizes(name, counts, sizes)
+        return pack(self.fields, {n: found[n] for n in self._kinds}, sizes, self._named, scratch)
+
+    def _check_sizes(self, name: str, counts: Index, sizes: dict[str, Index]) -> None:
+        """Check that fields that share a free axis have the same sizes in a batch."""
+        axis = self.fields[name].free_axis
+        if sizes.setdefault(axis, counts) is not counts and not np.array_equal(sizes[axis], counts):
+            raise DatasetError(
+                f'"{name}" has other sizes of the axis "{axis}" than the fields before it: the '
+                "rows of its window have others. Read windows only where sizes stay."
+            )
 
     def _place(self, number: int) -> tuple[int, int, int]:
         """Return the epoch of a batch, and its first position there and that after its last."""
@@ -316,7 +381,8 @@ class Batches(Closeable):
     def quantity(self, name: str) -> str:
         """Return the stored field whose quantity a field is: see `Field.like`."""
         stored = self.window(name).field
-        return self._sources[0].rows.fields[stored].like or stored
+        known = self._sources[0].rows.fields.get(stored)  # None: of what packing adds
+        return stored if known is None else known.like or stored
 
     @property
     def is_whole(self) -> bool:
@@ -326,6 +392,8 @@ class Batches(Closeable):
     def take(self, items: Index) -> Batch:
         """Return some of the items of a single source as a batch, whatever their order."""
         self._only.rows.check()
+        if self._axes:
+            return self._pack(self._only, self._only.items.locate(items))
         return self._values(self._only, self._only.items.locate(items))
 
     @property
@@ -407,13 +475,17 @@ class Batches(Closeable):
             found.append((mine, items))
         return found
 
-    def _values(self, source: Source, where: Located) -> Batch:
-        """Return what a batch contains of some items of a source."""
+    def _values(
+        self, source: Source, where: Located, windows: Mapping[str, Window] | None = None
+    ) -> Batch:
+        """Return what a batch contains of some items of a source, or of some windows."""
         found: Batch = {}
-        for name, window in self._windows.items():
+        for name, window in (self._windows if windows is None else windows).items():
             values = source.gather(window.field, where, window.at)
             values = values[:, 0] if window.is_single else values
-            found[name] = values.astype(self._kinds[name], copy=False)
+            if not self.fields[name].free_axis:
+                values = values.astype(self._kinds[name], copy=False)
+            found[name] = values
             if name + PAD in self.fields:
                 padded = source.items.are_padded(where.items, window.at)
                 found[name + PAD] = padded[:, 0] if window.is_single else padded
@@ -502,7 +574,7 @@ class Batches(Closeable):
         data = None if self.view.sources else str(self._sources[0].dataset.directory)
         options = {
             "data": data, "mode": self.mode, "part": self.part, "snapshot": self.snapshot,
-            "fields": self._names, "dtype": self._dtype, "reuse": self._reuse,
+            "fields": self._all_names, "dtype": self._dtype, "reuse": self._reuse,
         }  # fmt: skip
         return _reopen, (self.view, self.batch_size, self.seed, options)
 

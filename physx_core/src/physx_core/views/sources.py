@@ -229,6 +229,10 @@ class Source:
     def gather(self, name: str, where: Located, offsets: Sequence[int]) -> Array:
         """Return a stored field of items at some offsets, shape (items, offsets, *field shape)."""
         first, count = offsets[0], len(offsets)
+        if self.rows.fields[name].free_axis:
+            rows = self.items.rows(where.items, offsets)
+            found = self.rows.gather(name, rows.ravel())
+            return found.reshape(rows.shape)
         if where.rows is not None and tuple(offsets) == tuple(range(first, first + count)):
             return self.rows.windows(name, where.rows + first, count)
         rows = self.items.rows(where.items, offsets)

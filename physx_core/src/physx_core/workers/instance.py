@@ -25,7 +25,7 @@ from physx_core.errors import (
     UsageError,
     WrongSamplesError,
 )
-from physx_core.fields import Field, check_quantities
+from physx_core.fields import Field, check_together
 from physx_core.processes.endings import describe_ending, is_ending
 from physx_core.rows import RejectedSamples
 from physx_core.typing import Array, Sample
@@ -212,7 +212,7 @@ class Instance(Closeable):
                 "call define_training_fields()."
             )
         for fields in (environment.fields, environment.episode_fields):
-            check_quantities({field.name: field for field in fields})
+            check_together({field.name: field for field in fields})
         if with_states:
             self._try(self.track_states)
         self._draws = draw

@@ -10,6 +10,7 @@ import numpy as np
 from physx_core.errors import ConnectionRefusedByPeerError
 from physx_core.fields import Field
 from physx_core.net.frames import Kind, pack_header
+from physx_core.packing import lengths, split
 from physx_core.typing import Array, Batch
 
 _SMALL = 1 << 14
@@ -30,6 +31,8 @@ def pack_rows(block: Batch, count: int, kind: Kind = Kind.ROWS) -> list[bytes | 
         kind: Kind of the message.
     """
     arrays = list(block.values())
+    if any(array.dtype.hasobject for array in arrays):
+        arrays = [part for array in arrays for part in _parts(array)]
     length = sum(array.nbytes for array in arrays)
     begin = pack_header(kind, length, count)
     if length <= _SMALL:
@@ -45,6 +48,8 @@ def unpack_rows(payload: bytearray, fields: Sequence[Field], count: int) -> Batc
         fields: Fields of the rows, all shapes known.
         count: Number of rows according to the header.
     """
+    if any(field.free_axis for field in fields):
+        return _unpack_free(payload, fields, count)
     sizes = [field.nbytes for field in fields]
     if len(payload) != count * sum(sizes):
         raise ConnectionRefusedByPeerError(
@@ -56,6 +61,48 @@ def unpack_rows(payload: bytearray, fields: Sequence[Field], count: int) -> Batc
         shape = (count, *(field.shape or ()))
         block[field.name] = np.ndarray(shape, field.dtype, buffer=payload, offset=start)
         start += count * size
+    return block
+
+
+def _parts(array: Array) -> list[Array]:
+    """Return a field of rows as it is sent: with a free axis, the rows' sizes and their entries."""
+    if not array.dtype.hasobject:
+        return [array]
+    sizes = lengths(array).astype("<u8")
+    return [sizes, np.concatenate(array.tolist())] if len(array) else [sizes]
+
+
+def _unpack_free(payload: bytearray, fields: Sequence[Field], count: int) -> Batch:
+    """Return the rows of a message, some of whose fields have a free axis."""
+    block: Batch = {}
+    start = 0
+
+    def take(shape: tuple[int, ...], field: Field, nbytes: int) -> Array:
+        nonlocal start
+        if nbytes > len(payload) - start:
+            raise ConnectionRefusedByPeerError(
+                f'A client sent {len(payload)} bytes, too few for its field "{field.name}".'
+            )
+        found: Array = np.ndarray(shape, field.dtype, buffer=payload, offset=start)
+        start += nbytes
+        return found
+
+    for field in fields:
+        if not field.free_axis:
+            shape = (count, *field.entry_shape)
+            block[field.name] = take(shape, field, count * field.nbytes)
+            continue
+        sizes = take((count,), Field(field.free_axis, (), "<u8"), 8 * count)
+        if len(sizes) and sizes.max() > len(payload):
+            raise ConnectionRefusedByPeerError(f"A client sent rows of {sizes.max()} entries.")
+        counts = sizes.astype(np.intp)
+        total = int(counts.sum())
+        entries = take((total, *field.entry_shape), field, total * field.nbytes)
+        block[field.name] = split(entries, counts)
+    if start != len(payload):
+        raise ConnectionRefusedByPeerError(
+            f"A client sent {len(payload)} bytes for {count} rows of {start} bytes."
+        )
     return block
 
 

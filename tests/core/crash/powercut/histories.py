@@ -28,6 +28,7 @@ from powercut.promises import (
     encode,
     look,
     read,
+    width,
 )
 from powercut.stage import Stage
 
@@ -38,6 +39,9 @@ KINDS = (
     Field("s", (3,), "float32", unit="N"),
     Field("k", (1, 2), "int64"),
     Field("none", (0,)),
+    Field("p", ("node", 2), unit="m"),
+    Field("q", ("node",), "float32"),
+    Field("e", ("edge", 2), "int64"),
 )
 HEADER = 2**14
 LONGEST = 14
@@ -164,7 +168,7 @@ class Model:
         self.updates += 1
         for name in names:
             of = next(each for each in self.now.modes[mode].fields if each.name == name)
-            limits = self._sized((mode, name), int(np.prod(of.shape)))
+            limits = self._sized((mode, name), width(of))
             newest = limits.newest.copy()
             newest[rows] = self.updates
             self.versions[mode, name] = Versions(limits.kept, limits.stored, newest)
@@ -468,7 +472,7 @@ class History:
         if name not in self._model.now.modes:
             self._model.now.modes[name] = _Mode(fields)
             if self._chance.random() < 0.3:
-                fields = tuple(replace(of, shape=None) for of in fields)
+                fields = tuple(of if of.free_axis else replace(of, shape=None) for of in fields)
         self._told(f"defines {name}")
         dataset.define_fields(name, fields)
         self._model.now.modes[name].certain = True
@@ -659,7 +663,8 @@ class History:
 
     def _chosen_mode(self, dataset: Dataset) -> str:
         name = self._chance.choice(list(self._modes))
-        if self._shared and name not in dataset.modes:
+        is_free = any(of.free_axis for of in self._modes[name])  # no rows can tell that
+        if (self._shared or is_free) and name not in dataset.modes:
             self._define_in(dataset, name)
         if name not in self._model.now.modes:  # the fields will be those of the rows
             fields = tuple(replace(of, unit="", role="training") for of in self._modes[name])

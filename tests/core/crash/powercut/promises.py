@@ -22,14 +22,27 @@ VERSIONS = 16
 Array = np.ndarray
 
 
+MOST = 3
+"""How many entries of a free axis a row has at most; row r has 1 + r % MOST."""
+
+
 # Numbers ----------------------------------------------------------------------------------------
+
+
+def width(of: Field) -> int:
+    """Return how many numbers a row of a field has at most."""
+    return int(np.prod(of.entry_shape)) * (MOST if of.free_axis else 1)
 
 
 def encode(of: Field, rows: Array, version: int) -> Array:
     """Return the values of rows in one version, shape (rows, *field shape)."""
-    width = int(np.prod(of.shape))
-    token = (np.asarray(rows, np.int64) * VERSIONS + version)[:, None] * width
-    return (token + np.arange(width)).astype(of.dtype).reshape(len(rows), *of.shape)
+    most = width(of)
+    token = (np.asarray(rows, np.int64) * VERSIONS + version)[:, None] * most
+    if of.free_axis:
+        values = (token + np.arange(most)).astype(of.dtype).reshape(-1, MOST, *of.entry_shape)
+        cut = (each[: 1 + row % MOST] for each, row in zip(values, rows, strict=True))
+        return np.fromiter(cut, object, len(rows))
+    return (token + np.arange(most)).astype(of.dtype).reshape(len(rows), *of.shape)
 
 
 @dataclass(frozen=True)
@@ -47,6 +60,8 @@ class Decoded:
 
 def decode(of: Field, values: Array) -> Decoded | str:
     """Return what values say, or what is wrong with them."""
+    if of.free_axis:
+        return _decode_free(of, values)
     width = int(np.prod(of.shape))
     given = values.reshape(len(values), width)
     with np.errstate(invalid="ignore"):
@@ -58,6 +73,28 @@ def decode(of: Field, values: Array) -> Decoded | str:
         bad = int(np.flatnonzero(~fine.all(axis=1))[0])
         return f"row {bad} of {len(values)} was never written: {values[bad].ravel()[:6]}"
     return Decoded(rows[:, 0] if width else rows.reshape(-1), versions.astype(np.int8))
+
+
+def _decode_free(of: Field, values: Array) -> Decoded | str:
+    """Return what values of a free axis say; the versions of missing numbers are the first's."""
+    most = width(of)
+    rows, versions = np.zeros(len(values), np.int64), np.zeros((len(values), most), np.int8)
+    for place, value in enumerate(values):
+        given = value.ravel()
+        with np.errstate(invalid="ignore"):
+            whole = given.astype(np.int64)
+        numbers, places = np.divmod(whole, most)
+        found, version = np.divmod(numbers, VERSIONS)
+        fine = len(given) and found[0] > 0 and (whole == given).all() and (found == found[0]).all()
+        if not (
+            fine
+            and np.array_equal(places, np.arange(len(given)))
+            and value.shape == (1 + found[0] % MOST, *of.entry_shape)
+        ):
+            return f"row {place} of {len(values)} was never written: {given[:6]}"
+        rows[place], versions[place] = found[0], version[0]
+        versions[place, : len(given)] = version
+    return Decoded(rows, versions)
 
 
 # What is read -----------------------------------------------------------------------------------
@@ -99,10 +136,17 @@ class Seen:
             mine, others = self.values.get(mode, {}), other.values.get(mode, {})
             for name in mine.keys() | others.keys():
                 one, two = mine.get(name), others.get(name)
-                if one is None or two is None or not np.array_equal(one, two):
+                if one is None or two is None or not _equal(one, two):
                     lengths = [None if part is None else len(part) for part in (one, two)]
                     return f"{mode}/{name} was read otherwise before: {lengths} rows"
         return ""
+
+
+def _equal(one: Array, two: Array) -> bool:
+    """Return whether rows are equal."""
+    if one.dtype != object:
+        return bool(np.array_equal(one, two))
+    return len(one) == len(two) and all(map(np.array_equal, one, two))
 
 
 def look(folder: Path) -> Seen:

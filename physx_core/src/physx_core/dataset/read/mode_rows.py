@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import cached_property
 from typing import Any, NamedTuple
 
@@ -20,9 +20,11 @@ from physx_core.dataset.store.manifest import Partition
 from physx_core.dataset.store.partition.segment import RowsCheck, rows_per_block
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
+from physx_core.packing import pack, ranges, split
 from physx_core.typing import Array, Batch, Index
 
 _BLOCK = 2**15  # rows
+_SMALL_ROW = 1024  # bytes from which a copy for each row is faster than one for each entry
 
 
 class Snapshot(NamedTuple):
@@ -155,11 +157,69 @@ class ModeRows:
 
     def gather(self, name: str, rows: Index) -> Array:
         """Return some rows of a field, shape (n, *field shape)."""
+        if self.fields[name].free_axis:
+            return split(*self.entries(name, rows))
         stored = self.stored
         column = self._column(name)
         out = np.empty((len(rows), *column.shape[1:]), column.dtype)
         column.gather(rows if stored is None else stored(rows), out)
         return out
+
+    def entries(
+        self,
+        name: str,
+        rows: Index,
+        dtype: np.dtype[Any] | None = None,
+        allocate: Callable[[tuple[int, ...], np.dtype[Any]], Array] = np.empty,
+    ) -> tuple[Array, Index]:
+        """Return the entries of some rows of a field with a free axis, end to end.
+
+        Args:
+            name: Name of the field.
+            rows: Row numbers, shape (n,).
+            dtype: Type that floating-point fields are converted to; None: no conversion.
+            allocate: Returns an array of a shape and a type for the entries.
+
+        Returns:
+            The entries, and how many each row has, shape (n,).
+        """
+        field, column = self.fields[name], self._column(name)
+        bounds = self._reader.bounds(self.mode, field.free_axis)
+        stored = rows if self.stored is None else self.stored(rows)
+        starts = bounds[stored]
+        counts = bounds[stored + 1] - starts
+        out = allocate((int(counts.sum()), *field.entry_shape), field.converted_dtype(dtype))
+        if not out.size:
+            return out, counts
+        if len(out) * field.nbytes < _SMALL_ROW * len(rows):
+            column.gather(ranges(starts, counts), plain := np.empty(out.shape, column.dtype))
+            return plain.astype(out.dtype, copy=False), counts
+        np.concatenate(column.slices(starts, counts), out=out, casting="same_kind")
+        return out, counts
+
+    def packed(
+        self,
+        names: Sequence[str],
+        rows: Index,
+        dtype: np.dtype[Any] | None = None,
+        named: Sequence[str] | None = None,
+    ) -> Batch:
+        """Return some rows as a batch in which free axes are packed: see `packing.pack`.
+
+        Args:
+            names: Names of the fields.
+            rows: Row numbers, shape (n,).
+            dtype: Type that floating-point fields are converted to; None: no conversion.
+            named: See `packing.pack`.
+        """
+        fields, found, sizes = {name: self.fields[name] for name in names}, {}, {}
+        for name, field in fields.items():
+            if field.free_axis:
+                found[name], sizes[field.free_axis] = self.entries(name, rows, dtype)
+            else:
+                values = self.gather(name, rows)
+                found[name] = values.astype(field.converted_dtype(dtype), copy=False)
+        return pack(fields, found, sizes, named)
 
     def windows(self, name: str, first: Index, count: int) -> Array:
         """Return consecutive rows of a field from some rows on, shape (n, count, *field shape)."""
@@ -197,7 +257,7 @@ class ModeRows:
             The first row of a block, and field name to array of shape (n, *field shape).
         """
         count = min([_BLOCK, *(rows_per_block(self.fields[name].nbytes) for name in names)])
-        kinds = {n: ((of.shape or ()), of.numpy_dtype) for n, of in self.fields.items()}
+        kinds = {n: of.row_kind for n, of in self.fields.items()}
         buffers = {
             n: np.empty((min(count, stop - start), *kinds[n][0]), kinds[n][1]) for n in names
         }
@@ -205,7 +265,13 @@ class ModeRows:
         for first in range(start, stop, count):
             block = {name: buffer[: stop - first] for name, buffer in buffers.items()}
             for name, out in block.items():
-                if self.stored is None:
+                if self.fields[name].free_axis:
+                    out[:] = (
+                        self._reader.read(self.mode, name, first, first + len(out))
+                        if (self.stored is None)
+                        else self.gather(name, np.arange(first, first + len(out)))
+                    )
+                elif self.stored is None:
                     self._reader.read_into(out, self.mode, name, first, checks[name])
                 else:
                     out[:] = self.gather(name, np.arange(first, first + len(out)))
@@ -227,10 +293,7 @@ class ModeRows:
         entries = np.searchsorted(self.order.episodes.first, rows, "right") - 1
         records = self._reader.orders.places(self.mode)[self.order.last_records]
         once, places = np.unique(entries, return_inverse=True)
-        column = self._columns.map(EPISODES, name)
-        out = np.empty((len(once), *column.shape[1:]), column.dtype)
-        column.gather(records[once], out)
-        found: Array = out[places]
+        found: Array = self._columns.take(EPISODES, name, records[once])[places]
         return found
 
     @property

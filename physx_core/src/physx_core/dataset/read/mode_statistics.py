@@ -86,8 +86,11 @@ def count_sealed(
     statistics_file.load(directory, manifest)
     counted = []
     for partition in partitions:
-        have = (partition.running.get(name) for name in mode.counted_fields)
-        complete = all(s is not None and s.count == partition.rows for s in have)
+        complete = all(
+            (found := partition.running.get(name)) is not None
+            and found.count == partition.rows_of(field)
+            for name, field in mode.counted_fields.items()
+        )
         if partition.counted:
             continue
         if not (partition.checksums and complete):

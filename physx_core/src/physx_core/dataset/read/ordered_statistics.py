@@ -42,6 +42,8 @@ _LARGE_CELL = 2**26
 _KEPT = 2**25
 """Bytes of the cells of a field. Cells of more rows are made if there would be more."""
 _ARRAYS, _NUMBER = 4, 8
+_FREE_ROWS = 256
+"""Rows of free axes that are read at once."""
 _NO: Index = np.zeros(0, np.intp)
 
 
@@ -76,7 +78,8 @@ def compute_of_rows(
     """
     field = known.fields[of.field]
     cells = _divide(known, field, starts, counts)
-    if known.order is None or of.log or of.since or of.pooled != field.pooled:
+    special = of.log or of.since or of.pooled != field.pooled or field.free_axis
+    if known.order is None or special:
         return _read(known, of, cells).merged()
     return _Keeper(known, of).find(cells).merged()
 
@@ -96,8 +99,9 @@ def store_in_order(reader: Reader) -> None:
             compute_in_order(reader, name)
             found |= {
                 (name, field): kept
-                for field in mode.counted_fields
-                if len((kept := _Keeper(known, kept_of(known.fields[field])).stored()).keys)
+                for field, of in mode.counted_fields.items()
+                if not of.free_axis
+                and len((kept := _Keeper(known, kept_of(known.fields[field])).stored()).keys)
             }
     if found:
         order_file.write(reader.directory, found)
@@ -187,6 +191,8 @@ def _long_episodes(known: ModeRows, fewest: int) -> tuple[Index, Index]:
 def _read(known: ModeRows, of: Measured, cells: _Division) -> Cells:
     """Return the statistics of cells, computed from their rows."""
     field = known.fields[of.field]
+    if field.free_axis:
+        return _read_entries(known, of, cells)
     step, ends, first = rows_per_block(field.nbytes), np.cumsum(cells.size), 0
     found = [nothing(field, of.pooled).cells]
     while first < len(ends):
@@ -200,6 +206,18 @@ def _read(known: ModeRows, of: Measured, cells: _Division) -> Cells:
         else:
             found.append(Cells.one(values, of.pooled))
         first = last
+    return Cells.joined(found)
+
+
+def _read_entries(known: ModeRows, of: Measured, cells: _Division) -> Cells:
+    """Return the statistics of the entries of cells, of those that have some."""
+    found = [nothing(known.fields[of.field], of.pooled).cells]
+    for cell in range(len(cells.size)):
+        rows = cells.rows(cell)
+        blocks = (rows[begin : begin + _FREE_ROWS] for begin in range(0, len(rows), _FREE_ROWS))
+        values = [of.of({n: known.entries(n, block)[0] for n in of.names}) for block in blocks]
+        if any(map(len, values)):
+            found.append(Cells.one(values, of.pooled))
     return Cells.joined(found)
 
 

@@ -16,8 +16,10 @@ from physx_core.dataset.store.order_file import KeptCells
 from physx_core.dataset.store.partition.commits import name_rows
 from physx_core.dataset.store.partition.format import inspect
 from physx_core.dataset.store.partition.segment import BLOCK, RowsCheck, Segment, rows_per_block
+from physx_core.dataset.store.partition.spans import Span
 from physx_core.errors import DatasetError, listed, nearest
-from physx_core.fields import Field
+from physx_core.fields import ENDS, Field
+from physx_core.packing import split
 from physx_core.typing import Array, Index
 
 
@@ -42,6 +44,7 @@ class Reader:
         self.directory = directory
         self.manifest = manifest
         self.orders = Orders(manifest, self._read_table)
+        self._bounds: dict[tuple[str, str], tuple[int, Index]] = {}
         self.cells: dict[tuple[str, str], KeptCells] = {}
         self.stored_cells: dict[tuple[str, str], KeptCells] = {}
 
@@ -76,12 +79,61 @@ class Reader:
         return fields[name]
 
     def row_nbytes(self, mode: str) -> int:
-        """Return the bytes of a stored row of a mode, of all its fields."""
-        return sum(field.nbytes for field in self.mode(mode).fields.values())
+        """Return the bytes of a stored row of a mode, of all its fields; on average."""
+        known, total = self.mode(mode), 0
+        for field in known.fields.values():
+            entries = 1.0
+            if field.free_axis:
+                entries = sum(p.sizes.get(field.free_axis, 0) for p in known.partitions)
+                entries /= max(1, known.rows)
+            total += round(field.nbytes * entries)
+        return total
 
     def stored_rows(self, mode: str) -> int:
         """Return the number of stored rows of a mode."""
         return self.mode(mode).rows
+
+    def stored_values(self, mode: str, name: str) -> int:
+        """Return how many values the files of a field hold: rows, or entries of a free axis."""
+        axis = self.field(mode, name).free_axis
+        return int(self.bounds(mode, axis)[-1]) if axis else self.stored_rows(mode)
+
+    def bounds(self, mode: str, axis: str) -> Index:
+        """Return the first stored entry of each stored row of a mode, and the end, shape (n + 1).
+
+        Args:
+            mode: Name of the mode.
+            axis: Name of a free axis.
+        """
+        known, generation = self.mode(mode), self.manifest.generation
+        before, found = self._bounds.get((mode, axis), (generation, np.zeros(1, np.intp)))
+        rows = known.rows
+        if before != generation or len(found) > rows + 1:
+            found = np.zeros(1, np.intp)
+        if len(found) <= rows:
+            grown = np.empty(rows + 1, np.intp)
+            have = len(found) - 1
+            grown[: have + 1] = found
+            for segment in self.segments(mode, axis + ENDS, have, rows):
+                first, count = segment.span.inside(have, rows)
+                ends = np.empty(count, "<u8")
+                self._read_part(ends, mode, segment, first, {})
+                begin = segment.span.start + first
+                base = grown[segment.span.start]
+                grown[begin + 1 : begin + 1 + count] = base + ends.astype(np.intp)
+            if (np.diff(grown[have:]) < 0).any():
+                raise DatasetError(
+                    f'The ends of the axis "{axis}" of mode "{mode}" in {self.directory} do not '
+                    "ascend: they were changed. Restore them from a backup."
+                )
+            found = grown
+        self._bounds[mode, axis] = generation, found
+        return found
+
+    def sizes(self, mode: str, stored: Index) -> dict[str, Index]:
+        """Return how many entries some stored rows have, by free axis."""
+        bounds = {axis: self.bounds(mode, axis) for axis in self.mode(mode).axes}
+        return {axis: each[stored + 1] - each[stored] for axis, each in bounds.items()}
 
     def rows(self, mode: str) -> int:
         """Return the number of rows of a mode."""
@@ -103,17 +155,39 @@ class Reader:
     def segments(
         self, mode: str, name: str, start: int = 0, stop: int | None = None
     ) -> list[Segment]:
-        """Return where the rows of a field are stored, in order, or those that some are in."""
-        field, known = self.field(mode, name), self.mode(mode)
-        parts = known.partitions.between(start, known.rows if stop is None else stop)
-        return [partition.segment(self.directory, field, span) for partition, span in parts]
+        """Return where the rows of a field are stored, in order, or those that some are in.
+
+        With a free axis, here and below, rows are entries.
+        """
+        known = self.mode(mode)
+        field = known.ends.get(name) or self.field(mode, name)
+        if not field.free_axis:
+            parts = known.partitions.between(start, known.rows if stop is None else stop)
+            return [partition.segment(self.directory, field, span) for partition, span in parts]
+        bounds = self.bounds(mode, field.free_axis)
+        first = max(0, int(bounds.searchsorted(start, "right")) - 1)
+        last = known.rows if stop is None else int(bounds.searchsorted(stop, "left"))
+        found = []
+        for partition, span in known.partitions.between(first, last):
+            begin, end = bounds[[span.start, span.start + span.rows]].tolist()
+            found.append(partition.segment(self.directory, field, Span(begin, end - begin)))
+        return found
 
     def read(self, mode: str, name: str, start: int, stop: int) -> Array:
-        """Return rows as a new array, shape (stop - start, *field shape)."""
+        """Return rows as a new array, shape (stop - start, *field shape).
+
+        With a free axis, it is an array of objects: see `physx_core.packing`.
+        """
         field = self.field(mode, name)
+        if field.free_axis:
+            bounds = self.bounds(mode, field.free_axis)[start : max(start, stop) + 1]
+            counts, begin = np.diff(bounds), int(bounds[0]) if len(bounds) else 0
+            values = np.empty((int(counts.sum()), *field.entry_shape), field.dtype)
+            self.read_into(values, mode, name, begin)
+            return split(values, counts)
         if (stop - start) * field.nbytes > BLOCK:
             self.check(mode, name, start, stop)
-        out = np.empty((max(0, stop - start), *(field.shape or ())), field.dtype)
+        out = np.empty((max(0, stop - start), *field.entry_shape), field.numpy_dtype)
         self.read_into(out, mode, name, start)
         return out
 
@@ -152,8 +226,8 @@ class Reader:
         """Yield a partition's rows from its row `start` on, as `blocks` does for a mode."""
         field = self.field(partition.mode, name)
         segment = partition.segment(self.directory, field)
-        count, end = rows_per_block(field.nbytes), partition.rows
-        buffer = np.empty((min(count, max(0, end - start)), *(field.shape or ())), field.dtype)
+        count, end = rows_per_block(field.nbytes), partition.rows_of(field)
+        buffer = np.empty((min(count, max(0, end - start)), *field.entry_shape), field.numpy_dtype)
         checks: dict[int, RowsCheck] = {}
         for first in range(start, end, count):
             block = buffer[: end - first]
@@ -172,9 +246,10 @@ class Reader:
             start: First row.
             stop: Row before which to stop; None: after the last row committed so far.
         """
-        field, end = self.field(mode, name), self.stored_rows(mode) if stop is None else stop
+        field = self.field(mode, name)
+        end = self.stored_values(mode, name) if stop is None else stop
         count = rows_per_block(field.nbytes)
-        buffer = np.empty((min(count, max(0, end - start)), *(field.shape or ())), field.dtype)
+        buffer = np.empty((min(count, max(0, end - start)), *field.entry_shape), field.numpy_dtype)
         checks: dict[int, RowsCheck] = {}
         for first in range(start, end, count):
             block = buffer[: end - first]

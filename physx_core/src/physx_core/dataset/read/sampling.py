@@ -12,9 +12,9 @@ from numpy.typing import DTypeLike
 
 from physx_core.dataset.read.access.columns import ColumnCache
 from physx_core.dataset.read.batch_arrays import BatchArrays
-from physx_core.dataset.read.epochs import Epoch
 from physx_core.dataset.read.mode_rows import ModeRows
 from physx_core.dataset.read.shuffling import (
+    ItemOrder,
     OrderName,
     check_order,
     choose_order,
@@ -22,7 +22,9 @@ from physx_core.dataset.read.shuffling import (
     make_order,
 )
 from physx_core.errors import ConfigError, DatasetError
+from physx_core.fields import free_axes
 from physx_core.normalization import Normalization
+from physx_core.packing import packed_fields
 from physx_core.typing import Batch
 
 
@@ -70,7 +72,11 @@ class BatchReader:
         if first < 0:
             raise ConfigError(f"first is {first} but cannot be negative.")
         reader = columns.reader
-        self._names = list(dict.fromkeys(reader.mode(mode).fields if fields is None else fields))
+        stored = reader.mode(mode).fields
+        added = packed_fields(free_axes(stored.values())).keys() - stored.keys()
+        self._named = None if fields is None else [name for name in fields if name in added]
+        wanted = stored if fields is None else [name for name in fields if name not in added]
+        self._names = list(dict.fromkeys(wanted))
         if not self._names:
             raise ConfigError("Batches need at least one field.")
         known = [reader.field(mode, name) for name in self._names]
@@ -81,10 +87,11 @@ class BatchReader:
         self._order: OrderName | None = "stored" if not shuffle else order and check_order(order)
         self._key = key_of(secrets.randbits(64) if seed is None else seed)
         self._dtype = None if dtype is None else np.dtype(dtype)
+        self._is_packed = any(field.free_axis for field in known)
         kinds = {
-            field.name: (field.shape or (), field.converted_dtype(self._dtype)) for field in known
+            field.name: (field.entry_shape, field.converted_dtype(self._dtype)) for field in known
         }
-        self._arrays = BatchArrays(kinds, batch_size, reuse=reuse)
+        self._arrays = BatchArrays({} if self._is_packed else kinds, batch_size, reuse=reuse)
         scales = normalize if isinstance(normalize, Mapping) else {}
         self._scales = {
             name: replace(
@@ -102,11 +109,19 @@ class BatchReader:
         number, skipped = divmod(self._first, -(-first.count // size))
         while self._epochs is None or number < self._epochs:
             rows = ModeRows(self._columns, self._mode)
-            epoch = self._begin(number, rows)
+            rows.loads = self._is_packed
+            order = self._order_of(number, rows)
+            epoch = None if self._is_packed else rows.epoch(self._names, self._dtype, order)
             try:
                 for start in range(skipped * size, rows.count, size):
-                    batch = self._arrays.take(min(size, rows.count - start))
-                    epoch.fill(start, batch)
+                    stop = min(start + size, rows.count)
+                    if epoch is None:
+                        batch = rows.packed(
+                            self._names, order.items(start, stop), self._dtype, self._named
+                        )
+                    else:
+                        batch = self._arrays.take(stop - start)
+                        epoch.fill(start, batch)
                     for name, scale in self._scales.items():
                         values = batch[name]
                         if scale.log:
@@ -115,10 +130,10 @@ class BatchReader:
                         values /= scale.std
                     yield batch
             finally:
-                epoch.close()
+                if epoch is not None:
+                    epoch.close()
             number, skipped = number + 1, 0
 
-    def _begin(self, number: int, rows: ModeRows) -> Epoch:
+    def _order_of(self, number: int, rows: ModeRows) -> ItemOrder:
         name = self._order or choose_order(rows.count, rows.row_nbytes)
-        order = make_order(name, rows.count, rows.row_nbytes, key_of(self._key, number))
-        return rows.epoch(self._names, self._dtype, order)
+        return make_order(name, rows.count, rows.row_nbytes, key_of(self._key, number))

@@ -15,11 +15,14 @@ from physx_core.dataset.store.partition.segment import rows_per_block
 from physx_core.fields import Field
 from physx_core.typing import Array, Index
 
+_FREE_ROWS = 256
+
 
 class FieldView:
     """The rows of one field, indexed by a number, a slice, or an array of numbers or booleans.
 
-    Every result is a copy.
+    Every result is a copy. Rows of a field with a free axis are an array of objects, one array for
+    each row.
 
     Attributes:
         field: The field.
@@ -33,13 +36,13 @@ class FieldView:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """(rows, *field shape)."""
-        return (len(self), *(self.field.shape or ()))
+        """(rows, *field shape); with a free axis, (rows,)."""
+        return (len(self), *self.field.row_kind[0])
 
     @property
     def dtype(self) -> np.dtype[Any]:
-        """Type of the values."""
-        return np.dtype(self.field.dtype)
+        """Type of the rows: of their values, or with a free axis `object`, as each is an array."""
+        return self.field.row_kind[1]
 
     def __len__(self) -> int:
         return self._reader.rows(self._mode)
@@ -65,12 +68,12 @@ class FieldView:
         )
 
     def __iter__(self) -> Iterator[Any]:
-        if self._reader.order(self._mode) is None:
+        if self._reader.order(self._mode) is None and not self.field.free_axis:
             for block in self._reader.blocks(self._mode, self.field.name):
                 yield from block.copy()
             return
         stored, total = self._reader.index(self._mode), len(self)
-        step = rows_per_block(self.field.nbytes)
+        step = rows_per_block(self.field.nbytes) if not self.field.free_axis else _FREE_ROWS
         for start in range(0, total, step):
             rows = np.arange(start, min(start + step, total))
             yield from self._take(rows if stored is None else stored[rows])
@@ -100,11 +103,7 @@ class FieldView:
 
     def _take(self, index: Index) -> Array:
         """Return stored rows."""
-        column = self._columns.map(self._mode, self.field.name)
-        column.check()
-        out = np.empty((len(index), *column.shape[1:]), column.dtype)
-        column.gather(index, out)
-        return out
+        return self._columns.take(self._mode, self.field.name, index)
 
 
 class ModeView:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import re
 import warnings
-from collections.abc import Iterator, Mapping
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from itertools import chain
 from pathlib import Path
 
@@ -29,7 +29,17 @@ from physx_core.dataset.store.partition.format import (
     inspect,
     open_partition,
 )
-from physx_core.dataset.store.sealing import remove_files, scan, seal, sync_files
+from physx_core.dataset.store.sealing import (
+    count_rows as count_rows_of,
+)
+from physx_core.dataset.store.sealing import (
+    measure,
+    read_ends,
+    remove_files,
+    scan,
+    seal,
+    sync_files,
+)
 from physx_core.errors import (
     DatasetError,
     DatasetNotFoundError,
@@ -37,7 +47,7 @@ from physx_core.errors import (
     listed,
     nearest,
 )
-from physx_core.fields import Field
+from physx_core.fields import ENDS, Field, ends_fields
 
 _ATTEMPTS = 20
 _NAME = re.compile(r".+_\w+_\w+_\d+\.h5")
@@ -165,7 +175,7 @@ def _close(directory: Path, manifest: Manifest, mode: Mode, partition: Partition
     if not partition.rows:
         what = "had no committed rows and has been removed."
     if partition.problem:  # the original files are kept
-        keep(directory, [partition.path(directory, name) for name in mode.fields])
+        keep(directory, [partition.path(directory, name) for name in mode.files])
         what += f" {partition.problem} The original files are in {directory / FOLDER}."
     if not partition.rows:
         mode.partitions.remove(partition)
@@ -174,7 +184,7 @@ def _close(directory: Path, manifest: Manifest, mode: Mode, partition: Partition
         seal_without_damage(directory, manifest, mode, partition)
     else:
         listed = bool(partition.offsets)  # other files may be sealed, as an older manifest says
-        mode.swap(seal(directory, mode.fields, partition, rewrite=listed))
+        mode.swap(seal(directory, mode.files, partition, rewrite=listed))
     return f"{_label(partition)} {what}"
 
 
@@ -182,14 +192,14 @@ def clear_dropped(directory: Path, manifest: Manifest) -> None:
     """Remove leftover files of removed partitions."""
     for mode in manifest.modes.values():
         for partition in mode.dropped:
-            remove_files(directory, mode.fields, partition)
+            remove_files(directory, mode.files, partition)
         mode.dropped.clear()
 
 
 def _clear_unlisted(directory: Path, manifest: Manifest) -> list[str]:
     """Remove unlisted partitions without rows; set torn files aside."""
     done = []
-    counts: dict[tuple[str, str, int], dict[Path, int]] = {}
+    groups: dict[tuple[str, str, int], dict[Path, Inspection]] = {}
     for path in _unlisted(directory, manifest):
         try:
             found = inspect(path)
@@ -199,8 +209,8 @@ def _clear_unlisted(directory: Path, manifest: Manifest) -> list[str]:
         else:
             identity = found.identity
             key = identity.mode, identity.session, identity.index
-            counts.setdefault(key, {})[path] = found.rows
-    unfinished = [group for group in counts.values() if not all(group.values())]
+            groups.setdefault(key, {})[path] = found
+    unfinished = [group for group in groups.values() if not _has_rows(group.values())]
     if unfinished:
         manifest_file.save(directory, manifest)  # the one on disk may refer to the files
     for group in unfinished:
@@ -208,18 +218,25 @@ def _clear_unlisted(directory: Path, manifest: Manifest) -> list[str]:
     return done
 
 
-def _remove_unfinished(directory: Path, counts: Mapping[Path, int]) -> None:
+def _has_rows(group: Collection[Inspection]) -> bool:
+    """Return whether all files of a partition have rows; its rows may have no entries."""
+    counts = {found.identity.field.name: found.rows for found in group}
+    axes = {found.identity.field.name: found.identity.field.free_axis for found in group}
+    return all(rows or counts.get(axes[name] + ENDS) for name, rows in counts.items())
+
+
+def _remove_unfinished(directory: Path, group: Mapping[Path, Inspection]) -> None:
     """Remove the files of a partition if some of them have no rows.
 
     Files with rows go first: left alone, they would look like a complete partition with fewer
     fields.
     """
-    for path in counts:
-        if counts[path]:
-            files.remove(path)
-    if any(counts.values()):
+    with_rows = [path for path, found in group.items() if found.rows]
+    for path in with_rows:
+        files.remove(path)
+    if with_rows:
         files.sync_folder(directory)
-    for path in counts:
+    for path in group:
         files.remove(path)
 
 
@@ -229,8 +246,8 @@ def complete_checksums(directory: Path, manifest: Manifest) -> bool:
     for mode in manifest.modes.values():
         for partition in [p for p in mode.partitions if p.sealed and not p.checksums]:
             changed = True
-            sync_files(directory, mode.fields, partition)
-            mode.swap(scan(directory, mode.fields, partition))
+            sync_files(directory, mode.files, partition)
+            mode.swap(scan(directory, mode.files, partition))
     return changed
 
 
@@ -259,9 +276,9 @@ def _count_open(directory: Path, mode: Mode, partition: Partition, thorough: boo
     The files' headers reach the disk before the manifest lists the files, hence before any row is
     committed. A partition without rows in any file is therefore no error, whatever it lacks.
     """
-    counted, rows, losses, unreadable = [], [], [], None
-    damaged: list[Range] = []
-    for name, field in mode.fields.items():
+    counted, rows, losses, unreadable = {}, {}, [], None
+    damaged: dict[str, tuple[Range, ...]] = {}
+    for name, field in mode.files.items():
         path = partition.path(directory, name)
         try:
             found, kept = partition.find_rows(directory, field, thorough=thorough)
@@ -276,24 +293,73 @@ def _count_open(directory: Path, mode: Mode, partition: Partition, thorough: boo
                 f"{path} was changed or is damaged: its rows do not match their recorded "
                 "checksums. Restore it from a backup, or set it aside with `physx verify --repair`."
             )
-        counted.append(found.rows if found.is_consistent else kept.commit.rows)
-        rows.append(kept.commit.rows)
-        damaged += kept.damaged
+        counted[name] = found.rows if found.is_consistent else kept.commit.rows
+        rows[name] = kept.commit.rows
+        damaged[name] = kept.damaged
         partition.kept[name] = kept
         if not found.is_consistent:
             losses.append(
                 f"The row count in {path.name} is damaged; {kept.commit.rows} rows match."
             )
-    if unreadable is not None and any(counted):
+    if unreadable is not None and any(counted.values()):
         raise unreadable
-    partition.rows = 0 if unreadable is not None else min(rows)
-    if missing := min(counted, default=0) - partition.rows:
+    partition.rows = 0 if unreadable is not None else min(rows.values())
+    most = 0 if unreadable is not None else min(counted.values())
+    ranges = [each for name in damaged for each in damaged[name]]
+    if mode.ends and unreadable is None:
+        most, ranges = _count_entries(directory, mode, partition, counted, rows, damaged)
+    if missing := most - partition.rows:
         losses.append(f"Its last {missing} rows did not reach the disk.")
-    partition.damaged = tuple(within(merge_ranges(damaged), partition.rows))
+    partition.damaged = tuple(within(merge_ranges(ranges), partition.rows))
     if partition.damaged:
         what = name_rows(partition.damaged).capitalize()
         losses.append(f"{what} are damaged: their bits have changed since they were stored.")
     partition.problem = str(unreadable) if unreadable is not None else " ".join(losses)
+
+
+def _count_entries(
+    directory: Path,
+    mode: Mode,
+    partition: Partition,
+    counted: Mapping[str, int],
+    rows: Mapping[str, int],
+    damaged: Mapping[str, Sequence[Range]],
+) -> tuple[int, list[Range]]:
+    """Count the rows of a partition whose entries are there as well.
+
+    Args:
+        directory: The dataset's folder.
+        mode: The mode.
+        partition: The partition; receives rows and sizes.
+        counted: How many rows, or entries, each file counts, by field.
+        rows: How many of these can be read.
+        damaged: Which of these are damaged.
+
+    Returns:
+        How many rows the files count, and which of them are damaged. If the end of a row is, so are
+        all rows from there on.
+    """
+    files_of, found = mode.files, list[Range]()
+    most = min(n for name, n in rows.items() if not files_of[name].free_axis)
+    for name in mode.ends:
+        most = min([most, *(start for start, _ in damaged[name])])
+        found += [(start, most) for start, _ in damaged[name]]
+    sound = {n: c if files_of[n].free_axis else min(c, most) for n, c in rows.items()}
+    count_rows_of(directory, files_of, partition, sound)
+    kept = partition.rows
+    for name, ranges in damaged.items():
+        field = files_of[name]
+        if not field.free_axis:
+            found += [] if name in mode.ends else ranges
+            continue
+        ends = read_ends(directory, files_of[field.free_axis + ENDS], partition)
+        for start, stop in ranges:
+            first, last = ends.searchsorted([start, stop - 1], "right").tolist()
+            found.append((first, last + 1))
+    partition.sizes = measure(directory, files_of, partition).sizes
+    lost = any(rows[name] < counted[name] or damaged[name] for name in rows)
+    fixed = [count for name, count in counted.items() if not files_of[name].free_axis]
+    return min(fixed) if lost or min(fixed) > most else kept, found
 
 
 def _discard_behind_gaps(mode: Mode) -> None:
@@ -355,9 +421,11 @@ def _adopt(directory: Path, manifest: Manifest, strict: bool) -> None:
             groups.setdefault(key, {})[identity.field.name] = found
     for (mode_name, session, index), group in sorted(groups.items(), key=_order):
         identity = next(iter(group.values())).identity
-        if not all(found.rows for found in group.values()):
+        if not _has_rows(group.values()):
             continue  # the writer was killed before the partition's first commit
         fields = {name: found.identity.field for name, found in sorted(group.items(), key=_role)}
+        for name in ends_fields(fields.values()):
+            fields.pop(name, None)
         mode = manifest.modes.get(mode_name)
         if mode is not None and not strict and not _fits(mode, fields):
             continue  # part of a partition that was being removed, or of another dataset

@@ -150,17 +150,17 @@ def _keep_old(folder: Path) -> Path:
 def _repair_partition(folder: Path, mode: Mode, partition: Partition) -> list[str]:
     """Rewrite the headers of a partition's damaged files, or else set all its files aside."""
     done = []
-    for name, field in mode.fields.items():
+    for name, field in mode.files.items():
         problem = _find_damage(folder, partition, field)
         if problem is None:
             continue
         if not _has_sound_rows(folder, partition, field):
             mode.partitions.remove(partition)
             mode.forget_statistics()
-            paths = [partition.path(folder, each) for each in mode.fields]
+            paths = [partition.path(folder, each) for each in mode.files]
             return [_set_aside(folder, paths, problem, partition.rows)]
         path, identity = partition.path(folder, name), partition.identity(field)
-        offset, rows = partition.offsets[name], partition.rows
+        offset, rows = partition.offsets[name], partition.rows_of(field)
         partition.offsets[name], _ = copy(path, offset, path, identity, rows)
         files.sync_folder(folder)
         done.append(f"{problem} Its rows are sound; its header has been rewritten.")

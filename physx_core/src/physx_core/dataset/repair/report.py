@@ -10,7 +10,7 @@ import numpy as np
 
 from physx_core.dataset.store import manifest_file, statistics_file
 from physx_core.dataset.store.episode_table import LOST
-from physx_core.dataset.store.manifest import Manifest, Partition
+from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition.commits import Kept, name_rows
 from physx_core.dataset.store.partition.format import Inspection
 from physx_core.errors import DatasetError
@@ -37,11 +37,18 @@ def summarize(manifest: Manifest, rows_of: Callable[[str], int]) -> list[dict[st
             "like": field.like,
             "samples": counts[mode_name],
             "partitions": len(mode.partitions),
-            "bytes": counts[mode_name] * field.nbytes,
+            "bytes": _nbytes(mode, counts[mode_name], field),
         }
         for mode_name, mode in manifest.modes.items()
         for field in mode.fields.values()
     ]
+
+
+def _nbytes(mode: Mode, rows: int, field: Field) -> int:
+    """Return the bytes of a field's values; of entries, of all that are stored."""
+    if not field.free_axis:
+        return rows * field.nbytes
+    return sum(part.rows_of(field) for part in mode.partitions if part.sizes) * field.nbytes
 
 
 def find_problems(directory: Path, manifest: Manifest, content: bool = True) -> list[str]:
@@ -66,7 +73,7 @@ def find_partition_problems(directory: Path, manifest: Manifest, content: bool =
         find_problem(directory, partition, field, content)
         for mode in manifest.modes.values()
         for partition in mode.partitions
-        for field in mode.fields.values()
+        for field in mode.files.values()
     )
     return [problem for problem in found if problem is not None]
 
@@ -142,18 +149,18 @@ def find_loss(found: Inspection, kept: Kept | None) -> str | None:
 
 def _difference(found: Inspection, partition: Partition, field: Field) -> str | None:
     """Return how the header of a file differs from the manifest, or None."""
-    have = found.identity
+    have, rows = found.identity, partition.rows_of(field)
     if (have.mode, have.session, have.index) != (partition.mode, *partition.key):
         return f"belongs to another partition: {have.file_name}."
     if have.field != field:
         return f"holds {have.field}, but the manifest says {field}."
     if not partition.sealed:
-        short = found.rows < partition.rows
-        return f"has {found.rows} committed rows, not {partition.rows}." if short else None
-    if found.rows != partition.rows or found.capacity != partition.rows:
+        short = found.rows < rows
+        return f"has {found.rows} committed rows, not {rows}." if short else None
+    if found.rows != rows or found.capacity != rows:
         return (
             f"has {found.rows} committed rows and space for {found.capacity}, but "
-            f"{partition.rows} were expected."
+            f"{rows} were expected."
         )
     offset = partition.offsets[field.name]
     if found.data_offset != offset:

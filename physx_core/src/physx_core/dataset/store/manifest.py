@@ -31,7 +31,7 @@ from physx_core.dataset.store.partition.format import (
 from physx_core.dataset.store.partition.segment import Segment
 from physx_core.dataset.store.partition.spans import Span
 from physx_core.errors import ConfigError, DatasetError
-from physx_core.fields import Field
+from physx_core.fields import Field, ends_fields, free_axes
 from physx_core.statistics import RunningStatistics
 
 
@@ -45,6 +45,7 @@ class Partition:
         index: Its number in the session and mode, counted from 0.
         first_row: Address of its first row; orders the partitions.
         rows: Number of committed rows, the same in all fields.
+        sizes: Number of entries of these rows, by free axis.
         sealed: Whether it is complete: every file has exactly these rows.
         offsets: Byte of the file at which the rows begin, by field.
         checksums: CRC-32 of the rows, by field; empty until it is sealed, and while rows are
@@ -65,6 +66,7 @@ class Partition:
     index: int
     first_row: int
     rows: int = 0
+    sizes: dict[str, int] = field(default_factory=dict)
     sealed: bool = False
     offsets: dict[str, int] = field(default_factory=dict)
     checksums: dict[str, int] = field(default_factory=dict)
@@ -80,6 +82,10 @@ class Partition:
     def key(self) -> tuple[str, int]:
         """Key that is unique among the partitions of its mode."""
         return self.session, self.index
+
+    def rows_of(self, of: Field) -> int:
+        """Return the number of rows of a field's file: with a free axis, of entries."""
+        return self.sizes[of.free_axis] if of.free_axis else self.rows
 
     def file_name(self, name: str) -> str:
         """Return the name of a field's file."""
@@ -109,7 +115,7 @@ class Partition:
         return Segment(
             self.path(directory, of.name),
             of,
-            span or Span(0, self.rows),
+            span or Span(0, self.rows_of(of)),
             self.offsets.get(of.name, 0),
             self.sealed,
             self.checksums.get(of.name),
@@ -121,11 +127,12 @@ class Partition:
         if not self.sealed or not self.checksums:
             return ""
         kept = [(name, of.dtype, of.shape, self.checksums.get(name)) for name, of in fields.items()]
+        kept += [(n, "", (), self.checksums.get(n)) for n in ends_fields(fields.values())]
         return f"{xxh3_64_intdigest(repr(kept).encode()):016x}"
 
     def _kept_of(self, of: Field) -> Kept | None:
         kept = self.kept.get(of.name)
-        return kept if kept is not None and kept.commit.rows >= self.rows else None
+        return kept if kept is not None and kept.commit.rows >= self.rows_of(of) else None
 
     def to_dict(self) -> dict[str, Any]:
         """Return plain data for JSON; the row count of an open partition is only in its files."""
@@ -139,6 +146,8 @@ class Partition:
         if self.sealed:
             crc32 = {name: f"{value:08x}" for name, value in self.checksums.items()}
             plain |= {"rows": self.rows, "crc32": crc32, "counted": self.counted}
+            if self.sizes:
+                plain["sizes"] = self.sizes
         elif self.follows is not None:
             plain["follows"] = list(self.follows)
         return plain
@@ -266,6 +275,22 @@ class Mode:
     dropped: list[Partition] = field(default_factory=list)
     removed: dict[str, int] = field(default_factory=dict)
     taken: int = 0
+
+    @property
+    def ends(self) -> dict[str, Field]:
+        """The fields that say where the entries of a row end in its partition, by name."""
+        return ends_fields(self.fields.values())
+
+    @property
+    def axes(self) -> list[str]:
+        """Names of the free axes."""
+        return list(free_axes(self.fields.values()))
+
+    @property
+    def files(self) -> dict[str, Field]:
+        """The fields that have files, in the order in which their rows are committed."""
+        ends = self.ends
+        return self.fields | ends if ends else self.fields
 
     @property
     def rows(self) -> int:
@@ -432,7 +457,7 @@ class Manifest:
             partition.file_name(of)
             for mode in self.modes.values()
             for partition in (*mode.partitions, *mode.dropped)
-            for of in mode.fields
+            for of in mode.files
         }
 
     def copy(self) -> Manifest:

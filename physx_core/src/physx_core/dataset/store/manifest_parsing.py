@@ -14,7 +14,7 @@ from physx_core.dataset.store.validation import (
     parse_name,
     whole,
 )
-from physx_core.fields import Field
+from physx_core.fields import Field, check_together
 
 
 def parse_manifest(plain: Mapping[str, Any]) -> Manifest:
@@ -38,7 +38,7 @@ def apply_change(manifest: Manifest, plain: Any) -> None:
     """Take over a change of the manifest, described by plain data."""
     name = checked(str, plain["mode"], "a mode")
     mode = manifest.modes[name]
-    partition = _partition(name, plain["partition"], mode.fields)
+    partition = _partition(name, plain["partition"], mode)
     if any(partition.key == each.key for each in mode.dropped):
         raise ValueError("a partition is listed twice")
     mode.put(partition)
@@ -65,12 +65,10 @@ def _mode(mode_name: str, plain: Any) -> Mode:
         fields[field.name] = field
     if not fields:
         raise ValueError("a mode has no fields")
-    mode = Mode(
-        fields,
-        Partitions(_partition(mode_name, entry, fields) for entry in plain["partitions"]),
-        statistics=None,
-        dropped=[_partition(mode_name, entry, fields) for entry in plain.get("dropped", ())],
-    )
+    check_together(fields)
+    mode = Mode(fields, statistics=None)
+    mode.partitions = Partitions(_partition(mode_name, e, mode) for e in plain["partitions"])
+    mode.dropped = [_partition(mode_name, entry, mode) for entry in plain.get("dropped", ())]
     for session, index in checked(dict, plain.get("removed", {}), "'removed'").items():
         mode.removed[session] = whole(index, "the number of a partition", 2**31)
     keys = [partition.key for partition in (*mode.partitions, *mode.dropped)]
@@ -80,7 +78,8 @@ def _mode(mode_name: str, plain: Any) -> Mode:
     return mode
 
 
-def _partition(mode_name: str, plain: Any, fields: Mapping[str, Field]) -> Partition:
+def _partition(mode_name: str, plain: Any, mode: Mode) -> Partition:
+    fields = mode.files
     session = checked(str, plain["session"], "a session")
     if not SESSION.fullmatch(session):
         raise ValueError(f"a session cannot be {session!r:.60}")
@@ -95,18 +94,26 @@ def _partition(mode_name: str, plain: Any, fields: Mapping[str, Field]) -> Parti
     if sealed and any(field.shape is None for field in fields.values()):
         raise ValueError("a sealed partition has fields of unknown shape")
     rows = whole(plain["rows"], "a number of rows") if sealed else 0
+    sizes = checked(dict, plain.get("sizes", {}), "'sizes'") if sealed else {}
+    if sealed and sizes.keys() != set(mode.axes):
+        raise ValueError("a sealed partition has the sizes of other axes")
+    for size in sizes.values():
+        whole(size, "a number of entries")
     follows = None if sealed else plain.get("follows")
     if follows is not None:
         index, count = checked(list, follows, "'follows'")
         follows = whole(index, "the number of a partition", 2**31), whole(count, "a row count")
     for name, offset in offsets.items():
-        whole(whole(offset, "an offset") + rows * fields[name].nbytes, "the end of the rows")
+        of = fields[name]
+        count = sizes.get(of.free_axis, 0) if of.free_axis else rows
+        whole(whole(offset, "an offset") + count * of.nbytes, "the end of the rows")
     return Partition(
         mode=mode_name,
         session=session,
         index=whole(plain["index"], "the number of a partition", 2**31),
         first_row=whole(plain["first_row"], "a first row"),
         rows=rows,
+        sizes=sizes,
         sealed=sealed,
         offsets=offsets,
         checksums={n: int(checked(str, crc, "a checksum"), 16) for n, crc in crc32.items()},

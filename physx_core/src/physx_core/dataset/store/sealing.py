@@ -7,14 +7,16 @@ from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
+import numpy as np
 from zlib_ng.zlib_ng import crc32
 
 from physx_core import files
 from physx_core.dataset.store.manifest import Partition
 from physx_core.dataset.store.partition.commits import Commit, encode
 from physx_core.dataset.store.partition.file import copy
-from physx_core.fields import Field
+from physx_core.fields import ENDS, Field, free_axes
 from physx_core.statistics import RunningStatistics
+from physx_core.typing import Index
 
 
 def seal(
@@ -32,7 +34,7 @@ def seal(
 
     Args:
         directory: The dataset's folder.
-        fields: The fields of the mode.
+        fields: The fields that have files.
         partition: The partition; nothing may write to it any more.
         rewrite: Whether to rewrite full files too.
         statistics: Whether to compute those of the rows, which modes with episodes do not use.
@@ -40,19 +42,59 @@ def seal(
     Returns:
         The sealed partition, for the manifest.
     """
-    offsets = {}
+    offsets, partition = {}, measure(directory, fields, partition)
     for name, field in fields.items():
-        found = partition.inspect(directory, field)
+        found, rows = partition.inspect(directory, field), partition.rows_of(field)
         offsets[name] = found.data_offset
         path = partition.path(directory, name)
-        if rewrite or found.capacity != partition.rows or found.rows != partition.rows:
+        if rewrite or found.capacity != rows or found.rows != rows:
             identity = partition.identity(field)
-            offsets[name], _ = copy(path, found.data_offset, path, identity, partition.rows)
+            offsets[name], _ = copy(path, found.data_offset, path, identity, rows)
         else:
             files.sync_file(path)
     files.sync_folder(directory)
     sealed = replace(partition, offsets=offsets, sealed=True, writing=False, follows=None)
     return scan(directory, fields, sealed, statistics=statistics)
+
+
+def measure(directory: Path, fields: Mapping[str, Field], partition: Partition) -> Partition:
+    """Return a partition with the numbers of entries of its rows, read from its files."""
+    sizes = {}
+    for axis in free_axes(fields.values()):
+        ends = read_ends(directory, fields[axis + ENDS], partition, max(0, partition.rows - 1))
+        sizes[axis] = int(ends[-1]) if len(ends) else 0
+    return replace(partition, sizes=sizes) if sizes else partition
+
+
+def count_rows(
+    directory: Path, fields: Mapping[str, Field], partition: Partition, counts: Mapping[str, int]
+) -> int:
+    """Return how many rows of a partition are complete.
+
+    Args:
+        directory: The dataset's folder.
+        fields: The fields that have files.
+        partition: The partition; its rows are set to those that have ends.
+        counts: How many rows each file has, by field; of entries with a free axis.
+    """
+    axes = free_axes(fields.values())
+    partition.rows = min([n for name, n in counts.items() if not fields[name].free_axis], default=0)
+    for axis, names in axes.items():
+        ends = read_ends(directory, fields[axis + ENDS], partition)
+        entries = min(counts[name] for name in names)
+        partition.rows = int(ends.searchsorted(entries, "right"))
+    return partition.rows
+
+
+def read_ends(directory: Path, field: Field, partition: Partition, first: int = 0) -> Index:
+    """Return the ends of the entries of a partition's rows, from its row `first` on."""
+    found = np.empty(max(0, partition.rows - first), field.dtype)
+    if len(found):
+        segment = partition.segment(directory, field)
+        file, offset = segment.open()
+        with file:
+            segment.read(file, offset + first * field.nbytes, files.as_bytes(found))
+    return found.astype(np.intp)
 
 
 def scan(
@@ -79,8 +121,8 @@ def unseal(directory: Path, fields: Mapping[str, Field], partition: Partition) -
     Returns:
         The partition, for the manifest; the files are on disk.
     """
-    settled = Commit.unchecked(partition.rows)
     for name, field in fields.items():
+        settled = Commit.unchecked(partition.rows_of(field))
         found = partition.inspect(directory, field)
         if set(found.commits) != {settled}:
             descriptor = files.open_regular(partition.path(directory, name), os.O_WRONLY)

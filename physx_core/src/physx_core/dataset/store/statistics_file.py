@@ -120,8 +120,9 @@ def _find(
     mode: Mode, arrays: Mapping[str, Mapping[str, Array]]
 ) -> dict[str, RunningStatistics] | None:
     """Return the statistics of a mode if they are those of its counted rows, otherwise None."""
-    counted, found = sum(p.rows for p in mode.partitions if p.counted), {}
-    for name, of in mode.counted_fields.items() if counted else ():
+    parts, found = [p for p in mode.partitions if p.counted], {}
+    for name, of in mode.counted_fields.items() if any(p.rows for p in parts) else ():
+        counted = sum(p.rows_of(of) for p in parts)
         try:
             found[name] = RunningStatistics.from_arrays(arrays.get(name, {}), of.statistics_shape)
         except ValueError:

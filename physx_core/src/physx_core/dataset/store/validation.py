@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import math
 import re
 from typing import Any, TypeVar
-
-import numpy as np
 
 from physx_core.fields import ROLES, Field
 
@@ -41,7 +38,9 @@ def parse_field(plain: Any) -> Field:
     if shape is not None:
         if len(checked(list, shape, f"the shape of {name!r}")) > _MOST_AXES:
             raise ValueError(f"the shape of {name!r} cannot be {shape!r:.60}")
-        shape = tuple(whole(count, f"the shape of {name!r}") for count in shape)
+        free = shape[:1] if shape and isinstance(shape[0], str) else []
+        sizes = [whole(count, f"the shape of {name!r}") for count in shape[len(free) :]]
+        shape = (*(parse_name(axis, f"an axis of {name!r}") for axis in free), *sizes)
     if role not in ROLES:
         raise ValueError(f"the role of {name!r} cannot be {role!r:.60}")
     unit = checked(str, plain.get("unit", ""), f"the unit of {name!r}")
@@ -49,8 +48,9 @@ def parse_field(plain: Any) -> Field:
     axes = tuple(parse_name(each, f"an axis of {name!r}") for each in names)
     like = plain.get("like", "") and parse_name(plain["like"], f"what {name!r} is like")
     dtype = checked(str, plain["dtype"], f"the type of {name!r}")
-    field = Field(name, shape, dtype, unit, role, axes, like)
-    if math.prod(shape or ()) * np.dtype(field.dtype).itemsize > _WIDEST_ROW:
+    indexes = plain.get("indexes", "") and parse_name(plain["indexes"], f"what {name!r} indexes")
+    field = Field(name, shape, dtype, unit, role, axes, like, indexes)
+    if field.nbytes > _WIDEST_ROW:
         raise ValueError(f"the shape of {name!r} cannot be {shape!r:.60}")
     return field
 

@@ -11,10 +11,15 @@ from physx_core.dataset.store.episode_record import EpisodeRecord
 from physx_core.dataset.store.episode_table import EPISODES, TABLE_FIELDS, has_table, mode_index
 from physx_core.dataset.store.manifest import Mode
 from physx_core.dataset.write.recording import table_rows
-from physx_core.dataset.write.row_validation import check_rows, count_rows, infer_fields
+from physx_core.dataset.write.row_validation import (
+    check_rows,
+    count_rows,
+    infer_fields,
+    stored_form,
+)
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import ConfigError, UsageError, listed
-from physx_core.fields import Field, check_quantities
+from physx_core.fields import Field, check_together
 from physx_core.rows import RowBuffer, infer_shapes
 from physx_core.typing import Batch
 
@@ -45,7 +50,7 @@ class Appender:
                     "A mode needs an identifier as its name and at least one field, not "
                     f"{name!r} with {names}."
                 )
-            check_quantities(given)
+            check_together(given)
         known = self._manifest.modes
         if all(
             n in known and _complete(n, known[n], g) == known[n].fields for n, g in wanted.items()
@@ -178,8 +183,8 @@ class Appender:
     def _flush(self, mode: str) -> None:
         buffer = self._buffers.get(mode)
         if buffer is not None and buffer.count:
-            count = buffer.count
-            self.writer.append(mode, buffer.take(), count)
+            count, fields = buffer.count, self._manifest.modes[mode].fields
+            self.writer.append(mode, stored_form(fields, buffer.take()), count)
 
     def _is_settled(self, mode: str) -> bool:
         """Return whether all fields of a mode and their shapes are known."""

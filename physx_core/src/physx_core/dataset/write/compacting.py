@@ -12,6 +12,8 @@ import contextlib
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
+
 from physx_core import files
 from physx_core.dataset.read.access.columns import ColumnCache
 from physx_core.dataset.read.order.order import Order
@@ -28,8 +30,11 @@ from physx_core.dataset.write.compacted_records import compacted_records
 from physx_core.dataset.write.merging import forget
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError
-from physx_core.typing import Array, Batch
+from physx_core.fields import ENDS, free_axes
+from physx_core.packing import join, lengths
+from physx_core.typing import Array, Batch, Index
 
+_FREE_ROWS = 256
 PartitionsByMode = dict[str, list[Partition]]
 ReadRows = Callable[[str, int, int], Array]
 
@@ -94,7 +99,7 @@ def _check(directory: Path, manifest: Manifest, replaced: PartitionsByMode) -> N
     """Check what is to be copied: a copy of damaged rows would look sound."""
     for name, partitions in replaced.items():
         for partition in partitions:
-            for field in manifest.modes[name].fields.values():
+            for field in manifest.modes[name].files.values():
                 if (problem := find_problem(directory, partition, field)) is not None:
                     raise DatasetError(f"{problem} Nothing was compacted.")
 
@@ -108,14 +113,18 @@ def _replace(
         stay = {name: _without(manifest.modes[name].partitions, old[name]) for name in orders}
         begin = {name: sum(partition.rows for partition in stay[name]) for name in orders}
         for name, order in orders.items():
-            new[name] = _reserve(writer, manifest.modes, name, order.rows - begin[name])
+            sizes = _sizes(reader, name, order, begin[name])
+            rows = order.rows - begin[name]
+            new[name] = _reserve(writer, manifest.modes, name, rows, sizes)
         own = {name: [*stay[name], *new[name]] for name in orders}
         table = compacted_records(writer, reader, orders, own)
-        new[EPISODES] = _reserve(writer, manifest.modes, EPISODES, len(table["rows"]))
+        axes = free_axes(manifest.modes[EPISODES].fields.values())
+        sizes = {axis: lengths(table[names[0]]) for axis, names in axes.items()}
+        new[EPISODES] = _reserve(writer, manifest.modes, EPISODES, len(table["rows"]), sizes)
     try:
         for name in orders:
-            rows = _rows_of(reader, name, begin[name])
-            sealed[name] = list(_write(writer, new[name], rows))
+            read = _rows_of(reader, name, begin[name])
+            sealed[name] = list(_write(writer, new[name], read))
         sealed[EPISODES] = list(_write(writer, new[EPISODES], _rows_in(table)))
         files.sync_folder(store.directory)
         with store.change() as manifest:
@@ -130,15 +139,33 @@ def _replace(
     writer.recorder.load()
 
 
-def _reserve(writer: Writer, modes: Mapping[str, Mode], name: str, rows: int) -> list[Partition]:
+def _sizes(reader: Reader, mode: str, order: Order, begin: int) -> dict[str, Index]:
+    """Return how many entries rows have, in order from row `begin` on, by free axis."""
+    if not reader.mode(mode).axes:
+        return {}
+    return reader.sizes(mode, order.stored(np.arange(begin, order.rows)))
+
+
+def _reserve(
+    writer: Writer, modes: Mapping[str, Mode], name: str, rows: int, sizes: Mapping[str, Index]
+) -> list[Partition]:
     """List partitions for rows as dropped, to reserve their names and addresses."""
-    mode, found = modes[name], []
-    capacity = writer.capacity(mode)
-    for start in range(0, rows, capacity):
-        entry = writer.new_partition(name, mode)
-        entry.rows = min(capacity, rows - start)
+    mode, found, start = modes[name], [], 0
+    ends = {axis: np.append(0, np.cumsum(each)) for axis, each in sizes.items()}
+    least = {
+        axis: min(writer.capacity_of(f) for f in mode.fields.values() if f.free_axis == axis)
+        for axis in ends
+    }
+    while start < rows:
+        entry, stop = writer.new_partition(name, mode), min(start + writer.capacity(mode), rows)
+        for axis, end in ends.items():
+            last = int(end.searchsorted(end[start] + least[axis], "right")) - 1
+            stop = min(stop, max(last, start + 1))
+        entry.rows = stop - start
+        entry.sizes = {axis: int(end[stop] - end[start]) for axis, end in ends.items()}
         mode.dropped.append(entry)
         found.append(entry)
+        start = stop
     return found
 
 
@@ -156,13 +183,28 @@ def _write(writer: Writer, partitions: Sequence[Partition], read: ReadRows) -> I
     """Write rows to the files of reserved partitions, and yield these, sealed."""
     done, directory = 0, writer.store.directory
     for entry in partitions:
-        fields = writer.store.manifest.modes[entry.mode].fields
+        mode = writer.store.manifest.modes[entry.mode]
+        fields, free = mode.files, free_axes(mode.fields.values())
+        first_of = {axis + ENDS: names[0] for axis, names in free.items()}
         for name, field in fields.items():
-            file, step = writer.create_file(entry, field, entry.rows), rows_per_block(field.nbytes)
+            file = writer.create_file(entry, field, entry.rows_of(field))
+            step, entries = rows_per_block(field.nbytes), 0
+            if field.free_axis or name in first_of:
+                step = min(step, _FREE_ROWS)
             try:
                 for start in range(0, entry.rows, step):
                     stop = min(start + step, entry.rows)
-                    file.append(start, read(name, done + start, done + stop), stop, durable=True)
+                    rows = read(first_of.get(name, name), done + start, done + stop)
+                    if name in first_of:
+                        block = entries + np.cumsum(lengths(rows))
+                        entries = int(block[-1])
+                        file.append(start, block.astype("<u8"), stop, durable=True)
+                    elif field.free_axis:
+                        block, _ = join(field, rows.tolist())
+                        file.append(entries, block, entries + len(block), durable=True)
+                        entries += len(block)
+                    else:
+                        file.append(start, rows, stop, durable=True)
                 file.sync()
                 file.publish()
             finally:

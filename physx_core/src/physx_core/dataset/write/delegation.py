@@ -21,7 +21,7 @@ from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.store.definitions import compare_fields
 from physx_core.dataset.store.manifest import Mode, Partition
 from physx_core.dataset.store.manifest_store import ManifestStore
-from physx_core.dataset.store.sealing import seal
+from physx_core.dataset.store.sealing import count_rows, measure, seal
 from physx_core.dataset.write.recording import Recorder
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
@@ -29,6 +29,8 @@ from physx_core.typing import Batch
 
 PROOF = "dataset.clients"
 """File with a random string, by which other processes prove that they see the same folder."""
+TYPICAL = 1024
+"""Number of entries that a row may have on average; more only make partitions longer."""
 ADDRESSES = 2**36
 """Number of addresses of a process."""
 
@@ -44,8 +46,8 @@ class Owner(Protocol):
     store: ManifestStore
     recorder: Recorder
 
-    def capacity(self, mode: Mode) -> int:
-        """Return the number of rows of a mode that fit into a partition."""
+    def capacity(self, mode: Mode, entries: int = 0) -> int:
+        """Return the number of rows of a mode that fit into a partition: see `Writer`."""
 
     def begin(self, mode_name: str, first_row: int) -> Partition:
         """Begin a partition that another process writes, and return its entry."""
@@ -64,7 +66,7 @@ class Share:
     """What one process writes.
 
     Attributes:
-        fields: The fields of the rows.
+        fields: The fields that have files.
         capacity: Number of rows that fit into a partition.
         first: Address of its first row.
         end: Address after the last row that it has reported.
@@ -112,9 +114,10 @@ class Share:
         if found is None or found.rows != self.capacity:
             return False
         directory, offsets = self._owner.store.directory, {}
+        found = measure(directory, {field.name: field for field in self.fields}, found)
         for of in self.fields:
-            file = found.inspect(directory, of)
-            if file.identity != found.identity(of) or {file.rows, file.capacity} != {found.rows}:
+            file, rows = found.inspect(directory, of), found.rows_of(of)
+            if file.identity != found.identity(of) or {file.rows, file.capacity} != {rows}:
                 return False
             offsets[of.name] = file.data_offset
         del self._open[found.first_row]
@@ -188,8 +191,8 @@ class Delegation:
                 mode.fields = {name: given[name] for name in mode.fields}
         self._owner.recorder.end_stream(self._mode_name)  # without a record no row counts
         mode = manifest.modes[self._mode_name]
-        capacity = self._owner.capacity(mode)
-        share = Share(self._owner, self._mode_name, list(mode.fields.values()), capacity)
+        capacity = self._owner.capacity(mode, TYPICAL)
+        share = Share(self._owner, self._mode_name, list(mode.files.values()), capacity)
         self._shares.append(share)
         return share
 
@@ -241,10 +244,11 @@ class Delegation:
 
 def _count(directory: Path, fields: Iterable[Field], entry: Partition) -> int:
     """Return how many rows of an open partition are there, up to those that were reported."""
-    found = [entry.rows]
-    for field in fields:
+    known = {field.name: field for field in fields}
+    counts = {}
+    for name, field in known.items():
         _, kept = entry.find_rows(directory, field, thorough=True)
         if kept is None:
             return 0
-        found += [kept.commit.rows, *(start for start, _ in kept.damaged)]
-    return min(found)
+        counts[name] = min([kept.commit.rows, *(start for start, _ in kept.damaged)])
+    return count_rows(directory, known, replace(entry), counts)

@@ -18,6 +18,7 @@ from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition.file import copy
 from physx_core.dataset.store.sealing import remove_files, seal
 from physx_core.dataset.write.merged_records import MergedRecords
+from physx_core.dataset.write.row_validation import stored_form
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
@@ -41,7 +42,7 @@ def add_partitions(writer: Writer, source: Path, given: Manifest) -> None:
     try:
         for name, partitions in pairs.items():
             for old, new in partitions:
-                _copy_files(writer.store.directory, source, given.modes[name].fields, old, new)
+                _copy_files(writer.store.directory, source, given.modes[name].files, old, new)
         sealed = [_write_table(writer, records, entry) for entry in table]
         files.sync_folder(writer.store.directory)
         with writer.store.change() as manifest:
@@ -104,7 +105,7 @@ def _reserve(writer: Writer, given: Manifest) -> dict[str, Pairs]:
             first = mode.next_row
             for old in (partition for partition in other.partitions if partition.rows):
                 new = writer.new_partition(name, mode)
-                new.rows = old.rows
+                new.rows, new.sizes = old.rows, old.sizes
                 new.first_row = first + old.first_row
                 mode.dropped.append(new)
                 found.append((old, new))
@@ -125,11 +126,12 @@ def _reserve_table(writer: Writer, records: MergedRecords) -> list[Partition]:
 
 def _write_table(writer: Writer, records: MergedRecords, entry: Partition) -> Partition:
     """Write the merged records to their partition and return it, sealed."""
-    fields = writer.store.manifest.modes[EPISODES].fields
+    fields = writer.store.manifest.modes[EPISODES].files
+    rows = stored_form(writer.store.manifest.modes[EPISODES].fields, records.rows)
     for name, field in fields.items():
-        file = writer.create_file(entry, field, records.count)
+        file = writer.create_file(entry, field, len(rows[name]))
         try:
-            file.append(0, records.rows[name], records.count, durable=True)
+            file.append(0, rows[name], len(rows[name]), durable=True)
             file.sync()
             file.publish()
         finally:
@@ -143,7 +145,7 @@ def _copy_files(
     for name, field in fields.items():
         path, offset = old.path(source, name), old.inspect(source, field).data_offset
         place, identity = new.path(target, name), new.identity(field)
-        new.offsets[name], crc = copy(path, offset, place, identity, old.rows)
+        new.offsets[name], crc = copy(path, offset, place, identity, old.rows_of(field))
         new.checksums[name] = crc
         if old.checksums and crc != old.checksums[name]:
             wanted = old.checksums[name]
@@ -170,7 +172,7 @@ def forget(writer: Writer, partitions: Mapping[str, list[Partition]]) -> None:
     for name, dropped in partitions.items():
         mode = writer.store.manifest.modes[name]
         for partition in dropped:
-            remove_files(writer.store.directory, mode.fields, partition)
+            remove_files(writer.store.directory, mode.files, partition)
     with writer.store.change() as manifest:
         for name, dropped in partitions.items():
             keys = {partition.key for partition in dropped}

@@ -15,9 +15,10 @@ from physx_core.dataset.store.manifest import Partition
 from physx_core.dataset.store.partition.file import PartitionFile
 from physx_core.dataset.store.sealing import seal
 from physx_core.dataset.store.syncing import Syncer
+from physx_core.dataset.write.row_validation import stored_form
 from physx_core.dataset.write.writer import OpenPartition
 from physx_core.errors import DatasetError
-from physx_core.fields import Field
+from physx_core.fields import Field, ends_fields
 from physx_core.processes import Helper
 from physx_core.typing import Batch
 
@@ -29,7 +30,7 @@ class PartitionWriter(Closeable):
     later, and after about a second also a power failure.
 
     Attributes:
-        fields: The fields of the rows.
+        fields: The fields of the rows, and those of their free axes.
     """
 
     def __init__(
@@ -47,7 +48,8 @@ class PartitionWriter(Closeable):
             capacity: Number of rows that fit into a partition.
             helper: Makes what works beside the caller, given a name.
         """
-        self.fields = list(fields)
+        self._own = {field.name: field for field in fields}
+        self.fields = [*fields, *ends_fields(fields).values()]
         self._capacity, self._directory = capacity, directory
         self._waiting: deque[Partition] = deque()
         self._opened: OpenPartition | None = None
@@ -71,12 +73,14 @@ class PartitionWriter(Closeable):
         Raises:
             DatasetError: If the disk is full or fails.
         """
-        done, first = 0, 0
+        done, first, rows = 0, 0, stored_form(self._own, rows)
         with files.storing("The rows of this client"):
             self._syncer.check()
             while done < count:
                 opened = self._opened = self._opened or self._open(self._waiting.popleft())
                 entry, part = opened.partition, min(opened.free, count - done)
+                if opened.fitting(rows, done, part) < part:
+                    raise DatasetError(f"Partition {entry.index} has no space for more entries.")
                 first = first if done else entry.first_row + entry.rows
                 opened.append(rows, done, part)
                 done += part

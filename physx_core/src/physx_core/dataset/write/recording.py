@@ -24,8 +24,10 @@ from physx_core.dataset.store.episode_table import (
 from physx_core.dataset.store.failure_file import FailedEpisode
 from physx_core.dataset.store.manifest import Manifest, Mode
 from physx_core.dataset.store.manifest_store import ManifestStore
+from physx_core.dataset.write.row_validation import stored_form
 from physx_core.errors import DatasetError, UsageError
 from physx_core.fields import Field
+from physx_core.packing import split
 from physx_core.rows import check_names
 from physx_core.typing import Batch
 
@@ -213,7 +215,8 @@ class Recorder:
     def _store_stream(self, mode: str, campaign: int, first: int, rows: int) -> None:
         """Store the record of a stream and wait until it is on the disk."""
         fields = self.manifest.modes[EPISODES].fields
-        self._writer.append(EPISODES, stream_record(fields, mode, campaign, first, rows), 1)
+        record = stored_form(fields, stream_record(fields, mode, campaign, first, rows))
+        self._writer.append(EPISODES, record, 1)
         self._writer.sync(EPISODES)
         self._note(mode, campaign, -1, first, rows, 0, EpisodeStatus.STREAM)
 
@@ -298,7 +301,8 @@ def _values(name: str, field: Field, episodes: Sequence[EpisodeRecord]) -> Any:
 
 def _values_once(name: str, field: Field, episodes: Sequence[EpisodeRecord]) -> list[Any]:
     """Return the values of a field that an episode has once, for each number; 0 if it has none."""
-    none = np.zeros(field.shape or (), field.dtype)
+    size = (0, *field.entry_shape) if field.free_axis else field.entry_shape
+    none = np.zeros(size, field.dtype)
     return [value for e in episodes for value in [e.fields.get(name, none)] * e.count]
 
 
@@ -316,7 +320,9 @@ def stream_record(
         "status": EpisodeStatus.STREAM,
     }
     return {
-        name: np.full((1, *(field.shape or ())), values.get(name, 0), field.dtype)
+        name: split(np.empty((0, *field.entry_shape), field.dtype), np.zeros(1, np.intp))
+        if field.free_axis
+        else np.full((1, *field.entry_shape), values.get(name, 0), field.dtype)
         for name, field in fields.items()
     }
 

@@ -17,7 +17,8 @@ from physx_core.dataset.store.partition.spans import FlatIndex
 from physx_core.dataset.store.sealing import unseal
 from physx_core.dataset.write.row_validation import check_rows
 from physx_core.errors import DatasetError, FieldShapeError, MissingFieldError
-from physx_core.fields import Field
+from physx_core.fields import ENDS, Field, free_axes
+from physx_core.packing import ranges
 from physx_core.rows import check_names
 from physx_core.typing import Array, Batch, Index
 
@@ -40,7 +41,11 @@ def check_update(
         check_names(fields, unknown)
     given = {name: fields[name] for name in values}
     if single:
-        values = {name: field.convert(values[name])[None] for name, field in given.items()}
+        values = {
+            name: [found] if field.free_axis else found[None]
+            for name, field in given.items()
+            for found in [field.convert(values[name])]
+        }
     rows, count = check_rows(given, values)
     if count != len(index):
         raise FieldShapeError(f"{count} rows are given, but {len(index)} are selected.")
@@ -56,8 +61,36 @@ class Opened(Protocol):
         """Prepare some fields for an update of rows up to `last`."""
 
 
+def check_unchanged(fields: Mapping[str, Field], rows: Batch, sizes: Mapping[str, Index]) -> None:
+    """Check that rows keep the sizes of their free axes.
+
+    Args:
+        fields: The fields of the mode.
+        rows: The new rows, as they are stored.
+        sizes: How many entries the rows have, by free axis.
+
+    Raises:
+        FieldShapeError: If one has other sizes.
+    """
+    for axis, names in free_axes(fields[name] for name in rows if name in fields).items():
+        given = np.diff(rows[axis + ENDS].astype(np.intp), prepend=0)
+        wrong = np.flatnonzero(given != sizes[axis])
+        if len(wrong):
+            row = wrong[0]
+            raise FieldShapeError(
+                f'Row {row} of the update has {given[row]} entries on the axis "{axis}", but '
+                f"{sizes[axis][row]} are stored. Rows keep their sizes: append new ones.",
+                field=names[0],
+            )
+
+
 def update_rows(
-    store: ManifestStore, mode_name: str, index: Index, rows: Batch, opened: Opened | None
+    store: ManifestStore,
+    mode_name: str,
+    index: Index,
+    rows: Batch,
+    opened: Opened | None,
+    bounds: Mapping[str, Index],
 ) -> set[Path]:
     """Overwrite rows; sealed partitions lose their checksums until the dataset is closed.
 
@@ -67,12 +100,14 @@ def update_rows(
         index: Numbers of the rows, all in range.
         rows: Field name to new rows, checked.
         opened: The partition of the mode that is being written.
+        bounds: First stored entry of each row of the mode, and the end, by free axis.
 
     Returns:
         The files that were written to.
     """
     mode = store.manifest.modes[mode_name]
-    owners, rows_there = FlatIndex(mode.spans).locate(index)
+    spans = mode.spans
+    owners, rows_there = FlatIndex(spans).locate(index)
     touched = [mode.partitions[owner] for owner in np.unique(owners)]
     _invalidate(store, mode_name, touched)
     updated = set()
@@ -81,16 +116,25 @@ def update_rows(
         here = np.flatnonzero(owners == place)
         places = rows_there[here]
         if opened is not None and partition is opened.partition:
-            opened.settle(rows, int(places.max()))
+            opened.settle([name for name in rows if name not in mode.ends], int(places.max()))
         elif not partition.sealed:
             raise DatasetError(
                 f"Partition {partition.index} of mode {mode_name!r} could not be sealed. Free some "
                 "disk space and reopen the dataset before you update its rows."
             )
         for name, block in rows.items():
-            path = partition.path(store.directory, name)
+            if name in mode.ends:
+                continue  # the ends stay
+            path, axis = partition.path(store.directory, name), mode.fields[name].free_axis
             updated.add(path)
-            _write(path, partition.offsets[name], places, block[here])
+            if not axis:
+                _write(path, partition.offsets[name], places, block[here])
+                continue
+            known, ends = bounds[axis], rows[axis + ENDS].astype(np.intp)
+            begins = known[spans[place].start + places] - known[spans[place].start]
+            counts = known[spans[place].start + places + 1] - known[spans[place].start + places]
+            entries = ranges(ends[here] - counts, counts)
+            _write(path, partition.offsets[name], ranges(begins, counts), block[entries])
     return updated
 
 

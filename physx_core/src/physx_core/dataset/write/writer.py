@@ -10,6 +10,8 @@ from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from physx_core import files
 from physx_core.dataset.read.mode_statistics import compute_statistics, count_sealed
 from physx_core.dataset.read.ordered_statistics import store_in_order
@@ -26,12 +28,14 @@ from physx_core.dataset.write.delegation import Delegation
 from physx_core.dataset.write.recording import Recorder
 from physx_core.dataset.write.updating import update_rows
 from physx_core.errors import DatasetError, UsageError
-from physx_core.fields import Field
+from physx_core.fields import ENDS, Field
 from physx_core.processes import Helper
-from physx_core.typing import Batch, Index
+from physx_core.typing import Array, Batch, Index
 
 _HEADER = 2**14
 _COMMITTED = attrgetter("committed")
+_SPARSE = 2**40
+"""Bytes of entries for which a file that another process writes has space; it takes none."""
 
 
 class OpenPartition:
@@ -40,6 +44,7 @@ class OpenPartition:
     Attributes:
         partition: Its entry in the manifest.
         capacity: Number of rows that fit in.
+        axes: Number of entries that fit in, by free axis.
         files: The files by field.
     """
 
@@ -53,6 +58,12 @@ class OpenPartition:
         self.partition = partition
         self.capacity = capacity
         self.files = parts
+        self.axes: dict[str, int] = {}
+        for file in parts.values():
+            if axis := file.identity.field.free_axis:
+                self.axes[axis] = min(file.capacity, self.axes.get(axis, file.capacity))
+        self._ends = {axis + ENDS: axis for axis in self.axes}
+        partition.sizes = dict.fromkeys(self.axes, 0)
         self._syncer = syncer
 
     @property
@@ -60,8 +71,26 @@ class OpenPartition:
         """Number of rows that still fit in."""
         return self.capacity - self.partition.rows
 
+    @property
+    def is_full(self) -> bool:
+        """Whether nothing more fits into any of its files."""
+        return not self.free and self.axes == self.partition.sizes
+
+    def fitting(self, rows: Batch, start: int, count: int) -> int:
+        """Return how many of the rows `start` to `start + count` of a block still fit in."""
+        found = min(count, self.free)
+        for axis, capacity in self.axes.items():
+            ends = rows[axis + ENDS]
+            begin, _ = _entries(rows, axis, start, start)
+            most = begin + capacity - self.partition.sizes[axis]
+            found = int(ends[start : start + found].searchsorted(most, "right"))
+        return found
+
     def append(self, rows: Batch, start: int, count: int) -> None:
         """Write and commit all rows `start` to `start + count` of a block, or none of them."""
+        if self.axes:
+            self._append_free(rows, start, count)
+            return
         parts, durable = self.files.values(), self._syncer is None
         first = self.partition.rows
         last = first + count
@@ -78,17 +107,68 @@ class OpenPartition:
             self.partition.rows = last
         except BaseException:  # also an interrupt: the next rows go to the same offsets
             self.partition.rows = first
-            for file, commit in zip(parts, before, strict=True):
-                file.withdraw(commit)
+            self._withdraw(before)
             raise
         if self._syncer is not None:
             self._syncer.note(self)
 
+    def _append_free(self, rows: Batch, start: int, count: int) -> None:
+        """Do the same with rows that have free axes."""
+        parts, durable, known = self.files.values(), self._syncer is None, self.partition
+        first, before_sizes = known.rows, known.sizes
+        pieces, sizes = self._free_pieces(rows, start, count)
+        for file, _, _, end in pieces:
+            if file.room < end:
+                file.reserve(end)
+        before = tuple(map(_COMMITTED, parts))
+        try:
+            for file, block, begin, end in pieces:
+                file.append(begin, block, end, durable=durable)
+            if durable:
+                for file in parts:
+                    file.sync()
+            known.rows, known.sizes = first + count, sizes
+        except BaseException:
+            known.rows, known.sizes = first, before_sizes
+            self._withdraw(before)
+            raise
+        if self._syncer is not None:
+            self._syncer.note(self)
+
+    def _withdraw(self, commits: tuple[tuple[int, int, int], ...]) -> None:
+        """Return to earlier commits of the files."""
+        for file, commit in zip(self.files.values(), commits, strict=True):
+            file.withdraw(commit)
+
+    def _free_pieces(
+        self, rows: Batch, start: int, count: int
+    ) -> tuple[list[tuple[PartitionFile, Array, int, int]], dict[str, int]]:
+        """Return what of a block goes to which rows of each file, and the sizes after that."""
+        first, stop, pieces, sizes = self.partition.rows, start + count, [], {}
+        for name, file in self.files.items():
+            axis, block = file.identity.field.free_axis, rows[name]
+            if axis:
+                begin, end = _entries(rows, axis, start, stop)
+                base = self.partition.sizes[axis]
+                sizes[axis] = base + end - begin
+                pieces.append((file, block[begin:end], base, sizes[axis]))
+                continue
+            block = block[start:stop]
+            if name in self._ends:
+                base, (begin, _) = (
+                    self.partition.sizes[self._ends[name]],
+                    _entries(rows, self._ends[name], start, stop),
+                )
+                block = (block.astype(np.int64) + (base - begin)).astype("<u8")
+            pieces.append((file, block, first, first + count))
+        return pieces, sizes
+
     def settle(self, names: Iterable[str], last: int) -> None:
         """Prepare some fields for an update of rows up to `last`."""
         for name in names:
-            if self.files[name].is_checked(last):
-                self.files[name].settle()
+            file = self.files[name]
+            if file.identity.field.free_axis or file.is_checked(last):
+                file.settle()
 
     def close(self) -> None:
         """Close the files; the syncer syncs them once more."""
@@ -190,11 +270,13 @@ class Writer:
             while done < count:
                 partition = self._open.get(mode_name)
                 free = 0 if partition is None else partition.free
+                if partition is not None and partition.axes:
+                    free = partition.fitting(rows, done, count - done)
                 if partition is None or not free:
                     if partition is not None:
                         self._retire(mode_name)
-                    partition = self._open[mode_name] = self._begin(mode_name)
-                    free = partition.capacity
+                    partition = self._open[mode_name] = self._begin(mode_name, rows, done)
+                    free = partition.fitting(rows, done, count - done)
                 part = min(free, count - done)
                 partition.append(rows, done, part)
                 done += part
@@ -217,7 +299,9 @@ class Writer:
         with self.store.syncing():
             self._check()
             opened = self._open.get(mode_name)
-            updated = update_rows(self.store, mode_name, index, rows, opened)
+            mode = self.store.manifest.modes[mode_name]
+            bounds = {axis: self.reader.bounds(mode_name, axis) for axis in mode.axes}
+            updated = update_rows(self.store, mode_name, index, rows, opened, bounds)
             for path in updated:
                 self.note_path(path)
 
@@ -303,10 +387,10 @@ class Writer:
         """Close the open partition of a mode and seal it in the background."""
         opened = self._open.pop(mode_name)
         entry = opened.partition
-        entry.writing = not opened.free  # the files of a full one do not change
+        entry.writing = opened.is_full  # the files of a full one do not change
         opened.close()
         self._filled[mode_name] = entry
-        fields = self.store.manifest.modes[mode_name].fields
+        fields = self.store.manifest.modes[mode_name].files
         self._sealer.give(partial(_seal, self._directory, fields, replace(entry)))
 
     def _collect(self, *, wait: bool) -> None:
@@ -357,7 +441,7 @@ class Writer:
                 manifest.modes[entry.mode].partitions.remove(entry)
             write_index(self.reader, self.session)
         for entry in empty:
-            remove_files(self._directory, self.store.manifest.modes[entry.mode].fields, entry)
+            remove_files(self._directory, self.store.manifest.modes[entry.mode].files, entry)
 
     def seal(self, entry: Partition, how: Callable[[Partition], Partition]) -> None:
         """Seal a partition that another process has written, in the background."""
@@ -369,12 +453,21 @@ class Writer:
 
     def begin(self, mode_name: str, first_row: int) -> Partition:
         """Begin a partition that another process writes, and return its entry."""
-        opened = self._begin(mode_name, first_row)
+        opened = self._begin(mode_name, {}, 0, first_row)
         opened.close()
         return opened.partition
 
-    def _begin(self, mode_name: str, first_row: int | None = None) -> OpenPartition:
-        """Create the files of a partition, then list it; rows may be committed only after that."""
+    def _begin(
+        self, mode_name: str, rows: Batch, start: int, first_row: int | None = None
+    ) -> OpenPartition:
+        """Create the files of a partition, then list it; rows may be committed only after that.
+
+        Args:
+            mode_name: Name of the mode.
+            rows: Rows of which one must fit in; empty if another process writes them.
+            start: That one.
+            first_row: Address of its first row if another process writes it.
+        """
         parts: dict[str, PartitionFile] = {}
         try:
             with self.store.turn() as manifest:
@@ -386,8 +479,17 @@ class Writer:
                     entry.follows = self._find_unsealed_before(mode_name, mode)
                 else:
                     entry.first_row = first_row
-                for name, field in mode.fields.items():
-                    parts[name] = self.create_file(entry, field, capacity)
+                least = {
+                    axis: end - begin
+                    for axis in (mode.axes if rows else ())
+                    for begin, end in [_entries(rows, axis, start, start + 1)]
+                }
+                for name, field in mode.files.items():
+                    most = capacity
+                    if field.free_axis:
+                        most = max(self.capacity_of(field), least.get(field.free_axis, 0))
+                        most = most if rows else _SPARSE // max(1, field.nbytes)
+                    parts[name] = self.create_file(entry, field, most)
                 for part in parts.values():
                     part.publish()
                 files.sync_folder(self._directory)
@@ -398,10 +500,20 @@ class Writer:
             raise
         return OpenPartition(entry, capacity, parts, self._syncer)
 
-    def capacity(self, mode: Mode) -> int:
-        """Return the number of rows of a mode that fit into a partition."""
-        row_nbytes = max(1, *(field.nbytes for field in mode.fields.values()))
+    def capacity(self, mode: Mode, entries: int = 0) -> int:
+        """Return the number of rows of a mode that fit into a partition.
+
+        Args:
+            mode: The mode.
+            entries: About how many entries of a free axis a row has.
+        """
+        known = mode.files.values()
+        row_nbytes = max(1, *(f.nbytes * (entries if f.free_axis else 1) for f in known))
         return max(1, self._max_nbytes // row_nbytes)
+
+    def capacity_of(self, field: Field) -> int:
+        """Return the number of entries of a free axis that fit into a field's file."""
+        return max(1, self._max_nbytes // max(1, field.nbytes))
 
     def create_file(self, entry: Partition, field: Field, capacity: int) -> PartitionFile:
         """Create a file of a new partition under its temporary name."""
@@ -414,7 +526,7 @@ class Writer:
         """Return a partition with the first number whose files do not exist yet."""
         index = mode.next_index(self.session)
         entry = Partition(mode_name, self.session, index, mode.next_row)
-        while any(entry.path(self._directory, name).exists() for name in mode.fields):
+        while any(entry.path(self._directory, name).exists() for name in mode.files):
             entry = replace(entry, index=entry.index + 1)
         return entry
 
@@ -443,6 +555,12 @@ class Writer:
             manifest_file.save(self._directory, manifest)
         store_in_order(self.reader)
         write_index(self.reader, self.session, wait=True)
+
+
+def _entries(rows: Batch, axis: str, start: int, stop: int) -> tuple[int, int]:
+    """Return where the entries of rows `start` to `stop` of a block begin and end in it."""
+    ends = rows[axis + ENDS]
+    return int(ends[start - 1]) if start else 0, int(ends[stop - 1]) if stop else 0
 
 
 def _seal(directory: Path, fields: Mapping[str, Field], partition: Partition) -> Partition:

@@ -29,8 +29,9 @@ from physx_core.errors import (
     UsageError,
     listed,
 )
-from physx_core.fields import NUMBERS, Field, is_finite
+from physx_core.fields import NUMBERS, PTR, Field, free_axes, is_finite
 from physx_core.normalization import Normalization
+from physx_core.packing import join, pack, packed_fields, split
 from physx_core.pipelines.learning.components import create, create_network
 from physx_core.plugins import import_component
 from physx_core.plugins.networks import resolve_network
@@ -86,6 +87,7 @@ class Learner:
         self.network.set_device(config.device)
         self.optimization: Optimization | None = None
         self.fields: dict[str, Field] = {}
+        self._free: dict[str, Field] = {}  # those of batches, if one of them has a free axis
         self.group = Group()
         self.row_losses: Array = np.zeros(0)
         self._is_between_steps = False
@@ -128,8 +130,14 @@ class Learner:
         Raises:
             FieldsMismatchError: If the network needs fields with other names or shapes.
         """
-        self.fields = dict(fields)
+        fields = {**fields, **packed_fields(free_axes(fields.values()))}
+        self.fields = fields
         self.network.bind(fields)
+        self._free = {n: fields[n] for n in self.batch_fields if n in fields}
+        if not any(field.free_axis for field in self._free.values()):
+            self._free = {}
+        if self._free and self.group.size > 1:
+            raise ConfigError("Networks that read free axes are trained by one process.")
         self.normalize(normalization)
 
     def normalize(self, normalization: Mapping[str, Normalization]) -> None:
@@ -156,7 +164,46 @@ class Learner:
 
     def _predict_batch(self, batch: Batch) -> PredictedBatch:
         """Predict a batch in physical units that contains `batch_fields`."""
-        return PredictedBatch.of(self.network, self.transformation, self._read(batch))
+        packed, _ = self._pack(batch)
+        return PredictedBatch.of(self.network, self.transformation, self._read(packed))
+
+    def _pack(self, batch: Batch) -> tuple[Batch, dict[str, Index]]:
+        """Return a batch in which free axes are packed, and the sizes if they were not before."""
+        free, sizes = self._free, dict[str, Index]()
+        if not free or any(f.free_axis + PTR in batch for f in free.values() if f.free_axis):
+            return batch, sizes
+        found: Batch = {}
+        for name, values in batch.items():
+            field = free.get(name)
+            if field is None or not field.free_axis:
+                found[name] = values
+                continue
+            rows = [field.convert(each) for each in values]
+            found[name], counts = join(field, rows)
+            if not np.array_equal(sizes.setdefault(field.free_axis, counts), counts):
+                raise FieldShapeError(
+                    f'field "{name}" has other sizes of the axis "{field.free_axis}" than the '
+                    "fields before it.",
+                    field=name,
+                )
+        fields = {n: free[n] for n in found if n in free}
+        return pack(fields, found, sizes, self.network.net_fields), sizes
+
+    def predicted_shape(self, name: str, values: Array) -> tuple[Any, ...]:
+        """Return the shape of a predicted field, of which there are values by row."""
+        if not values.dtype.hasobject:
+            return values.shape[1:]
+        pairs = zip(self.network.pred_fields, self.network.opt_fields, strict=False)
+        return self.fields[dict(pairs)[name]].free_axis, *values[0].shape[1:]
+
+    def _split(self, answer: Batch, sizes: Mapping[str, Index]) -> Batch:
+        """Return predictions row by row if the rows had the sizes of free axes."""
+        pairs = zip(self.network.pred_fields, self.network.opt_fields, strict=False)
+        axes = {name: self.fields[of].free_axis for name, of in pairs if of in self.fields}
+        return {
+            name: split(values, sizes[axes[name]]) if axes.get(name) in sizes else values
+            for name, values in answer.items()
+        }
 
     def _read_with_gradients(self, batch: Batch) -> Tensors:
         return self.network.with_gradients(self.network.numpy_to_tensor(batch))
@@ -258,7 +305,7 @@ class Learner:
         sums: dict[str, float] = {}
         count = 0.0
         for batch in batches:
-            share, size = batch, float(len(next(iter(batch.values()))))
+            share, size = batch, float(len(batch[self._counted(batch)]))
             if self.group.size > 1:
                 share, weight = self.group.share_of(batch)
                 size *= weight
@@ -270,6 +317,11 @@ class Learner:
         self.network.set_train()
         *totals, total = self.group.total([*sums.values(), count])
         return {name: value / total for name, value in zip(sums, totals, strict=True)}
+
+    def _counted(self, batch: Batch) -> str:
+        """Return the field whose length is the weight of a batch: rows, or a target's entries."""
+        targets = [name for name in self.network.opt_fields if name in batch]
+        return targets[0] if targets and self._free else next(iter(batch))
 
     def distributions(self) -> dict[str, Array]:
         """Return weights and gradients as arrays, ``weights/<name>`` and ``gradients/<name>``."""
@@ -335,10 +387,16 @@ class Learner:
             batch_size: Largest number of rows to predict at once.
         """
         network, rows = self.network, len(next(iter(batch.values())))
-        parts = [
-            self.predict_in_training({n: v[first : first + batch_size] for n, v in batch.items()})
-            for first in range(0, rows, batch_size)
-        ]
+        parts = (
+            [self.predict_in_training(batch)]
+            if self._free
+            else [
+                self.predict_in_training(
+                    {n: v[first : first + batch_size] for n, v in batch.items()}
+                )
+                for first in range(0, rows, batch_size)
+            ]
+        )
         answer = concatenate(parts)
         pairs = zip(network.opt_fields, network.pred_fields, strict=False)
         predicted = {true: answer[name] for true, name in pairs if true in batch}
@@ -353,6 +411,7 @@ class Learner:
             FieldShapeError: If the network fails because a field has the wrong shape.
         """
         network = self.network
+        batch, sizes = self._pack(batch)
         try:
             read = pick(batch, network.net_fields)
         except KeyError as error:
@@ -363,7 +422,8 @@ class Learner:
             ) from None
         try:
             inputs = network.numpy_to_tensor(read)
-            return network.tensor_to_numpy(predict(network, self.transformation, inputs))
+            answer = network.tensor_to_numpy(predict(network, self.transformation, inputs))
+            return self._split(answer, sizes) if sizes else answer
         except PhysxError:
             raise
         except Exception:  # from a library; other shapes are fine as long as the network takes them
@@ -385,8 +445,8 @@ class Learner:
     def _check_shapes(self, inputs: Batch, *, exactly: bool = False) -> None:
         for name in self.network.net_fields:
             values, field = inputs.get(name), self.fields.get(name)
-            if values is None or field is None:
-                continue
+            if values is None or field is None or field.free_axis:
+                continue  # what has a free axis is checked when it is packed
             if values.dtype.kind not in NUMBERS:
                 raise FieldTypeError(f'field "{name}" does not consist of numbers.', field=name)
             shape = values.shape[1:]

@@ -356,7 +356,11 @@ def _check_fields(records: list[EpisodeRecord], peer: Peer) -> None:
     """
     for each in records:
         if each.fields:
-            block = {name: value[None] for name, value in each.fields.items()}
+            free = {field.name for field in peer.episode_fields if field.free_axis}
+            block = {
+                name: np.fromiter([value], object, 1) if name in free else value[None]
+                for name, value in each.fields.items()
+            }
             check_values({**block, "step": np.array([-1])}, peer.episode_fields, peer.instance_id)
 
 
@@ -386,7 +390,10 @@ def _parse(plain: Any, fields: list[Field]) -> EpisodeRecord:
         raise ValueError(f"the status {known.name}")
     wanted = fields if known is EpisodeStatus.FINISHED else []
     kinds = {name: (of.dtype.str, of.shape) for name, of in values.items()}
-    if kinds != {field.name: (field.dtype, field.shape) for field in wanted}:
+    if kinds.keys() != {field.name for field in wanted} or not all(
+        kinds[field.name][0] == field.dtype and field.is_shape(kinds[field.name][1])
+        for field in wanted
+    ):
         raise ValueError(f"an episode with the fields {kinds!r:.200}")
     return EpisodeRecord(
         episode=episode,

@@ -17,8 +17,9 @@ from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
 from physx_core.fields import RESERVED, ROLES, Field, first_not_finite
 from physx_core.net.frames import MAX_PAYLOAD
 from physx_core.net.values import decode
+from physx_core.packing import check_sizes
 from physx_core.rows import ROW_FIELDS
-from physx_core.typing import Batch
+from physx_core.typing import Array, Batch
 
 _DTYPE = re.compile(r"[<>|=]?[biufc]\d{1,2}")
 _MOST_PARAMETERS = 4096
@@ -102,7 +103,9 @@ def _is_field(plain: Any) -> bool:
         isinstance(dtype, str)
         and _DTYPE.fullmatch(dtype) is not None
         and isinstance(shape, list)
-        and all(type(size) is int for size in shape)
+        and all(type(size) is int for size in shape[1:])
+        and {*map(type, shape[:1])} <= {int, str}
+        and isinstance(plain.get("indexes", ""), str)
         and isinstance(plain.get("unit", ""), str)
         and plain.get("role", "training") in ROLES
     )
@@ -204,19 +207,27 @@ def check_rows(block: Batch, fields: Sequence[Field], instance_id: int, last_ste
     return int(steps[-1])
 
 
+def _raw(values: Array) -> bytes:
+    """Return the bytes of values."""
+    return b"".join(each.tobytes() for each in (values if values.dtype.hasobject else [values]))
+
+
 def check_values(block: Batch, fields: Sequence[Field], instance_id: int) -> None:
     """Check the values of received rows, as the client should have done before sending them.
 
     Raises:
         NotFiniteError: If one is NaN or infinity.
     """
+    free = {field.name: field for field in fields if field.free_axis or field.indexes}
+    for row in range(len(block["step"])) if free else ():
+        check_sizes(free, {name: block[name][row] for name in free}, instance_id)
     for field in fields:
         values = block[field.name]
         kind = values.dtype.kind
-        if kind == "b" and values.tobytes().translate(None, b"\0\1"):
+        if field.numpy_dtype.kind == "b" and _raw(values).translate(None, b"\0\1"):
             raise ConnectionRefusedByPeerError(
                 f'It sent rows whose field "{field.name}" is neither true nor false.'
             )
-        bad = first_not_finite(values) if kind in "fc" else None
+        bad = first_not_finite(values) if kind in "fcO" else None
         if bad is not None:
             raise field.not_finite(instance_id=instance_id, step=int(block["step"][bad]))

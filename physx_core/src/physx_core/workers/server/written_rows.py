@@ -88,10 +88,10 @@ class WrittenRows:
 
     def _take_sealed(self, peer: Peer, frame: Frame) -> None:
         checksums, share = decode(frame.payload), self._shares.get(peer)
-        fields = {field.name for field in peer.row_fields}
         is_valid = (
             isinstance(checksums, dict)
-            and checksums.keys() == fields
+            and share is not None
+            and checksums.keys() == {field.name for field in share.fields}
             and all(type(value) is int and 0 <= value < 2**32 for value in checksums.values())
         )
         if self._delegation.is_closed:

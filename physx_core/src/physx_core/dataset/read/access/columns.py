@@ -13,11 +13,12 @@ from physx_core.dataset.read.access.mapping import MappedColumn, Runs
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.shuffling import LARGE_ROW
 from physx_core.fields import Field
+from physx_core.packing import join, split
 from physx_core.typing import Array, Index
 
 
 class MemoryColumn:
-    """The stored rows of a field in memory, in the requested type.
+    """The stored rows of a field in memory, in the requested type; of a free axis, the entries.
 
     Attributes:
         shape: (rows, *field shape).
@@ -26,7 +27,7 @@ class MemoryColumn:
 
     def __init__(self, reader: Reader, mode: str, field: Field, dtype: np.dtype[Any]) -> None:
         self.dtype = dtype
-        self.shape: tuple[int, ...] = (0, *(field.shape or ()))
+        self.shape: tuple[int, ...] = (0, *field.entry_shape)
         self._reader = reader
         self._mode, self._name = mode, field.name
         self._plain = np.dtype(field.dtype) == dtype
@@ -63,6 +64,12 @@ class MemoryColumn:
             .view(self.dtype)
             .reshape(len(first), count, *self.shape[1:])
         )
+
+    def slices(self, starts: Index, counts: Index) -> list[Array]:
+        """Return runs of rows as views, valid while this is not closed."""
+        begins, array = starts.tolist(), self._array
+        ends = (starts + counts).tolist()
+        return [array[begin:end] for begin, end in zip(begins, ends, strict=True)]
 
     def gather(self, index: Index, out: Array) -> None:
         """Copy the rows of an index array, all in range, into `out`."""
@@ -134,7 +141,7 @@ class ColumnCache:
         column = self._loaded.get(key)
         if column is None:
             column = self._loaded[key] = MemoryColumn(self.reader, mode, field, key[2])
-        rows = self.reader.stored_rows(mode)
+        rows = self.reader.stored_values(mode, name)
         if column.shape[0] != rows:
             self.reader.check(mode, name, column.shape[0])
             column.extend(rows)
@@ -143,12 +150,24 @@ class ColumnCache:
     def map(self, mode: str, name: str) -> MappedColumn:
         """Map all currently committed rows of a field into the address space and return them."""
         self._drop_stale()
-        field, rows = self.reader.field(mode, name), self.reader.stored_rows(mode)
+        field, rows = self.reader.field(mode, name), self.reader.stored_values(mode, name)
         column = self._mapped.get((mode, name))
         if column is None or column.shape[0] != rows:
             column = MappedColumn(self.reader.segments(mode, name), field)
             self._mapped[mode, name] = column
         return column
+
+    def take(self, mode: str, name: str, index: Index) -> Array:
+        """Return stored rows of a field as a new array, shape (n, *field shape)."""
+        column, field = self.map(mode, name), self.reader.field(mode, name)
+        column.check()
+        if field.free_axis:
+            bounds = self.reader.bounds(mode, field.free_axis)
+            starts, counts = bounds[index], bounds[index + 1] - bounds[index]
+            return split(join(field, column.slices(starts, counts))[0], counts)
+        out = np.empty((len(index), *column.shape[1:]), column.dtype)
+        column.gather(index, out)
+        return out
 
     def missing(self, mode: str, name: str, dtype: np.dtype[Any] | None) -> int:
         """Return the number of bytes of memory that loading a field would take."""
@@ -156,7 +175,7 @@ class ColumnCache:
         field = self.reader.field(mode, name)
         kind = field.converted_dtype(dtype)
         loaded = self._loaded.get((mode, name, kind))
-        rows = self.reader.stored_rows(mode) - (loaded.shape[0] if loaded else 0)
+        rows = self.reader.stored_values(mode, name) - (loaded.shape[0] if loaded else 0)
         return rows * (field.nbytes // np.dtype(field.dtype).itemsize) * kind.itemsize
 
     def clear(self) -> None:

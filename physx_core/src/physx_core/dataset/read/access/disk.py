@@ -44,7 +44,7 @@ class DiskColumn:
             dtype: Type that floating-point rows are converted to; None: no conversion.
         """
         field = reader.field(mode, name)
-        self.shape: tuple[int, ...] = (reader.stored_rows(mode), *(field.shape or ()))
+        self.shape: tuple[int, ...] = (reader.stored_rows(mode), *field.entry_shape)
         self.dtype = field.converted_dtype(dtype)
         self.row_nbytes = field.nbytes
         self._own = np.dtype(field.dtype)

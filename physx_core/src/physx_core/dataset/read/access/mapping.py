@@ -74,7 +74,7 @@ class MappedColumn:
         """Map the partitions."""
         self.shape: tuple[int, ...] = (
             sum(segment.rows for segment in segments),
-            *(field.shape or ()),
+            *field.entry_shape,
         )
         self.dtype = np.dtype(field.dtype)
         self._row_nbytes = field.nbytes
@@ -94,6 +94,14 @@ class MappedColumn:
             numbers, places = self._index.locate(index)
             index = self._slots[numbers] + places
         self._array.take(index, 0, out, "clip")
+
+    def slices(self, starts: Index, counts: Index) -> list[Array]:
+        """Return runs of rows within partitions as views, valid while this exists."""
+        if not self._single and len(starts):
+            numbers, places = self._index.locate(starts)
+            starts = self._slots[numbers] + places
+        begins, ends, array = starts.tolist(), (starts + counts).tolist(), self._array
+        return [array[begin:end] for begin, end in zip(begins, ends, strict=True)]
 
     def windows(self, first: Index, count: int) -> Array:
         """Return consecutive rows from each of some rows on, shape (n, count, *field shape)."""

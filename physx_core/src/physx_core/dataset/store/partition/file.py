@@ -41,6 +41,7 @@ class PartitionFile:
 
     Attributes:
         identity: Identity of the file.
+        capacity: Number of rows that fit in.
         data_offset: Offset of the first row.
         descriptor: The open file; -1 if it is closed.
         path: Its path once it is published.
@@ -57,6 +58,7 @@ class PartitionFile:
         digester: Helper[None],
     ) -> None:
         self.identity = identity
+        self.capacity = header.capacity
         self.data_offset = header.data_offset
         self.path = path
         self.committed: tuple[int, int, int] = Commit.unchecked(0)

@@ -2,10 +2,11 @@
 
 It holds contiguous datasets: ``data`` (capacity, *field shape); the scalar ``rows``, the number of
 committed rows; ``commits``, the records that show which rows have reached the disk; and
-``digests``, those of the blocks of rows. Its
-attributes state what it is part of; ``header`` repeats that, with a digest of everything that never
-changes. h5py creates all of it once, in memory; after that, rows are written at known file offsets,
-so that HDF5 never runs while samples arrive, and h5py can open the file at any time.
+``digests``, those of the blocks of rows. If the field has a free axis, its rows are the entries of
+all samples, end to end; where those of each end is in a file of its own. Its attributes state what
+it is part of; ``header`` repeats that, with a digest of everything that never changes. h5py creates
+all of it once, in memory; after that, rows are written at known file offsets, so that HDF5 never
+runs while samples arrive, and h5py can open the file at any time.
 """
 
 from __future__ import annotations
@@ -203,7 +204,7 @@ def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
         digests = h5d.create(
             file.id, b"digests", h5t.STD_U64LE, h5s.create_simple((blocks,)), layout
         )
-        space = h5s.create_simple((capacity, *(field.shape or ())))
+        space = h5s.create_simple((capacity, *field.entry_shape))
         layout.set_alloc_time(h5d.ALLOC_TIME_LATE)  # after everything that HDF5 needs
         data = h5d.create(file.id, b"data", kind, space, layout)
         if capacity * field.nbytes:

@@ -89,7 +89,7 @@ class Segment:
         """Yield all rows in blocks of about a megabyte, each valid until the next."""
         row_nbytes = self.field.nbytes
         count = rows_per_block(row_nbytes)
-        buffer = np.empty((min(count, self.rows), *(self.field.shape or ())), self.field.dtype)
+        buffer = np.empty((min(count, self.rows), *self.field.entry_shape), self.field.numpy_dtype)
         file, offset = self.open()
         with file:
             for first in range(0, self.rows, count):

@@ -14,6 +14,7 @@ from physx_core.normalization import (
     compute_normalization,
     measured,
 )
+from physx_core.packing import join
 from physx_core.pipelines.campaign_writer import CampaignWriter
 from physx_core.pipelines.learning.batches.feeder import Feeder
 from physx_core.pipelines.learning.batches.row_statistics import RowStatistics
@@ -217,9 +218,11 @@ class Blocks:
         return {name: view[name][start:stop] for name in self._dataset.fields(self._mode)}
 
     def _add(self, rows: Batch) -> None:
-        for of in measured(self._normalize, self._dataset.fields(self._mode)):
+        fields = self._dataset.fields(self._mode)
+        entries = {n: join(of, rows[n].tolist())[0] for n, of in fields.items() if of.free_axis}
+        for of in measured(self._normalize, fields):
             statistics = self._statistics.setdefault(of, RunningStatistics(of.pooled))
-            statistics.update(of.of(rows))
+            statistics.update(of.of({**rows, **entries}))
 
 
 def _part(rows: Batch, part: slice) -> Batch:
@@ -227,4 +230,4 @@ def _part(rows: Batch, part: slice) -> Batch:
 
 
 def _counted(fields: Mapping[str, Field]) -> list[str]:
-    return [name for name, of in fields.items() if of.has_statistics]
+    return [name for name, of in fields.items() if of.has_statistics and not of.free_axis]

@@ -34,7 +34,9 @@ class RowStore:
             data_type: Floating-point type of the batches.
         """
         kinds = {
-            name: (fields[name].shape or (), fields[name].converted_dtype(np.dtype(data_type)))
+            name: fields[name].row_kind
+            if fields[name].free_axis
+            else (fields[name].entry_shape, fields[name].converted_dtype(np.dtype(data_type)))
             for name in names
             if name in fields
         }

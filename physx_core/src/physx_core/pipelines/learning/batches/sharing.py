@@ -82,7 +82,7 @@ def _to_plain(block: Block) -> dict[str, Any]:
 def _to_block(plain: dict[str, Any]) -> Block:
     fields = {one["name"]: Field.from_dict(one) for one in plain["fields"]}
     normalization = {
-        name: Normalization.from_arrays(arrays, fields[name].shape or ())
+        name: Normalization.from_arrays(arrays, fields[name].entry_shape)
         for name, arrays in plain["normalization"].items()
     }
     return Block({}, fields, normalization)
