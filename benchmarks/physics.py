@@ -20,13 +20,13 @@ from pathlib import Path
 import gymnasium
 import numpy as np
 from measure import claim, finish, rates, report
+from truth import GRAVITY, table, threshold
 
 import physx_gym  # noqa: F401 - registers the environments
 from physx_core import plugins
 from physx_sim import Box, Ground, Robot, Simulation, World, Wrench
 
 SOLVERS = {"dart": ("nsgs", "fbf", "dantzig"), "pinocchio": ("pgs",), "mujoco": ("newton",)}
-GRAVITY = 9.81
 PAIRS = [(engine, solver) for engine, solvers in SOLVERS.items() for solver in solvers]
 ANGLES = (0, 15, 30, 45)
 FRICTION = 0.3
@@ -143,18 +143,6 @@ def tumbling(engine: str, integrator: str) -> float:
         simulation.step(10_000)
         w = simulation.velocities()
         return float(abs(w[3:] @ mass[3:, 3:] @ w[3:] / (v[3:] @ mass[3:, 3:] @ v[3:]) - 1))
-
-
-def threshold(holds: Callable[[float], bool], theory: float) -> float:
-    """Return the relative error of the value at which something starts or ceases to hold."""
-    low, high = 0.85, 1.15
-    below = holds(theory * low)
-    if holds(theory * high) == below:
-        return math.inf
-    while high - low > 2e-3:
-        middle = 0.5 * (low + high)
-        low, high = (middle, high) if holds(theory * middle) == below else (low, middle)
-    return abs(0.5 * (low + high) - 1)
 
 
 # Time -------------------------------------------------------------------------------------------
@@ -287,6 +275,9 @@ def main() -> None:
             error = tumbling(engine, integrator)
             print(f"{engine}, {integrator}: energy of a tumbling box after 10 s: {error:.1e}")
         met.append(claim(f"{engine}: the same, rk4", error, at_most=1e-3))
+    print()
+    for engine, share in table(tuple(SOLVERS)).items():
+        met.append(claim(f"{engine}: worst case, of its limit", share, at_most=1.0))
     times()
     print()
     met.append(claim("Ant-v0, pinocchio / dart", environments(), at_least=0.27))

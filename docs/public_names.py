@@ -49,6 +49,7 @@ FACES = {
     "physx_remote": ("", "errors"),
     "physx_cluster": ("", "sweep", "errors"),
     "physx_report": ("", "drawing", "errors"),
+    "physx_agree": ("",),
 }
 MODULES = [f"{root}.{name}".rstrip(".") for root, names in FACES.items() for name in names]
 

@@ -85,7 +85,6 @@ existing_dir = "sessions/cloth"
 normalize = { x_next = "increment", v_next = "increment" }
 
 [training.dataset.view]
-test_fold = 1
 window.x = { field = "x", at = 0 }
 window.v = { field = "v", at = 0 }
 window.wind_next = { field = "wind", at = 1 }
@@ -166,9 +165,9 @@ physx generate toy/spring --mode validation --batch-nb 10 --batch-size 40 --envi
 physx train --config online.toml --session-name online --no-new-session --quiet
 
 python learn.py
-physx evaluate sessions/policy --env physx/Cartpole-v0 --env-kwargs simulation_duration_max=3.0 \\
+physx evaluate sessions/policy --env physx/Cartpole-v0 --env-kwargs simulation_duration_max=2.0 \\
       --film sessions/policy/film.webp
-physx evaluate sessions/policy --env physx/Cartpole-v0 --env-kwargs simulation_duration_max=3.0 \\
+physx evaluate sessions/policy --env physx/Cartpole-v0 --env-kwargs simulation_duration_max=2.0 \\
       --backend pinocchio
 
 physx generate toy/spring --batch-nb 20 --batch-size 25 --environment.seed 1 \\

@@ -14,6 +14,7 @@ PACKAGES = (
     "gym",
     "remote",
     "cluster",
+    "agree",
 )
 
 

@@ -102,6 +102,10 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     physx_core.View: {"folds": 4, "fold": 1, "test_fold": 2, "fold_seed": 3, "stride": 2}
     | {"sources": {"a": 0.5}},
     EpisodeRecord: {"episode": 3, "rows": 2, "seconds": 0.5},
+    physx_sim.BodySettings: {"mass": 2.5, "friction": 0.25, "hidden": True}
+    | {"position": (0.5, 1.0, 2.0), "orientation": (0.0, 0.0, 0.0, 1.0)}
+    | {"velocity": (0.5, 1.0, 2.0), "angular_velocity": (0.5, 1.0, 2.0)}
+    | {"surface_velocity": (0.5, 1.0, 2.0)},
     NetworkConfig: {"lr": 0.5, "which_network": 2, "save_best": True},
     physx_core.DataGeneration: {"environment_config": ENVIRONMENT, "batch_nb": 2, "batch_size": 4},
     physx_core.Training: {"network_config": NetworkConfig(), "epoch_nb": 2, "batch_size": 4}
@@ -139,6 +143,7 @@ RECORDS = {
     *("UrdfShape", "Episode", "StepperState", "Result", "Comparison", "Trial", "Normalization"),
     *("CollisionShape", "Joint", "MovableBody", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
     "Bond",
+    *("Agreement", "Cause", "Figure", "Parting", "Ranking"),
     *("Kind", "Format", "Table", "Section", "RolloutResult", "Unseen"),
 }
 ABSTRACT = {"Attachment", "Pipeline", "RaySensor", "Sensor"}

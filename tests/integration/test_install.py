@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.processes]
 PACKAGES = (
     *("physx_core", "physx_testing", "physx_sim", "physx_formats", "physx_dart", "physx_mujoco"),
     *("physx_torch", "physx_rerun", "physx_gym", "physx_remote", "physx_cluster"),
-    "physx_report",
+    *("physx_report", "physx_agree"),
 )
 PHYSX = ("-m", "physx_core")
 GENERATE = "--batch-nb 2 --batch-size 10"
@@ -235,6 +235,13 @@ def test_report_writes_a_page(python, add, run):
     add("physx_report")
     generate(run, python)
     assert "report.html" in run(*PHYSX, "report", "sessions/data_generation", python=python).stdout
+
+
+@pytest.mark.faults
+def test_agree_says_which_engine_is_missing(python, add, run):
+    add("physx_agree")
+    missing = run(*PHYSX, "agree", "physx_gym:physx/Cartpole-v0", python=python, ok=False)
+    assert missing.returncode == 1 and "physx_dart" in missing.stderr
 
 
 @pytest.mark.faults

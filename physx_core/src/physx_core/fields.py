@@ -143,7 +143,7 @@ class Field:
 
     @cached_property
     def row_kind(self) -> tuple[tuple[int, ...], np.dtype[Any]]:
-        """Shape and type of a row in an array of rows: with a free axis, an object, an array."""
+        """Shape and type of a row in an array of rows, an object with a free axis."""
         return ((), np.dtype(object)) if self.free_axis else (self.entry_shape, self.numpy_dtype)
 
     @cached_property

@@ -10,8 +10,10 @@ from .blocks import PDAdapter as PDAdapter
 from .blocks import PDController as PDController
 from .blocks import QuantityObserver as QuantityObserver
 from .bridge.gym_environment import GymEnvironment as GymEnvironment
+from .bridge.make_env import make_env as make_env
 from .bridge.plain import plain as plain
 from .bridge.policy import Policy as Policy
+from .cli.evaluate import robot_of as robot_of
 from .env.layers.block_layers import ControlledEnv as ControlledEnv
 from .env.layers.block_layers import ObservedEnv as ObservedEnv
 from .env.layers.composed import ComposedEnv as ComposedEnv

@@ -5,6 +5,8 @@ A step is repeated with adjusted torques until it ends with the desired velociti
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import mujoco
 import numpy as np
 
@@ -19,10 +21,16 @@ _MOST, _EXACT = 30, 1e-10
 
 
 class Drives:
-    """The joints whose velocities are controlled or limited; `idle` if there are none."""
+    """The joints whose velocities are controlled or limited; `idle` if there are none.
 
-    def __init__(self, layout: Layout, running: Running) -> None:
-        self._running, modes = running, np.array(layout.modes)
+    Args:
+        layout: The joints.
+        running: The world.
+        step: Simulates a physics step.
+    """
+
+    def __init__(self, layout: Layout, running: Running, step: Callable[[], None]) -> None:
+        self._running, self._step, modes = running, step, np.array(layout.modes)
         self._driven = modes != "force"
         self._places = np.array(list(layout.velocity_index.values()), np.intp)
         self._fastest = np.where(self._driven, np.inf, layout.max_velocity)
@@ -39,7 +47,7 @@ class Drives:
         for _ in range(_MOST):
             data.qfrc_applied[at] = np.where(driven, 0.0, wanted) + torques
             data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = q, v, warm
-            mujoco.mj_step(model, data)
+            self._step()
             now = data.qvel[at]
             side = -np.copysign(1.0, np.where(torques, torques, -now))  # of a limit
             active = driven | (side * now > self._fastest) | (torques != 0)

@@ -40,6 +40,9 @@ _ALL, _STATIC, _MOVING, _OWN = (1 << 31) - 1, 1, 2, 2
 """Bits of MuJoCo's collision masks: static, moving and, from `_OWN` on, one for each robot."""
 _STEPS, _DAMPING, _IMPEDANCE = 2.0, 2.0, (0.9999, 0.9999, 0.001, 0.5, 2.0)
 """Time constant in steps, damping ratio, and impedance of the nearly rigid constraints."""
+LAG = 2 * _STEPS * _DAMPING**2 + 1
+"""Steps of a motion, by which a contact lags behind what pushes it: damping by stiffness, and the
+step itself."""
 SPARE = 16
 """Number of attachments that a world can get at a time in addition to those that it starts with."""
 _DEEP = 10.0
@@ -54,13 +57,56 @@ class WorldModel:
         model: MuJoCo's model.
         bodies: The model's body for each link and object, in the order of `Layout.bodies`.
         owners: For each shape of the model, the index of its owner in `Layout.names`.
+        made: For each shape of the model, its number in the order in which they were added.
+        statics: The model's body for each static body.
         spare: Equality constraints for attachments.
     """
 
     model: Any
     bodies: Index
     owners: Index
+    made: Index
+    statics: Index
     spare: range
+
+    def write_masses(self, parts: Parts) -> None:
+        """Write the masses and moments of inertia of all links and objects."""
+        model, at = self.model, self.bodies
+        links = [body for movable in parts.movables for body in movable.model.bodies]
+        model.body_mass[at] = [body.mass for body in links]
+        model.body_inertia[at] = [np.linalg.eigh(body.inertia)[0] for body in links]
+
+    def derive(self) -> None:
+        """Compute what MuJoCo derives from what was written, also from which shapes may touch."""
+        mujoco.mj_setConst(self.model, mujoco.MjData(self.model))
+
+    def write_frictions(self, parts: Parts) -> None:
+        """Write the coefficients of friction of all shapes.
+
+        Of two shapes, MuJoCo uses the friction of the one with the higher priority.
+        """
+        shapes = [shape for movable in parts.movables for shape in movable.model.shapes]
+        frictions = [shape.friction for shape in shapes]
+        for owner, static in enumerate(parts.statics, len(self.bodies)):
+            frictions += [static.what.friction] * int((self.owners == owner).sum())
+        ranks = {mu: rank for rank, mu in enumerate(sorted(set(frictions), reverse=True))}
+        self.model.geom_friction[:, 0] = np.array(frictions)[self.made]
+        self.model.geom_priority[:] = np.array([ranks[mu] for mu in frictions], int)[self.made]
+
+    def write_heights(self, parts: Parts) -> None:
+        """Write the heights of the ground."""
+        other = ModelBuilder(parts).ground_alone()
+        (mine,) = (self.model.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD).nonzero()[0]
+        (its,) = (other.geom_type == mujoco.mjtGeom.mjGEOM_HFIELD).nonzero()[0]
+        for name in ("geom_pos", "geom_size", "geom_aabb", "geom_rbound"):
+            getattr(self.model, name)[mine] = getattr(other, name)[its]
+        trees = [(self.model, self.model.geom_bodyid[mine]), (other, other.geom_bodyid[its])]
+        to, source = (
+            model.bvh_aabb[model.body_bvhadr[body] :][: model.body_bvhnum[body]]
+            for model, body in trees
+        )
+        to[:] = source
+        self.model.hfield_size[:], self.model.hfield_data[:] = other.hfield_size, other.hfield_data
 
 
 class ModelBuilder:
@@ -70,49 +116,61 @@ class ModelBuilder:
         self._parts, self._spec = parts, mujoco.MjSpec()
         self._spec.compiler.degree = False
         self._hard = {"solref": (_STEPS * parts.world.period, _DAMPING), "solimp": _IMPEDANCE}
-        self._moments: list[Vector] = []
-        self._masses: list[float] = []
+        self._count = 0
         self._owners: list[int] = []
-        shapes = [shape for movable in parts.movables for shape in movable.model.shapes]
-        frictions = {float(x.friction) for x in (*shapes, *(each.what for each in parts.statics))}
-        # Of two shapes, MuJoCo uses the friction of the one with the higher priority.
-        self._priorities = {mu: i for i, mu in enumerate(sorted(frictions, reverse=True))}
 
     def build(self) -> WorldModel:
         """Return the model, with MuJoCo's default options."""
         for place, movable in enumerate(self._parts.movables):
             self._add_movable(place, movable)
-        count = len(self._moments)
-        if self._parts.world.contacts != "none":
-            for place, static in enumerate(self._parts.statics):
-                self._add_static(static, count + place)
+        count, touching = self._count, self._parts.world.contacts != "none"
+        statics = self._parts.statics if touching else ()
+        for place, static in enumerate(statics):
+            self._add_static(static, place, count)
         coupled, spare = len(self._spec.equalities), len(self._parts.attachments) + SPARE
         for _ in range(spare):
             kind, body = mujoco.mjtEq.mjEQ_WELD, mujoco.mjtObj.mjOBJ_BODY
             added = self._spec.add_equality(type=kind, objtype=body, name1="0", name2="world")
             added.active, added.solref, added.solimp = False, *self._hard.values()
-        try:
-            model = self._spec.compile()
-        except ValueError as error:
-            raise ModelError(f"MuJoCo cannot load this world: {error}.") from error
+        model = self._compile()
         bodies = np.array([model.body(str(place)).id for place in range(count)], np.intp)
-        owners = np.array(
-            [self._owners[int(model.geom(i).name)] for i in range(model.ngeom)], np.intp
+        made = np.array([int(model.geom(i).name) for i in range(model.ngeom)], np.intp)
+        names = [f"static {place}" for place in range(len(statics))]
+        world = WorldModel(
+            model,
+            bodies,
+            np.array(self._owners, np.intp)[made],
+            made,
+            np.array([model.body(name).id for name in names], np.intp),
+            range(coupled, coupled + spare),
         )
-        model.body_mass[bodies], model.body_inertia[bodies] = self._masses, self._moments
-        mujoco.mj_setConst(model, mujoco.MjData(model))
+        world.write_masses(self._parts)
+        if len(made):
+            world.write_frictions(self._parts)
+        world.derive()
         first = 0
         for movable in self._parts.movables:
             last = first + len(movable.model.links)
             check_loaded("mujoco", movable, _loaded(model, movable, bodies[first:last]))
             first = last
-        return WorldModel(model, bodies, owners, range(coupled, coupled + spare))
+        return world
+
+    def ground_alone(self) -> Any:
+        """Return a model of the ground without anything else."""
+        self._add_static(self._parts.statics[0], 0, 0)
+        return self._compile()
+
+    def _compile(self) -> Any:
+        try:
+            return self._spec.compile()
+        except ValueError as error:
+            raise ModelError(f"MuJoCo cannot load this world: {error}.") from error
 
     # Robots and objects ---------------------------------------------------------------------
 
     def _add_movable(self, place: int, movable: MovableBody) -> None:
         added: list[Any] = []
-        first = len(self._moments)
+        first = self._count
         for body in movable.model.bodies:
             if body.parent < 0:
                 turn = to_matrix(movable.orientation)
@@ -139,13 +197,12 @@ class ModelBuilder:
 
     def _add_body(self, parent: Any, body: RigidBody, position: Vector, turn: Vector) -> Any:
         """Add a link; its mass, which may be 0, and its moments of inertia are set later."""
-        new = parent.add_body(name=str(len(self._moments)), pos=position, quat=quaternion_of(turn))
-        moments, axes = np.linalg.eigh(body.inertia)
+        new = parent.add_body(name=str(self._count), pos=position, quat=quaternion_of(turn))
+        _, axes = np.linalg.eigh(body.inertia)
         axes[:, 2] *= np.linalg.det(axes)  # a rotation, not a reflection
         new.explicitinertial, new.mass, new.inertia = True, 1.0, (1.0, 1.0, 1.0)
         new.ipos, new.iquat = body.center, quaternion_of(axes)
-        self._masses.append(body.mass)
-        self._moments.append(moments)
+        self._count += 1
         return new
 
     def _couple(self, mimic: Mimic, follower: str, leader: str) -> None:
@@ -182,37 +239,38 @@ class ModelBuilder:
 
     # Shapes ---------------------------------------------------------------------------------
 
-    def _add_static(self, static: Static, owner: int) -> None:
-        what, world = static.what, self._spec.worldbody
+    def _add_static(self, static: Static, place: int, first: int) -> None:
+        """Add an object or the ground; the index of its owner counts from `first`."""
+        what, owner = static.what, first + place
+        body = self._spec.worldbody.add_body(name=f"static {place}")
+        body.explicitinertial, body.mass, body.inertia = True, 1.0, (1.0, 1.0, 1.0)
         more: dict[str, Any] = {"contype": _STATIC | _MOVING, "conaffinity": 0}
         if isinstance(what, CollisionShape):
-            turn = quaternion_of(to_matrix(static.orientation))
-            frame = world.add_frame(pos=static.position, quat=turn)
-            self._add_shape(world, what, owner, **more).set_frame(frame)
+            body.mocap, body.pos = True, static.position
+            body.quat = quaternion_of(to_matrix(static.orientation))
+            self._add_shape(body, what, owner, **more)
         elif isinstance(what, HeightField):
-            self._add_heights(what, owner, **more)
+            self._add_heights(body, what, owner, **more)
         else:
             plane = what if isinstance(what, Ground) else Ground()
             quat, normal = np.zeros(4), np.array(plane.normal)
             mujoco.mju_quatZ2Vec(quat, normal)
             pose = {"size": (0.0, 0.0, 1.0), "pos": plane.height * normal, "quat": quat}
-            kind = mujoco.mjtGeom.mjGEOM_PLANE
-            self._add_geom(world, kind, owner, what.friction, **pose, **more)
+            self._add_geom(body, mujoco.mjtGeom.mjGEOM_PLANE, owner, **pose, **more)
             for center, size in what.boxes() if isinstance(what, Stairs) else ():
                 pose = {"size": 0.5 * np.array(size), "pos": center}
-                self._add_geom(world, _SHAPES["box"], owner, what.friction, **pose, **more)
+                self._add_geom(body, _SHAPES["box"], owner, **pose, **more)
 
-    def _add_heights(self, field: HeightField, owner: int, **more: Any) -> None:
+    def _add_heights(self, body: Any, field: HeightField, owner: int, **more: Any) -> None:
         (rows, columns), (x, y) = field.heights.T.shape, field.corner()
         low, high = float(field.heights.min()), float(field.heights.max())
         half = 0.5 * (np.array(field.heights.shape) - 1) * field.spacing
         added = self._spec.add_hfield(name="ground", nrow=rows, ncol=columns)
         added.size, added.userdata = (*half, max(high - low, 1e-9), _DEEP), field.heights.T.ravel()
         more |= {"pos": (x + half[0], y + half[1], low), "hfieldname": "ground"}
-        kind = mujoco.mjtGeom.mjGEOM_HFIELD
-        self._add_geom(self._spec.worldbody, kind, owner, field.friction, **more)
+        self._add_geom(body, mujoco.mjtGeom.mjGEOM_HFIELD, owner, **more)
 
-    def _add_shape(self, body: Any, shape: CollisionShape, owner: int, **more: Any) -> Any:
+    def _add_shape(self, body: Any, shape: CollisionShape, owner: int, **more: Any) -> None:
         more |= {"pos": shape.position, "quat": quaternion_of(shape.rotation)}
         if shape.mesh is not None:
             more["meshname"] = f"mesh {len(self._owners)}"
@@ -222,13 +280,13 @@ class ModelBuilder:
             halves = 0.5 * np.array(shape.size)
             halves[0] *= 1 if shape.kind == "box" else 2
             more["size"] = [*halves, 0.0, 0.0][:3]
-        return self._add_geom(body, _SHAPES[shape.kind], owner, shape.friction, **more)
+        self._add_geom(body, _SHAPES[shape.kind], owner, **more)
 
-    def _add_geom(self, body: Any, kind: Any, owner: int, friction: float, **more: Any) -> Any:
-        more |= {"name": str(len(self._owners)), "friction": (float(friction), 0.0, 0.0)}
+    def _add_geom(self, body: Any, kind: Any, owner: int, **more: Any) -> None:
+        """Add a shape, without friction."""
+        more |= {"name": str(len(self._owners)), "friction": (0.0, 0.0, 0.0)}
         self._owners.append(owner)
-        priority = self._priorities[float(friction)]
-        return body.add_geom(type=kind, condim=3, priority=priority, **self._hard, **more)
+        body.add_geom(type=kind, condim=3, **self._hard, **more)
 
 
 def _loaded(model: Any, movable: MovableBody, bodies: Index) -> LoadedRobot:

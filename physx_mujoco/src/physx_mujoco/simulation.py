@@ -5,15 +5,16 @@ Steps are semi-implicit Euler, with implicit damping and springs (MuJoCo's integ
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import mujoco
 import numpy as np
 
 from physx_core.errors import UnknownOptionError
-from physx_core.typing import Records
+from physx_core.typing import Records, Vector
 from physx_mujoco.algorithms import MujocoAlgorithms
+from physx_mujoco.contact_rows import ContactRows
 from physx_mujoco.drives import Drives
 from physx_mujoco.model import SPARE, ModelBuilder, WorldModel, quaternion_of
 from physx_mujoco.robot import MujocoRobot, Running
@@ -90,7 +91,9 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
             MujocoRobot(movable, part, self._world.bodies[part.bodies], self._running)
             for movable, part in zip(parts.movables, layout.parts.values(), strict=True)
         ]
-        self._drives = Drives(layout, self._running)
+        self._contact_rows = ContactRows(self._world, data)
+        self._drives = Drives(layout, self._running, self._contact_rows.step)
+        self._touches = model.geom_contype.copy(), model.geom_conaffinity.copy()
         super().__init__(parts, robots, () if world.integrator == "euler" else RK4_LACKS)
 
     def _check_features(self, parts: Parts) -> None:
@@ -122,18 +125,42 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
 
     def _run(self, n: int) -> None:
         running, data = self._running, self._running.data
-        if self._drives.idle:
+        if self._drives.idle and not self._contact_rows.active:
             if n > 1:
                 mujoco.mj_step(running.model, data, n - 1)
             running.positions[:], running.velocities[:] = data.qpos, data.qvel
             mujoco.mj_step(running.model, data)
-        else:
-            for _ in range(n):
+            return
+        for _ in range(n):
+            if self._drives.idle:
+                running.positions[:], running.velocities[:] = data.qpos, data.qvel
+                self._contact_rows.step()
+            else:
                 self._drives.step()
 
     def change_gravity(self, gravity: tuple[float, ...]) -> None:
         """Change the gravity in MuJoCo."""
         self._running.model.opt.gravity[:] = gravity
+
+    def change_parts(self, before: Parts) -> None:
+        """Take over masses, friction, and ground."""
+        self._world.write_masses(self.parts)
+        if len(self._world.made):
+            self._world.write_frictions(self.parts)
+        if self.parts.world.ground is not before.world.ground:
+            self._world.write_heights(self.parts)
+        self._world.derive()
+
+    def hide(self, bodies: Sequence[int]) -> None:
+        """Let only bodies that are not among these touch."""
+        model, shown = self._running.model, ~np.isin(self._world.owners, bodies)
+        model.geom_contype[:], model.geom_conaffinity[:] = (mask * shown for mask in self._touches)
+        self._world.derive()
+
+    def place_static(self, static: int, pose: Vector, velocity: Vector, surface: Vector) -> None:
+        """Place a static body for the next step."""
+        if len(self._world.statics):
+            self._contact_rows.place(static, pose, velocity, surface)
 
     def bind(self, number: int, bond: Bond) -> None:
         """Hold two bodies together until `unbind`.
@@ -169,6 +196,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
     def clear_warm_start(self) -> None:
         """Make the state alone determine what follows."""
         self._running.data.qacc_warmstart[:] = 0.0
+        self._contact_rows.expect_depth()
 
     def read_contacts(self) -> Records:
         """Return the contacts of the last physics step."""
@@ -193,7 +221,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         """Free the world; further calls do nothing."""
         if not self._closed:
             super().close()
-            del self._running, self._drives, self._world
+            del self._running, self._drives, self._contact_rows, self._world
 
 
 def _set_options(model: mujoco.MjModel, world: World) -> None:
@@ -205,3 +233,4 @@ def _set_options(model: mujoco.MjModel, world: World) -> None:
     option.cone, option.impratio = mujoco.mjtCone.mjCONE_ELLIPTIC, 10.0
     option.iterations = world.iterations or option.iterations
     option.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
+    option.enableflags |= mujoco.mjtEnableBit.mjENBL_SPECULATIVE

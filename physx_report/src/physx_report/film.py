@@ -23,7 +23,7 @@ MOST = 40
 """Largest number of pictures of a film."""
 _SECONDS = 0.1
 """Between two pictures of a film."""
-_LOOK = {"quality": 60, "method": 4}
+_LOOK = {"quality": 50, "method": 4}
 
 
 class Camera(Closeable):

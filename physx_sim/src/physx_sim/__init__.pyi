@@ -7,6 +7,7 @@ from .backend import Simulation as Simulation
 from .description.attachment import Attachment as Attachment
 from .description.attachment import Connect as Connect
 from .description.attachment import Weld as Weld
+from .description.body_settings import BodySettings as BodySettings
 from .description.ground import Ground as Ground
 from .description.ground import HeightField as HeightField
 from .description.ground import Stairs as Stairs

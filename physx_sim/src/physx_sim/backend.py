@@ -15,6 +15,8 @@ import numpy as np
 from physx_core import Closeable
 from physx_core.typing import Records, Vector
 from physx_sim.description.attachment import Attachment
+from physx_sim.description.body_settings import BodySettings
+from physx_sim.description.ground import HeightField
 from physx_sim.description.world import World
 from physx_sim.description.wrench import Wrench
 from physx_sim.errors import FeatureNotSupportedError
@@ -186,6 +188,37 @@ class Simulation(Closeable):
             SimulationError: If it is not three finite numbers.
         """
         raise self._lacks("gravity")
+
+    def set_body(self, name: str, settings: BodySettings) -> None:
+        """Change a body from now on; snapshots contain it.
+
+        Masses, friction, hidden objects: feature `changes`. Static objects that move, and surfaces
+        that do: feature `moving_statics`.
+
+        Args:
+            name: Name of a link, object, or static body, as in `Layout.names`.
+            settings: What to change; the rest stays.
+
+        Raises:
+            SimulationError: If there is no body with that name, or it does not have what changes.
+        """
+        raise self._lacks("changes")
+
+    def body_settings(self, name: str) -> BodySettings:
+        """Return what `set_body` changed about a body, with its current pose if that changes.
+
+        Raises:
+            SimulationError: If there is no body with that name.
+        """
+        raise self._lacks("changes")
+
+    def set_ground(self, field: HeightField) -> None:
+        """Replace a height field by another one with as many heights; snapshots contain it.
+
+        Raises:
+            SimulationError: If it is no height field, or the ground is none or has others.
+        """
+        raise self._lacks("changes")
 
     def attach(self, attachment: Attachment) -> int:
         """Hold two bodies together from now on; return the attachment's number for `detach`.

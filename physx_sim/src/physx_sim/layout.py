@@ -16,6 +16,8 @@ import numpy as np
 
 from physx_core.typing import Records, Vector
 from physx_sim.description.attachment import Attachment
+from physx_sim.description.body_settings import BodySettings
+from physx_sim.description.ground import HeightField
 from physx_sim.description.wrench import Wrench
 
 CONTACT = np.dtype(
@@ -163,6 +165,8 @@ class State:
         accelerations: Accelerations of the last step, shape (nv,); empty: none.
         contacts: Contacts of the last step, `CONTACT` records.
         gravity: Acceleration of free fall, in m/s², shape (3,); empty: that of the world.
+        bodies: What was changed about bodies since the simulation was built, by name.
+        ground: The height field that replaced the ground since then, if any.
     """
 
     positions: Vector
@@ -176,3 +180,5 @@ class State:
     accelerations: Vector = field(default_factory=lambda: np.zeros(0))
     contacts: Records = field(default_factory=lambda: np.zeros(0, CONTACT))
     gravity: Vector = field(default_factory=lambda: np.zeros(0))
+    bodies: Mapping[str, BodySettings] = field(default_factory=dict)
+    ground: HeightField | None = None

@@ -83,12 +83,11 @@ def states(layout, rng):
 class Theirs:
     """A file in MuJoCo itself, without what no engine of physx has."""
 
-    def __init__(self, path, layout, *, armature=True):
+    def __init__(self, path, layout):
         self.model = mujoco.MjModel.from_xml_path(str(path))
         self.model.opt.density = self.model.opt.viscosity = 0.0
         self.model.opt.gravity[:] = 0.0, 0.0, -9.81
         self.model.dof_frictionloss[:] = 0.0
-        self.model.dof_armature *= armature
         self.data, self.layout = mujoco.MjData(self.model), layout
         at = [self.model.joint(name.rpartition("/")[2]) for name in layout.joints]
         self.q, self.v = ([int(getattr(j, a)[0]) for j in at] for a in ("qposadr", "dofadr"))
@@ -154,7 +153,7 @@ def compare(path, engine):
     robots = without_friction(mjcf_robots(path, collisions="none"))
     with plugins.resolve("backend", engine).build(World(robots)) as simulation:
         layout, rng = simulation.layout, np.random.default_rng(0)
-        theirs = Theirs(path, layout, armature=engine != "dart")
+        theirs = Theirs(path, layout)
         named = [name for name in layout.bodies if name.rpartition("/")[2] in path.read_text()]
         named = [name for name in named if "." not in name and "world" not in name]
         for _ in range(3):

@@ -101,7 +101,7 @@ def test_meshes_are_hit_at_their_triangles(tmp_path):
     mesh = Mesh(name="mesh", path=path, scale=2.0, static=True, position=(1, 0, 0))
     world = World(objects=[mesh, Sphere(name="ball", radius=0.1, position=(9, 9, 9))])
     caster = Caster(read_parts(world))
-    poses = np.array([[9, 9, 9, 0, 0, 0, 1.0]])
+    poses = np.array([[9, 9, 9, 0, 0, 0, 1.0], [1, 0, 0, 0, 0, 0, 1.0]])
     begins = np.array([[1.5, 0.5, 5], [1.2, 0.2, -1], [2.9, 1.9, 5]])
     hits = caster.cast(begins, begins * (1, 1, 0) + [(0, 0, -1), (0, 0, 3), (0, 0, -1)], poses, ())
     assert hits["hit"].tolist() == [True, True, False]

@@ -11,6 +11,7 @@ from .result import Result as Result
 from .result import RivalResult as RivalResult
 from .result import RolloutResult as RolloutResult
 from .result import rollout_notes as rollout_notes
+from .stored import from_plain as from_plain
 from .stored import read_results as read_results
 from .stored import store_result as store_result
 from .sweep import SettingResult as SettingResult

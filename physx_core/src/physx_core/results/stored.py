@@ -32,7 +32,7 @@ def store_result(session: Path, result: Result) -> None:
     with contextlib.suppress(OSError, ValueError, AttributeError):  # none yet, or damaged
         for name, each in parse_json(files.read_content(session / FILE, _LARGEST)).items():
             with contextlib.suppress(*_WRONG):  # of another version: the new one matters more
-                known[name] = _typed(Result, each).to_plain()
+                known[name] = from_plain(Result, each).to_plain()
     try:
         text = json.dumps({**known, result.kind: result.to_plain()}, indent=1, allow_nan=False)
         files.replace(session / FILE, f"{text}\n".encode())
@@ -54,28 +54,36 @@ def read_results(session: str | Path) -> dict[str, Result]:
         return {}
     try:
         plain = parse_json(files.read_content(path, _LARGEST))
-        return {name: _typed(Result, each) for name, each in plain.items()}
+        return {name: from_plain(Result, each) for name, each in plain.items()}
     except (OSError, *_WRONG) as error:
         raise SessionError(f"{path} is damaged: {error}. Remove it.") from error
 
 
-def _typed(hint: Any, value: Any) -> Any:
-    """Return plain data as a value of a type, of those that results are made of."""
+def from_plain(hint: Any, value: Any) -> Any:
+    """Return plain data as a value of a type, of those that results are made of.
+
+    Args:
+        hint: A dataclass, or the type of one of its fields: plain types, sequences, mappings.
+        value: What `dataclasses.asdict` returned, as JSON keeps it; None stands for NaN.
+
+    Raises:
+        ValueError: If it is no such value; also TypeError, AttributeError or LookupError.
+    """
     kinds = typing.get_args(hint)
     match typing.get_origin(hint) or hint:
         case typing.Any:
             return value
         case made if dataclasses.is_dataclass(made):
             hints = typing.get_type_hints(made)
-            return made(**{name: _typed(hints[name], each) for name, each in value.items()})  # type: ignore[operator]
+            return made(**{name: from_plain(hints[name], each) for name, each in value.items()})  # type: ignore[operator]
         case made if made in (typing.Union, types.UnionType):
             [kind] = [kind for kind in kinds if kind is not type(None)]
-            return None if value is None else _typed(kind, value)
+            return None if value is None else from_plain(kind, value)
         case made if isinstance(made, type) and issubclass(made, Mapping):
-            return {str(name): _typed(kinds[1], each) for name, each in value.items()}
+            return {str(name): from_plain(kinds[1], each) for name, each in value.items()}
         case made if isinstance(made, type) and issubclass(made, Sequence) and kinds:
             each_kind = kinds if made is tuple else kinds[:1] * len(value)
-            return tuple(_typed(k, each) for k, each in zip(each_kind, value, strict=True))
+            return tuple(from_plain(k, each) for k, each in zip(each_kind, value, strict=True))
         case typing.Literal:
             if value not in kinds:
                 raise ValueError(f"{value!r} is none of {kinds}")

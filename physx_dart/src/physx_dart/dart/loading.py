@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from dartpy import dynamics, utils
 
-from physx_core.rotations import to_matrix
+from physx_core.rotations import to_matrix, to_rotation_vector
 from physx_core.typing import Vector
 from physx_sim import Ground, HeightField, Stairs
 from physx_sim.engines import (
@@ -71,6 +71,7 @@ def load_skeleton(movable: MovableBody, *, free: bool = False) -> dynamics.Skele
     with _silence():  # DART warns of links without mass
         for link in model.bodies:
             nodes.append(_add_link(skeleton, link, nodes, movable))
+        write_masses(skeleton, movable)
     moving = [
         node.getParentJoint()
         for link, node in zip(model.bodies, nodes, strict=True)
@@ -110,7 +111,6 @@ def _add_link(
         joint, body = skeleton.createFreeJointAndBodyNodePair()
     if place is not None:
         joint.setTransformFromParentBodyNode(place)
-    body.setInertia(dynamics.Inertia(link.mass, link.center, link.inertia))
     return body
 
 
@@ -137,18 +137,49 @@ def _configure(joint: Joint, native: Any) -> None:
 
 def attach_shapes(skeleton: dynamics.Skeleton, movable: MovableBody) -> None:
     """Attach the collision shapes of a robot or object to its bodies."""
-    links = {name: place for place, name in enumerate(movable.model.links)}
     for shape in movable.model.shapes:
-        body = skeleton.getBodyNode(links.get(shape.body, 0))  # an object has a single body
+        body = skeleton.getBodyNode(_link_of(shape, movable.model.links))
         _attach(body, _dart_shape(shape), shape, _transform(shape.position, shape.rotation))
 
 
+def write_masses(skeleton: dynamics.Skeleton, movable: MovableBody) -> None:
+    """Write the masses and moments of inertia of a robot's or object's links."""
+    for link, body in zip(movable.model.bodies, skeleton.getBodyNodes(), strict=True):
+        body.setInertia(dynamics.Inertia(link.mass, link.center, link.inertia))
+
+
 def static_skeleton(static: Static) -> dynamics.Skeleton:
-    """Return the immobile skeleton of a static shape or the ground."""
+    """Return the skeleton of a static shape or the ground, which moves only as prescribed."""
     skeleton = dynamics.Skeleton(static.name)
-    joint, body = skeleton.createWeldJointAndBodyNodePair()
-    rotation = to_matrix(static.orientation)
-    joint.setTransformFromParentBodyNode(_transform(static.position, rotation))
+    joint, body = skeleton.createFreeJointAndBodyNodePair()
+    joint.setActuatorType(dynamics.ActuatorType.VELOCITY)
+    place_skeleton(skeleton, np.array([*static.position, *static.orientation]), np.zeros(6))
+    attach_static(body, static)
+    return skeleton
+
+
+def place_skeleton(skeleton: dynamics.Skeleton, pose: Vector, velocity: Vector) -> None:
+    """Place a static skeleton for the next step.
+
+    Args:
+        skeleton: The skeleton.
+        pose: Position in m and quaternion x, y, z, w, shape (7,).
+        velocity: Linear and angular velocity in the world frame, in m/s and rad/s, shape (6,).
+    """
+    moves = bool(velocity.any())
+    skeleton.setMobile(moves)
+    joint, place = skeleton.getJoint(0), _transform(pose[:3], to_matrix(pose[3:]))
+    # A body that does not move is placed by its joint, to the last digit.
+    joint.setTransformFromParentBodyNode(np.eye(4) if moves else place)
+    turn = to_rotation_vector(pose[3:])
+    skeleton.setPositions(np.concatenate([turn, pose[:3]]) if moves else np.zeros(6))
+    skeleton.setVelocities(velocity[[3, 4, 5, 0, 1, 2]])
+    skeleton.setCommands(velocity[[3, 4, 5, 0, 1, 2]])
+
+
+def attach_static(body: dynamics.BodyNode, static: Static) -> None:
+    """Attach the shapes of a static body, instead of those that it has."""
+    body.removeAllShapeNodes()
     what = static.what
     if isinstance(what, CollisionShape):
         _attach(body, _dart_shape(what), what, _transform(what.position, what.rotation))
@@ -157,7 +188,6 @@ def static_skeleton(static: Static) -> dynamics.Skeleton:
     else:
         for size, place in _ground_boxes(what):
             _attach(body, dynamics.BoxShape(list(size)), what, place)
-    return skeleton
 
 
 def _ground_boxes(ground: Ground | Stairs) -> list[tuple[Sequence[float], Vector]]:
@@ -194,6 +224,20 @@ def _attach(
     aspect = node.createDynamicsAspect()
     aspect.setFrictionCoeff(float(material.friction))
     aspect.setRestitutionCoeff(float(material.restitution))
+
+
+def write_frictions(skeleton: dynamics.Skeleton, movable: MovableBody) -> None:
+    """Write the coefficients of friction of a robot's or object's shapes."""
+    nodes = [node for body in skeleton.getBodyNodes() for node in body.getShapeNodes()]
+    links = list(movable.model.links)
+    shapes = sorted(movable.model.shapes, key=lambda each: _link_of(each, links))
+    for node, shape in zip(nodes, shapes, strict=True):
+        node.getDynamicsAspect().setFrictionCoeff(float(shape.friction))
+
+
+def _link_of(shape: CollisionShape, links: Sequence[str]) -> int:
+    """Return the index of the link that has a shape; an object has a single link."""
+    return links.index(shape.body) if shape.body in links else 0
 
 
 def _dart_shape(shape: CollisionShape) -> Any:

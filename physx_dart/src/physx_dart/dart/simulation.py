@@ -7,7 +7,7 @@ position and velocity limits, servos, and Coulomb friction are constraints of it
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import dartpy
@@ -16,12 +16,18 @@ from dartpy import constraint
 from dartpy.simulation import CollisionDetectorType
 
 from physx_core.errors import UnknownOptionError, listed
+from physx_core.rotations import to_matrix
 from physx_core.typing import Records, Vector
 from physx_dart.dart.bonds import bonded
 from physx_dart.dart.contacts import ContactReader
-from physx_dart.dart.loading import attach_shapes, static_skeleton
+from physx_dart.dart.loading import (
+    attach_shapes,
+    attach_static,
+    place_skeleton,
+    static_skeleton,
+)
 from physx_dart.dart.skeleton import DartRobot
-from physx_sim import FEATURES, Simulation, World
+from physx_sim import FEATURES, HeightField, Simulation, World
 from physx_sim.engines import (
     RK4_LACKS,
     Algorithms,
@@ -47,6 +53,8 @@ _ISOTROPIC = ("nsgs", "fbf")
 _STATELESS = ("dart", "dantzig")
 """The detector and the solver that keep nothing between steps. With an iterative solver, impulses
 kept by this detector depend on memory addresses, so even a rerun differs."""
+_HEAVY = 20
+"""Ratio of masses above which the iterative solvers let a body sink into one below it."""
 _SWEEPS, _TOLERANCE = 50, 1e-6
 """Maximum iterations of ``nsgs`` per step, and the error in m/s that ends them. They start from
 the impulses of the last step, so more iterations mostly sharpen impacts (docs/contacts.md)."""
@@ -58,8 +66,9 @@ class DartBackend(RobotBackend):
     Contact solvers: ``nsgs`` (default) and ``fbf``, iterative with Coulomb's law; ``dantzig``, a
     direct solver whose friction is up to 41 % too strong between the axes, and too weak where it
     holds parts together (docs/contacts.md). Without contacts the default is ``dantzig``, which is
-    then exact. Detectors: ``bullet`` (default), ``ode``, ``fcl`` (without capsules), and ``dart``
-    (default for ``dantzig``), with which the other solvers are not bit-reproducible.
+    then exact. Detectors: ``bullet`` (default), ``ode`` (default on height fields), ``fcl``
+    (without capsules), and ``dart`` (default for ``dantzig``), with which the other solvers are not
+    bit-reproducible.
     """
 
     def build(self, world: World, seed: int | None = None) -> Simulation:
@@ -82,6 +91,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
         "exact_restore": "not with the detector `dart` and an iterative solver",
         "isotropic_friction": "not with the solver `dantzig`",
         "joint_wrenches": "not while anything is attached",
+        "moving_statics": "a surface that moves along itself pushes what touches its ends",
         "mimic": "what contacts, limits and servos change is corrected in the next step",
     }
 
@@ -97,7 +107,9 @@ class DartSimulation(RobotSimulation[DartRobot]):
         _warn_of_rotors(parts)
         touching = any(movable.model.shapes for movable in parts.movables)
         solver = world.solver or ("nsgs" if touching else "dantzig")
-        detector = world.detector or ("dart" if solver == "dantzig" else "bullet")
+        detector = world.detector or _detector(world, solver)
+        if solver in _ISOTROPIC and world.contacts == "all":
+            _warn_of_ratios(parts)
         self._check_features(parts, detector)
         self._world = _new_world(world, detector, solver)
         self._stateless = (detector, solver) == _STATELESS
@@ -112,7 +124,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
         bodies = [body for robot in robots for body in robot.bodies]
         bodies += [skeleton.getBodyNode(0) for skeleton in self._statics]
         self._nodes, self._bonds = bodies, dict[int, tuple[Bond, Any]]()
-        immobile = [[each.getBodyNode(0)] for each in self._statics]
+        immobile = [[body] for body in bodies[len(bodies) - len(self._statics) :]]
         immobile += [robot.bodies for robot in robots if not robot.movable.moves]
         _disable_contacts(self._world, immobile)
         if world.contacts == "static":
@@ -170,6 +182,29 @@ class DartSimulation(RobotSimulation[DartRobot]):
         for robot in self._robots:
             robot.change_gravity(gravity)
 
+    def change_parts(self, before: Parts) -> None:
+        """Take over masses, friction, and ground."""
+        for robot, old, new in zip(self._robots, before.movables, self.parts.movables, strict=True):
+            if new is not old:
+                robot.change(new)
+        for skeleton, was, static in zip(
+            self._statics, before.statics, self.parts.statics, strict=False
+        ):
+            if static is not was:
+                attach_static(skeleton.getBodyNode(0), static)
+
+    def hide(self, bodies: Sequence[int]) -> None:
+        """Let only bodies that are not among these touch."""
+        for place, node in enumerate(self._nodes):
+            node.setCollidable(place not in bodies)
+
+    def place_static(self, static: int, pose: Vector, velocity: Vector, surface: Vector) -> None:
+        """Place a static body for the next step."""
+        if self._statics:
+            moved = velocity.copy()
+            moved[:3] += to_matrix(pose[3:]) @ surface
+            place_skeleton(self._statics[static], pose, moved)
+
     def bind(self, number: int, bond: Bond) -> None:
         """Hold two bodies together until `unbind`."""
         nodes = [self._nodes[body] if body >= 0 else None for body in bond.bodies]
@@ -225,6 +260,32 @@ class DartSimulation(RobotSimulation[DartRobot]):
             super().close()
             del self._step_world, self._reader, self._statics, self._world
             del self._nodes, self._bonds, self._prepared
+
+
+def _detector(world: World, solver: str) -> str:
+    """Return the default detector: of all, only ``ode`` holds boxes on height fields."""
+    if isinstance(world.ground, HeightField):
+        return "ode"
+    return "dart" if solver == "dantzig" else "bullet"
+
+
+def _warn_of_ratios(parts: Parts) -> None:
+    """Warn once of bodies that are so much heavier than others that these do not hold them."""
+    masses = {
+        movable.name: sum(body.mass for body in movable.model.bodies)
+        for movable in parts.movables
+        if not movable.fixed_base and movable.model.shapes
+    }
+    if not masses:
+        return
+    light, heavy = min(masses, key=masses.__getitem__), max(masses, key=masses.__getitem__)
+    if masses[heavy] > _HEAVY * masses[light]:
+        warn_once(
+            f'"{heavy}" is {masses[heavy] / masses[light]:.0f} times as heavy as "{light}". Where '
+            "it stands on it, it sinks in on DART's default solver. "
+            'World(solver="dantzig") holds it, with friction that depends on the direction; so do '
+            "the engines pinocchio and mujoco."
+        )
 
 
 def _warn_of_rotors(parts: Parts) -> None:

@@ -17,7 +17,7 @@ from physx_core.rotations import (
 )
 from physx_core.typing import Vector
 from physx_dart.dart.drives import Drives
-from physx_dart.dart.loading import load_skeleton
+from physx_dart.dart.loading import load_skeleton, write_frictions, write_masses
 from physx_sim import World
 from physx_sim.engines import MovableBody, RobotEngine, base_accelerations, rk4_step
 
@@ -33,6 +33,7 @@ class DartRobot(RobotEngine):
 
     def __init__(self, movable: MovableBody, world: World) -> None:
         super().__init__(movable)
+        self._described = movable
         period, gravity = world.period, world.gravity
         self._period = period
         self.skeleton = load_skeleton(movable)
@@ -58,6 +59,13 @@ class DartRobot(RobotEngine):
     def change_gravity(self, gravity: tuple[float, ...]) -> None:
         """Change the gravity in the dynamics of other states."""
         self._gravity, self._made_shadow = gravity, None
+
+    def change(self, movable: MovableBody) -> None:
+        """Take over the masses and the friction of a description."""
+        write_masses(self.skeleton, movable)
+        if self.skeleton.getNumShapeNodes():
+            write_frictions(self.skeleton, movable)
+        self._described, self._made_shadow = movable, None
 
     def prepare(self) -> None:
         """Write what DART is told anew before each step."""
@@ -199,7 +207,7 @@ class DartRobot(RobotEngine):
     @property
     def _shadow(self) -> Any:
         if self._made_shadow is None:
-            self._made_shadow = load_skeleton(self.movable, free=True)
+            self._made_shadow = load_skeleton(self._described, free=True)
             self._made_shadow.setGravity(list(self._gravity))
             self._made_shadow.setTimeStep(self._period)
             for dof, armature in enumerate(self.resistance.armature):

@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from physx_core.typing import Records, Vector
 from physx_dart.pinocchio.models import twists_of
-from physx_dart.pinocchio.surfaces import Plane, surface_of
-from physx_sim import CONTACT
+from physx_dart.pinocchio.surfaces import Heights, Plane, surface_of
+from physx_sim import CONTACT, HeightField
 from physx_sim.engines import CollisionShape, MovableBody, Static
 from physx_sim.errors import FeatureNotSupportedError
 
@@ -25,8 +25,8 @@ MARGIN = 1e-4
 """Distance, in m, below which a point counts as touching."""
 _RETURN = 0.1
 """Fraction of a point's penetration that is corrected in each step."""
-_FASTEST_RETURN = 1.0
-"""Maximum speed of this correction, in m/s."""
+_FASTEST_RETURN = 0.1
+"""Maximum speed of this correction, in m/s: a body that is pushed out faster jumps visibly."""
 _BOUNCE = 0.1
 """Approach speed, in m/s, above which contacts bounce."""
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
@@ -48,6 +48,7 @@ class ContactPoints:
         friction: Coefficients of friction, shape (k,).
         restitution: Coefficients of restitution, shape (k,).
         jacobian: Jacobian of the points along their axes, shape (3 k, nv).
+        drift: Velocities along the axes of what they touch, in m/s, shape (3 k,); None: at rest.
     """
 
     numbers: Indices
@@ -57,6 +58,7 @@ class ContactPoints:
     friction: Vector
     restitution: Vector
     jacobian: Vector
+    drift: Vector | None = None
 
     def widened(self, span: slice, width: int) -> ContactPoints:
         """Return the points with a wider Jacobian, in which `span` holds their columns."""
@@ -94,10 +96,13 @@ class ContactPoints:
             gap / period if gap > 0 else max(_RETURN * gap / period, -_FASTEST_RETURN)
             for gap in self.gaps.tolist()
         ]
+        if self.drift is not None:
+            found -= self.drift
         if any(self.restitution.tolist()):
-            approach = self.jacobian[2::3] @ before
+            drift = np.zeros(len(self.gaps)) if self.drift is None else self.drift[2::3]
+            approach = self.jacobian[2::3] @ before - drift
             bounces = (self.restitution > 0) & (approach < -_BOUNCE)
-            found[2::3] = np.where(bounces, self.restitution * approach, found[2::3])
+            found[2::3] = np.where(bounces, self.restitution * approach - drift, found[2::3])
         return found
 
 
@@ -146,12 +151,30 @@ class ContactFinder:
                 points.append((frame.parentJoint, spot, radius, link, shape))
         self._arrange(points, rims)
         anchors = [*points, *(rim[:5] for rim in rims for _ in _THIRDS)]
-        materials, shapes = [static.what for static in statics], [row[4] for row in anchors]
-        of_materials = np.array([(each.friction, each.restitution) for each in materials])
+        places = {id(shape): place for place, shape in enumerate(movable.model.shapes)}
+        self._shapes = [places[id(row[4])] for row in anchors]
+        self._drifts: dict[int, Vector] = {}
+        self.hidden = False
+        self.take_materials(movable, statics)
+
+    def take_materials(self, movable: MovableBody, statics: Sequence[Static]) -> None:
+        """Take over friction and restitution, and the heights of the ground."""
+        shapes = [movable.model.shapes[place] for place in self._shapes]
+        of_materials = np.array([(x.what.friction, x.what.restitution) for x in statics])
         of_shapes = np.array([(shape.friction, shape.restitution) for shape in shapes])
         first, second = of_materials.reshape(-1, 1, 2), of_shapes.reshape(1, -1, 2)
         self._friction = np.minimum(first[:, :, 0], second[:, :, 0])
         self._restitution = first[:, :, 1] * second[:, :, 1]
+        for number, (place, surface) in enumerate(self._surfaces):
+            what = statics[place].what
+            if isinstance(surface, Heights) and isinstance(what, HeightField):
+                self._surfaces[number] = place, Heights(what)
+
+    def move_surface(self, static: int, velocity: Vector) -> None:
+        """Let the surface of a static body move along itself, in m/s, shape (3,)."""
+        self._drifts.pop(static, None)
+        if velocity.any():
+            self._drifts[static] = velocity.copy()
 
     def _arrange(self, points: list[Any], rims: list[Any]) -> None:
         """Collect the points, then the rim centers, in arrays."""
@@ -174,7 +197,7 @@ class ContactFinder:
 
     def __bool__(self) -> bool:
         """Return whether anything can ever touch."""
-        return len(self._joints) > 0
+        return len(self._joints) > 0 and not self.hidden
 
     def __len__(self) -> int:
         """Return an upper bound on `ContactPoints.numbers`."""
@@ -217,9 +240,16 @@ class ContactFinder:
                     self._friction.take(numbers),
                     self._restitution.take(numbers),
                     jacobian.reshape(len(points), 3, -1).take(rows, 0).reshape(3 * len(rows), -1),
+                    self._drift(place, frames.take(rows, 0)[:, :, :3]) if self._drifts else None,
                 )
             )
         return _together(found) if found else None
+
+    def _drift(self, static: int, axes: Vector) -> Vector:
+        """Return the velocities of a surface along the axes (k, 3, 3) of points, shape (3 k,)."""
+        found: Vector = axes @ self._drifts.get(static, np.zeros(3))
+        found[:, 2] = 0.0
+        return found.ravel()
 
     def bodies(self, numbers: Indices) -> tuple[Indices, Indices]:
         """Return the robot's links and the static bodies for `ContactPoints.numbers`."""
@@ -265,10 +295,13 @@ def _together(found: list[ContactPoints]) -> ContactPoints:
     """Return the points of several surfaces combined."""
     if len(found) == 1:
         return found[0]
-    names = ContactPoints.__slots__
-    return ContactPoints(
+    *names, _ = ContactPoints.__slots__
+    points = ContactPoints(
         *(np.concatenate([getattr(each, name) for each in found]) for name in names)
     )
+    if found[0].drift is not None:
+        points.drift = np.concatenate([each.drift for each in found if each.drift is not None])
+    return points
 
 
 def _points(shape: CollisionShape) -> tuple[Vector, float]:

@@ -28,16 +28,16 @@ class Coupling:
     ) -> None:
         """Determine what may touch."""
         self._robots, self._solver, self._period = robots, solver, parts.world.period
-        self._finder = PairFinder(parts, robots, features)
+        self.finder = PairFinder(parts, robots, features)
         self._touching: PairPoints | None = None
         self._impulses = np.zeros((0, 3))
         self.ties = Ties(robots, self._period)
         # Impulses of pairs in the last step, in the world frame, which warm-start the next one.
-        self._warmth = np.zeros((len(self._finder), 3))
+        self._warmth = np.zeros((len(self.finder), 3))
 
     def __bool__(self) -> bool:
         """Return whether any pair of shapes may touch, or anything is held together."""
-        return len(self._finder) > 0 or bool(self.ties)
+        return len(self.finder) > 0 or bool(self.ties)
 
     def clear_warm_start(self) -> None:
         """Discard the impulses of the last step."""
@@ -46,7 +46,7 @@ class Coupling:
     def step(self) -> None:
         """Simulate one step of all robots."""
         free = [robot.free_velocities() for robot in self._robots]
-        touching = self._finder.find(free, self._period) if len(self._finder) else None
+        touching = self.finder.find(free, self._period) if len(self.finder) else None
         self._touching = touching
         coupled = sorted(self.ties.robots | (set() if touching is None else touching.robots))
         for place, robot in enumerate(self._robots):
@@ -59,7 +59,7 @@ class Coupling:
         contacts, warm = None, None
         if touching is not None:
             contacts = touching.contacts
-            wide = [contacts.jacobian[:, self._finder.columns[place]] for place in coupled]
+            wide = [contacts.jacobian[:, self.finder.columns[place]] for place in coupled]
             contacts.jacobian = np.concatenate(wide, axis=1)
             share = self._warmth[touching.pairs] / np.bincount(touching.pairs)[touching.pairs, None]
             warm = np.einsum("kij,kj->ki", contacts.axes, share)

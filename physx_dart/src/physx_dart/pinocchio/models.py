@@ -43,6 +43,18 @@ def twists_of(found: Vector) -> Vector:
     return found.reshape(6, -1)
 
 
+def write_inertias(movable: MovableBody, model: Any) -> None:
+    """Write the inertias of a robot's or object's links into its model."""
+    found = [pinocchio.Inertia.Zero() for _ in range(model.njoints)]
+    for link, number in zip(movable.model.bodies, frames_of(movable), strict=True):
+        frame = model.frames[number]
+        inertia = pinocchio.Inertia.Zero()  # its constructor refuses what only a whole body needs
+        inertia.mass, inertia.lever, inertia.inertia = link.mass, link.center, link.inertia
+        found[frame.parentJoint] += frame.placement.act(inertia)
+    for joint, inertia in enumerate(found):
+        model.inertias[joint] = inertia
+
+
 def _load(movable: MovableBody, gravity: tuple[float, ...], armature: Vector, *base: Any) -> Any:
     _check_size(movable)
     model, nowhere = pinocchio.Model(), pinocchio.SE3.Identity()
@@ -61,11 +73,9 @@ def _load(movable: MovableBody, gravity: tuple[float, ...], armature: Vector, *b
         if link.joint is not None:
             kind = _joint_model(link.joint.unit, link.axis)
             joint, place = model.addJoint(joint, kind, place, link.joint.name), nowhere
-        inertia = pinocchio.Inertia.Zero()  # its constructor refuses what only a whole body needs
-        inertia.mass, inertia.lever, inertia.inertia = link.mass, link.center, link.inertia
-        model.appendBodyToJoint(joint, inertia, place)
         model.addFrame(pinocchio.Frame(link.name, joint, place, pinocchio.FrameType.BODY))
         places.append((joint, place))
+    write_inertias(movable, model)
     model.gravity.linear = np.array(gravity, np.float64)
     model.armature = np.asarray(armature, np.float64)
     check_loaded("pinocchio", movable, _loaded(model, movable))

@@ -28,6 +28,9 @@ from physx_sim.errors import FeatureNotSupportedError
 _TOLERANCE = 1e-4
 """Distance, in m, from the plane of a patch up to which a point belongs to it."""
 
+_NOWHERE = -1e9
+"""Radius of the bounding sphere of a hidden shape, in m: nothing is near it."""
+
 
 @dataclass(eq=False, slots=True)
 class _Solid:
@@ -96,6 +99,8 @@ class PairFinder:
         ]
         self._geometries = shapes  # the queries do not keep them alive
         self._request, self._patch_request = coal.CollisionRequest(), coal.ContactPatchRequest()
+        self._paces = np.zeros(len(solids))
+        self._moved: dict[int, tuple[Vector, Vector, Vector]] = {}
         self._request.enable_contact, self._request.num_max_contacts = True, 1
         self._patch_request.setPatchTolerance(_TOLERANCE)
 
@@ -130,6 +135,50 @@ class PairFinder:
                 turn = to_matrix(static.orientation)
                 yield _Solid(None, 0, 0, body, what, turn, np.array(static.position))
 
+    def take_materials(self, parts: Parts) -> None:
+        """Take over friction and restitution from the parts of the world."""
+        self._parts = parts
+        found = [*self._moving(), *self._static()]
+        for solid, changed in zip(self._solids, found, strict=True):
+            solid.shape = changed.shape
+
+    def hide(self, bodies: Sequence[int]) -> None:
+        """Let only bodies that are not among these touch."""
+        for place, solid in enumerate(self._solids):
+            hidden = solid.body in bodies
+            self._radii[place] = _NOWHERE if hidden else _radius(solid.shape)
+
+    def place_static(self, static: int, pose: Vector, velocity: Vector, surface: Vector) -> None:
+        """Place a static body and prescribe its motion, as in `RobotSimulation.place_static`."""
+        body, turn, center = self.statics + static, to_matrix(pose[3:]), pose[:3].copy()
+        self._moved.pop(body, None)
+        if velocity.any() or surface.any():
+            self._moved[body] = center, velocity.copy(), turn @ surface
+        for place, solid in enumerate(self._solids):
+            if solid.body == body and not isinstance(self._parts.statics[static].what, Stairs):
+                self._rotations[place], self._positions[place, :, 0] = turn, center
+                self._paces[place] = np.linalg.norm(velocity[:3]) + (
+                    np.linalg.norm(velocity[3:]) * _radius(solid.shape)
+                )
+
+    def _drift(self, bodies: Sequence[int], points: Vector, axes: Vector) -> Vector:
+        """Return the velocities of static bodies along the axes of contact points, shape (3 k,).
+
+        Args:
+            bodies: The second body of each point.
+            points: The points, shape (k, 3).
+            axes: Two tangents and the normal of each, shape (k, 3, 3).
+        """
+        found = np.zeros((len(bodies), 3))
+        for place, (body, point) in enumerate(zip(bodies, points, strict=True)):
+            if body in self._moved:
+                center, velocity, surface = self._moved[body]
+                along = axes[place] @ surface
+                along[2] = 0.0
+                arm = np.cross(velocity[3:], point - center)
+                found[place] = along + axes[place] @ (velocity[:3] + arm)
+        return found.ravel()
+
     def _possible(self, solids: Sequence[_Solid]) -> Iterator[tuple[int, int]]:
         """Yield the pairs of shapes that may touch: those that can move relative to each other."""
         contacts, movables = self._parts.world.contacts, self._parts.movables
@@ -162,6 +211,7 @@ class PairFinder:
         turns, twists = self._turns[self._joints], self._twists[self._joints]
         centers = (turns @ self._positions)[:, :, 0] + self._places[self._joints]
         speeds = _lengths(twists[:, :3] + cross_rows(twists[:, 3:], centers))
+        speeds += self._paces
         reach = self._radii + period * (speeds + self._radii * _lengths(twists[:, 3:]))
         first, second = self._first, self._second
         apart = _lengths(centers[first] - centers[second])
@@ -229,7 +279,12 @@ class PairFinder:
                 moved[own] += sign * supports[joints[own]]
             if moved.any():
                 jacobian[:, columns] = frames.reshape(-1, 6) @ motions * np.repeat(moved, 3, axis=0)
-        ahead = gaps + period * (jacobian[2::3] @ np.concatenate(velocities))
+        drift = None
+        if self._moved:
+            touched = [self._solids[self._pairs[pair][1]].body for pair in pairs]
+            drift = self._drift(touched, points, axes)
+        speeds = jacobian[2::3] @ np.concatenate(velocities)
+        ahead = gaps + period * (speeds if drift is None else speeds - drift[2::3])
         close = (np.minimum(gaps, ahead) < MARGIN).nonzero()[0]
         if not len(close):
             return None
@@ -244,6 +299,7 @@ class PairFinder:
             np.array([min(a.shape.friction, b.shape.friction) for a, b in touching]),
             np.array([a.shape.restitution * b.shape.restitution for a, b in touching]),
             jacobian.reshape(len(gaps), 3, -1)[close].reshape(3 * len(close), -1),
+            None if drift is None else drift.reshape(-1, 3)[close].ravel(),
         )
         owners = {
             solid.owner

@@ -21,7 +21,12 @@ from physx_core.typing import Records, Vector
 from physx_dart.pinocchio.constraints import Constraints, Warmth, constrained, limited
 from physx_dart.pinocchio.contacts import ContactFinder
 from physx_dart.pinocchio.limits import JointConstraints
-from physx_dart.pinocchio.models import frames_of, load_stepping_model, twists_of
+from physx_dart.pinocchio.models import (
+    frames_of,
+    load_stepping_model,
+    twists_of,
+    write_inertias,
+)
 from physx_dart.pinocchio.solver import ImpulseSolver
 from physx_sim import CONTACT, World
 from physx_sim.engines import MovableBody, RobotEngine, Static, rk4_step, twist_change
@@ -60,7 +65,7 @@ class PinocchioRobot(RobotEngine):
         self._pushes.extend(pinocchio.Force.Zero() for _ in range(self.model_in_motion.njoints))
         self._more: tuple[Any, ...] = ()  # the wrenches, if there are any
         self._joints = JointConstraints(self.model.joints, dt, self.base)
-        self._contacts = ContactFinder(
+        self.contact_finder = ContactFinder(
             movable,
             statics if movable.moves else (),
             self.model_in_motion,
@@ -68,7 +73,7 @@ class PinocchioRobot(RobotEngine):
             self.frames,
             features,
         )
-        self._acted_on = bool(self._contacts) or self._joints.acts
+        self._acted_on = bool(self.contact_finder) or self._joints.acts
         self._solver = solver
         self._rk4 = world.integrator == "rk4"
         modes = [joint.mode for joint in self.model.joints]
@@ -85,7 +90,7 @@ class PinocchioRobot(RobotEngine):
         self._springs = bool(resists.stiffness.any())
         self._smooth = bool(resists.damping.any() or resists.stiffness.any())
         self._constraints: Constraints | None = None
-        self._warmth = Warmth(len(self._contacts), len(self._joints.columns))
+        self._warmth = Warmth(len(self.contact_finder), len(self._joints.columns))
         # Pinocchio only computes the upper triangle of the inverse mass matrix.
         self._upper = np.triu(np.ones((self.nv, self.nv)), 1) + 0.5 * np.eye(self.nv)
 
@@ -195,7 +200,8 @@ class PinocchioRobot(RobotEngine):
                 that a spring on one side and a torque on the other are in equilibrium.
         """
         q, base = self._positions, self.base
-        touching = self._contacts.find(q, v, self._period) if self._contacts else None
+        finder = self.contact_finder
+        touching = finder.find(q, v, self._period) if finder else None
         self._constraints = Constraints(
             self._joints,
             self._warmth,
@@ -216,6 +222,11 @@ class PinocchioRobot(RobotEngine):
         """Change the acceleration of free fall, in m/s²."""
         for model in (self.model_in_motion, self._model):
             model.gravity.linear = np.array(gravity)
+
+    def change_masses(self, movable: MovableBody) -> None:
+        """Take over the masses and moments of inertia of a description."""
+        for model in (self.model_in_motion, self._model):
+            write_inertias(movable, model)
 
     def clear_warm_start(self) -> None:
         """Discard the impulses of the last step."""
@@ -252,7 +263,7 @@ class PinocchioRobot(RobotEngine):
         part = self._constraints
         if part is None or part.touching is None:
             return np.zeros(0, CONTACT)
-        links, touched = self._contacts.bodies(part.touching.numbers)
+        links, touched = self.contact_finder.bodies(part.touching.numbers)
         return part.touching.records(first + links, statics + touched, part.impulses, self._period)
 
     def hold(self, commands: Vector) -> None:

@@ -5,12 +5,12 @@ All calls to pinocchio are in `physx_dart.pinocchio` and `physx_dart.batch`.
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from typing import ClassVar
 
 import numpy as np
 
-from physx_core.typing import Records
+from physx_core.typing import Records, Vector
 from physx_dart.batch.processes import ParallelAlgorithms
 from physx_dart.pinocchio.coupling import Coupling
 from physx_dart.pinocchio.robot import PinocchioRobot
@@ -93,6 +93,27 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
         """Change the gravity of all robots and objects."""
         for robot in self._robots:
             robot.change_gravity(gravity)
+
+    def change_parts(self, before: Parts) -> None:
+        """Take over masses, friction, and ground."""
+        statics = [] if before.world.contacts == "none" else self.parts.statics
+        for robot, old, new in zip(self._robots, before.movables, self.parts.movables, strict=True):
+            if new.model.bodies != old.model.bodies:
+                robot.change_masses(new)
+            robot.contact_finder.take_materials(new, statics if new.moves else ())
+        self._coupling.finder.take_materials(self.parts)
+
+    def hide(self, bodies: Sequence[int]) -> None:
+        """Let only bodies that are not among these touch."""
+        for robot, part in zip(self._robots, self.layout.parts.values(), strict=True):
+            robot.contact_finder.hidden = part.bodies.start in bodies
+        self._coupling.finder.hide(bodies)
+
+    def place_static(self, static: int, pose: Vector, velocity: Vector, surface: Vector) -> None:
+        """Place a static body for the next step."""
+        for robot in self._robots:
+            robot.contact_finder.move_surface(static, surface)
+        self._coupling.finder.place_static(static, pose, velocity, surface)
 
     def bind(self, number: int, bond: Bond) -> None:
         """Hold two bodies together until `unbind`."""

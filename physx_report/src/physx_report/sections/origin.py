@@ -16,7 +16,9 @@ _COMMANDS = {"data_generation": "generate", "training": "train", "prediction": "
 
 def _blocks(run: Run) -> Iterator[Block]:
     for kind, result in run.results.items():
-        yield Table(["", ""], [list(each) for each in result.places.items()], f"Places ({kind})")
+        places = [list(each) for each in result.places.items()]
+        if places:
+            yield Table(["", ""], places, f"Places ({kind})")
     for kind, options in run.config.items():
         rows = [list(each) for each in wording.flat(options).items() if each[0] != "new_session"]
         yield Table(["option", "value"], rows, f"Options ({kind})")

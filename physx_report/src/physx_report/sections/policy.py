@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Iterator, Mapping
+from itertools import cycle
 
 from matplotlib.ticker import MaxNLocator
 
@@ -21,8 +22,10 @@ def _blocks(run: Run) -> Iterator[Block]:
     result = run.results.get("evaluation")
     if result is None or not result.policies:
         return
-    lines = [line.strip() for name, each in result.policies.items() for line in each.lines(name)]
-    yield Text(lines, "verdict")
+    for name, each in result.policies.items():
+        first, *others = each.lines(name)
+        yield Text([first], "verdict")
+        yield Text([line.strip() for line in others])
     yield _table(result.policies)
     for name, policy in result.policies.items():
         yield from _rewards(name, policy)
@@ -48,8 +51,9 @@ def _table(policies: Mapping[str, PolicyResult]) -> Table:
 def _rewards(name: str, policy: PolicyResult) -> Iterator[Block]:
     caption = f"{name}. Reward of each episode, by its seed, of the checkpoint {policy.network}"
     with drawing.figure(caption, height=2.8) as (found, (axes,)):
-        for label, of in policy.rivals.items():
-            axes.plot(policy.seeds, of.rewards, ".", label=label)
+        colors = drawing.TRUTH, drawing.MUTED
+        for (label, of), color in zip(policy.rivals.items(), cycle(colors), strict=False):
+            axes.plot(policy.seeds, of.rewards, ".", color=color, label=label)
         axes.plot(policy.seeds, policy.rewards, "o", ms=4, color=drawing.PREDICTION, label="policy")
         axes.set_xlabel("seed of the episode")
         axes.set_ylabel("reward")
@@ -67,7 +71,8 @@ def _film(run: Run, name: str, policy: PolicyResult) -> Iterator[Block]:
     file = run.path / policy.film
     if not policy.film:
         yield Text(["There is no film of it. With an environment of a robot, this makes one:"])
-        yield Text([f"{again} --film {session}/film.webp"], "code")
+        name = f"film_{policy.backend}" if policy.backend else "film"
+        yield Text([f"{again} --film {session}/{name}.webp"], "code")
         return
     content = file.read_bytes() if file.is_file() and file.stat().st_size < _MOST_BYTES else b""
     picture = Picture(content, f"{name}. The episode with the seed {policy.seeds[0]}")

@@ -10,6 +10,7 @@ import numpy as np
 from physx_core.typing import Vector
 from physx_sim import (
     FEATURES,
+    BodySettings,
     Box,
     Connect,
     Ground,
@@ -21,7 +22,7 @@ from physx_sim import (
     World,
     Wrench,
 )
-from physx_sim.conformance.worlds import ARM, PERIOD, arm, box, build, busy, pendulum
+from physx_sim.conformance.worlds import ARM, PERIOD, arm, box, build, busy, need, pendulum
 from physx_sim.errors import FeatureNotSupportedError
 from physx_testing.subject import Check, Subject, expect
 
@@ -35,6 +36,7 @@ def _zeros(simulation: Simulation) -> tuple[Vector, Vector]:
 _CALLS: Mapping[str, _Call] = {
     "accelerations": lambda one: one.accelerations(),
     "attachments": lambda one: one.detach(one.attach(Connect("hand"))),
+    "changes": lambda one: one.set_body("hand", BodySettings(mass=2.0)),
     "contacts": lambda one: one.contacts(),
     "derivatives": lambda one: one.forward_dynamics_derivatives(*_zeros(one), _zeros(one)[1]),
     "forward_dynamics": lambda one: one.forward_dynamics(*_zeros(one), _zeros(one)[1]),
@@ -134,7 +136,26 @@ def _spring(subject: Subject) -> None:
     expect(abs(angle - 0.5) < 0.02, f"a spring with rest=0.5 rad settles at {angle:.3f} rad")
 
 
+def _drives(subject: Subject) -> None:
+    need(subject, "moving_statics")
+    belt = Box(name="belt", size=(4.0, 1.0, 0.1), static=True, position=(0.0, 0.0, -0.05))
+    load = Box(name="load", size=(0.2, 0.2, 0.2), position=(0.0, 0.0, 0.1), friction=0.5)
+    with build(subject, World(objects=[load, belt], period=PERIOD)) as simulation:
+        simulation.set_body("belt", BodySettings(surface_velocity=(0.5, 0.0, 0.0)))
+        simulation.step(300)
+        speed = float(simulation.body_velocities(["load"])[0, 0])
+        expect(abs(speed - 0.5) < 0.01, f"a belt at 0.5 m/s carries a box at {speed:.3f} m/s")
+        state = simulation.snapshot()
+        simulation.set_body("load", BodySettings(hidden=True, mass=3.0))
+        simulation.restore(state)
+        expect(
+            simulation.body_settings("load") == BodySettings(),
+            "restore() does not undo what set_body() changed",
+        )
+
+
 CHECKS: dict[str, Check] = {
+    "drives what lies on a belt": _drives,
     "claims features that exist": _known,
     "can do what its features say": _honest,
     "builds what its features say": _builds,

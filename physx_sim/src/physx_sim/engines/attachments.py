@@ -78,6 +78,10 @@ class Attachments:
         """Return the number of active attachments."""
         return len(self._active)
 
+    def hold(self, body: str) -> bool:
+        """Return whether anything holds a body."""
+        return any(body in (each.body_a, each.body_b) for each in self._active.values())
+
     def add(self, attachment: Attachment) -> int:
         """Attach two bodies; return the attachment's number."""
         number = self._next

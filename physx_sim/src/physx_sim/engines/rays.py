@@ -7,7 +7,7 @@ from collections.abc import Collection
 import numpy as np
 from numpy.typing import NDArray
 
-from physx_core.rotations import to_matrix, to_matrix_rows
+from physx_core.rotations import to_matrix_rows
 from physx_core.typing import Index, Records, Vector
 from physx_sim import RAY_HIT, Ground, HeightField, Stairs
 from physx_sim.engines.models.meshes import read_triangles
@@ -30,21 +30,19 @@ class Caster:
     """
 
     def __init__(self, parts: Parts) -> None:
-        found: list[tuple[int, Vector, CollisionShape]] = []
+        found: list[tuple[int, CollisionShape]] = []
         self._planes: list[tuple[int, Vector, float]] = []
         self._heights: list[tuple[int, _Heights]] = []
         first = 0
         for movable in parts.movables:
             links = {name: place for place, name in enumerate(movable.model.links)}
             for shape in movable.model.shapes:
-                found.append((first + links.get(shape.body, 0), np.eye(4), shape))
+                found.append((first + links.get(shape.body, 0), shape))
             first += len(links)
-        self._moving = first
         for body, static in enumerate(parts.statics, first):
-            what, pose = static.what, np.eye(4)
+            what = static.what
             if isinstance(what, CollisionShape):
-                pose[:3, :3], pose[:3, 3] = to_matrix(static.orientation), static.position
-                found.append((body, pose, what))
+                found.append((body, what))
             elif isinstance(what, HeightField):
                 self._heights.append((body, _Heights(what)))
             else:
@@ -53,17 +51,14 @@ class Caster:
                 self._planes.append((body, normal, float(height)))
                 for center, size in what.boxes() if isinstance(what, Stairs) else ():
                     place = np.array(center), np.eye(3)
-                    found.append((body, pose, CollisionShape("box", size, *place, "", 0.0, 0.0)))
-        found.sort(key=lambda each: _KINDS.index(each[2].kind))
-        self._shapes = [shape for *_, shape in found]
-        self.bodies = np.array([body for body, *_ in found], np.intp)
-        turns = [pose[:3, :3] @ shape.rotation for _, pose, shape in found]
-        places = [pose[:3, :3] @ shape.position + pose[:3, 3] for _, pose, shape in found]
-        self._turns, self._places = np.array(turns).reshape(-1, 3, 3), np.reshape(places, (-1, 3))
+                    found.append((body, CollisionShape("box", size, *place, "", 0.0, 0.0)))
+        found.sort(key=lambda each: _KINDS.index(each[1].kind))
+        self._shapes = [shape for _, shape in found]
+        self.bodies = np.array([body for body, _ in found], np.intp)
+        self._turns = np.array([shape.rotation for shape in self._shapes]).reshape(-1, 3, 3)
+        self._places = np.array([shape.position for shape in self._shapes]).reshape(-1, 3)
         kinds = [_KINDS.index(shape.kind) for shape in self._shapes]
         self._ends = np.searchsorted(kinds, [_BOX, _MESH], side="left").tolist()
-        # The last row is the frame of static bodies.
-        self._frames = np.minimum(self.bodies, self._moving)
         self._sizes = np.zeros((len(found), 3))  # half the edges of a box; radius, half the length
         for row, shape in zip(self._sizes, self._shapes, strict=True):
             row[: len(shape.size)] = shape.size
@@ -84,16 +79,15 @@ class Caster:
         Args:
             begins: Start points, shape (n, 3), in m, in the world frame.
             ends: End points, in the same form.
-            poses: Poses of all moving bodies, shape (bodies, 7).
+            poses: Poses of all bodies, static ones included, shape (bodies, 7).
             ignored: Bodies that rays pass, as indices into `Layout.names`.
         """
         rays = np.arange(len(begins))
         ways, best, normals = ends - begins, np.full(len(begins), np.inf), np.zeros(begins.shape)
         touched = np.full(len(begins), -1)
         if len(self._shapes) and len(begins):
-            turns = np.concatenate([to_matrix_rows(poses[:, 3:]), np.eye(3)[None]])[self._frames]
-            origins = np.concatenate([poses[:, :3], np.zeros((1, 3))])[self._frames]
-            places = (turns @ self._places[..., None])[..., 0] + origins
+            turns = to_matrix_rows(poses[:, 3:])[self.bodies]
+            places = (turns @ self._places[..., None])[..., 0] + poses[self.bodies, :3]
             turns = turns @ self._turns
             shapes, near = self._near(places, begins, ways, ignored)
             starts = ((begins[near] - places[shapes])[:, None] @ turns[shapes])[:, 0]

@@ -19,6 +19,7 @@ RK4_LACKS = (
     "joint_friction",
     "limits",
     "mimic",
+    "moving_statics",
     "restitution",
     "self_collisions",
 )

@@ -21,6 +21,8 @@ from physx_sim import (
     FEATURES,
     AppliedAttachment,
     Attachment,
+    BodySettings,
+    HeightField,
     Hook,
     Simulation,
     State,
@@ -32,10 +34,11 @@ from physx_sim import (
 )
 from physx_sim.engines.algorithms import Algorithms
 from physx_sim.engines.attachments import Attachments, Bond, filled, frames_of
+from physx_sim.engines.changes import Changes, Scenery, motion_of
 from physx_sim.engines.checks import LayoutChecks, integer
 from physx_sim.engines.engine import RobotEngine
 from physx_sim.engines.influences import Hooks, Wrenches
-from physx_sim.engines.models.parts import Parts, layout_of
+from physx_sim.engines.models.parts import Parts, layout_of, warn_once
 from physx_sim.engines.models.reach import Reach
 from physx_sim.engines.rays import Caster
 from physx_sim.engines.reactions import Reactions
@@ -45,6 +48,8 @@ _FASTEST = 1e8
 """Speed, in m/s or rad/s, above which a state counts as no longer finite."""
 _NOTHING = np.zeros(0), np.zeros(0, CONTACT)
 """What is measured before the first step."""
+_DEEP = 5e-3
+"""Depth, in m, above which a contact in the first step from a state is reported."""
 _BLOCK = 64
 """Physics steps between checks of the state."""
 
@@ -95,6 +100,10 @@ class RobotSimulation(Simulation, Generic[Engine]):
         for robot in robots:
             robot.write(robot.neutral(), np.zeros(robot.nv))
         self._wrenches, self._hooks = Wrenches(self.period), Hooks()
+        self._changes, self._scenery = Changes(parts, self.layout), Scenery.of(parts)
+        self._movers: list[int] = []
+        self._hidden: list[int] = []
+        self._frozen: dict[int, tuple[Vector, Vector]] = {}
         self._set_command_limits()
         self._watch()
         commands = np.zeros(self._joint_count)
@@ -208,11 +217,14 @@ class RobotSimulation(Simulation, Generic[Engine]):
             return
         while n > 0:
             block = n if n < _BLOCK else _BLOCK
+            if not self._stepped:
+                block = 1
             self.advance(block)
             n -= block
             self._frame += block
-            self._stepped = True
             self._check_finite()
+            if not self._stepped:
+                self._check_start()
 
     def _step_watched(self, n: int) -> None:
         self._stepping = True
@@ -221,21 +233,50 @@ class RobotSimulation(Simulation, Generic[Engine]):
                 self._hooks.call(self, self._frame)
                 self._check_open()
                 block = 1
-                if len(self._wrenches) or len(self._positioned):
+                if len(self._wrenches) or len(self._positioned) or self._movers:
                     self._push()
                     self._steer()
                 else:
                     block = min(n, _BLOCK, self._hooks.pause(self._frame))
                 self.advance(block)
+                self._carry_on()
                 n -= block
                 self._frame += block
-                self._stepped = True
                 self._check_finite()
+                if not self._stepped:
+                    self._check_start()
         finally:
             self._stepping = False
             self._watch()
             if not self._closed and not len(self._wrenches):
                 self._release()
+
+    def _check_start(self) -> None:
+        """Name bodies that are inside others when the first step from a state is made."""
+        self._stepped = True
+        if "contacts" not in self.features:
+            return
+        contacts = self.read_contacts()
+        for first, second in contacts[["body_a", "body_b"]][contacts["depth"] > _DEEP].tolist():
+            names = self.layout.names
+            warn_once(
+                f'"{names[first]}" started more than {1e3 * _DEEP:.0f} mm inside '
+                f'"{names[second]}". Engines push it out slowly; let it start elsewhere.'
+            )
+
+    def _carry_on(self) -> None:
+        """Move static bodies on, and leave hidden ones where they are."""
+        for place in self._movers:
+            self._scenery.advance(place, self.period)
+            self._place(place)
+        for place, native in self._frozen.items():
+            self._robots[place].set_native(*native)
+
+    def _place(self, static: int) -> None:
+        scenery = self._scenery
+        self.place_static(
+            static, scenery.poses[static], scenery.velocities[static], scenery.surfaces[static]
+        )
 
     def _push(self) -> None:
         """Apply the wrenches of this frame."""
@@ -275,7 +316,13 @@ class RobotSimulation(Simulation, Generic[Engine]):
 
     def _watch(self) -> None:
         """Note whether any work is needed between steps."""
-        self._watched = bool(len(self._hooks) or len(self._wrenches) or len(self._positioned))
+        self._watched = bool(
+            len(self._hooks)
+            or len(self._wrenches)
+            or len(self._positioned)
+            or self._movers
+            or self._frozen
+        )
 
     def add_hook(self, hook: Hook, every: int = 1) -> None:
         """Call a function before the physics steps whose frame is a multiple of `every`."""
@@ -328,20 +375,129 @@ class RobotSimulation(Simulation, Generic[Engine]):
         wanted = tuple(finite_vector("gravity", gravity, 3).tolist())
         if wanted == self.parts.world.gravity:
             return
-        self.parts = replace(self.parts, world=replace(self.parts.world, gravity=wanted))
+        world = replace(self.parts.world, gravity=wanted)
+        self._change_parts(replace(self.parts, world=world))
+        self.change_gravity(wanted)
+
+    def _change_parts(self, parts: Parts) -> None:
+        """Forget what was made from the parts of the world."""
+        self.parts = parts
         if self._made_algorithms is not None:
             self._made_algorithms.close()
-        self._made_algorithms = self._made_reactions = None
-        self.change_gravity(wanted)
+        self._made_algorithms = self._made_reactions = self._caster = None
 
     def change_gravity(self, gravity: tuple[float, ...]) -> None:
         """Change the gravity in the engine; feature `gravity`."""
         raise self._lacks("gravity")
 
+    def set_body(self, name: str, settings: BodySettings) -> None:
+        """Change a body from now on.
+
+        Raises:
+            SimulationError: If there is no body with that name, or it does not have what changes.
+            FeatureNotSupportedError: If the engine lacks `changes` or `moving_statics`.
+        """
+        body = self._checked_body(name, settings)
+        if settings.hidden and self._attachments.hold(name):
+            raise SimulationError(f'"{name}" is attached; detach it before hiding it.')
+        self._changes.merge(name, settings)
+        self._move_static(body, settings)
+        self._apply_changes()
+
+    def body_settings(self, name: str) -> BodySettings:
+        """Return what `set_body` changed about a body.
+
+        Raises:
+            SimulationError: If there is no body with that name.
+        """
+        self._check_has("changes")
+        self._checks.body(name)
+        return self._changes.now(name, self._scenery)
+
+    def set_ground(self, field: HeightField) -> None:
+        """Replace a height field by another one.
+
+        Raises:
+            SimulationError: If it is no height field, or the ground is none or has others.
+        """
+        self._check_has("changes")
+        self._changes.check_ground(field)
+        self._changes.ground = field
+        self._apply_changes()
+
+    def _checked_body(self, name: str, settings: BodySettings) -> int:
+        self._check_has("changes")
+        body = self._checks.body(name)
+        self._changes.check(name, settings)
+        if any(value is not None for value in motion_of(settings)):
+            self._check_has("moving_statics")
+        return body
+
+    def _move_static(self, body: int, settings: BodySettings) -> None:
+        """Set the pose and the velocities of a static body where they are given."""
+        if all(value is None for value in motion_of(settings)):
+            return
+        static = body - len(self._links)
+        self._scenery.change(static, settings)
+        self._place(static)
+
+    def _apply_changes(self) -> None:
+        """Give the engine what differs between its parts and the changed ones."""
+        before, hidden = self.parts, self._changes.hidden()
+        self._movers = self._scenery.moving()
+        parts = self._changes.parts(before)
+        if parts.movables != before.movables or parts.statics != before.statics:
+            self._change_parts(parts)
+            self.change_parts(before)
+        if hidden != self._hidden:
+            self._hidden, frozen = hidden, {}
+            for place, part in enumerate(self.layout.parts.values()):
+                if part.bodies.start in hidden:
+                    frozen[place] = self._frozen.get(place) or self._at_rest(place)
+            self._frozen = frozen
+            self.hide(hidden)
+        self._watch()
+
+    def _at_rest(self, place: int) -> tuple[Vector, Vector]:
+        """Stop an object; return its native state."""
+        robot = self._robots[place]
+        robot.write(robot.positions(), np.zeros(robot.nv))
+        return robot.native()
+
+    def change_parts(self, before: Parts) -> None:
+        """Take over masses, friction, and ground of `parts`; feature `changes`.
+
+        Args:
+            before: The parts that the engine has; what did not change is the same object.
+        """
+        raise self._lacks("changes")
+
+    def hide(self, bodies: Sequence[int]) -> None:
+        """Let bodies, given as indices into `Layout.names`, touch nothing, and all others touch.
+
+        Moving objects among them are left where they are after each block of steps. Feature
+        `changes`.
+        """
+        raise self._lacks("changes")
+
+    def place_static(self, static: int, pose: Vector, velocity: Vector, surface: Vector) -> None:
+        """Place a static body, given by its index, for the next step; feature `moving_statics`.
+
+        Args:
+            static: Index into `Layout.statics`.
+            pose: Position in m, quaternion x, y, z, w, shape (7,); must not be kept.
+            velocity: Velocity in the world frame, in m/s, then rad/s, shape (6,); likewise.
+            surface: Velocity of its surface along itself, in its frame, in m/s, shape (3,).
+        """
+        raise self._lacks("moving_statics")
+
     def attach(self, attachment: Attachment) -> int:
         """Hold two bodies together from now on; return the attachment's number for `detach`."""
         self._check_has("attachments")
         self._check_attachment(attachment)
+        for name in (attachment.body_a, attachment.body_b):
+            if self._changes.of(name).hidden:
+                raise SimulationError(f'"{name}" is hidden, so nothing can be attached to it.')
         poses = [self._pose_of(name) for name in (attachment.body_a, attachment.body_b)]
         return self._attachments.add(filled(attachment, poses))
 
@@ -417,7 +573,12 @@ class RobotSimulation(Simulation, Generic[Engine]):
             found = self._last[0]
             return found.copy() if len(found) else np.zeros(self.layout.nv)
         only = self._only
-        return only.accelerations() if only else _join([r.accelerations() for r in self._robots])
+        if only and not self._frozen:
+            return only.accelerations()
+        found = _join([robot.accelerations() for robot in self._robots])
+        for place in self._frozen:
+            found[self._slices[place][2]] = 0.0
+        return found
 
     def set_state(self, positions: Vector, velocities: Vector) -> None:
         """Set the state without resetting the time."""
@@ -430,6 +591,8 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._stepped, self._last = False, _NOTHING
         for robot, part, speed in self._slices:
             robot.write(q[part], v[speed])
+        for place in self._frozen:
+            self._frozen[place] = self._at_rest(place)
 
     def snapshot(self) -> State:
         """Return everything that `restore` needs to continue exactly from here.
@@ -441,6 +604,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         if self._stepped:
             last = self.accelerations().copy(), self.read_contacts()
         self.clear_warm_start()
+        changes = self._changes
         return State(
             self.positions(),
             self.velocities(),
@@ -452,6 +616,8 @@ class RobotSimulation(Simulation, Generic[Engine]):
             self._attachments.snapshot(),
             *last,
             self.gravity,
+            {name: changes.now(name, self._scenery) for name in sorted(changes.applied)},
+            changes.ground,
         )
 
     def restore(self, state: State) -> None:
@@ -476,10 +642,15 @@ class RobotSimulation(Simulation, Generic[Engine]):
         if len(state.gravity):
             gravity = finite_vector("state.gravity", state.gravity, 3)
         native = self._checked_native(state) if state.engine == self.engine else []
+        bodies = {self._checked_body(name, each): each for name, each in state.bodies.items()}
+        if state.ground is not None:
+            self._changes.check_ground(state.ground)
         self.set_gravity(gravity.tolist())
+        self._restore_changes(state, bodies)
         self._write(q, v)
         for robot, pair in zip(self._robots, native, strict=False):
             robot.set_native(*pair)
+        self._frozen = {place: self._robots[place].native() for place in self._frozen}
         self._attachments.restore(state.attachments)
         self.clear_warm_start()
         self._release()
@@ -487,6 +658,18 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._watch()
         self._hold(commands)
         self._frame, self._last = frame, last
+
+    def _restore_changes(self, state: State, bodies: Mapping[int, BodySettings]) -> None:
+        changes, scenery = self._changes, Scenery.of(self.parts)
+        if not (changes.applied or changes.ground or bodies or state.ground):
+            return
+        changes.applied, changes.ground = dict(state.bodies), state.ground
+        before, self._scenery = self._scenery, scenery
+        for body, settings in bodies.items():
+            self._move_static(body, settings)
+        for static in before.differing(scenery):
+            self._place(static)
+        self._apply_changes()
 
     def _check_applied(self, applied: AppliedAttachment) -> None:
         self._check_has("attachments")
@@ -541,7 +724,9 @@ class RobotSimulation(Simulation, Generic[Engine]):
         if self._caster is None:
             self._caster = Caster(self.parts)
         poses = self._algorithms.body_poses(self.positions(), range(len(self.layout.bodies)))
-        return self._caster.cast(first, last, poses, self._checks.bodies(ignored))
+        poses = np.concatenate([poses, self._scenery.poses])
+        passed = [*self._checks.bodies(ignored), *self._hidden]
+        return self._caster.cast(first, last, poses, passed)
 
     def joint_wrenches(self) -> Vector:
         """Return the joint reactions in the last step, shape (joints, 6)."""
@@ -608,7 +793,18 @@ class RobotSimulation(Simulation, Generic[Engine]):
         """Return the poses of bodies, shape (names, 7): x, y, z and quaternion x, y, z, w."""
         self._check_open()
         q = self.positions() if positions is None else self._checks.positions(positions)
-        return self._algorithms.body_poses(q, self._checks.bodies(names))
+        chosen = self._checks.bodies(names)
+        found = self._algorithms.body_poses(q, chosen)
+        return self._with_scenery(found, chosen) if self._changes.applied else found
+
+    def _with_scenery(self, found: Vector, bodies: Sequence[int]) -> Vector:
+        """Return poses or motions of bodies, with those of static bodies as they are now."""
+        scenery = self._scenery
+        for row, body in zip(found, bodies, strict=True):
+            if (static := body - len(self._links)) >= 0:
+                row[:7] = scenery.poses[static]
+                row[7:13] = scenery.velocities[static, : len(row) - 7]
+        return found
 
     def body_velocities(
         self,
@@ -624,8 +820,12 @@ class RobotSimulation(Simulation, Generic[Engine]):
         v = self.velocities()
         if velocities is not None:
             v = self._checks.velocities("velocities", velocities)
-        chosen, nothing = self._checks.bodies(names), np.zeros(self.layout.nv)
-        return self._algorithms.motions(q, v, nothing, chosen)[:, 7:13].copy()
+        return self._motions(q, v, np.zeros(self.layout.nv), names)[:, 7:13].copy()
+
+    def _motions(self, q: Vector, v: Vector, a: Vector, names: Sequence[str] | None) -> Vector:
+        chosen = self._checks.bodies(names)
+        found = self._algorithms.motions(q, v, a, chosen)
+        return self._with_scenery(found, chosen) if self._changes.applied else found
 
     def body_accelerations(self, names: Sequence[str] | None = None) -> Vector:
         """Return the accelerations of body origins, shape (names, 6): linear, angular."""
@@ -635,8 +835,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
         """Return the current poses, velocities, and accelerations of bodies, shape (names, 19)."""
         if self._closed:
             self._check_open()
-        q, v, a = self.positions(), self.velocities(), self.accelerations()
-        return self._algorithms.motions(q, v, a, self._checks.bodies(names))
+        return self._motions(self.positions(), self.velocities(), self.accelerations(), names)
 
     def reach(self, name: str, direction: Vector, positions: Vector | None = None) -> float:
         """Return how far a robot's or object's collision shapes extend along a direction."""

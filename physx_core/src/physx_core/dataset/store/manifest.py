@@ -289,7 +289,8 @@ class Mode:
     @property
     def files(self) -> dict[str, Field]:
         """The fields that have files, in the order in which their rows are committed."""
-        return self.fields | self.ends
+        ends = self.ends
+        return self.fields | ends if ends else self.fields
 
     @property
     def rows(self) -> int:

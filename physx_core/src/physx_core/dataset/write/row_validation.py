@@ -121,9 +121,9 @@ def _fit(fields: Mapping[str, Field], block: Batch) -> bool:
     for name, field in fields.items():
         if not field.indexes:
             continue
-        sizes = np.diff(block[field.indexes + ENDS].astype(np.intp), prepend=0)
+        sizes: Any = np.diff(block[field.indexes + ENDS].astype(np.intp), prepend=0)
         if field.free_axis:
-            counts = np.diff(block[field.free_axis + ENDS].astype(np.intp), prepend=0)
+            counts: Any = np.diff(block[field.free_axis + ENDS].astype(np.intp), prepend=0)
             sizes = np.repeat(sizes, counts)
         values = block[name]
         sizes = sizes.reshape(-1, *(1,) * (values.ndim - 1))

@@ -88,14 +88,35 @@ class OpenPartition:
 
     def append(self, rows: Batch, start: int, count: int) -> None:
         """Write and commit all rows `start` to `start + count` of a block, or none of them."""
+        if self.axes:
+            self._append_free(rows, start, count)
+            return
         parts, durable = self.files.values(), self._syncer is None
         first = self.partition.rows
         last = first + count
-        if self.axes:
-            pieces, sizes = self._free_pieces(rows, start, count)
-        else:
-            stop, sizes = start + count, self.partition.sizes
-            pieces = [(f, rows[name][start:stop], first, last) for name, f in self.files.items()]
+        for file in parts:
+            if file.room < last:
+                file.reserve(last)
+        before = tuple(map(_COMMITTED, parts))
+        try:
+            for name, file in self.files.items():
+                file.append(first, rows[name][start : start + count], last, durable=durable)
+            if durable:
+                for file in parts:
+                    file.sync()
+            self.partition.rows = last
+        except BaseException:  # also an interrupt: the next rows go to the same offsets
+            self.partition.rows = first
+            self._withdraw(before)
+            raise
+        if self._syncer is not None:
+            self._syncer.note(self)
+
+    def _append_free(self, rows: Batch, start: int, count: int) -> None:
+        """Do the same with rows that have free axes."""
+        parts, durable, known = self.files.values(), self._syncer is None, self.partition
+        first, before_sizes = known.rows, known.sizes
+        pieces, sizes = self._free_pieces(rows, start, count)
         for file, _, _, end in pieces:
             if file.room < end:
                 file.reserve(end)
@@ -106,14 +127,18 @@ class OpenPartition:
             if durable:
                 for file in parts:
                     file.sync()
-            self.partition.rows, self.partition.sizes = last, sizes
-        except BaseException:  # also an interrupt: the next rows go to the same offsets
-            self.partition.rows = first
-            for file, commit in zip(parts, before, strict=True):
-                file.withdraw(commit)
+            known.rows, known.sizes = first + count, sizes
+        except BaseException:
+            known.rows, known.sizes = first, before_sizes
+            self._withdraw(before)
             raise
         if self._syncer is not None:
             self._syncer.note(self)
+
+    def _withdraw(self, commits: tuple[tuple[int, int, int], ...]) -> None:
+        """Return to earlier commits of the files."""
+        for file, commit in zip(self.files.values(), commits, strict=True):
+            file.withdraw(commit)
 
     def _free_pieces(
         self, rows: Batch, start: int, count: int

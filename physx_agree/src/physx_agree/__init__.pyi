@@ -1,0 +1,11 @@
+"""How far physics engines agree on a task, and why they part."""
+
+from .agreement import Agreement as Agreement
+from .causes import Cause as Cause
+from .causes import Parting as Parting
+from .figures import Figure as Figure
+from .figures import Ranking as Ranking
+from .stored import read_agreement as read_agreement
+from .stored import store_agreement as store_agreement
+from .study import agree as agree
+from .version import __version__ as __version__

@@ -1,0 +1,52 @@
+"""Agreements as a session keeps them: a file of plain data beside the session's results."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from physx_agree.agreement import Agreement
+from physx_core import Result, files
+from physx_core.errors import SessionError
+from physx_core.parsing import parse_json
+from physx_core.results import from_plain, store_result
+
+FILE = "agreement.json"
+KIND = "agreement"
+"""What its result is called in the session."""
+_LARGEST = 2**24
+
+
+def store_agreement(session: str | Path, agreement: Agreement, seconds: float = 0.0) -> None:
+    """Keep an agreement in a session's folder, which is made if it does not exist.
+
+    Args:
+        session: The folder.
+        agreement: What to keep, in place of what was there.
+        seconds: How long it took, in s.
+
+    Raises:
+        SessionError: If it cannot be written.
+    """
+    folder = Path(session)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        files.replace(folder / FILE, f"{agreement.to_json()}\n".encode())
+    except OSError as error:
+        raise SessionError(f"{folder / FILE} cannot be written: {error}.") from error
+    store_result(folder, Result(KIND, folder.name, seconds, str(agreement).splitlines()))
+
+
+def read_agreement(session: str | Path) -> Agreement | None:
+    """Return a session's agreement; None if it has none.
+
+    Raises:
+        SessionError: If the file is damaged.
+    """
+    path = Path(session) / FILE
+    if not path.is_file():
+        return None
+    try:
+        found: Agreement = from_plain(Agreement, parse_json(files.read_content(path, _LARGEST)))
+    except (OSError, ValueError, TypeError, AttributeError, LookupError) as error:
+        raise SessionError(f"{path} is damaged: {error}. Remove it.") from error
+    return found

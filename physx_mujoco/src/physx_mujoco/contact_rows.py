@@ -1,0 +1,96 @@
+"""Contacts of which MuJoCo knows too little: with bodies that move as prescribed, and deep ones.
+
+A step is split where MuJoCo has found the contacts but not yet solved for their forces.
+"""
+
+from __future__ import annotations
+
+import mujoco
+import numpy as np
+
+from physx_core.rotations import to_matrix
+from physx_core.typing import Vector
+from physx_mujoco.model import LAG, WorldModel
+
+_FASTEST_RETURN = 0.1
+"""Maximum speed, in m/s, at which contacts are pushed out: otherwise deep ones would jump."""
+
+
+class ContactRows:
+    """Steps in which static bodies push and drag, and deep contacts do not jump.
+
+    Args:
+        world: The world.
+        data: Its state.
+    """
+
+    def __init__(self, world: WorldModel, data: mujoco.MjData) -> None:
+        self._world, self._data = world, data
+        self._moving: dict[int, Vector] = {}
+        self.expect_depth()
+
+    @property
+    def active(self) -> bool:
+        """Whether steps differ from MuJoCo's own."""
+        return self._deep or bool(self._moving)
+
+    def expect_depth(self) -> None:
+        """Note that a state was set, in which contacts may be deep."""
+        # With this integrator there are none, and its steps cannot be split.
+        self._deep = self._world.model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
+
+    def place(self, static: int, pose: Vector, velocity: Vector, surface: Vector) -> None:
+        """Place a static body for the next step, as in `RobotSimulation.place_static`."""
+        model, data, body = self._world.model, self._data, self._world.statics[static]
+        if (mocap := model.body_mocapid[body]) >= 0:
+            data.mocap_pos[mocap], data.mocap_quat[mocap] = pose[:3], pose[[6, 3, 4, 5]]
+        turn = to_matrix(pose[3:])
+        # What drags is MuJoCo's velocity of surfaces, in the frame of each shape.
+        for shape in (model.geom_bodyid == body).nonzero()[0].tolist():
+            own = np.zeros(9)
+            mujoco.mju_quat2Mat(own, model.geom_quat[shape])
+            whole, arm = turn @ own.reshape(3, 3), turn @ model.geom_pos[shape]
+            linear = velocity[:3] + np.cross(velocity[3:], arm) + turn @ surface
+            model.geom_surfacevel[shape] = *(linear @ whole), *(velocity[3:] @ whole)
+        model.flg_surfacevel = bool(model.geom_surfacevel.any())
+        self._moving.pop(int(body), None)
+        if velocity.any():
+            self._moving[int(body)] = np.concatenate([pose[:3], velocity])
+
+    def step(self) -> None:
+        """Simulate a physics step."""
+        model, data = self._world.model, self._data
+        if not self.active:
+            mujoco.mj_step(model, data)
+            return
+        mujoco.mj_step1(model, data)
+        if self._deep:
+            self._limit_depth()
+        if self._moving:
+            self._push()
+        mujoco.mj_step2(model, data)
+
+    def _limit_depth(self) -> None:
+        """Let contacts appear only so deep as they may return."""
+        most = _FASTEST_RETURN * (LAG - 1) * self._world.model.opt.timestep
+        contact, data = self._data.contact, self._data
+        rows = contact.efc_address[(contact.dist < -most) & (contact.efc_address >= 0)]
+        data.efc_pos[rows] = -most
+        self._deep = len(rows) > 0
+
+    def _push(self) -> None:
+        """Let contacts know the speeds at which moving bodies approach.
+
+        MuJoCo adds the gap, in the unit of a velocity, to the speed at which it closes, so a speed
+        that it does not know is told as a part of the gap, with the motion within the step.
+        """
+        model, data, contact = self._world.model, self._data, self._data.contact
+        bodies = model.geom_bodyid[contact.geom].reshape(-1, 2)
+        for number, row in enumerate(contact.efc_address.tolist()):
+            for side, body in enumerate(bodies[number].tolist()):
+                if row < 0 or body not in self._moving:
+                    continue
+                center, linear, angular = np.split(self._moving[body], 3)
+                moved = linear + np.cross(angular, contact.pos[number] - center)
+                speed = float(moved @ contact.frame[number, :3]) * (1.0 if side else -1.0)
+                data.efc_pos[row] += speed * LAG * model.opt.timestep
