@@ -11,7 +11,7 @@ import pytest
 from planted import Stagger, late_on, plants
 
 from physx_agree import Agreement, agree, read_agreement, store_agreement
-from physx_agree.figures import Figure, interval_of, rankings, student
+from physx_agree.scores import Score, interval_of, rankings, student
 from physx_core import DataGeneration, DatasetConfig, EnvironmentConfig, NetworkConfig, Training
 from physx_core.cli import main
 from physx_core.errors import ConfigError, SessionError
@@ -124,7 +124,7 @@ def test_policies_keep_their_ranking():
     found = agree(
         planted.Rewarded, ["dart", "mujoco"], policies, seeds=range(4), steps=20, metric="effort"
     )
-    assert [(each.policy, each.engine) for each in found.figures] == [
+    assert [(each.policy, each.engine) for each in found.scores] == [
         ("wild", "dart"), ("wild", "mujoco"), ("steady", "dart"), ("steady", "mujoco"),
     ]  # fmt: skip
     [ranking] = found.rankings
@@ -138,13 +138,13 @@ def test_policies_keep_their_ranking():
 )
 def test_a_ranking_survives_only_if_no_interval_doubts_it(other, verdict):
     zero = (0.0, 0.0, 0.0)
-    figures = [
-        Figure("a", "dart", (1.0, 1.2, 0.8)),
-        Figure("b", "dart", zero),
-        Figure("a", "mujoco", other),
-        Figure("b", "mujoco", zero),
+    scores = [
+        Score("a", "dart", (1.0, 1.2, 0.8)),
+        Score("b", "dart", zero),
+        Score("a", "mujoco", other),
+        Score("b", "mujoco", zero),
     ]
-    [ranking] = rankings(figures)
+    [ranking] = rankings(scores)
     assert ranking.verdict == verdict
 
 
@@ -213,7 +213,7 @@ def test_the_command_prints_80_columns_and_keeps_its_result(command, tmp_path):
 def test_the_command_prints_json(command):
     found = json.loads(command("--engines", "dart", "mujoco", "--json"))
     assert found["engines"] == ["dart", "mujoco"]
-    assert [each["engine"] for each in found["figures"]] == ["dart", "mujoco"]
+    assert [each["engine"] for each in found["scores"]] == ["dart", "mujoco"]
 
 
 @pytest.mark.processes
@@ -230,7 +230,7 @@ def test_the_command_ranks_trained_policies(command, tmp_path):
         Training(network, data, session_name=name, epoch_nb=1, batch_size=50, **options).execute()
     policies = ("--policy", "one", "--policy", "two", "--env-kwargs", "continuous=True")
     found = json.loads(command("--engines", "dart", "pinocchio", "--json", *policies))
-    assert [each["policy"] for each in found["figures"]] == ["one", "one", "two", "two"]
+    assert [each["policy"] for each in found["scores"]] == ["one", "one", "two", "two"]
     [ranking] = found["rankings"]
     assert sorted(ranking["policies"]) == ["one", "two"]
     assert ranking["margins"]["dart"] == ranking["margins"]["pinocchio"]

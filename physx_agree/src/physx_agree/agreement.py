@@ -11,7 +11,7 @@ from typing import Any
 
 from physx_agree import wording
 from physx_agree.causes import Parting
-from physx_agree.figures import Figure, Ranking
+from physx_agree.scores import Ranking, Score
 
 
 @dataclass(frozen=True)
@@ -23,7 +23,7 @@ class Agreement:
         metric: What is compared: ``"return"``, ``"length"``, or a name of the information of steps.
         engines: The engines, the first of which the others are compared with.
         seeds: Seeds of the episodes.
-        figures: The metric of each policy on each engine.
+        scores: The metric of each policy on each engine.
         rankings: For each pair of policies, whether its order survives.
         partings: For each other engine, where and why its steps part from those of the first.
     """
@@ -32,7 +32,7 @@ class Agreement:
     metric: str
     engines: Sequence[str]
     seeds: Sequence[int]
-    figures: Sequence[Figure]
+    scores: Sequence[Score]
     rankings: Sequence[Ranking]
     partings: Sequence[Parting]
 
@@ -50,7 +50,7 @@ class Agreement:
         lines = [
             *textwrap.wrap(f"{head}, seeds {wording.span(self.seeds)}", wording.WIDTH),
             "",
-            *wording.columns([wording.HEAD, *map(wording.row_of, self.figures)]),
+            *wording.columns([wording.HEAD, *map(wording.row_of, self.scores)]),
         ]
         for ranking in self.rankings:
             text = wording.ranking_text(ranking)

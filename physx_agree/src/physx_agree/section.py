@@ -17,7 +17,7 @@ def _blocks(run: Run) -> Iterator[Text | Table]:
         f"{found.task}: {found.metric} of {len(found.seeds)} episodes, "
         f"seeds {wording.span(found.seeds)}"
     ])  # fmt: skip
-    rows = [wording.row_of(figure) for figure in found.figures]
+    rows = [wording.row_of(score) for score in found.scores]
     yield Table(wording.HEAD, rows, "The same seeds and policies on each engine")
     if found.rankings:
         yield Text([wording.ranking_text(each) for each in found.rankings], "verdict")

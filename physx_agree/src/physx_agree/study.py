@@ -11,7 +11,7 @@ import gymnasium
 from physx_agree.agreement import Agreement
 from physx_agree.diagnosis import Diagnosis
 from physx_agree.episodes import RETURN, Act, figures_of, record, robot_below
-from physx_agree.figures import Figure, figures_by_engine, rankings
+from physx_agree.scores import Score, rankings, scores_by_engine
 from physx_core import checks
 from physx_core.errors import ConfigError
 from physx_gym import Policy, make_env
@@ -74,14 +74,14 @@ def agree(
 
     makers = _makers(policies, trust)
     names = _names(engines)
-    figures: list[Figure] = []
+    scores: list[Score] = []
     values = {
         name: {label: _values(make(engine), maker, seeds, metric)
                for label, engine in zip(names, engines, strict=True)}
         for name, maker in makers.items()
     }  # fmt: skip
     for name, found in values.items():
-        figures += figures_by_engine(name, found)
+        scores += scores_by_engine(name, found)
     first = make(engines[0])
     try:
         episode = record(first, next(iter(makers.values()))(first)(seeds[0]), seeds[0], steps)
@@ -92,9 +92,9 @@ def agree(
         Diagnosis(make, (labels[0], each), episode, seeds[0]).parting() for each in labels[1:]
     ]
     label = task if isinstance(task, str) else getattr(task, "__qualname__", str(task))
-    ranked = tuple(rankings(figures))
+    ranked = tuple(rankings(scores))
     return Agreement(
-        label, metric, tuple(names), tuple(seeds), tuple(figures), ranked, tuple(partings)
+        label, metric, tuple(names), tuple(seeds), tuple(scores), ranked, tuple(partings)
     )
 
 

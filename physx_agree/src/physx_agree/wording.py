@@ -1,4 +1,4 @@
-"""Wording: figures, rankings and partings as text of 80 columns."""
+"""Wording: scores, rankings and partings as text of 80 columns."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import textwrap
 from collections.abc import Iterator, Sequence
 
 from physx_agree.causes import Parting
-from physx_agree.figures import Figure, Interval, Ranking
+from physx_agree.scores import Interval, Ranking, Score
 
 WIDTH = 80
 """Longest line, in columns."""
@@ -20,11 +20,11 @@ def span(seeds: Sequence[int]) -> str:
 HEAD = ("policy", "engine", "mean", "difference", "95 % interval")
 
 
-def row_of(figure: Figure) -> tuple[str, ...]:
-    """Return the cells of a figure's row under `HEAD`."""
-    difference = "" if figure.difference is None else f"{figure.difference:+.4g}"
-    between = "" if figure.difference is None else between_of(figure.interval)
-    return figure.policy, figure.engine, f"{figure.mean:.4g}", difference, between
+def row_of(score: Score) -> tuple[str, ...]:
+    """Return the cells of a score's row under `HEAD`."""
+    difference = "" if score.difference is None else f"{score.difference:+.4g}"
+    between = "" if score.difference is None else between_of(score.interval)
+    return score.policy, score.engine, f"{score.mean:.4g}", difference, between
 
 
 def between_of(interval: Interval | None) -> str:

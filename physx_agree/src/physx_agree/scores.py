@@ -1,4 +1,4 @@
-"""Figures of episodes: means, differences between engines on the same seeds, and rankings."""
+"""Scores of episodes: means, differences between engines on the same seeds, and rankings."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ _LEVEL = 0.95
 
 
 @dataclass(frozen=True)
-class Figure:
+class Score:
     """The metric of a policy on an engine.
 
     Attributes:
@@ -56,14 +56,14 @@ class Ranking:
     verdict: str
 
 
-def figures_by_engine(policy: str, values: Mapping[str, Sequence[float]]) -> list[Figure]:
-    """Return the figures of a policy on each engine, the first of which the others differ from."""
+def scores_by_engine(policy: str, values: Mapping[str, Sequence[float]]) -> list[Score]:
+    """Return the scores of a policy on each engine, the first of which the others differ from."""
     first = next(iter(values))
-    found = [Figure(policy, first, tuple(values[first]))]
+    found = [Score(policy, first, tuple(values[first]))]
     for engine in list(values)[1:]:
         differences = np.subtract(values[engine], values[first])
         found.append(
-            Figure(
+            Score(
                 policy, engine, tuple(values[engine]), float(differences.mean()),
                 interval_of(differences.tolist()),
             )
@@ -71,11 +71,11 @@ def figures_by_engine(policy: str, values: Mapping[str, Sequence[float]]) -> lis
     return found
 
 
-def rankings(figures: Sequence[Figure]) -> list[Ranking]:
+def rankings(scores: Sequence[Score]) -> list[Ranking]:
     """Return for each pair of policies whether their order is the same on all engines."""
-    known = {(each.policy, each.engine): each for each in figures}
-    policies = list(dict.fromkeys(each.policy for each in figures))
-    engines = list(dict.fromkeys(each.engine for each in figures))
+    known = {(each.policy, each.engine): each for each in scores}
+    policies = list(dict.fromkeys(each.policy for each in scores))
+    engines = list(dict.fromkeys(each.engine for each in scores))
     found = []
     for pair in itertools.combinations(policies, 2):
         better, worse = sorted(pair, key=lambda name: -known[name, engines[0]].mean)
