@@ -67,9 +67,9 @@ def main() -> int:
 
     networks, rivals = {"network": (network(), epochs)}, ["all", map_of_products]
     results, guesses = compared(stored, networks, "input", rivals, batch_size=64)
-    print(f"the same as a training in one go: {np.array_equal(resumed, guesses['network'])}")
+    print(f"the same as a training in one go: {np.array_equal(resumed, guesses['network'][0])}")
     if asked.picture:
-        draw(asked.picture, training.session.path, right, guesses["network"])
+        draw(asked.picture, training.session.path, right, guesses["network"][0])
     comparison = Comparison.of(results, "error/ground_truth/relative_l2")
     return conclude(comparison, small=asked.small)
 

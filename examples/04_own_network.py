@@ -53,7 +53,7 @@ def main() -> int:
     if asked.picture:
         (right,) = samples(stored, "validation", "ground_truth")
         names = [list(guesses)[k] for k in (0, 1, 3)]
-        draw(asked.picture, right, {name: guesses[name] for name in names})
+        draw(asked.picture, right, {name: guesses[name][0] for name in names})
     comparison = Comparison.of(results, "error/ground_truth/relative_l2")
     return conclude(comparison, small=asked.small)
 

@@ -13,7 +13,7 @@ then runs in the environment: orange, over the solver's gray beam and linear ela
 import sys
 
 import numpy as np
-from common import SEEDS, compared, conclude, config, generate, options, samples
+from common import SEEDS, compared, conclude, config, generate, linear_map, options, samples
 from environments.beam import Beam, Timed
 
 from physx_core import Comparison, EnvironmentConfig, NetworkConfig
@@ -43,8 +43,9 @@ def target(name):
 def main():
     chosen = options(__doc__).parse_args()
     session = generate(Beam, 40 if chosen.small else 1600, chosen.session_dir, num_clients=2)
-    exact, missing = samples(session, "validation", "displacement", "correction")
-    results, guesses = compared(session, networks(4 if chosen.small else 40), "forces")
+    known = samples(session, "training", "forces", "displacement")
+    given, exact, missing = samples(session, "validation", "forces", "displacement", "correction")
+    _, guesses = compared(session, networks(4 if chosen.small else 40), "forces", rivals=[])
     recording = {"visualizer": "rerun", "visualizer_kwargs": {"path": f"{session}/beam.rrd"}}
     beam = EnvironmentConfig(Beam, as_tcp_ip_client=False, seed=1, **recording)
     place = {"session_dir": f"{session}/networks", "session_name": f"{OWN} {SEEDS[0]}"}
@@ -55,17 +56,20 @@ def main():
         render_picture(f"{session}/beam.rrd", chosen.picture, (900, 450), at=step)
     text = "{:.1f} by finite elements, {:.2f} by linear elasticity, {:.2f} more for its correction"
     print("ms of the CPU for a push:", text.format(*1e3 * np.median(shown.found, 0)[1:]))
-    flat = (each.reshape(len(each), -1) for each in (exact, missing, missing - guesses[OWN]))
-    size, *off = (np.linalg.norm(each, axis=1) for each in flat)
-    worst = (f"{(each / size).max():.0%}" for each in off)
-    print(f"worst push: linear elasticity {next(worst)}, {OWN} {next(worst)}")
-    alone = results["FC 128"][0]
-    errors = {n: [alone[f"error/displacement/{n}/rmse"]] for n in ("mean", "linear map")}
-    errors["linear elasticity"] = [float(np.sqrt((missing**2).mean()))]
-    for name, found in results.items():
-        errors[name] = [each[f"error/{target(name)}/rmse"] for each in found]
-    compare = Comparison(errors, OWN, "displacement: rmse in mm", list(results))
-    return conclude(compare, small=chosen.small)
+    linear = exact - missing
+    found = {"linear elasticity": [linear], "linear map": [linear_map(*known)(given)]}
+    for name, tried in guesses.items():
+        found[name] = [each + linear if "elasticity" in name else each for each in tried]
+    sizes = np.linalg.norm(exact.reshape(len(exact), -1), axis=1)
+    errors = {
+        name: [np.linalg.norm((g - exact).reshape(len(g), -1), axis=1) / sizes for g in tried]
+        for name, tried in found.items()
+    }
+    worst = (f"{name} {errors[name][0].max():.0%}" for name in ("linear elasticity", OWN))
+    print("worst push:", ", ".join(worst))
+    means = {name: [float(each.mean()) for each in tried] for name, tried in errors.items()}
+    comparison = Comparison(means, OWN, "relative error of a push", list(guesses))
+    return conclude(comparison, small=chosen.small)
 
 
 if __name__ == "__main__":

@@ -71,7 +71,7 @@ def main() -> int:
         state, right = samples(folder, "validation", "state", "later")
         theory = theory_of_small_swings({"state": state})
         shown = {"exact": right, "theory of small swings": theory}
-        draw(asked.picture, state, shown | {"FC, width 64": guesses["FC, width 64"]})
+        draw(asked.picture, state, shown | {"FC, width 64": guesses["FC, width 64"][0]})
     return conclude(Comparison.of(results, "error/later/relative_l2"), small=asked.small)
 
 

@@ -55,7 +55,7 @@ def samples(session: Path, mode: str, *fields: str) -> list[np.ndarray]:
 
 def config(
     network: str | type,
-    given: str,
+    given: str | Sequence[str],
     wanted: str,
     epochs: int,
     lr: float,
@@ -101,32 +101,34 @@ def trained(
 def compared(
     session: Path,
     networks: Mapping[str, tuple[NetworkConfig, int]],
-    given: str,
+    given: str | Sequence[str],
     rivals: Sequence[str | Callable[..., Any]] = ("all",),
     **options: Any,
-) -> tuple[dict[str, list[Result]], dict[str, np.ndarray]]:
+) -> tuple[dict[str, list[Result]], dict[str, list[np.ndarray]]]:
     """Train networks on a session's samples with each of `SEEDS`.
 
     Args:
         session: The session's folder.
         networks: Configuration and number of epochs of each network, by name.
-        given: The network's input.
+        given: The network's inputs.
         rivals: See `Training.rivals`; they are the same for all networks.
         options: Further options of trainings.
 
     Returns:
-        The result for each seed, and the first seed's predictions for the validation samples, both
-        by the network's name.
+        The result and the predictions for the validation samples of each seed, by the network's
+        name.
     """
-    (tested,), results, guesses = samples(session, "validation", given), {}, {}
+    names, results, guesses = [given] if isinstance(given, str) else list(given), {}, {}
+    tested = dict(zip(names, samples(session, "validation", *names), strict=True))
     for name, (network, epochs) in networks.items():
         tried = []
         for seed in SEEDS:
             own = {"rivals": [] if results or tried else rivals, **options}
             training = trained(session, network, epochs, seed, session_name=f"{name} {seed}", **own)
             tried.append(training.result)
-            if name not in guesses:
-                (guesses[name],) = training.learner.predict_in_training({given: tested}).values()
+            guesses.setdefault(name, []).extend(
+                training.learner.predict_in_training(tested).values()
+            )
         results[name] = tried
     return results, guesses
 

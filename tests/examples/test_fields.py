@@ -81,59 +81,86 @@ def plate(module):
     return module("environments.plate")
 
 
-def test_triangles_fill_the_plate_and_leave_its_hole(plate):
-    nodes, triangles = plate.mesh()
+@pytest.mark.parametrize("shape", ["hole", "corner"])
+@pytest.mark.parametrize("space", [0.05, 0.25])
+def test_triangles_fill_the_plate_and_leave_what_it_lacks(shape, space, plate):
+    nodes, triangles = plate.mesh(shape, space, np.random.default_rng(0))
     first, second, third = nodes[triangles].swapaxes(0, 1)
     (a, b), (c, d) = (second - first).T, (third - first).T
     areas = (a * d - b * c) / 2
-    assert areas.min() > plate.SPACE**2 / 10
+    assert areas.min() > space**2 / 12
     rim = np.isclose(np.linalg.norm(nodes - plate.SIDE / 2, axis=1), plate.RADIUS).sum()
-    hole = rim * plate.RADIUS**2 * np.sin(2 * np.pi / rim) / 2  # a regular polygon
-    assert areas.sum() == pytest.approx(plate.SIDE**2 - hole)
+    hole = rim * plate.RADIUS**2 * np.sin(2 * np.pi / max(1, rim)) / 2  # a regular polygon
+    lacks = hole if shape == "hole" else plate.SIDE**2 / 4
+    assert areas.sum() == pytest.approx(plate.SIDE**2 - lacks)
     assert set(triangles.ravel()) == set(range(len(nodes)))
 
 
 def test_no_heat_leaves_the_plate_and_differences_fade(plate, simulate):
-    environment = plate.Plate.__new__(plate.Plate)
-    environment.create()
-    before, after = simulate(plate.Plate, "before", "after")
-    assert before[..., 1].min() > 0
-    before, after = before[..., 0], after[..., 0]
-    np.testing.assert_allclose(after @ environment.masses, before @ environment.masses, atol=1e-6)
-    assert np.all(np.ptp(after, axis=1) < np.ptp(before, axis=1))
+    names = ("place", "triangle", "edge", "before", "after")
+    plates = list(zip(*simulate(plate.Plate, *names), strict=True))
+    assert len({len(nodes) for nodes, *_ in plates}) > 1
+    for nodes, triangles, edges, before, after in plates:
+        first, second, third = nodes[triangles].swapaxes(0, 1)
+        (a, b), (c, d) = (second - first).T, (third - first).T
+        masses = np.zeros(len(nodes))
+        np.add.at(masses, triangles, ((a * d - b * c) / 6)[:, None])
+        temperature, conductivity = before.T
+        assert conductivity.min() > 0
+        assert after[:, 0] @ masses == pytest.approx(temperature @ masses, abs=1e-6)
+        assert np.ptp(after) < np.ptp(temperature)
+        sides = {tuple(sorted(t[[i, i - 1]])) for t in triangles for i in range(3)}
+        assert {tuple(each) for each in edges} == sides and len(edges) == len(sides)
 
 
 @pytest.fixture
 def network(plate, module):
-    """A graph network on the plate, with random weights."""
+    """A graph network for heat with random weights."""
     pytest.importorskip("torch_geometric", reason="needs torch-geometric")
     torch.manual_seed(0)
     made = module("networks.heat").HeatNetwork(channels=8, steps=2).double()
-    made.places = made.places.double()
     torch.nn.init.zeros_(made.last.bias)
     return made
 
 
+@pytest.fixture
+def mesh(plate):
+    """Nodes, triangles and edges of a plate, as tensors but for the triangles."""
+    nodes, triangles = plate.mesh("hole", 0.1, np.random.default_rng(0))
+    sides = np.concatenate([triangles[:, [0, 1]], triangles[:, 1:], triangles[:, ::2]])
+    edges = np.unique(np.sort(sides), axis=0)
+    return torch.from_numpy(nodes), triangles, torch.from_numpy(edges).long()
+
+
 @pytest.mark.slow
-def test_a_node_hears_of_others_as_far_as_there_are_steps(network, plate):
+def test_a_node_hears_of_others_as_far_as_there_are_steps(network, mesh):
     """With two steps, warmth comes from nodes at most two edges away; conductivity from three."""
-    nodes, triangles = plate.mesh()
+    nodes, triangles, edges = mesh
     near = np.eye(len(nodes), dtype=bool)
     for triangle in triangles:
         near[np.ix_(triangle, triangle)] = True
-    values = torch.randn(1, len(nodes), 2, dtype=torch.double, requires_grad=True)
-    network(values)[0, 0, 0].backward()
-    temperature, conductivity = (values.grad[0] != 0).numpy().T
+    values = torch.randn(len(nodes), 2, dtype=torch.double, requires_grad=True)
+    network(nodes, edges, values)[0, 0].backward()
+    temperature, conductivity = (values.grad != 0).numpy().T
     reach = [np.linalg.matrix_power(near.astype(int), hops)[0] > 0 for hops in (1, 2, 3)]
     np.testing.assert_array_equal(temperature, reach[1])
     assert not np.any(conductivity & ~reach[2]) and np.any(conductivity & ~reach[0])
 
 
 @pytest.mark.slow
-def test_a_plate_of_one_temperature_stays_as_it_is(network):
-    values = torch.randn(2, len(network.places), 2, dtype=torch.double)
-    values[..., 0] = 1.5
-    assert torch.allclose(network(values), torch.tensor(1.5, dtype=torch.double))
-    values[:, :5, 0] = 2
-    warm = network(values)
+def test_a_plate_of_one_temperature_stays_as_it_is_and_no_mesh_touches_another(network, mesh):
+    nodes, _, edges = mesh
+    values = torch.randn(len(nodes), 2, dtype=torch.double)
+    values[:, 0] = 1.5
+    assert torch.allclose(network(nodes, edges, values), torch.tensor(1.5, dtype=torch.double))
+    warmer = values.clone()
+    warmer[:5, 0] = 2
+    warm = network(nodes, edges, warmer)
     assert torch.all((warm > 1.5 - 1e-9) & (warm <= 2)) and warm.max() > 1.6
+    both = network(
+        torch.cat([nodes, nodes]),
+        torch.cat([edges, edges + len(nodes)]),
+        torch.cat([values, warmer]),
+    )
+    torch.testing.assert_close(both[len(nodes) :], warm)
+    assert torch.allclose(both[: len(nodes)], torch.tensor(1.5, dtype=torch.double))
