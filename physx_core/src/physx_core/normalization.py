@@ -28,6 +28,8 @@ Normalize = bool | Mapping[str, str]
 
 _INCREMENT = "increment"
 _STATISTICS = ("mean", "std", "minimum", "maximum")
+_ROUNDING = 4 * np.finfo(np.float64).eps
+"""Smallest relative deviation that is no rounding error."""
 
 
 @dataclass(frozen=True)
@@ -52,6 +54,14 @@ class Normalization:
     maximum: Array | None = None
     log: bool = False
     since: str = ""
+
+    @property
+    def is_constant(self) -> Array:
+        """Where all values are the same, up to rounding, of the shape of `std`."""
+        if self.minimum is None or self.maximum is None:
+            return np.zeros(np.shape(self.std), bool)
+        found: Array = self.maximum - self.minimum <= _ROUNDING * np.abs(self.mean)
+        return found
 
     def arrays(self) -> dict[str, Array]:
         """Return the known statistics by name, for a file or another process."""
@@ -179,8 +189,12 @@ def compute_normalization(
             continue
         known = known.pool() if by == "field" else known
         mean, std = known.mean, known.std
-        resolution = 4 * np.finfo(np.float64).eps * np.abs(mean)
-        arrays = mean, np.where(std > resolution, std, 1.0), known.minimum, known.maximum
+        arrays = (
+            mean,
+            np.where(std > _ROUNDING * np.abs(mean), std, 1.0),
+            known.minimum,
+            known.maximum,
+        )
         mean, std, least, most = (_fitted(a, by, fields[name], of) for a in arrays)
         found[name] = Normalization(mean, std, least, most, what.log, what.since)
     return found

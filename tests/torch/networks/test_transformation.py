@@ -85,6 +85,20 @@ def test_constant_component_is_shifted_only(network):
     assert transformation.transform_before_prediction({"x": x})["x"].tolist() == [[0.0, 2.0]]
 
 
+def test_a_target_that_was_constant_is_predicted_as_it_was_whatever_the_network_says(network):
+    mean, std = np.array([7.0, 0.0, 3.0]), np.array([1.0, 1.0, 2.0])
+    spread = np.array([7.0, 0.0, -1.0]), np.array([7.0, 0.0, 5.0])
+    transformation = TorchTransformation()
+    transformation.set_normalization({"y": Normalization(mean, std, *spread)}, network)
+    said = torch.tensor([[0.3, -0.2, 0.5]], dtype=torch.float64)
+    assert transformation.transform_before_apply({"p": said})["p"].tolist() == [[7.0, 0.0, 4.0]]
+    kept = Normalization(np.array([5.0]), np.array([1.0]), np.array([5.0]), np.array([5.0]), True)
+    transformation.set_normalization({"y": kept}, network)
+    assert transformation.transform_before_apply({"p": said})["p"].tolist() == [[np.exp(5.0)] * 3]
+    _, targets = transformation.transform_before_loss({}, {"y": torch.full((1, 1), np.exp(5.0))})
+    assert targets["y"].tolist() == [[pytest.approx(0, abs=1e-9)]]
+
+
 def test_integer_inputs_become_floating(network):
     transformation = TorchTransformation()
     transformation.set_normalization(

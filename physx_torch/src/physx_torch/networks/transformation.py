@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import NamedTuple
 
+import numpy as np
 import torch
 
 from physx_core import Network, Normalization, Transformation
@@ -26,7 +27,7 @@ class TorchTransformation(Transformation):
 
     Fields of `net_fields` and `opt_fields` are normalized with their own coefficients; the i-th of
     `pred_fields` is converted to physical units with those of the i-th of `opt_fields`. Fields
-    without coefficients are unchanged.
+    without coefficients are unchanged. What was constant in all samples is predicted as it was.
 
     Everything is computed in the network's data type: in float32, values with a large offset (1e6
     standard deviations) lose their last digits before the mean is subtracted; use float64 for
@@ -61,7 +62,10 @@ class TorchTransformation(Transformation):
         self._inputs = {n: scales[n] for n in network.net_fields if n in scales}
         self._targets = {n: scales[n] for n in network.opt_fields if n in scales}
         pairs = zip(network.pred_fields, network.opt_fields, strict=False)
-        self._predictions = {pred: scales[opt] for pred, opt in pairs if opt in scales}
+        self._predictions = {
+            pred: _with_constants(scales[opt], normalization[opt])
+            for pred, opt in pairs if opt in scales
+        }  # fmt: skip
 
     def transform_before_prediction(self, data: Tensors) -> Tensors:
         """Return the data with `net_fields` normalized."""
@@ -91,6 +95,12 @@ def _scale(item: Normalization, network: TorchNetwork) -> _Scale:
         for values in (item.mean, item.std)
     )
     return _Scale(mean, std, item.log)
+
+
+def _with_constants(scale: _Scale, item: Normalization) -> _Scale:
+    """Return a scale by which whatever a network says of a constant becomes that constant."""
+    constant = torch.from_numpy(np.asarray(item.is_constant)).to(scale.std.device)
+    return scale._replace(std=scale.std.masked_fill(constant, 0.0))
 
 
 def _normalize(data: Tensors, scales: Mapping[str, _Scale]) -> Tensors:
