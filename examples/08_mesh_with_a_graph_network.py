@@ -49,7 +49,7 @@ def nothing_changes(given: dict[str, np.ndarray]) -> np.ndarray:
 def main() -> int:
     """Compare; the exit status tells whether the network for heat beats all others."""
     asked = options(__doc__).parse_args()
-    count, epochs = (60, 2) if asked.small else (1000, 20)
+    count, epochs = (60, 2) if asked.small else (300, 12)
     session = generate(Plate, count, asked.session_dir, as_tcp_ip_client=False)
     kinds = {
         "graph network of physx": ("torch/graph", {"nodes": 4, "outputs": 1, "steps": 8}, 2e-3),
