@@ -24,6 +24,7 @@ GIVEN = {
     "torch/fc": {"arguments": {"layers": [4, 8, 3]}},
     "cluster/local": {"arguments": {"options": {}, "threads": 1}},
     "remote/godot-rl": {"arguments": {"timeout": 0.1}},
+    "torch/graph": {"arguments": {"nodes": 2, "outputs": 1}},
     "torch/encoder_decoder": {"arguments": {"encoder": [4, 2]}},
     "torch/module": {
         "arguments": {"module": "torch.nn:Linear", "in_features": 4, "out_features": 3}

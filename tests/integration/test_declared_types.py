@@ -144,7 +144,7 @@ RECORDS = {
     *("CollisionShape", "Joint", "MovableBody", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
     "Bond",
     *("Agreement", "Cause", "Figure", "Parting", "Ranking"),
-    *("Kind", "Format", "Table", "Section", "RolloutResult", "Unseen"),
+    *("Kind", "Format", "Table", "Section", "RolloutResult", "Unseen", "Score"),
 }
 ABSTRACT = {"Attachment", "Pipeline", "RaySensor", "Sensor"}
 

@@ -26,6 +26,15 @@ def slots_of(kind: Any) -> list[str]:
 
 
 @functools.cache
+def cached_of(kind: Any) -> frozenset[str]:
+    """Return the names of the cached properties of a class whose objects never change."""
+    if not getattr(getattr(kind, "__dataclass_params__", None), "frozen", False):
+        return frozenset()
+    members = [item for each in kind.__mro__ for item in vars(each).items()]
+    return frozenset(n for n, what in members if isinstance(what, functools.cached_property))
+
+
+@functools.cache
 def recipe_of(kind: Any, base: Any) -> str | None:
     """Return the name of a class; None if it is the base itself."""
     if kind is base:

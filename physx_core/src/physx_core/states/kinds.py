@@ -14,7 +14,7 @@ import numpy as np
 
 from physx_core.errors import StateError
 from physx_core.states.arrays import ARRAYS
-from physx_core.states.classes import class_named, class_of, new_of, recipe_of, slots_of
+from physx_core.states.classes import cached_of, class_named, class_of, new_of, recipe_of, slots_of
 from physx_core.states.kind import Kind, Part, RefusedError, StateAdapter, Value
 
 _BITS = {
@@ -282,8 +282,9 @@ def _adapted(name: str) -> str | None:
 
 
 def read_attributes(value: Any, part: Part, left_out: frozenset[str] = frozenset()) -> Any:
-    """Return the attributes of an object as parts, by name."""
+    """Return the attributes of an object as parts, by name, but for what is computed from them."""
     own = getattr(value, "__dict__", {})
+    left_out = left_out | cached_of(class_of(value))
     found = {name: part(own[name], f".{name}") for name in own if name not in left_out}
     for name in slots_of(class_of(value)):
         if hasattr(value, name):

@@ -456,7 +456,10 @@ def _to_dict(name: str, field: Field | type) -> dict[str, Any]:
 def _from_dict(plain: Mapping[str, Any]) -> MessageField:
     if "text" in plain:
         return plain["name"], str if plain["text"] else bytes
-    return Field.from_dict(plain)
+    field = Field.from_dict(plain)
+    if field.free_axis:
+        raise ConfigError(f'Field "{field.name}": messages have no free axes.')
+    return field
 
 
 def _proto_text(parts: Mapping[str, Mapping[str, tuple[bool, str]]]) -> str:

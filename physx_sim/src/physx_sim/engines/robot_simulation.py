@@ -492,7 +492,11 @@ class RobotSimulation(Simulation, Generic[Engine]):
         raise self._lacks("moving_statics")
 
     def attach(self, attachment: Attachment) -> int:
-        """Hold two bodies together from now on; return the attachment's number for `detach`."""
+        """Hold two bodies together from now on; return the attachment's number for `detach`.
+
+        Raises:
+            SimulationError: If one of them is hidden, or neither can move.
+        """
         self._check_has("attachments")
         self._check_attachment(attachment)
         for name in (attachment.body_a, attachment.body_b):

@@ -129,6 +129,7 @@ class Learner:
 
         Raises:
             FieldsMismatchError: If the network needs fields with other names or shapes.
+            ConfigError: If it reads free axes, and several processes train it.
         """
         fields = {**fields, **packed_fields(free_axes(fields.values()))}
         self.fields = fields
@@ -164,8 +165,9 @@ class Learner:
 
     def _predict_batch(self, batch: Batch) -> PredictedBatch:
         """Predict a batch in physical units that contains `batch_fields`."""
-        packed, _ = self._pack(batch)
-        return PredictedBatch.of(self.network, self.transformation, self._read(packed))
+        if self._free:
+            batch, _ = self._pack(batch)
+        return PredictedBatch.of(self.network, self.transformation, self._read(batch))
 
     def _pack(self, batch: Batch) -> tuple[Batch, dict[str, Index]]:
         """Return a batch in which free axes are packed, and the sizes if they were not before."""
