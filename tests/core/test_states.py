@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import enum
+import functools
 import threading
 from collections import Counter, OrderedDict, defaultdict, deque
 from dataclasses import dataclass, field
@@ -31,6 +32,15 @@ class Node:
 class Frozen:
     first: Any
     second: Any = field(default=())
+
+
+@dataclass(frozen=True)
+class Triangle:
+    legs: tuple[float, float]
+
+    @functools.cached_property
+    def area(self) -> float:
+        return self.legs[0] * self.legs[1] / 2
 
 
 class Slotted:
@@ -429,6 +439,16 @@ def test_objects_created_differently_are_refused():
     ):
         with pytest.raises(StateError, match=rf"attributes differ: {name}"):
             Baseline(other).restore(state)
+
+
+def test_what_an_immutable_object_has_computed_is_no_part_of_its_state():
+    here, there = Node(shape=Triangle((3.0, 4.0))), Node(shape=Triangle((3.0, 4.0)))
+    baseline = Baseline(here)
+    assert here.shape.area == 6
+    other = Baseline(there)  # which has not asked for it
+    other.restore(baseline.capture())
+    assert there.shape.area == 6
+    baseline.restore(other.capture())
 
 
 def test_a_state_creates_no_class_that_is_not_plain():
