@@ -35,7 +35,7 @@ def test_defaults_of_networks_resolve():
 def test_unknown_network_names_the_nearest():
     with pytest.raises(ComponentNotFoundError, match="fc") as caught:
         plugins.resolve("network", "torch/fcc")
-    assert caught.value.known == ["encoder_decoder", "fc", "module", "unet"]
+    assert caught.value.known == ["encoder_decoder", "fc", "graph", "module", "unet"]
 
 
 def test_loading_the_plugin_does_not_import_torch():
