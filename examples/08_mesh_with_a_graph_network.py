@@ -7,7 +7,7 @@ happens along an edge. It is compared with the general graph network that comes 
 what needs none. It is a plain PyTorch class that knows nothing about physx: networks/heat.py.
 
     python examples/08_mesh_with_a_graph_network.py
-    physx export sessions/plate p.vtkhdf --to vtkhdf --mode validation --points place --cells triangle
+    physx export sessions/plate p.hdf --to vtkhdf --mode validation --points place --cells triangle
 """
 
 import sys

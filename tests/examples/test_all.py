@@ -30,7 +30,7 @@ PRINTED = {  # what an example has to print, as patterns
     "10_quadruped": (r"standing on dart +0\.\d\d m", r"trotting on pinocchio +[2-9]\.\d\d m"),
     "11_pushing": (r"nothing +0 +0", r"rule +4 +4"),
     "12_reinforcement_learning": (r"chance +\d", r"rule +4\d\d", r"PPO, seed 2 +\d"),
-    "15_own_loop": (r"theory of small swings +\d", r"FC, width 64 +\d"),
+    "15_own_loop": (r"theory_of_small_swings +\d", r"FC, width 64 +\d"),
     "16_deploy_onnx": ("loaded of physx and PyTorch: None", r"100 guesses: [\d.e-]+ m"),
     "17_two_machines": ("physx client --connect", r"instances \[1 2\], as in one process: True"),
     "20_policy_on_a_cluster": ("equal to those learned here: True",),
