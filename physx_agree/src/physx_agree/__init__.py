@@ -1,4 +1,4 @@
-"""How far physics engines agree on a task, and why they part."""
+"""Agreement of physics engines: how far they agree on a task, and why they part."""
 
 from __future__ import annotations
 

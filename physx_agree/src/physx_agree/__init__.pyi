@@ -1,4 +1,4 @@
-"""How far physics engines agree on a task, and why they part."""
+"""Agreement of physics engines: how far they agree on a task, and why they part."""
 
 from .agreement import Agreement as Agreement
 from .causes import Cause as Cause

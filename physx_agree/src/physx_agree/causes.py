@@ -1,4 +1,4 @@
-"""What is found out about two engines: plain values that are printed and stored."""
+"""Causes and partings: differences between two engines, as plain values that are stored."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What engines hold of a world, read back from their dynamics in random states.
+"""Models: masses, friction and more that engines hold, read back from their dynamics.
 
 Mass matrix and inverse dynamics are linear in masses, centers of mass, moments of inertia, rotors,
 dampings, frictions, stiffnesses and gravity (C. G. Atkeson, C. H. An and J. M. Hollerbach,

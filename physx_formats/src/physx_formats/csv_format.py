@@ -38,11 +38,11 @@ def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
             "(physx edit --keep)."
         )
     with out.open("wb") as file:
-        options = csv.WriteOptions(include_header=True)
+        form = csv.WriteOptions(include_header=True)
         for block in table.blocks(BLOCK):
             columns = [column for values in block.values() for column in _columns(values)]
-            csv.write_csv(arrow.table(columns, names=names), file, options)
-            options = csv.WriteOptions(include_header=False)
+            csv.write_csv(arrow.table(columns, names=names), file, form)
+            form = csv.WriteOptions(include_header=False)
     return 0
 
 

@@ -99,7 +99,7 @@ class _Column:
         while hasattr(kind, "list_size"):
             shape.append(kind.list_size)
             kind = kind.value_type
-        self._file, self._name, self._left = file, field.name, np.empty((0, *shape))
+        self._file, self._name = file, field.name
         self._batches: Iterator[Any] | None = None
         self.shape, self.problem = (file.metadata.num_rows, *shape), ""
         known = field.metadata or {}
@@ -117,7 +117,7 @@ class _Column:
             self.shape = self.shape[:-1]
             self.dtype = np.result_type(self.dtype, np.complex64)
         self.unit = known.get(b"unit", b"").decode(errors="replace")
-        self._path = path
+        self._path, self._left = path, np.empty((0, *self.shape[1:]), self.dtype)
 
     def read(self, start: int, count: int) -> Array:
         """Return the next rows."""
@@ -126,7 +126,7 @@ class _Column:
         parts = [self._left]
         while sum(map(len, parts)) < count:
             parts.append(self._values(next(self._batches).column(0)))
-        rows = np.concatenate(parts) if len(parts[0]) else np.concatenate(parts[1:])
+        rows = np.concatenate(parts)
         found, self._left = rows[:count], rows[count:]
         return found
 

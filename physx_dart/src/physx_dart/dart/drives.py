@@ -1,4 +1,4 @@
-"""What DART lacks in joints: rotors, joints that follow others, and servos that leave a limit.
+"""Drives: rotors, joints that follow others, and servos that leave a limit, which DART lacks.
 
 Each is written as torques and settings before a physics step. DART's solver for contacts, limits
 and servos knows nothing of them, so what its impulses change there is corrected in the next step.

@@ -1,4 +1,4 @@
-"""What has changed in a world since it was built: settings of bodies, motions of static ones."""
+"""Changes: settings of bodies and motions of static ones since a world was built."""
 
 from __future__ import annotations
 

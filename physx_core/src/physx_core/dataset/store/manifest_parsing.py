@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Set
 from typing import Any
 
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition, Partitions
@@ -38,7 +38,7 @@ def apply_change(manifest: Manifest, plain: Any) -> None:
     """Take over a change of the manifest, described by plain data."""
     name = checked(str, plain["mode"], "a mode")
     mode = manifest.modes[name]
-    partition = _partition(name, plain["partition"], mode)
+    partition = _partition(name, plain["partition"], mode.files, set(mode.axes))
     if any(partition.key == each.key for each in mode.dropped):
         raise ValueError("a partition is listed twice")
     mode.put(partition)
@@ -67,8 +67,9 @@ def _mode(mode_name: str, plain: Any) -> Mode:
         raise ValueError("a mode has no fields")
     check_together(fields)
     mode = Mode(fields, statistics=None)
-    mode.partitions = Partitions(_partition(mode_name, e, mode) for e in plain["partitions"])
-    mode.dropped = [_partition(mode_name, entry, mode) for entry in plain.get("dropped", ())]
+    known = mode.files, set(mode.axes)
+    mode.partitions = Partitions(_partition(mode_name, e, *known) for e in plain["partitions"])
+    mode.dropped = [_partition(mode_name, entry, *known) for entry in plain.get("dropped", ())]
     for session, index in checked(dict, plain.get("removed", {}), "'removed'").items():
         mode.removed[session] = whole(index, "the number of a partition", 2**31)
     keys = [partition.key for partition in (*mode.partitions, *mode.dropped)]
@@ -78,8 +79,9 @@ def _mode(mode_name: str, plain: Any) -> Mode:
     return mode
 
 
-def _partition(mode_name: str, plain: Any, mode: Mode) -> Partition:
-    fields = mode.files
+def _partition(
+    mode_name: str, plain: Any, fields: Mapping[str, Field], axes: Set[str]
+) -> Partition:
     session = checked(str, plain["session"], "a session")
     if not SESSION.fullmatch(session):
         raise ValueError(f"a session cannot be {session!r:.60}")
@@ -95,7 +97,7 @@ def _partition(mode_name: str, plain: Any, mode: Mode) -> Partition:
         raise ValueError("a sealed partition has fields of unknown shape")
     rows = whole(plain["rows"], "a number of rows") if sealed else 0
     sizes = checked(dict, plain.get("sizes", {}), "'sizes'") if sealed else {}
-    if sealed and sizes.keys() != set(mode.axes):
+    if sealed and sizes.keys() != axes:
         raise ValueError("a sealed partition has the sizes of other axes")
     for size in sizes.values():
         whole(size, "a number of entries")
