@@ -14,7 +14,7 @@ DIST := --dist loadgroup --no-loadscope-reorder
 ROOM = $(wildcard tests/$(P) tests/*/$(P) tests/*/*/$(P))
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check
 COMPILE := $(BIN)/python -m compileall -q -j 0 .venv/lib >/dev/null 2>&1 || true  # pip uses one core
-PACKAGES := -e ./physx_core -e ./physx_testing -e "./physx_sim[robots,meshes,mjcf]" -e ./physx_formats -e "./physx_dart[robots]" -e ./physx_mujoco -e "./physx_torch[export]" -e ./physx_rerun -e ./physx_gym -e ./physx_remote -e ./physx_cluster -e ./physx_report -e ./physx_agree
+PACKAGES := -e ./physx_core -e ./physx_testing -e "./physx_sim[robots,meshes,mjcf]" -e ./physx_formats -e "./physx_dart[robots]" -e ./physx_mujoco -e "./physx_torch[export]" -e ./physx_rerun -e ./physx_gym -e ./physx_remote -e ./physx_cluster -e ./physx_report -e ./physx_agree -e ./physx_identify
 PROJECTS := $(wildcard physx_*/pyproject.toml) constraints.txt
 
 .PHONY: demo test quick lint docs bench clean
@@ -61,6 +61,7 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/differentiable.py
 	$(BIN)/python benchmarks/physics.py
 	$(BIN)/python benchmarks/agree.py
+	$(BIN)/python benchmarks/identify.py
 	$(BIN)/python benchmarks/gym.py
 	$(BIN)/python benchmarks/idle_threads.py
 	$(BIN)/python benchmarks/remote.py

@@ -16,7 +16,7 @@ pytestmark = [pytest.mark.slow, pytest.mark.processes]
 PACKAGES = (
     *("physx_core", "physx_testing", "physx_sim", "physx_formats", "physx_dart", "physx_mujoco"),
     *("physx_torch", "physx_rerun", "physx_gym", "physx_remote", "physx_cluster"),
-    *("physx_report", "physx_agree"),
+    *("physx_report", "physx_agree", "physx_identify"),
 )
 PHYSX = ("-m", "physx_core")
 GENERATE = "--batch-nb 2 --batch-size 10"

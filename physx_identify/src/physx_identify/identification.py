@@ -1,0 +1,206 @@
+"""Identification: what a log says about a robot; a plain value that is printed and stored."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from physx_identify import wording
+from physx_identify.errors import IdentificationError
+from physx_identify.structure import Test
+from physx_sim import JointSettings, Robot
+
+SETTINGS = ("damping", "friction", "armature")
+"""Kinds that are settings of a robot's joints."""
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What the log says about one parameter.
+
+    Attributes:
+        name: Such as ``"friction elbow"``.
+        kind: As in `Unknown`.
+        of: Name of the link or joint.
+        part: Which number of an inertia.
+        unit: Its unit.
+        nominal: In the robot's file and settings.
+        value: The most likely value that is physical.
+        verdict: ``"told"``; ``"hardly told"``: the interval is wider than the value; or
+            ``"inseparable"``.
+        error: Standard error; None: the parameter cannot be told from others.
+        low: Lower end of the interval; None likewise, or if the fit did not converge.
+        high: Upper end.
+        blocks: Standard error from the spread between blocks of the log, relative to `error`: a
+            check, about 1.
+    """
+
+    name: str
+    kind: str
+    of: str
+    part: str
+    unit: str
+    nominal: float
+    value: float
+    verdict: str
+    error: float | None = None
+    low: float | None = None
+    high: float | None = None
+    blocks: float | None = None
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A sum of parameters that the log tells, although it cannot tell them apart.
+
+    Attributes:
+        factors: Factor of each parameter, by name.
+        value: Of the sum.
+        low: Lower end of its interval.
+        high: Upper end.
+    """
+
+    factors: Mapping[str, float]
+    value: float
+    low: float | None = None
+    high: float | None = None
+
+    def __str__(self) -> str:
+        return " + ".join(
+            name if factor == 1 else f"{factor:.4g} x {name}"
+            for name, factor in self.factors.items()
+        ).replace("+ -", "- ")
+
+
+@dataclass(frozen=True)
+class LogNoise:
+    """Noise of a log.
+
+    Attributes:
+        encoder: Standard deviation of the positions, in rad or m.
+        torque: Standard deviation of each torque, in N m or N.
+        correlation: Of each torque, from sample to sample.
+        order: Order of the autoregression.
+        innovations: Deviation of the autoregression's innovations, of each torque.
+        regression: Its coefficients, of each torque.
+    """
+
+    encoder: float
+    torque: Sequence[float]
+    correlation: Sequence[float]
+    order: int
+    innovations: Sequence[float]
+    regression: Sequence[Sequence[float]]
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What a log says about a robot.
+
+    Attributes:
+        robot: Its file, or name.
+        source: The log.
+        joints: Names of the joints.
+        samples: Number of samples.
+        period: Time between them, in s.
+        level: Nominal probability of the intervals, such as 0.95.
+        estimates: The parameters.
+        combinations: What is told of those that are inseparable.
+        noise: Of the log.
+        tests: Of what is left.
+        converged: Whether the fit converged, from two starts, to the same values.
+        residual: Root mean square of what is left of each torque, in N m or N.
+        farthest: Largest position of each joint from 0, in rad or m.
+        fastest: Largest velocity of each joint, in rad/s or m/s.
+        mean: Posterior mean of all parameters.
+        covariance: Posterior covariance.
+        draws: Physical draws from the posterior, one a row.
+    """
+
+    robot: str
+    source: str
+    joints: Sequence[str]
+    samples: int
+    period: float
+    level: float
+    estimates: Sequence[Estimate]
+    combinations: Sequence[Combination]
+    noise: LogNoise
+    tests: Sequence[Test]
+    converged: bool
+    residual: Sequence[float]
+    farthest: Sequence[float]
+    fastest: Sequence[float]
+    mean: Sequence[float]
+    covariance: Sequence[Sequence[float]]
+    draws: Sequence[Sequence[float]]
+
+    @property
+    def lacks(self) -> list[str]:
+        """What the model lacks, according to the tests that failed."""
+        failed = sorted((each for each in self.tests if each.failed), key=lambda x: x.probability)
+        return [f"{each.lacks} ({each.joint})" if each.joint else each.lacks for each in failed]
+
+    @property
+    def holds(self) -> bool:
+        """Whether the intervals may be called by their level."""
+        return self.converged and not self.lacks
+
+    def __getitem__(self, name: str) -> Estimate:
+        """Return the estimate of a parameter.
+
+        Raises:
+            IdentificationError: If it was not unknown.
+        """
+        for each in self.estimates:
+            if each.name == name:
+                return each
+        names = ", ".join(each.name for each in self.estimates)
+        raise IdentificationError(f'"{name}" was not unknown; that was: {names}.')
+
+    def applied_to(self, robot: Robot, values: Sequence[float] | None = None) -> Robot:
+        """Return a robot with the values of masses, damping, friction and armature.
+
+        Args:
+            robot: The robot.
+            values: Of all parameters; None: the most likely ones.
+
+        Raises:
+            IdentificationError: If something else was unknown of the robot itself, which no option
+                of a robot holds: inertia, payload, Stribeck friction.
+        """
+        given = [each.value for each in self.estimates] if values is None else list(values)
+        odd = [e.name for e in self.estimates if e.kind in ("inertia", "payload", "stribeck")]
+        if odd:
+            raise IdentificationError(
+                f'No option of a robot holds "{odd[0]}": edit its file, or identify its mass.'
+            )
+        masses, joints = dict(robot.mass_factors), dict(robot.joints)
+        for each, value in zip(self.estimates, given, strict=True):
+            if each.kind == "mass":
+                masses[each.of] = masses.get(each.of, 1.0) * value / each.nominal
+            elif each.kind in SETTINGS:
+                settings = joints.get(each.of, JointSettings())
+                joints[each.of] = dataclasses.replace(settings, **{each.kind: value})
+        return dataclasses.replace(robot, mass_factors=masses, joints=joints)
+
+    def to_plain(self) -> dict[str, Any]:
+        """Return all of it as plain data."""
+        plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
+        return plain
+
+    def to_json(self) -> str:
+        """Return all of it as JSON, with what it amounts to: ``holds`` and ``lacks``."""
+        return json.dumps({"holds": self.holds, "lacks": self.lacks, **self.to_plain()}, indent=1)
+
+    def __str__(self) -> str:
+        return "\n".join(wording.lines_of(self))
+
+
+def robot_text(robot: Robot) -> str:
+    """Return a robot's file or name."""
+    return str(Path(robot.urdf)) if isinstance(robot.urdf, Path) else robot.urdf
