@@ -25,8 +25,8 @@ _RATIO = 1.5
 _WELL = 0.5
 """Correlation above which velocities are those of a joint."""
 _TOO_LARGE = 20.0
-_CLEAR = 0.2
-"""Gain of correlation that shows that torques are in another order."""
+_CLEAR, _UNLIKE = 0.2, 0.02
+"""Share of what is unlike the model, and least of it, that shows that torques are exchanged."""
 _SHOWN_SIGN = -0.5
 _FAMILIAR = {180 / np.pi: "degrees", np.pi / 180: "radians taken for degrees", 1e3: "mm or ms"}
 
@@ -58,8 +58,8 @@ def _check_joints(log: Log, model: Model) -> None:
         return
     if set(log.joints) == set(model.joints):
         raise IdentificationError(
-            f"{log.source} has the joints in the order {listed(log.joints)}, the robot in the order "
-            f"{listed(model.joints)}. Arrange the columns like the robot."
+            f"{log.source} has the joints in the order {listed(log.joints)}, the robot in "
+            f"the order {listed(model.joints)}. Arrange the columns like the robot."
         )
     missing = [name for name in model.joints if name not in log.joints]
     more = [name for name in log.joints if name not in model.joints]
@@ -78,8 +78,8 @@ def _check_length(log: Log, parameters: int) -> None:
         )
     if not _FAST <= log.period <= _SLOW:
         raise IdentificationError(
-            f"{log.source} has a sample every {log.period:g} s, which no log of a robot has. Is time "
-            "in ms? Give the period in s."
+            f"{log.source} has a sample every {log.period:g} s, which no log of a robot has. Is "
+            "time in ms? Give the period in s."
         )
 
 
@@ -95,29 +95,29 @@ def _check_positions(log: Log, model: Model) -> None:
         repeated = float(np.mean(np.diff(own) == 0))
         if repeated > _REPEATED and np.ptp(own) > 1e-3:
             raise IdentificationError(
-                f"{where} repeat in {100 * repeated:.0f} % of the samples: the encoder is slower or "
-                "coarser than the log. Keep every second, third ... sample only."
+                f"{where} repeat in {100 * repeated:.0f} % of the samples: the encoder is slower "
+                "or coarser than the log. Keep every second, third ... sample only."
             )
         span = joint.upper - joint.lower
         beyond = max(joint.lower - own.min(), own.max() - joint.upper)
         if np.isfinite(span) and beyond > 0.1 * span:
             low, high = joint.lower, joint.upper
             raise IdentificationError(
-                f"{where} reach from {own.min():.4g} to {own.max():.4g}, but the joint's limits are "
-                f"{low:.4g} and {high:.4g} {joint.unit}. Are they in degrees, or of another joint?"
+                f"{where} reach from {own.min():.4g} to {own.max():.4g}, but the joint's limits "
+                f"are {low:.4g} and {high:.4g} {joint.unit}. Degrees, or another joint?"
             )
         if joint.unit == "rad" and np.abs(own).max() > _TOO_LARGE:
             raise IdentificationError(
-                f"{where} reach {np.abs(own).max():.4g} rad. Are they in degrees? Then say so: a unit "
-                "in the file, as in  q.elbow [deg]."
+                f"{where} reach {np.abs(own).max():.4g} rad. Are they in degrees? Then say so: a "
+                "unit in the file, as in  q.elbow [deg]."
             )
         steps = np.abs(np.diff(own, 2))
         worst = int(np.argmax(steps))
         usual = float(np.sort(steps)[-max(5, len(steps) // 50)])
         if steps[worst] > 30 * usual + 1e-9 and steps[worst] > 0.01:
             raise IdentificationError(
-                f"{where} jump by {steps[worst]:.3g} {joint.unit} at {worst * log.period:.4g} s: a "
-                "sample is wrong or missing. Cut the log there."
+                f"{where} jump by {steps[worst]:.3g} {joint.unit} at {worst * log.period:.4g} s: "
+                "a sample is wrong or missing. Cut the log there."
             )
 
 
@@ -134,7 +134,9 @@ def _check_velocities(log: Log, velocities: Vector) -> None:
                 f"{where} are those of {log.joints[other]}: columns are in another order."
             )
         if alike[number, number] < _WELL:
-            raise IdentificationError(f"{where} are not the change of its positions. Leave them out.")
+            raise IdentificationError(
+                f"{where} are not the change of its positions. Leave them out."
+            )
         ratio = float(np.std(velocities[:, number]) / np.std(moved[:, number]))
         if not 1 / _RATIO < ratio < _RATIO:
             unit = next((n for f, n in _FAMILIAR.items() if abs(ratio / f - 1) < 0.2), "")
@@ -154,8 +156,8 @@ def _check_torques(log: Log, model: Model) -> None:
             share = float(np.mean(own == end))
             if share > _CLIPPED and len(np.unique(own)) > 10:
                 raise IdentificationError(
-                    f"{where} are {end:.4g} in {100 * share:.0f} % of the samples: cut off by a limit, "
-                    "so the true ones are unknown. Cut the log there, or move less."
+                    f"{where} are {end:.4g} in {100 * share:.0f} % of the samples: cut off by a "
+                    "limit, so the true ones are unknown. Cut the log there, or move less."
                 )
     path = Smoother(log.positions)(log.positions)
     motion = Path(path, log.period)
@@ -168,8 +170,8 @@ def _check_torques(log: Log, model: Model) -> None:
     clear = float(np.median(np.diagonal(alike))) > _WELL
     if clear and not 1 / _TOO_LARGE < ratio < _TOO_LARGE:
         raise IdentificationError(
-            f"{log.source}: torques are {ratio:.3g} times those of the robot as it is known. Are they "
-            "in another unit (N mm, A), or at the other side of the gear? Convert them to N m."
+            f"{log.source}: torques are {ratio:.3g} times those of the robot as it is known. Are "
+            "they in another unit (N mm, A), or at the other side of the gear? Convert them to N m."
         )
 
 
@@ -180,13 +182,15 @@ def _check_order(log: Log, alike: Vector) -> None:
     wrong = [joint for joint in joints if own[joint] < _SHOWN_SIGN]
     if wrong:
         raise IdentificationError(
-            f"{log.source}: torques of {log.joints[wrong[0]]} have the opposite sign of the robot's "
-            f"(correlation {own[wrong[0]]:.2f})."
+            f"{log.source}: torques of {log.joints[wrong[0]]} have the opposite sign of the "
+            f"robot's (correlation {own[wrong[0]]:.2f})."
         )
+    unlike = 1 - alike**2
     for first, second in itertools.combinations(joints, 2):
-        now = own[first] + own[second]
-        swapped = alike[first, second] + alike[second, first]
-        if swapped > now + 2 * _CLEAR and min(alike[first, second], alike[second, first]) > _WELL:
+        now = unlike[first, first] + unlike[second, second]
+        swapped = unlike[first, second] + unlike[second, first]
+        signs = min(alike[first, second], alike[second, first])
+        if swapped < _CLEAR * now and now > _UNLIKE and signs > _WELL:
             raise IdentificationError(
                 f"{log.source}: torques of {log.joints[first]} and {log.joints[second]} seem to be "
                 "exchanged."

@@ -93,9 +93,7 @@ def propose(
         raise ConfigError(f"A motion of {seconds:g} s from {trials} trials cannot be found.")
     design = _Design(Model(robot, gravity), found, seconds)
     random = np.random.default_rng(seed)
-    best = min(
-        (design.random(random) for _ in range(max(1, trials // 2))), key=design.cost
-    )
+    best = min((design.random(random) for _ in range(max(1, trials // 2))), key=design.cost)
     cost = design.cost(best)
     for trial in range(trials - trials // 2):
         other = best + 0.5 * 0.97**trial * random.standard_normal(best.shape) * np.abs(best).mean()
@@ -164,7 +162,10 @@ class _Design:
         # Where the file gives no limit, the log's motion is one.
         far, fast = np.array(found.farthest), np.array(found.fastest)
         lower, upper = (np.array([getattr(j, end) for j in joints]) for end in ("lower", "upper"))
-        lower, upper = np.where(np.isfinite(lower), lower, -far), np.where(np.isfinite(upper), upper, far)
+        lower, upper = (
+            np.where(np.isfinite(lower), lower, -far),
+            np.where(np.isfinite(upper), upper, far),
+        )
         self._middle, self._reach = 0.5 * (lower + upper), 0.5 * _SHARE * (upper - lower)
         fastest = np.array([j.max_velocity for j in joints])
         self._fastest = _SHARE * np.where(np.isfinite(fastest) & (fastest > 0), fastest, fast)

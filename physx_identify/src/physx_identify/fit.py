@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import qr, solve_triangular
 
-from physx_core.typing import Vector
+from physx_core.typing import Array, Vector
 from physx_identify.errors import IdentificationError
 from physx_identify.model import Model, Path
 from physx_identify.noise import ORDERS, Noise, Whitener
@@ -84,8 +84,8 @@ class Fit:
     """
 
     values: Vector
-    independent: Vector
-    dependent: Vector
+    independent: Array
+    dependent: Array
     mixing: Vector
     covariance: Vector
     noise: Noise
@@ -96,7 +96,7 @@ class Fit:
     columns: Vector
     torques: Vector
     residual: Vector
-    used: Vector
+    used: Array
     path: Path
     whitener: Whitener
 
@@ -272,7 +272,7 @@ class _Problem:
                 found[:, joint, place] = -own[:, joint]
         return found
 
-    def _first(self, path: Path, smoother: Smoother, used: Vector) -> Vector:
+    def _first(self, path: Path, smoother: Smoother, used: Array) -> Vector:
         """Return the values of least squares along a smoothed path, for torques smoothed alike."""
         smooth = dataclasses.replace(self._data, torques=smoother(self._data.torques))
         equation = _Problem(self._model, self._parameters, smooth)._equation(
@@ -306,7 +306,7 @@ class _Problem:
         noise: Noise,
         step: int,
         path: Path,
-        used: Vector,
+        used: Array,
     ) -> Fit:
         target, columns = equation.target, equation.columns
         factor = whitener.factor(noise)
@@ -323,7 +323,7 @@ class _Problem:
         rank = int((sizes > _SEPARABLE * sizes[:1]).sum()) if sizes[:1].any() else 0
         if not rank:
             raise IdentificationError(
-                "Nothing that is unknown acts on the torques of this log. Move the joints concerned."
+                "Nothing unknown acts on the torques of this log. Move the joints concerned."
             )
         free, held = order[:rank], order[rank:]
         mixing = solve_triangular(triangle[:rank, :rank], triangle[:rank, rank:])

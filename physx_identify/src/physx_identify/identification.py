@@ -185,7 +185,8 @@ class Identification:
                 masses[each.of] = masses.get(each.of, 1.0) * value / each.nominal
             elif each.kind in SETTINGS:
                 settings = joints.get(each.of, JointSettings())
-                joints[each.of] = dataclasses.replace(settings, **{each.kind: value})
+                changed: Any = {each.kind: value}
+                joints[each.of] = dataclasses.replace(settings, **changed)
         return dataclasses.replace(robot, mass_factors=masses, joints=joints)
 
     def to_plain(self) -> dict[str, Any]:

@@ -9,7 +9,7 @@ from scipy.optimize import least_squares
 from scipy.stats import t as student
 
 from physx_core.errors import ConfigError
-from physx_core.typing import Vector
+from physx_core.typing import Array, Vector
 from physx_identify.checks import check_log
 from physx_identify.fit import Data, Fit, fit
 from physx_identify.identification import (
@@ -148,11 +148,11 @@ def _estimates(
     return estimates
 
 
-def _shares(found: Fit) -> Vector:
+def _shares(found: Fit) -> Array:
     """Return which fitted parameters hold a share of which held ones."""
     errors = np.sqrt(np.diag(found.covariance))
     size = np.abs(found.values[found.independent]) + errors
-    shown: Vector = np.abs(found.mixing) > _SHOWN * size[:, None]
+    shown: Array = np.abs(found.mixing) > _SHOWN * size[:, None]
     return shown
 
 

@@ -10,7 +10,7 @@ import numpy as np
 
 from physx_core.dataset import Dataset, holds_dataset
 from physx_core.errors import listed, nearest
-from physx_core.typing import Vector
+from physx_core.typing import Array, Vector
 from physx_formats import all_formats
 from physx_gym import read_log as read_episode
 from physx_gym.errors import LogError
@@ -37,7 +37,8 @@ _FACTORS = {
     "rad": 1.0, "deg": np.pi / 180, "degree": np.pi / 180, "°": np.pi / 180, "mrad": 1e-3,
     "m": 1.0, "mm": 1e-3, "cm": 1e-2, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9,
     "N m": 1.0, "Nm": 1.0, "N*m": 1.0, "mN m": 1e-3, "N mm": 1e-3, "kN m": 1e3, "N": 1.0, "kN": 1e3,
-    "rad/s": 1.0, "deg/s": np.pi / 180, "°/s": np.pi / 180, "m/s": 1.0, "mm/s": 1e-3, "rpm": np.pi / 30,
+    "rad/s": 1.0, "deg/s": np.pi / 180, "°/s": np.pi / 180, "m/s": 1.0, "mm/s": 1e-3,
+    "rpm": np.pi / 30,
 }  # fmt: skip
 """Units by their names, in rad, m, s, N m, N."""
 _MOST = 2**30
@@ -60,7 +61,7 @@ class Log:
         left_out: Columns of the source that are none of these.
 
     Raises:
-        IdentificationError: If shapes differ, a number is not finite, or the period is not positive.
+        IdentificationError: If shapes differ, a number is not finite, or the period not positive.
     """
 
     joints: tuple[str, ...]
@@ -89,8 +90,8 @@ class Log:
             if len(wrong):
                 row, joint = wrong[0]
                 raise IdentificationError(
-                    f"{self.source}: {name} of {self.joints[joint]} are {values[row, joint]} in row "
-                    f"{row}; {len(wrong)} numbers are not finite. Cut the log there."
+                    f"{self.source}: {name} of {self.joints[joint]} are {values[row, joint]} in "
+                    f"row {row}; {len(wrong)} numbers are not finite. Cut the log there."
                 )
             values.flags.writeable = False
             object.__setattr__(self, name, values)
@@ -136,9 +137,7 @@ def read_log(
     if wrong:
         raise IdentificationError(f'There is no column "{wrong[0]}" to choose: {listed(NAMES)}.')
     used: set[str] = set()
-    found = {
-        name: _find(path, table, units, name, given.get(name), joints, used) for name in NAMES
-    }
+    found = {name: _find(path, table, units, name, given.get(name), joints, used) for name in NAMES}
     for name in _NEEDED:
         if found[name] is None:
             raise IdentificationError(
@@ -146,62 +145,72 @@ def read_log(
                 f"{listed(table)}. Name it with columns (--columns {name}=NAME)."
             )
     left_out = tuple(name for name in table if name not in used)
-    positions, torques, velocities = (found[n] for n in ("positions", "torques", "velocities"))
-    assert positions is not None and torques is not None
+    assert found["positions"] is not None
+    assert found["torques"] is not None
+    series = [found["positions"], found["torques"]]
+    if found["velocities"] is not None:
+        series.append(found["velocities"])
     time = found["time"]
     if period is None:
         if time is None:
             raise IdentificationError(
                 f"{path} has no column of times. Give the time between samples: period (--period)."
             )
-        values = [positions, torques, *([] if velocities is None else [velocities])]
-        period, rows = _even(path, time[:, 0], values)
-        positions, torques, velocities = (*rows, None)[:3]
-    return Log(
-        tuple(joints), period, positions, torques, velocities, str(path), left_out
-    )  # fmt: skip
+        period, series = _even(path, time[:, 0], series)
+    velocities = series[2] if len(series) > 2 else None
+    return Log(tuple(joints), period, series[0], series[1], velocities, str(path), left_out)
 
 
 def _table_of(path: Path) -> tuple[dict[str, Vector], dict[str, str]]:
     """Return the columns of a file, each of shape (rows, numbers), and their units."""
-    if path.is_dir() and (path / "meta" / "info.json").is_file():
-        parts = sorted((path / "data").rglob("*.parquet"))
-        tables = [_table_of(part)[0] for part in parts]
-        if not tables:
-            raise IdentificationError(f"{path} has no files data/**/*.parquet.")
-        return {n: np.concatenate([each[n] for each in tables]) for n in tables[0]}, {}
-    if holds_dataset(path) or holds_dataset(path / "dataset"):
-        with Dataset.open(path) as dataset:
-            view = dataset["training" if "training" in dataset.modes else dataset.modes[0]]
-            fields = {name: view[name] for name in view.fields}
-            units = {name: field.unit for name, field in view.fields.items()}
-            return {n: _flat(values[:]) for n, values in fields.items()}, units
-    if path.suffix in (".h5", ".hdf5") and path.is_file():
-        try:
-            episode = read_episode(path)
-        except LogError:
-            pass
-        else:
-            columns = {name: _flat(each) for name, each in episode.variables.items()}
-            return columns, dict(episode.units)
     if not path.exists():
         raise IdentificationError(f"There is no log {path}.")
-    begin = b"" if path.is_dir() else path.open("rb").read(8)
+    if (path / "meta" / "info.json").is_file():
+        return _lerobot(path)
+    if holds_dataset(path) or holds_dataset(path / "dataset"):
+        with Dataset.open(path) as dataset:
+            mode = "training" if "training" in dataset.modes else dataset.modes[0]
+            fields = dataset.fields(mode)
+            values = {name: _flat(dataset[mode][name][:]) for name in fields}
+            return values, {name: field.unit for name, field in fields.items()}
+    if path.suffix in (".h5", ".hdf5"):
+        try:
+            episode = read_episode(path)
+        except LogError:  # a table of another program
+            return _file(path)
+        return {n: _flat(each) for n, each in episode.variables.items()}, dict(episode.units)
+    return _file(path)
+
+
+def _lerobot(path: Path) -> tuple[dict[str, Vector], dict[str, str]]:
+    tables = [_file(part)[0] for part in sorted((path / "data").rglob("*.parquet"))]
+    if not tables:
+        raise IdentificationError(f"{path} has no files data/**/*.parquet.")
+    return {name: np.concatenate([each[name] for each in tables]) for name in tables[0]}, {}
+
+
+def _file(path: Path) -> tuple[dict[str, Vector], dict[str, str]]:
+    begin = b""
+    if not path.is_dir():
+        with path.open("rb") as file:
+            begin = file.read(8)
     for each in all_formats().values():
-        if each.open is not None and each.recognizes(path, begin):
-            with each.open(path, _MOST) as (columns, notes):
-                numbers = {
-                    name: column for name, column in columns.items()
-                    if not column.problem and column.dtype.kind in "biuf" and column.shape
-                }  # fmt: skip
-                units = {name: column.unit for name, column in numbers.items()}
-                for mode in notes.modes.values():
-                    units |= {name: field.unit for name, field in mode.items() if field.unit}
-                return {n: _flat(c.read(0, c.shape[0])) for n, c in numbers.items()}, units
+        if each.open is None or not each.recognizes(path, begin):
+            continue
+        with each.open(path, _MOST) as (columns, notes):
+            numbers = {
+                name: column
+                for name, column in columns.items()
+                if not column.problem and column.dtype.kind in "biuf" and column.shape
+            }
+            units = {name: column.unit for name, column in numbers.items()}
+            for mode in notes.modes.values():
+                units |= {name: field.unit for name, field in mode.items() if field.unit}
+            return {n: _flat(c.read(0, c.shape[0])) for n, c in numbers.items()}, units
     raise IdentificationError(f"{path} is of no known format: {listed(all_formats())}.")
 
 
-def _flat(values: Vector) -> Vector:
+def _flat(values: Array) -> Vector:
     found = np.asarray(values)
     return found.reshape(len(found), -1).astype(np.float64)
 
@@ -295,15 +304,15 @@ def _even(path: Path, time: Vector, values: list[Vector]) -> tuple[float, list[V
     if not (steps > 0).all():
         row = int(np.argmin(steps))
         raise IdentificationError(
-            f"{path}: time does not increase: it is {time[row]:g} s, then {time[row + 1]:g} s, in row "
-            f"{row + 1}."
+            f"{path}: time does not increase: it is {time[row]:g} s, then {time[row + 1]:g} s, in "
+            f"row {row + 1}."
         )
     period = float(np.median(steps))
     worst = int(np.argmax(steps))
     if steps[worst] > 1.5 * period:
         raise IdentificationError(
-            f"{path} has a gap of {steps[worst]:.4g} s after {time[worst]:.4g} s, where samples are "
-            f"{period:.4g} s apart. Cut the log there."
+            f"{path} has a gap of {steps[worst]:.4g} s after {time[worst]:.4g} s, where samples "
+            f"are {period:.4g} s apart. Cut the log there."
         )
     if np.abs(steps - period).max() <= _EVEN * period:
         return float((time[-1] - time[0]) / len(steps)), values

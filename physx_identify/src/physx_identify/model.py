@@ -13,7 +13,7 @@ from physx_core.typing import Vector
 from physx_dart.pinocchio.models import frames_of, load_model
 from physx_identify.errors import IdentificationError
 from physx_identify.inertia import TEN, UNITS, carried, ten_of
-from physx_identify.unknowns import JOINTS, LINKS, Parameter, Unknown
+from physx_identify.unknowns import LINKS, Parameter, Unknown
 from physx_sim import Robot, World
 from physx_sim.engines import MovableBody, read_parts
 
@@ -52,7 +52,9 @@ class Path:
     @property
     def ends(self) -> Vector:
         """Velocities that resistance depends on: of an engine, those at the end of the step."""
-        return self.velocities if self.instant else np.diff(self.positions[1:], axis=0) / self.period
+        return (
+            self.velocities if self.instant else np.diff(self.positions[1:], axis=0) / self.period
+        )
 
     @property
     def accelerations(self) -> Vector:
@@ -111,8 +113,8 @@ class Model:
         odd = [joint.name for joint in joints if joint.stiffness or joint.mimic is not None]
         if odd:
             raise IdentificationError(
-                f'{what}: the joint "{odd[0]}" has a spring or follows another, which identification '
-                "does not know; set JointSettings(stiffness=0.0, mimic=Mimic(\"\"))."
+                f'{what}: the joint "{odd[0]}" has a spring or follows another, which is not '
+                'identified yet; set JointSettings(stiffness=0.0, mimic=Mimic("")).'
             )
 
     # Unknowns -------------------------------------------------------------------------------
@@ -153,9 +155,7 @@ class Model:
         names = [unknown.of] if unknown.of else known
         return [each for name in names for each in self._of_one(kind, name, prior)]
 
-    def _of_one(
-        self, kind: str, name: str, prior: tuple[float, float | None]
-    ) -> list[Parameter]:
+    def _of_one(self, kind: str, name: str, prior: tuple[float, float | None]) -> list[Parameter]:
         if kind == "payload":
             return [Parameter(kind, name, "", "kg", 0.0, *prior)]
         if kind in LINKS:

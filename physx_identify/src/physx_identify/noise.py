@@ -15,13 +15,14 @@ import numpy as np
 from scipy.linalg import cholesky_banded, lapack
 from scipy.optimize import minimize
 
-from physx_core.typing import Vector
+from physx_core.typing import Array, Vector
 
 ORDERS = 2
 """Highest order of the autoregression of torques."""
 _ITERATIONS = 8
 _NEVER = 1e12
 _NEAR = 1e-6
+
 
 @dataclass(frozen=True)
 class Noise:
@@ -52,7 +53,7 @@ class Whitener:
         used: Which torques count, shape (samples, joints).
     """
 
-    def __init__(self, blocks: Vector, used: Vector) -> None:
+    def __init__(self, blocks: Vector, used: Array) -> None:
         self._used, self._blocks = used, blocks
         before, own, after = blocks
         self._products = [
@@ -61,7 +62,7 @@ class Whitener:
             after[:-2] @ _turned(before[2:]),
         ]
 
-    def rows(self, order: int) -> Vector:
+    def rows(self, order: int) -> Array:
         """Return which filtered torques count, shape (samples - order, joints)."""
         end = len(self._used) - order
         found = self._used[order:].copy()
@@ -108,7 +109,8 @@ class Whitener:
                         if place >= 0:
                             columns[place, : count - ahead, i] = block[:, i, j]
         columns[0] += np.where(rows, noise.torque**2, 1.0)
-        return cholesky_banded(band, lower=True, check_finite=False)
+        factor: Vector = cholesky_banded(band, lower=True, check_finite=False)
+        return factor
 
     def whitened(self, values: Vector, noise: Noise, factor: Vector | None = None) -> Vector:
         """Return values, shape (samples, joints, ...), whitened, shape (rows, ...)."""
@@ -116,7 +118,8 @@ class Whitener:
         found = self.filtered(values, noise)
         flat = found.reshape(found.shape[0] * found.shape[1], -1)
         solved, _ = lapack.dtbtrs(factor, flat, uplo="L")
-        return solved.reshape(-1, *values.shape[2:])
+        white: Vector = solved.reshape(-1, *values.shape[2:])
+        return white
 
     def corrections(self, residual: Vector, noise: Noise) -> Vector:
         """Return what positions have to be corrected by, given the torques' residual.
@@ -282,7 +285,8 @@ def _regression(partial: Vector) -> Vector:
 
 def _partial(regression: Vector) -> Vector:
     """Return the partial autocorrelations of coefficients."""
-    rest, found = regression, []
+    rest = regression
+    found: list[Vector] = []
     while rest.shape[1]:
         last = np.clip(rest[:, -1:], -0.999, 0.999)
         found.insert(0, last[:, 0])

@@ -35,8 +35,7 @@ class Identified(Randomization):
                 an environment can change.
         """
         super().__init__(name)
-        given = isinstance(path, Identification)
-        self.found: Identification = path if given else read_identification(path)
+        self.found = path if isinstance(path, Identification) else read_identification(path)
         self._places = [
             (place, each) for place, each in enumerate(self.found.estimates)
             if each.kind in ("mass", *SETTINGS)

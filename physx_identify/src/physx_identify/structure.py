@@ -47,7 +47,7 @@ class Test:
 
 def structure_tests(found: Fit, joints: Sequence[str]) -> list[Test]:
     """Return the tests of a fit's residual."""
-    raw = [(*names, probability) for *names, probability in _tests(found, joints)]
+    raw = list(_tests(found, joints))
     return [Test(joint, lacks, p, SIZE / len(raw)) for joint, lacks, p in raw]
 
 
@@ -82,7 +82,11 @@ def _tests(found: Fit, joints: Sequence[str]) -> Iterator[tuple[str, str, float]
     halves = _score(found, late * found.instruments[:, found.independent])
     if halves is not None:
         yield "", "something that changes with time: the halves of the log differ", halves
-    yield "", "noise as it is: what is left is still correlated", _whiteness(found, len(joints), rows)
+    yield (
+        "",
+        "noise as it is: what is left is still correlated",
+        _whiteness(found, len(joints), rows),
+    )
 
 
 def _score(found: Fit, features: Vector) -> float | None:

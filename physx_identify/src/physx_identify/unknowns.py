@@ -22,8 +22,8 @@ class Unknown:
     Attributes:
         kind: Of a link: ``"mass"`` in kg, with moments of inertia in proportion; ``"inertia"``, all
             ten numbers of its mass, center and moments; ``"payload"``, a point mass in kg at the
-            origin of its frame. Of a joint: ``"damping"``, ``"friction"`` (Coulomb), ``"armature"``
-            as in `JointSettings`; ``"stribeck"``, the friction in N m or N that vanishes with speed;
+            origin of its frame. Of a joint: ``"damping"``, ``"friction"`` (Coulomb) and
+            ``"armature"`` as in `JointSettings`; ``"stribeck"``, friction that vanishes with speed;
             ``"gain"``, the torque for a logged torque of 1; ``"bias"``, an offset of the logged
             torque in N m or N; ``"encoder"``, an offset of the logged position in rad or m. Of the
             log: ``"delay"``, by which its torques are late relative to its positions, in s.
@@ -63,7 +63,9 @@ class Unknown:
             if found is not None:
                 given = found.groupdict(default="")
                 prior = (
-                    (float(given["mean"]), float(given["deviation"])) if given["mean"] else (0.0, None)
+                    (float(given["mean"]), float(given["deviation"]))
+                    if given["mean"]
+                    else (0.0, None)
                 )
                 return cls(given["kind"], given["of"], *prior)
         except ValueError:

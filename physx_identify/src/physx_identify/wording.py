@@ -41,7 +41,7 @@ def verdict_lines(found: Identification) -> list[str]:
     """Return whether the intervals may be called by their level, and why not."""
     level = f"{100 * found.level:g} %"
     if not found.converged:
-        return [f"No intervals: two starts did not converge to the same values. Give priors, "
+        return ["No intervals: two starts did not converge to the same values. Give priors, "
                 "leave something known, or move more."]  # fmt: skip
     if found.lacks:
         return [

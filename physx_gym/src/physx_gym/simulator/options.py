@@ -93,7 +93,7 @@ def _change(where: str, thing: Any, options: Any, without: Sequence[str] = ()) -
 
 
 def _joints(where: str, robot: Robot, options: Any) -> Mapping[str, JointSettings]:
-    """Return the settings of a robot's joints with some options changed, by their names in its file."""
+    """Return the settings of a robot's joints, by name, with some options changed."""
     found, where = dict(robot.joints), f"{where}.joints"
     for name, own in _mapping(where, options).items():
         found[name] = _change(f"{where}.{name}", found.get(name, JointSettings()), own)

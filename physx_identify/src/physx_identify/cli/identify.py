@@ -86,7 +86,9 @@ def run(words: Sequence[str]) -> None:
         notes.append(f"identification: {options.output}")
     if options.session is not None:
         store_identification(options.session, found, time.monotonic() - begin)
-        notes.append(f"result: {options.session}; physx report {options.session} makes a page of it")
+        notes.append(
+            f"result: {options.session}; physx report {options.session} makes a page of it"
+        )
     if options.propose is not None:
         motion = propose(found, robot, gravity=options.gravity)
         write_motion(options.propose, motion)
