@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import re
 
-import logged_arm as arm
 import h5py
+import logged_arm as arm
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -89,8 +89,8 @@ def test_other_engines_logs_are_told_or_called_model_error(engine):
 
 def test_biases_gains_and_delays_are_found(clean):
     log = arm.noisy(clean, encoder=1e-5, torque=0.01)
-    torques = log.torques + [0.0, 0.3]
-    biased = Log(log.joints, log.period, log.positions + [0.02, 0.0], torques)
+    torques = log.torques + np.array([0.0, 0.3])
+    biased = Log(log.joints, log.period, log.positions + np.array([0.02, 0.0]), torques)
     known = arm.hidden()
     found = identify(biased, known, ["bias:elbow", "encoder:shoulder", "friction"])
     assert found["bias elbow"].value == pytest.approx(0.3, abs=0.02)
@@ -112,7 +112,7 @@ def test_a_hidden_friction_is_named_and_the_level_refused(clean):
     assert "not 95 % intervals" in str(found)
 
 
-# What cannot be told -------------------------------------------------------------------------------
+# What cannot be told -----------------------------------------------------------------------------
 
 
 def test_inseparable_parameters_are_named_with_what_is_told_of_them(clean):
@@ -299,7 +299,7 @@ def test_an_episode_of_an_environment_is_a_log(tmp_path):
     assert np.ptp(log.torques, axis=0).min() > 0.5
 
 
-# Into the world ------------------------------------------------------------------------------------
+# Into the world ----------------------------------------------------------------------------------
 
 
 def test_an_identification_survives_its_file(found, tmp_path):

@@ -43,7 +43,11 @@ def motion(samples, seed=1):
     rates = 2 * np.pi * np.linspace(0.2, 1.7, 6)
     sizes, phases = random.normal(size=(2, 6)) * 0.3, random.uniform(0, 6.28, (2, 6))
     moved = np.stack(
-        [np.sin(np.outer(time, rates) + phase) @ size for size, phase in zip(sizes, phases, strict=True)], axis=1
+        [
+            np.sin(np.outer(time, rates) + phase) @ size
+            for size, phase in zip(sizes, phases, strict=True)
+        ],
+        axis=1,
     )
     targets = ramp * (moved - moved[0])
     return targets, np.gradient(targets, PERIOD, axis=0)

@@ -66,7 +66,7 @@ def _check_joints(log: Log, model: Model) -> None:
     what = f"lacks the joint {missing[0]}" if missing else f"has a joint {more[0]}"
     raise IdentificationError(
         f"{log.source} {what}, which the robot has {'' if missing else 'not'}: "
-        f"{listed(model.joints)}. Fix joints that did not move in the robot's file."
+        f"{listed(model.joints)}. Name joints that did not move: held (--held)."
     )
 
 
@@ -90,7 +90,7 @@ def _check_positions(log: Log, model: Model) -> None:
         where = f"{log.source}: positions of {joint.name}"
         if np.ptp(own) < _STILL_RANGE:
             raise IdentificationError(
-                f"{where} never change. Move it, or fix it in the robot's file."
+                f"{where} never change. Move it, or leave it out and name it: held (--held)."
             )
         repeated = float(np.mean(np.diff(own) == 0))
         if repeated > _REPEATED and np.ptp(own) > 1e-3:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import textwrap
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path as FilePath
 
@@ -14,7 +14,7 @@ from physx_core.errors import ConfigError
 from physx_core.typing import Vector
 from physx_identify.errors import IdentificationError
 from physx_identify.identification import Identification
-from physx_identify.model import Model, Path
+from physx_identify.model import GRAVITY, Model, Path
 from physx_identify.noise import Noise, Whitener
 from physx_identify.unknowns import Parameter, Unknown
 from physx_identify.wording import WIDTH, number
@@ -68,7 +68,8 @@ def propose(
     robot: Robot,
     *,
     duration: float | None = None,
-    gravity: tuple[float, ...] = (0.0, 0.0, -9.81),
+    gravity: Sequence[float] = GRAVITY,
+    held: Sequence[str] = (),
     trials: int = 60,
     seed: int = 0,
 ) -> Motion:
@@ -82,6 +83,7 @@ def propose(
         robot: The robot.
         duration: In s; None: that of the log.
         gravity: In m/s².
+        held: As in `identify`.
         trials: Number of motions that are tried.
         seed: Seed of their random numbers.
 
@@ -91,7 +93,7 @@ def propose(
     seconds = found.samples * found.period if duration is None else duration
     if not seconds > 0 or trials < 1:
         raise ConfigError(f"A motion of {seconds:g} s from {trials} trials cannot be found.")
-    design = _Design(Model(robot, gravity), found, seconds)
+    design = _Design(Model(robot, gravity, held), found, seconds)
     random = np.random.default_rng(seed)
     best = min((design.random(random) for _ in range(max(1, trials // 2))), key=design.cost)
     cost = design.cost(best)
@@ -116,7 +118,9 @@ def expected_errors(
     found: Identification,
     robot: Robot,
     positions: Vector,
-    gravity: tuple[float, ...] = (0.0, 0.0, -9.81),
+    *,
+    gravity: Sequence[float] = GRAVITY,
+    held: Sequence[str] = (),
 ) -> dict[str, float]:
     """Return the standard errors that a motion would give under the log's noise.
 
@@ -125,8 +129,9 @@ def expected_errors(
         robot: The robot.
         positions: Shape (samples, joints), in rad or m, at the log's period.
         gravity: In m/s².
+        held: As in `identify`.
     """
-    design = _Design(Model(robot, gravity), found, len(positions) * found.period)
+    design = _Design(Model(robot, gravity, held), found, len(positions) * found.period)
     return design.errors(positions)[0]
 
 

@@ -11,7 +11,7 @@ from typing import Any
 
 from physx_identify import wording
 from physx_identify.errors import IdentificationError
-from physx_identify.structure import Test
+from physx_identify.structure import ResidualTest
 from physx_sim import JointSettings, Robot
 
 SETTINGS = ("damping", "friction", "armature")
@@ -130,7 +130,7 @@ class Identification:
     estimates: Sequence[Estimate]
     combinations: Sequence[Combination]
     noise: LogNoise
-    tests: Sequence[Test]
+    tests: Sequence[ResidualTest]
     converged: bool
     residual: Sequence[float]
     farthest: Sequence[float]

@@ -21,7 +21,7 @@ from physx_identify.identification import (
 )
 from physx_identify.inertia import cholesky_of, from_cholesky, is_physical
 from physx_identify.log import Log
-from physx_identify.model import Model
+from physx_identify.model import GRAVITY, Model
 from physx_identify.structure import structure_tests
 from physx_identify.unknowns import Parameter, Unknown, as_unknowns
 from physx_sim import Robot
@@ -44,7 +44,8 @@ def identify(
     unknowns: Sequence[Unknown | str] | Unknown | str,
     *,
     level: float = 0.95,
-    gravity: tuple[float, ...] = (0.0, 0.0, -9.81),
+    gravity: Sequence[float] = GRAVITY,
+    held: Sequence[str] = (),
     instant: bool = False,
     seed: int = 0,
 ) -> Identification:
@@ -56,6 +57,7 @@ def identify(
         unknowns: What to find, such as ``["mass:hand", "friction"]``; see `Unknown`.
         level: Nominal probability of the intervals.
         gravity: In m/s².
+        held: Names of joints that did not move and are not in the log: they are at 0.
         instant: Whether torques are those at the instants of the samples. By default, each is held
             from its sample to the next one, as engines and digital controllers do.
         seed: Seed of the draws from the posterior.
@@ -69,7 +71,7 @@ def identify(
     """
     if not 0 < level < 1:
         raise ConfigError(f"level is {level!r} but must be between 0 and 1.")
-    model = Model(robot, gravity)
+    model = Model(robot, gravity, held)
     parameters = model.parameters(as_unknowns(unknowns))
     check_log(log, model, len(parameters))
     data = Data(log.positions, log.torques, log.period, instant)
@@ -88,8 +90,9 @@ def _summary(
     seed: int,
 ) -> Identification:
     errors = np.sqrt(np.diag(found.covariance))
-    apart = np.abs(found.values - again.values)[found.independent] / errors
-    same = np.array_equal(found.independent, again.independent) and bool((apart < _AGREE).all())
+    apart = found.values - again.values
+    apart = np.abs(apart[found.independent] + found.mixing @ apart[found.dependent]) / errors
+    same = len(found.independent) == len(again.independent) and bool((apart < _AGREE).all())
     converged = found.converged and again.converged and same
     width = float(student.ppf(0.5 + 0.5 * level, found.freedom))
     values = _physical(parameters, found)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import pinocchio
@@ -18,6 +18,8 @@ from physx_sim import Robot, World
 from physx_sim.engines import MovableBody, read_parts
 
 _TORQUE = {"rad": "N m", "m": "N"}
+GRAVITY = (0.0, 0.0, -9.81)
+"""In m/s²."""
 STRIBECK = 0.1
 """Velocity at which Stribeck friction has fallen to 1/e, in rad/s or m/s."""
 
@@ -75,21 +77,33 @@ class Model:
         numbers: All numbers as in its file and settings, shape (14 * joints,).
     """
 
-    def __init__(self, robot: Robot, gravity: tuple[float, ...] = (0.0, 0.0, -9.81)) -> None:
+    def __init__(
+        self,
+        robot: Robot,
+        gravity: Sequence[float] = GRAVITY,
+        held: Sequence[str] = (),
+    ) -> None:
         """Load a robot.
+
+        Args:
+            robot: The robot.
+            gravity: In m/s².
+            held: Names of joints that do not move: they stay at 0, and are none of the joints.
 
         Raises:
             ModelError: If it cannot be loaded.
+            ComponentNotFoundError: If there is no joint of a name.
             IdentificationError: If its base floats, it has no joints, or joints follow others or
                 have springs.
         """
         self.robot = robot
-        self.movable: MovableBody = read_parts(World(robots=[robot], gravity=gravity)).movables[0]
+        world = World(robots=[robot], gravity=tuple(gravity))
+        self.movable = _with_held(read_parts(world).movables[0], held)
         joints = self.movable.model.joints
         self._check(robot, self.movable)
         self.joints = tuple(joint.name for joint in joints)
         self.units = tuple(joint.unit for joint in joints)
-        self._pin = load_model(self.movable, gravity, armature=np.zeros(len(joints)))
+        self._pin = load_model(self.movable, world.gravity, armature=np.zeros(len(joints)))
         self._data = self._pin.createData()
         bodies = [
             ten_of(each.mass, each.lever, each.inertia) if each.mass else np.zeros(10)
@@ -258,3 +272,19 @@ class Model:
         return np.stack([
             second - by_v / h, by_q + (by_v - damping) / h - 2 * second, second + damping / h
         ])  # fmt: skip
+
+
+def _with_held(movable: MovableBody, held: Sequence[str]) -> MovableBody:
+    """Return a robot some of whose joints are fixed at 0, with those that follow them."""
+    names = [joint.name for joint in movable.model.joints]
+    for name in held:
+        if name not in names:
+            raise ComponentNotFoundError("joint", name, f'Robot "{movable.name}"', names)
+    bodies = tuple(
+        replace(body, joint=None, axis=np.zeros(3))
+        if body.joint is not None
+        and (body.joint.name in held or (body.joint.mimic and body.joint.mimic.leader in held))
+        else body
+        for body in movable.model.bodies
+    )
+    return replace(movable, model=replace(movable.model, bodies=bodies))

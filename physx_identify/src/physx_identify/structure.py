@@ -24,7 +24,7 @@ _NEW = 1e-3
 
 
 @dataclass(frozen=True)
-class Test:
+class ResidualTest:
     """A test of the residual.
 
     Attributes:
@@ -45,10 +45,10 @@ class Test:
         return self.probability < self.threshold
 
 
-def structure_tests(found: Fit, joints: Sequence[str]) -> list[Test]:
+def structure_tests(found: Fit, joints: Sequence[str]) -> list[ResidualTest]:
     """Return the tests of a fit's residual."""
     raw = list(_tests(found, joints))
-    return [Test(joint, lacks, p, SIZE / len(raw)) for joint, lacks, p in raw]
+    return [ResidualTest(joint, lacks, p, SIZE / len(raw)) for joint, lacks, p in raw]
 
 
 def _tests(found: Fit, joints: Sequence[str]) -> Iterator[tuple[str, str, float]]:

@@ -49,6 +49,8 @@ class Identify:
     """Episode of a dataset with several."""
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     """In m/s^2."""
+    held: tuple[str, ...] = ()
+    """Joints that did not move and are not in the log, such as a gripper's: they are at 0."""
     instant: bool = False
     """Torques are those at the instants of the samples, instead of held from each to the next."""
     level: float = 0.95
@@ -64,7 +66,7 @@ def run(words: Sequence[str]) -> None:
     begin = time.monotonic()
     log = read_log(
         options.log,
-        Model(robot, options.gravity).joints,
+        Model(robot, options.gravity, options.held).joints,
         period=options.period,
         columns=options.columns,
         episode=options.episode,
@@ -75,6 +77,7 @@ def run(words: Sequence[str]) -> None:
         options.free,
         level=options.level,
         gravity=options.gravity,
+        held=options.held,
         instant=options.instant,
     )
     show(found.to_json() if options.json else found)
@@ -90,7 +93,7 @@ def run(words: Sequence[str]) -> None:
             f"result: {options.session}; physx report {options.session} makes a page of it"
         )
     if options.propose is not None:
-        motion = propose(found, robot, gravity=options.gravity)
+        motion = propose(found, robot, gravity=options.gravity, held=options.held)
         write_motion(options.propose, motion)
         notes += ["", *str(motion).splitlines(), f"motion: {options.propose}"]
     if not options.json:
