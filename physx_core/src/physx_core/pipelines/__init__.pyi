@@ -1,5 +1,6 @@
 """Pipelines: data generation, training, prediction, and replay."""
 
+from .branch import Branch as Branch
 from .data_generation import DataGeneration as DataGeneration
 from .evaluating import evaluate as evaluate
 from .evaluating import trace_episode as trace_episode

@@ -149,7 +149,9 @@ def trace(
         NotRunError: If there is nothing to feed back, or no such episode.
     """
     runs = _Runs.open(network, batches, targets, {})
-    return runs.trace(about["first_row"], _MOST_PREDICTIONS * runs.stride if steps is None else steps)
+    return runs.trace(
+        about["first_row"], _MOST_PREDICTIONS * runs.stride if steps is None else steps
+    )
 
 
 class _Runs:
@@ -323,11 +325,7 @@ class _Runs:
         common = set.intersection(*(set(each) for each in later.values()))
         rows = [offset for offset in sorted(common) if row + offset <= steps]
         truth = {name: self._values(name, batch[name]) for name in later}
-        if self._kept is not None:
-            for offset in rows:
-                self._kept[row + offset] = tuple(
-                    {name: values[offset] for name, values in of.items()} for of in (truth, later)
-                )
+        self._keep(row, rows, truth, later)
         for label in self._invariants:
             first = self._first[label][alive]
             for offset in rows:
@@ -338,6 +336,16 @@ class _Runs:
                 for record in records.values():
                     record.drift(label, row + offset, *moved)
         return later
+
+    def _keep(
+        self, row: int, offsets: Sequence[int], *values: Mapping[str, Mapping[int, Array]]
+    ) -> None:
+        """Keep values at offsets from a row, if they are traced."""
+        if self._kept is not None:
+            for offset in offsets:
+                self._kept[row + offset] = [
+                    {name: each[offset] for name, each in of.items()} for of in values
+                ]
 
     def _invariant(self, label: str, values: Mapping[str, Array], alive: Index) -> Array:
         """Return what a function makes of values and the episodes' parameters, shape (rows,)."""
