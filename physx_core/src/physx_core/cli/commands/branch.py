@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 from physx_core import plugins
@@ -15,7 +14,7 @@ from physx_core.pipelines.branch import Branch
 
 _CURSOR = "cursor"
 _ROW = "row"
-_CHANGE = re.compile(r"^--set(?=$|[.=])")
+_SET = "--set"
 
 
 def run(words: Sequence[str]) -> None:
@@ -23,9 +22,9 @@ def run(words: Sequence[str]) -> None:
 
     Both futures are drawn by the given visualizer, by default that of the only installed visualizer
     plugin. The row ``cursor`` is where the cursor of an open viewer stands, which then shows the
-    futures as well. ``--set NAME=VALUE ...`` is short for ``--change``.
+    futures as well. ``--set NAME=VALUE ...`` is short for ``--change.NAME VALUE``.
     """
-    words = [_CHANGE.sub("--change", word) for word in words]
+    words = list(_with_changes(words))
     viewers = [] if "--visualizer" in words else visualizer_plugins()
     given: dict[str, Any] = {"visualizer": viewers[0]} if len(viewers) == 1 else {}
     if len(words) > 1 and words[1] == _CURSOR:
@@ -46,6 +45,20 @@ def run(words: Sequence[str]) -> None:
         ),
     )
     pipeline.execute()
+
+
+def _with_changes(words: Sequence[str]) -> Iterator[str]:
+    """Yield the words, with the option of a single change for each word after ``--set``."""
+    sets = False
+    for word in words:
+        sets = word == _SET or (sets and not word.startswith("-"))
+        if not sets:
+            yield word
+        elif word != _SET:
+            name, equals, value = word.partition("=")
+            if not equals:
+                raise UsageError(f"{_SET} {word}: write {_SET} NAME=VALUE.")
+            yield from (f"--change.{name}", value)
 
 
 def _cursor(viewers: Sequence[str]) -> tuple[str, Cursor]:
