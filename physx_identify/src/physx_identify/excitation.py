@@ -70,7 +70,7 @@ def propose(
     duration: float | None = None,
     gravity: Sequence[float] = GRAVITY,
     held: Sequence[str] = (),
-    trials: int = 60,
+    trials: int = 200,
     seed: int = 0,
 ) -> Motion:
     """Return a motion that would tell more about the parameters of an identification.
