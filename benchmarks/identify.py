@@ -14,11 +14,13 @@ expected errors of the proposed motion relative to a sweep in frequency of equal
 
 from __future__ import annotations
 
+import importlib
 import sys
 import time
 from collections.abc import Callable
 from concurrent.futures import ProcessPoolExecutor
 from pathlib import Path
+from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
@@ -68,11 +70,17 @@ def draw(job: tuple[str, float, int]) -> tuple[list[bool] | None, bool]:
     return held, bool(result.lacks)
 
 
+def sysid() -> Any:
+    """Return the module of MuJoCo's intervals, without what it prints and plots with."""
+    while True:
+        try:
+            return importlib.import_module("mujoco.sysid._src.optimize")
+        except ModuleNotFoundError as error:
+            sys.modules[str(error.name)] = MagicMock()
+
+
 def peer(correlation: float, seed: int) -> list[bool]:
     """Return which intervals of MuJoCo's sysid hold."""
-    sys.modules.setdefault("colorama", MagicMock())  # colors what it prints; not in its wheel
-    from mujoco.sysid._src.optimize import calculate_intervals
-
     positions, torques = clean()
     log = arm.noisy((positions, torques), 0.0, 0.05, correlation, seed)
     model = Model(arm.KNOWN)
@@ -86,7 +94,7 @@ def peer(correlation: float, seed: int) -> list[bool]:
     jacobian = (columns[..., :-1] * scale).reshape(-1, len(parameters))
     target = ((log.torques[1:-1] - columns[..., -1]) * scale[..., 0]).ravel()
     values = np.linalg.lstsq(jacobian, target, rcond=None)[0]
-    _, half = calculate_intervals([target - jacobian @ values], jacobian)
+    _, half = sysid().calculate_intervals([target - jacobian @ values], jacobian)
     true = np.array(list(arm.HIDDEN.values()))
     inside: list[bool] = (np.abs(values - true) <= half).tolist()
     return inside

@@ -1,13 +1,13 @@
 """Identification: parameters of robots from logs, with intervals that hold."""
 
 from .checks import check_log as check_log
+from .estimates import Combination as Combination
+from .estimates import Estimate as Estimate
+from .estimates import LogNoise as LogNoise
 from .excitation import Motion as Motion
 from .excitation import propose as propose
 from .excitation import write_motion as write_motion
-from .identification import Combination as Combination
-from .identification import Estimate as Estimate
 from .identification import Identification as Identification
-from .identification import LogNoise as LogNoise
 from .identify import identify as identify
 from .log import Log as Log
 from .log import read_log as read_log

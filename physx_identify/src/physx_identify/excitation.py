@@ -98,7 +98,7 @@ def propose(
     best = min((design.random(random) for _ in range(max(1, trials // 2))), key=design.cost)
     cost = design.cost(best)
     for trial in range(trials - trials // 2):
-        other = best + 0.5 * 0.97**trial * random.standard_normal(best.shape) * np.abs(best).mean()
+        other = best + 0.5 * 0.985**trial * random.standard_normal(best.shape) * np.abs(best).mean()
         changed = design.cost(other)
         if changed < cost:
             best, cost = other, changed

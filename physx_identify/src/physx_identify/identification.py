@@ -4,97 +4,19 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping, Sequence
+import textwrap
+from collections.abc import Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Any
 
 from physx_identify import wording
 from physx_identify.errors import IdentificationError
+from physx_identify.estimates import Combination, Estimate, LogNoise
 from physx_identify.structure import ResidualTest
 from physx_sim import JointSettings, Robot
 
 SETTINGS = ("damping", "friction", "armature")
 """Kinds that are settings of a robot's joints."""
-
-
-@dataclass(frozen=True)
-class Estimate:
-    """What the log says about one parameter.
-
-    Attributes:
-        name: Such as ``"friction elbow"``.
-        kind: As in `Unknown`.
-        of: Name of the link or joint.
-        part: Which number of an inertia.
-        unit: Its unit.
-        nominal: In the robot's file and settings.
-        value: The most likely value that is physical.
-        verdict: ``"told"``; ``"hardly told"``: the interval is wider than the value; or
-            ``"inseparable"``.
-        error: Standard error; None: the parameter cannot be told from others.
-        low: Lower end of the interval; None likewise, or if the fit did not converge.
-        high: Upper end.
-        blocks: Standard error from the spread between blocks of the log, relative to `error`: a
-            check, about 1.
-    """
-
-    name: str
-    kind: str
-    of: str
-    part: str
-    unit: str
-    nominal: float
-    value: float
-    verdict: str
-    error: float | None = None
-    low: float | None = None
-    high: float | None = None
-    blocks: float | None = None
-
-
-@dataclass(frozen=True)
-class Combination:
-    """A sum of parameters that the log tells, although it cannot tell them apart.
-
-    Attributes:
-        factors: Factor of each parameter, by name.
-        value: Of the sum.
-        low: Lower end of its interval.
-        high: Upper end.
-    """
-
-    factors: Mapping[str, float]
-    value: float
-    low: float | None = None
-    high: float | None = None
-
-    def __str__(self) -> str:
-        return " + ".join(
-            name if factor == 1 else f"{factor:.4g} x {name}"
-            for name, factor in self.factors.items()
-        ).replace("+ -", "- ")
-
-
-@dataclass(frozen=True)
-class LogNoise:
-    """Noise of a log.
-
-    Attributes:
-        encoder: Standard deviation of the positions, in rad or m.
-        torque: Standard deviation of each torque, in N m or N.
-        correlation: Of each torque, from sample to sample.
-        order: Order of the autoregression.
-        innovations: Deviation of the autoregression's innovations, of each torque.
-        regression: Its coefficients, of each torque.
-    """
-
-    encoder: float
-    torque: Sequence[float]
-    correlation: Sequence[float]
-    order: int
-    innovations: Sequence[float]
-    regression: Sequence[Sequence[float]]
 
 
 @dataclass(frozen=True)
@@ -150,6 +72,11 @@ class Identification:
         """Whether the intervals may be called by their level."""
         return self.converged and not self.lacks
 
+    @property
+    def verdict(self) -> list[str]:
+        """Whether the intervals may be called by their level, and why not, as sentences."""
+        return wording.verdict_lines(self.level, self.converged, self.lacks)
+
     def __getitem__(self, name: str) -> Estimate:
         """Return the estimate of a parameter.
 
@@ -199,9 +126,17 @@ class Identification:
         return json.dumps({"holds": self.holds, "lacks": self.lacks, **self.to_plain()}, indent=1)
 
     def __str__(self) -> str:
-        return "\n".join(wording.lines_of(self))
-
-
-def robot_text(robot: Robot) -> str:
-    """Return a robot's file or name."""
-    return str(Path(robot.urdf)) if isinstance(robot.urdf, Path) else robot.urdf
+        begin = wording.origin_text(self.robot, self.source, self.samples, self.period)
+        lines = textwrap.wrap(begin, wording.WIDTH)
+        lines += ["", *wording.columns([wording.HEAD, *map(wording.row_of, self.estimates)])]
+        if self.combinations:
+            lines += ["", f"{wording.TOGETHER}:"]
+        for each in self.combinations:
+            text = wording.combination_text(each)
+            lines += textwrap.wrap(
+                f"  {text}", wording.WIDTH, subsequent_indent="    ", break_on_hyphens=False
+            )
+        lines.append("")
+        for text in (wording.noise_text(self.noise), *self.verdict):
+            lines += textwrap.wrap(text, wording.WIDTH)
+        return "\n".join(lines)

@@ -11,14 +11,9 @@ from scipy.stats import t as student
 from physx_core.errors import ConfigError
 from physx_core.typing import Array, Vector
 from physx_identify.checks import check_log
+from physx_identify.estimates import Combination, Estimate, LogNoise
 from physx_identify.fit import Data, Fit, fit
-from physx_identify.identification import (
-    Combination,
-    Estimate,
-    Identification,
-    LogNoise,
-    robot_text,
-)
+from physx_identify.identification import Identification
 from physx_identify.inertia import cholesky_of, from_cholesky, is_physical
 from physx_identify.log import Log
 from physx_identify.model import GRAVITY, Model
@@ -97,7 +92,7 @@ def _summary(
     width = float(student.ppf(0.5 + 0.5 * level, found.freedom))
     values = _physical(parameters, found)
     return Identification(
-        robot_text(robot),
+        str(robot.urdf),
         log.source,
         log.joints,
         len(log),

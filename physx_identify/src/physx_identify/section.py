@@ -15,10 +15,10 @@ def _blocks(run: Run) -> Iterator[Text | Table]:
     if not path.is_file():
         return
     found = read_identification(path)
-    yield Text(wording.verdict_lines(found), "verdict")
+    yield Text(found.verdict, "verdict")
     yield Text([
-        f"{found.robot} from {found.source}: {found.samples} samples, every {found.period:.4g} s",
-        wording.noise_text(found),
+        wording.origin_text(found.robot, found.source, found.samples, found.period),
+        wording.noise_text(found.noise),
     ])  # fmt: skip
     head = (*wording.HEAD[:-1], "by blocks", "")
     rows = [
@@ -28,7 +28,7 @@ def _blocks(run: Run) -> Iterator[Text | Table]:
     yield Table(head, rows, f"{100 * found.level:g} % intervals, and the errors that blocks show")
     if found.combinations:
         texts = [wording.combination_text(each) for each in found.combinations]
-        yield Text(["Inseparable in this log; told of them together:", *texts])
+        yield Text([f"{wording.TOGETHER}:", *texts])
     rows = [
         [each.joint or "all", each.lacks, f"{each.probability:.3g}", "yes" if each.failed else ""]
         for each in found.tests

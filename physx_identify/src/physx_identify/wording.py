@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import textwrap
-from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
-if TYPE_CHECKING:
-    from physx_identify.identification import Combination, Estimate, Identification
+from physx_identify.estimates import Combination, Estimate, LogNoise
 
 WIDTH = 80
+TOGETHER = "Inseparable in this log; told of them together"
 HEAD = ("parameter", "unit", "nominal", "value", "interval", "")
 
 
@@ -37,23 +35,29 @@ def combination_text(each: Combination) -> str:
     return f"{each}: {number(each.value)}, {between(each.low, each.high)}"
 
 
-def verdict_lines(found: Identification) -> list[str]:
+def verdict_lines(level: float, converged: bool, lacks: Sequence[str]) -> list[str]:
     """Return whether the intervals may be called by their level, and why not."""
-    level = f"{100 * found.level:g} %"
-    if not found.converged:
-        return ["No intervals: two starts did not converge to the same values. Give priors, "
-                "leave something known, or move more."]  # fmt: skip
-    if found.lacks:
+    if not converged:
         return [
-            f"These are not {level} intervals: what is left of the torques keeps a structure.",
-            *(f"The model lacks {each}." for each in found.lacks),
+            "No intervals: two starts did not converge to the same values. Give priors, leave "
+            "something known, or move more."
         ]
-    return [f"{level} intervals: no test of what is left of the torques found anything."]
+    if lacks:
+        return [
+            f"These are not {100 * level:g} % intervals: what is left of the torques keeps a "
+            "structure.",
+            *(f"The model lacks {each}." for each in lacks),
+        ]
+    return [f"{100 * level:g} % intervals: no test of what is left of the torques found anything."]
 
 
-def noise_text(found: Identification) -> str:
+def origin_text(robot: str, source: str, samples: int, period: float) -> str:
+    """Return what was identified from what."""
+    return f"{robot} from {source}: {samples} samples, every {period:.4g} s"
+
+
+def noise_text(noise: LogNoise) -> str:
     """Return the log's noise as a sentence."""
-    noise = found.noise
     torques = ", ".join(
         f"{number(deviation)} ({correlation:.2f})"
         for deviation, correlation in zip(noise.torque, noise.correlation, strict=True)
@@ -62,28 +66,6 @@ def noise_text(found: Identification) -> str:
         f"Noise: encoders {number(noise.encoder)}; torques, with their correlation from sample to "
         f"sample, {torques}."
     )
-
-
-def lines_of(found: Identification) -> Iterator[str]:
-    """Yield an identification as lines."""
-    yield from textwrap.wrap(
-        f"{found.robot} from {found.source}: {found.samples} samples, every {found.period:.4g} s",
-        WIDTH,
-    )
-    yield ""
-    yield from columns([HEAD, *map(row_of, found.estimates)])
-    if found.combinations:
-        yield ""
-        yield "Inseparable in this log; told of them together:"
-        for each in found.combinations:
-            text = combination_text(each)
-            yield from textwrap.wrap(
-                text, WIDTH, initial_indent="  ", subsequent_indent="    ", break_on_hyphens=False
-            )
-    yield ""
-    yield from textwrap.wrap(noise_text(found), WIDTH)
-    for text in verdict_lines(found):
-        yield from textwrap.wrap(text, WIDTH)
 
 
 def columns(rows: Sequence[Sequence[str]]) -> list[str]:
