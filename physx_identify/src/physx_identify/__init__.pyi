@@ -17,6 +17,5 @@ from .stored import read_identification as read_identification
 from .stored import store_identification as store_identification
 from .stored import write_identification as write_identification
 from .structure import ResidualTest as ResidualTest
-from .unknowns import Parameter as Parameter
 from .unknowns import Unknown as Unknown
 from .version import __version__ as __version__
