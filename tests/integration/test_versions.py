@@ -14,7 +14,7 @@ import pytest
 pytestmark = pytest.mark.processes
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = sorted(path.parent.name for path in ROOT.glob("physx_*/pyproject.toml"))
+PACKAGES = sorted(path.parent.name for path in ROOT.glob("physx*/pyproject.toml"))
 
 
 def test_all_distributions_have_the_same_version():
