@@ -1,8 +1,4 @@
-"""Builds all packages into a folder, with an index of them (PEP 503): python .ci/wheels.py dist.
-
-    uvx --index dist/simple physx demo
-    pip install --find-links dist physx
-"""
+"""Builds all packages into a folder, with an index of them (PEP 503): python .ci/wheels.py dist."""
 
 from __future__ import annotations
 
@@ -47,7 +43,7 @@ def index(files: list[Path], folder: Path) -> None:
 
 def main() -> None:
     """Build into the folder that the command line names."""
-    parser = argparse.ArgumentParser(description=(__doc__ or "").partition(":")[0])
+    parser = argparse.ArgumentParser(description="Build all packages, and an index of them.")
     parser.add_argument("folder", type=Path)
     folder = parser.parse_args().folder
     for old in [*folder.glob("*.whl"), *folder.glob("*.tar.gz")]:

@@ -1,9 +1,9 @@
 """An arm that learns its own dynamics, in one file: change it, and run it again.
 
-Two processes simulate an arm with two joints in random motions. A network learns from these samples
-which torque a motion takes. Then three simulated arms follow a motion that the network has never seen: with a
-weak joint controller (PD) alone, with the torque that the network predicts added to it in each
-step, and with that of the exact model.
+Two processes simulate an arm with two joints in random motions. A network learns from these
+samples which torque a motion takes. Then three simulated arms follow a motion that the network has
+never seen: with a weak joint controller (PD) alone, with the torque that the network predicts added
+to it in each step, and with that of the exact model.
 
     python arm.py
 """
