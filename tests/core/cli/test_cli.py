@@ -209,7 +209,7 @@ def test_a_switch_that_is_neither_on_nor_off_is_an_error(capsys):
 
 
 FAILS = """
-from physx_core import Environment
+from physx_core import Dataset, Environment
 
 class Fails(Environment):
     def create(self):
@@ -229,7 +229,7 @@ def test_an_error_names_the_line_of_the_users_own_code(capsys, clients):
     line = "self.set_training_data(x=[1.0][self.step_index])"
     said = capsys.readouterr().err
     assert f"IndexError: list index out of range (fails.py:10: {line})" in said
-    Path("fails.py").write_text(FAILS.replace("x=[1.0][self.step_index]", "y=1.0"))
+    Path("fails.py").write_text(FAILS.replace("[1.0][self.step_index]", 'Dataset.open("nowhere")'))
     assert main([*words, *LOCAL]) == 1
     said = " ".join(capsys.readouterr().err.split())
     assert "in step() of instance 1, at fails.py:10" in said
