@@ -69,6 +69,10 @@ def own_line(error: BaseException) -> str:
 class PhysxError(Exception):
     """Base class of all physx errors."""
 
+    def _render_traceback_(self) -> list[str]:
+        """Return what a notebook shows: the message, as a terminal does."""
+        return [f"{type(self).__name__}: {self}", *getattr(self, "__notes__", [])]
+
 
 # Configuration ------------------------------------------------------------------------------
 
