@@ -28,7 +28,7 @@ def test_all_distributions_have_the_same_version():
 
 @pytest.mark.parametrize("name", PACKAGES)
 def test_a_package_reads_its_version_from_the_metadata(name):
-    package = pytest.importorskip(name)
+    package = pytest.importorskip("physx_demo" if name == "physx" else name)
     assert package.__version__ == version(name.replace("_", "-"))
     assert "__version__" in dir(package)
 

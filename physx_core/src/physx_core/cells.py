@@ -58,7 +58,7 @@ def lent() -> Iterator[tuple[dict[str, str], Sequence[int]]]:
         return
     number = os.memfd_create(MODULE)
     try:
-        with open(number, "w", encoding="utf-8", closefd=False) as memory:
+        with os.fdopen(number, "w", encoding="utf-8", closefd=False) as memory:
             memory.write(_gather(list(_names)))
         yield {_VARIABLE: str(number)}, (number,)
     finally:
@@ -69,7 +69,7 @@ def take() -> None:
     """Make what the parent process has lent importable."""
     number = os.environ.pop(_VARIABLE, None)
     if number is not None:
-        with open(int(number), encoding="utf-8") as memory:
+        with os.fdopen(int(number), encoding="utf-8") as memory:
             memory.seek(0)
             sys.meta_path.append(_Finder(memory.read()))
 

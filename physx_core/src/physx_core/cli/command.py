@@ -34,7 +34,8 @@ if TYPE_CHECKING:
 _ORDER = (
     *("generate", "train", "predict", "replay", "info", "stats", "verify"),
     *("export", "import", "export-network", "client", "include", "plugins", "new", "check"),
-    "doctor", "completion",
+    "doctor",
+    "completion",
 )
 """Order of the core's commands in the overview; others follow alphabetically."""
 _USAGE = 2  # the status of a parser that does not understand its words

@@ -1,4 +1,4 @@
-"""``physx doctor``: show what a bug report needs: versions, drivers, GPU, disk, limits, problems."""
+"""``physx doctor``: show what a bug report needs: versions, drivers, disk, limits, problems."""
 
 from __future__ import annotations
 

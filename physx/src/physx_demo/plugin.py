@@ -8,10 +8,10 @@ from physx_core.plugins import Components, hookimpl
 @hookimpl
 def physx_environments() -> Components:
     """Return the arm in random motions, and arms that follow one."""
-    return {"arm": "physx.arm:Arm", "tracking": "physx.arm:Tracking"}
+    return {"arm": "physx_demo.arm:Arm", "tracking": "physx_demo.arm:Tracking"}
 
 
 @hookimpl
 def physx_networks() -> Components:
     """Return the network."""
-    return {"features": "physx.arm:Features"}
+    return {"features": "physx_demo.arm:Features"}

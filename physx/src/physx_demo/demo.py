@@ -29,7 +29,7 @@ class Demo:
 def run(words: Sequence[str]) -> None:
     """Run the demo, and say what it shows and where it is."""
     options = tyro.cli(Demo, args=words, prog="physx demo")
-    from physx import arm
+    from physx_demo import arm
 
     options.out.mkdir(parents=True, exist_ok=True)
     program = shutil.copy(arm.__file__, options.out)

@@ -1,4 +1,4 @@
-"""physx as a whole: the command ``physx``, its demo, and extras that install its packages."""
+"""The demo of physx, which comes with the distribution ``physx``."""
 
 from __future__ import annotations
 
