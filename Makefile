@@ -68,11 +68,15 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/viewer.py
 	$(BIN)/python benchmarks/cluster.py
 
-wheels: .venv/tools
-	$(BIN)/python .ci/wheels.py dist
+wheels: build/tools/bin/hatchling
+	build/tools/bin/python .ci/wheels.py dist
+
+build/tools/bin/hatchling:
+	$(PYTHON) -m venv build/tools
+	build/tools/bin/python -m pip install --quiet --disable-pip-version-check hatchling
 
 clean:
-	rm -rf dist docs/_build .venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf build dist docs/_build .venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} +
 
 .venv/packages: $(PROJECTS)

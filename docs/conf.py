@@ -21,7 +21,7 @@ include_patterns = [
     "docs/**.md",
     "physx*/README.md",
     "examples/*/README.md",
-    *(f"{name}.md" for name in ("README", "CHANGELOG", "CONTRIBUTING", "SECURITY")),
+    *(f"{name}.md" for name in ("README", "CHANGELOG", "CONTRIBUTING", "RELEASING", "SECURITY")),
 ]
 exclude_patterns = ["docs/_build", ".venv", "sessions", "tests", "physx*/src"]
 myst_heading_anchors = 4

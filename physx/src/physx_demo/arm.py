@@ -190,8 +190,10 @@ def draw(reference: np.ndarray, angles: np.ndarray, film: Path) -> np.ndarray:
             arm.set_data(*places[step].T)
             curve.set_data(times[: step + 1], error[: step + 1])
             for line in (ghost, arm, curve):
-                line.axes.draw_artist(line)
-        return Image.fromarray(np.array(canvas.buffer_rgba())).convert("P", palette=Image.WEB)
+                figure.draw_artist(line)
+        return Image.fromarray(np.array(canvas.buffer_rgba())).convert(
+            "P", palette=Image.Palette.WEB
+        )
 
     first, *others = map(picture, np.linspace(0, len(times) - 1, FRAMES).astype(int))
     duration = round(1000 * times[-1] / FRAMES)  # of a picture, in ms

@@ -142,11 +142,11 @@ def _definition(value: Any) -> ast.ClassDef | ast.FunctionDef | None:
     """Return the syntax of a class or function that a cell defines; None: its text is unknown."""
     functions = [value, *vars(value).values()] if inspect.isclass(value) else [value]
     files = [each.__code__.co_filename for each in functions if inspect.isfunction(each)]
+    name = getattr(value, "__name__", "")
     cells = [file for file in linecache.cache if "ipython" in file or "ipykernel" in file]
     for file in [*files[:1], *reversed(cells)]:
         with contextlib.suppress(SyntaxError):
             for node in reversed(ast.parse("".join(linecache.getlines(file))).body):
-                is_definition = isinstance(node, (ast.ClassDef, ast.FunctionDef))
-                if is_definition and node.name == getattr(value, "__name__", ""):
+                if isinstance(node, ast.ClassDef | ast.FunctionDef) and node.name == name:
                     return node
     return None

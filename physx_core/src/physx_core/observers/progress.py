@@ -8,7 +8,6 @@ from typing import Any
 
 from physx_core.components.visualizer import Observer
 
-
 _EPOCHS = "{desc}:{percentage:4.0f}%|{bar}| {remaining} left{postfix}"
 _AMOUNT = "{desc}:{percentage:4.0f}%|{bar}| {n_fmt} of {total_fmt}{unit}, {remaining} left{postfix}"
 _ENDLESS = "{desc}: {n_fmt}{unit} in {elapsed}, {rate_fmt}{postfix}"
