@@ -240,7 +240,7 @@ def test_an_error_names_the_line_of_the_users_own_code(capsys, clients):
     ("words", "said"),
     [
         ("train x --lr 3", "physx: --lr: did you mean --network.lr?"),
-        ("verify x --step_nb 3", "physx: --step-nb is an option of physx predict"),
+        ("verify x --epoch_nb 3", "physx: --epoch-nb is an option of physx train."),
     ],
 )
 def test_an_option_of_another_command_or_configuration_is_suggested(capsys, words, said):
