@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any, Literal, TypeAlias, get_args
 
@@ -87,10 +88,10 @@ class Field:
     axes: tuple[str, ...] = ()
     like: str = ""
     indexes: str = ""
-    numpy_dtype: np.dtype[Any] = field(init=False, repr=False, compare=False)
-    free_axis: str = field(init=False, repr=False, compare=False)
-    entry_shape: tuple[int, ...] = field(init=False, repr=False, compare=False)
-    nbytes: int = field(init=False, repr=False, compare=False)
+    numpy_dtype: np.dtype[Any] = dataclasses.field(init=False, repr=False, compare=False)
+    free_axis: str = dataclasses.field(init=False, repr=False, compare=False)
+    entry_shape: tuple[int, ...] = dataclasses.field(init=False, repr=False, compare=False)
+    nbytes: int = dataclasses.field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Check the name, and normalize shape and type.
