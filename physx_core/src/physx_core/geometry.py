@@ -28,12 +28,12 @@ class LinearMap(NamedTuple):
     """A map whose results are weighted sums of a few values each.
 
     Attributes:
-        index: Numbers of the values, shape (n, k).
+        numbers: Numbers of the values, shape (n, k).
         weights: Their weights, of sum 1, shape (n, k).
         inside: Whether the point is in the mesh or grid, shape (n,).
     """
 
-    index: Index
+    numbers: Index
     weights: Array
     inside: Array
 
@@ -43,7 +43,7 @@ class LinearMap(NamedTuple):
         Args:
             values: Those of the nodes, shape (nodes, ...).
         """
-        chosen = np.asarray(values)[self.index]
+        chosen = np.asarray(values)[self.numbers]
         found: Array = np.einsum("nk,nk...->n...", self.weights, chosen)
         return found
 
@@ -76,7 +76,8 @@ class VoxelGrid(NamedTuple):
     @property
     def centers(self) -> Array:
         """Centers of the cubes that are inside, shape (n, 3), in m."""
-        return self.origin + self.spacing * self.cubes
+        found: Array = self.origin + self.spacing * self.cubes
+        return found
 
     def map_to(self, points: ArrayLike) -> LinearMap:
         """Return the map from values of the whole grid, flat, to points: see `trilinear_map`."""
@@ -140,7 +141,7 @@ def trilinear_map(
     _check("points", points, (None, size))
     steps = np.broadcast_to(np.asarray(spacing, float), (size,))
     if not ((last >= 0).all() and (steps > 0).all()):
-        raise ConfigError(f"A grid of shape {shape} and spacing {spacing} has no points.")
+        raise ConfigError(f"A grid of shape {shape} and spacing {spacing!r} has no points.")
     places = (points - np.asarray(origin, float)) / steps
     inside = ((places >= -_CLOSE) & (places <= last + _CLOSE)).all(axis=1)
     places = np.clip(places, 0, last)
