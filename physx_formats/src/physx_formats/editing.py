@@ -103,7 +103,7 @@ def edit(
         names = [name for name in names if name != EPISODES or not source.has_episodes]
         fields = _Fields(keep, drop, cast or {}, units or {}, rename or {})
         origin = {"dataset": Path(directory).resolve().name, "digest": _digest(source, names)}
-        said = _said(view, part, drop_episodes, rows, derive) | fields.said()
+        said = _said(modes, view, part, drop_episodes, rows, derive) | fields.said()
         done, draft = {}, Path(folder) / "dataset"
         with Dataset.create(draft, session="edit") as target:
             history = source.info.get("edits", [])
@@ -113,10 +113,7 @@ def edit(
                 edited = _Mode(source, name, Path(folder))
                 if derive is not None:
                     edited.derive(*_function(derive))
-                numbers = edited.choose(view, part)
-                if rows is not None:
-                    numbers = edited.filter(*_function(rows), numbers)
-                numbers = edited.without(numbers, drop_episodes)
+                numbers = edited.choose(view, part, rows, drop_episodes)
                 chooses = part != "all" or bool(view.episodes or view.where)
                 failed = None if chooses else drop_episodes
                 done[name] = edited.copy(target, fields.of(edited.fields), numbers, advance, failed)
@@ -258,7 +255,16 @@ class _Mode:
             return field, np.zeros(shape, kind)
         return field, np.memmap(place, kind, "w+", shape=shape)
 
-    def choose(self, view: View, part: Part) -> Index:
+    def choose(
+        self, view: View, part: Part, rows: Function | None, dropped: Collection[int]
+    ) -> Index:
+        """Return the numbers of the rows that are kept, ascending: see `edit`."""
+        numbers = self._of_view(view, part)
+        if rows is not None:
+            numbers = self._filter(*_function(rows), numbers)
+        return self._without(numbers, dropped)
+
+    def _of_view(self, view: View, part: Part) -> Index:
         """Return the numbers of the rows that a view has, ascending."""
         if view.stride > 1 and "step" in self.fields:
             self._number_steps(view.stride)
@@ -276,7 +282,7 @@ class _Mode:
             steps[numbers] = steps[numbers[0]] + np.arange(len(numbers)) // stride
         self._derived["step"] = steps
 
-    def filter(
+    def _filter(
         self, function: Callable[[Mapping[str, Array]], Any], what: str, numbers: Index
     ) -> Index:
         """Return those of some rows that a function keeps."""
@@ -301,7 +307,7 @@ class _Mode:
             )
         return numbers[keeps[numbers]]
 
-    def without(self, numbers: Index, episodes: Collection[int]) -> Index:
+    def _without(self, numbers: Index, episodes: Collection[int]) -> Index:
         """Return those of some rows that do not belong to some episodes."""
         if not episodes:
             return numbers
@@ -444,6 +450,7 @@ def _name_of(given: Function) -> str:
 
 
 def _said(
+    modes: Sequence[str],
     view: View,
     part: Part,
     drop_episodes: Iterable[int],
@@ -451,7 +458,7 @@ def _said(
     derive: Function | None,
 ) -> dict[str, Any]:
     """Return what chooses rows, and what computes fields, as plain data."""
-    found: dict[str, Any] = {}
+    found: dict[str, Any] = {"modes": list(modes)} if modes else {}
     for name in ("episodes", "where", "stride"):
         if getattr(view, name) != getattr(_ALL, name):
             found[name] = getattr(view, name)
