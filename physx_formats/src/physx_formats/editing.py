@@ -23,7 +23,7 @@ from physx_core.dataset import (
     rows_per_block,
 )
 from physx_core.errors import ConfigError, DatasetError, listed, nearest
-from physx_core.fields import RESERVED, Field
+from physx_core.fields import RESERVED, Field, free_axes
 from physx_core.plugins import import_component
 from physx_core.typing import Array, Batch, Index
 from physx_core.views import Batches, Part, View
@@ -73,7 +73,7 @@ def edit(
         rows: Returns which rows to keep, booleans of shape (rows,). A reference
             ``"module:function"`` or ``"script.py:function"``, or the function itself.
         derive: Returns further fields, or new values of fields, by name: arrays of shape
-            (rows, *field shape). Likewise.
+            (rows, *field shape), or for a free axis a list of arrays, one for each row. Likewise.
         keep: The fields to keep; empty: all.
         drop: The fields to leave out.
         cast: New types of fields. Values are rounded as when they are stored: see `Field.convert`.
@@ -228,11 +228,13 @@ class _Mode:
             if not isinstance(found, Mapping) or not found:
                 raise ExchangeError(f"{what} returned {found!r:.80}, not arrays by field name.")
             for name, given in found.items():
-                values = np.asarray(given)
+                known = fields.get(name)
+                is_free = known.free_axis if known is not None else free_axes(fields.values())
+                values = _as_rows(given) if is_free else np.asarray(given)
                 if name not in derived:
-                    fields[name], derived[name] = self._begin(name, values)
+                    fields[name], derived[name] = self._begin(name, values, numbers)
                 field = fields[name]
-                if values.shape != (len(numbers), *(field.shape or ())):
+                if values.shape != (len(numbers), *field.row_kind[0]):
                     raise ExchangeError(
                         f'{what} returned "{name}" of shape {values.shape} for {len(numbers)} '
                         f"rows of {field.shape}."
@@ -243,9 +245,14 @@ class _Mode:
                 raise ExchangeError(f'{what} did not return "{lacks}" for each trajectory.')
         self._derived, self.fields = derived, fields
 
-    def _begin(self, name: str, values: Array) -> tuple[Field, Array]:
-        """Return a derived field, and room for its values."""
+    def _begin(self, name: str, values: Array, numbers: Index) -> tuple[Field, Array]:
+        """Return a derived field, and room for its values, given those of some rows."""
         known = self.fields.get(name)
+        if values.dtype.hasobject and name not in RESERVED:
+            if known is None:
+                shape = self._axis(name, values, numbers), *values[0].shape[1:]
+                known = Field(name, shape, values[0].dtype)
+            return known, np.empty(self.count, object)
         if name in RESERVED or values.dtype.kind not in "biufc" or not values.ndim:
             raise ExchangeError(f'"{name}" of {values.dtype} cannot be derived as a field.')
         field = known or Field(name, values.shape[1:], values.dtype)
@@ -254,6 +261,18 @@ class _Mode:
         if not all(shape):
             return field, np.zeros(shape, kind)
         return field, np.memmap(place, kind, "w+", shape=shape)
+
+    def _axis(self, name: str, values: Array, numbers: Index) -> str:
+        """Return the free axis that has the sizes of the values of some rows."""
+        sizes = [np.shape(each)[:1] for each in values]
+        axes = free_axes(self.fields.values())
+        for axis, (first, *_) in axes.items():
+            if [(len(each),) for each in self.read(first, numbers)] == sizes:
+                return axis
+        raise ExchangeError(
+            f'"{name}" has an array of another size for each row, and these are the sizes of no '
+            f"free axis: there are {listed(axes) or 'none'}."
+        )
 
     def choose(
         self, view: View, part: Part, rows: Function | None, dropped: Collection[int]
@@ -404,6 +423,13 @@ class _Column:
         """Return the next `count` rows, which begin at `start`."""
         values = self._mode.read(self._name, self._numbers[start : start + count])
         return self._field.convert(values, axes=1)
+
+
+def _as_rows(given: Any) -> Array:
+    """Return values as an array; a list of arrays as an array of objects, as of free axes."""
+    if isinstance(given, list) and any(np.ndim(each) for each in given):
+        return np.fromiter(map(np.asarray, given), object, len(given))
+    return np.asarray(given)
 
 
 def _records_of(table: Batch, numbers: Index, lost: Collection[int] | None) -> Batch:
