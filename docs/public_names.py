@@ -29,6 +29,7 @@ FACES = {
             "pipelines",
             "plugins",
             "rotations",
+            "geometry",
         ),
         *("errors", "fields", "typing", "checks", "parsing", "rows", "sources"),
         *("workers", "net", "clock", "processes", "files", "origin", "cli"),

@@ -287,3 +287,29 @@ def test_a_killed_edit_leaves_no_dataset(data, tmp_path):
     assert subprocess.run([sys.executable, "-c", program], check=False).returncode == -9
     assert not (tmp_path / "out").exists()
     assert edit(data, tmp_path / "out") == {"training": 16}
+
+
+def test_values_of_free_axes_are_derived(tmp_path):
+    rows = {"before": [np.arange(3.0), np.arange(5.0)], "n": np.arange(2)}
+    with Dataset.create(tmp_path / "data") as dataset:
+        fields = [Field("before", ("node",), unit="K"), Field("n", (), "int64")]
+        dataset.define_fields("training", fields)
+        dataset.append("training", rows)
+
+    def derive(rows):
+        return {
+            "twice": rows["before"] * 2,
+            "pairs": [np.stack([each, -each], 1) for each in rows["before"]],
+            "before": [each + 1 for each in rows["before"]],
+        }
+
+    edit(tmp_path / "data", tmp_path / "out", derive=derive, units={"twice": "K"})
+    with Dataset.open(tmp_path / "out") as found:
+        assert found.fields("training")["pairs"].shape == ("node", 2)
+        for row, before in enumerate(rows["before"]):
+            values = {name: found["training"][name][row] for name in ("twice", "pairs", "before")}
+            np.testing.assert_array_equal(values["twice"], 2 * before)
+            np.testing.assert_array_equal(values["pairs"][:, 1], -before)
+            np.testing.assert_array_equal(values["before"], before + 1)
+    with pytest.raises(ExchangeError, match=r"the sizes of no free axis: there are node"):
+        edit(tmp_path / "data", tmp_path / "no", derive=lambda r: {"x": [np.ones(9)] * len(r["n"])})

@@ -26,6 +26,9 @@ GIVEN = {
     "remote/godot-rl": {"arguments": {"timeout": 0.1}},
     "torch/graph": {"arguments": {"nodes": 2, "outputs": 1}},
     "torch/encoder_decoder": {"arguments": {"encoder": [4, 2]}},
+    "torch/padded": {
+        "arguments": {"module": "torch.nn:Linear", "in_features": 2, "out_features": 1}
+    },
     "torch/module": {
         "arguments": {"module": "torch.nn:Linear", "in_features": 4, "out_features": 3}
     },

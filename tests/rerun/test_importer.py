@@ -11,7 +11,7 @@ import pytest
 import rerun as rr
 from rerun.experimental import Hdf5Reader
 
-from physx_core import Dataset, Field
+from physx_core import DataGeneration, Dataset, Environment, EnvironmentConfig, Field
 from physx_core.cli import main as physx
 from physx_rerun import dataset as drawing
 from physx_rerun.importer import FOREIGN
@@ -129,3 +129,86 @@ def test_rerun_itself_reads_a_single_file_and_a_partition(folder, tmp_path):
     chunks = Hdf5Reader(partition).stream(ignore_datasets=ignored)
     (rows,) = (c for c in chunks if c.entity_path == "/")
     assert rows.to_record_batch().num_rows == ROWS
+
+
+def test_each_row_of_free_axes_has_its_own_mesh(tmp_path, read):
+    square = np.array([[0, 0], [1, 0], [0, 1], [1, 1]], float)
+    cells = [np.array([[0, 1, 2]]), np.array([[0, 1, 2], [1, 3, 2]])]
+    fields = [
+        Field("place", ("node", 2), unit="m"),
+        Field("triangle", ("triangle", 3), "int64", indexes="node"),
+        Field("heat", ("node",), unit="K"),
+        Field("strain", ("triangle", 2)),
+        Field("signal", ("time",)),
+    ]
+    with Dataset.create(tmp_path / "dataset") as dataset:
+        dataset.define_fields("training", fields)
+        rows = {
+            "place": [square[:3], square],
+            "triangle": cells,
+            "heat": [np.arange(3.0), np.arange(4.0)],
+            "strain": [np.ones((1, 2)), np.array([[1.0, 2.0], [3.0, 4.0]])],
+            "signal": [np.zeros(2), np.zeros(3)],
+        }
+        dataset.append("training", rows)
+    stream = rr.RecordingStream("test")
+    stream.save(tmp_path / "out.rrd")
+    drawing.write_dataset(tmp_path / "dataset", stream)
+    stream.disconnect()
+
+    def drawn(name, component):
+        found = read(tmp_path / "out.rrd", f"/training/env_1/{name}", component, "row")
+        return [(row, np.array(value)) for row, value in found if row is not None]
+
+    for (row, points), (_, triangles) in zip(
+        drawn("heat", "Mesh3D:vertex_positions"),
+        drawn("heat", "Mesh3D:triangle_indices"),
+        strict=True,
+    ):
+        np.testing.assert_array_equal(points.reshape(-1, 3)[:, :2], rows["place"][row])
+        np.testing.assert_array_equal(triangles.reshape(-1, 3), cells[row])
+    colors = [set(value.tolist()) for _, value in drawn("heat", "Mesh3D:vertex_colors")]
+    assert len(colors[0]) == 3 and len(colors[1]) == 4 and colors[0] < colors[1]
+    for name in ("strain_0", "strain_1"):  # each triangle has one color
+        shades = dict(drawn(name, "Mesh3D:vertex_colors"))[1].reshape(2, 3)
+        assert (shades == shades[:, :1]).all() and shades[0, 0] != shades[1, 0]
+
+
+@pytest.mark.parametrize("width", [2, 4])
+def test_meshes_of_episodes_are_drawn_with_their_rows(width, tmp_path, read):
+    corners = np.concatenate([np.zeros((1, 3)), np.eye(3), [[1.0, 1.0, 1.0]]])
+    cells = np.array([[0, 1, 2, 3], [1, 2, 3, 4]])[:, :width]
+
+    class Solid(Environment):
+        independent_episodes, episode_steps = True, 2
+
+        def create(self):
+            pass
+
+        def init_database(self):
+            self.define_training_fields([Field("heat", ("node",))])
+            cell = Field("cell", ("cell", width), "int64", indexes="node")
+            self.define_episode_fields([Field("place", ("node", 3)), cell])
+
+        def reset_parameters(self):
+            self.size = 1.0 + self.episode_index
+            self.set_episode_data(place=self.size * corners, cell=cells)
+
+        def step(self):
+            self.set_training_data(heat=np.arange(5.0))
+
+    config = EnvironmentConfig(Solid, as_tcp_ip_client=False, seed=1)
+    DataGeneration(config, episodes=2, session_dir=str(tmp_path), quiet=True).execute()
+    stream = rr.RecordingStream("test")
+    stream.save(tmp_path / "out.rrd")
+    drawing.write_dataset(tmp_path / "data_generation", stream)
+    stream.disconnect()
+    shown = "Mesh3D:vertex_positions" if width == 4 else "Points3D:positions"
+    found = read(tmp_path / "out.rrd", "/training/env_0/heat", shown, "row")
+    for row, points in found:
+        scale = 1.0 + row // 2
+        np.testing.assert_array_equal(np.reshape(points, (-1, 3)), scale * corners)
+    assert [row for row, _ in found] == [0, 1, 2, 3]
+    component = "Mesh3D:triangle_indices" if width == 4 else "LineStrips3D:strips"
+    (_, parts), *_ = read(tmp_path / "out.rrd", "/training/env_0/heat", component, "row")
+    assert len(np.reshape(parts, (-1, 3))) == (6 if width == 4 else 4)  # without the side inside

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
@@ -73,6 +74,10 @@ class Field:
             normalized by its statistics. Empty: it is a quantity of its own.
         indexes: Name of the free axis whose entries the values are numbers of, from 0 in each
             sample, as the nodes of an edge are: where samples are joined, they are shifted.
+        numpy_dtype: The type as a NumPy object.
+        free_axis: Name of the free axis; empty if there is none.
+        entry_shape: Shape of an entry of the free axis; without one, that of a sample's value.
+        nbytes: Size of an entry, or without a free axis a value, in bytes; 0: the shape is unknown.
     """
 
     name: str
@@ -83,6 +88,10 @@ class Field:
     axes: tuple[str, ...] = ()
     like: str = ""
     indexes: str = ""
+    numpy_dtype: np.dtype[Any] = dataclasses.field(init=False, repr=False, compare=False)
+    free_axis: str = dataclasses.field(init=False, repr=False, compare=False)
+    entry_shape: tuple[int, ...] = dataclasses.field(init=False, repr=False, compare=False)
+    nbytes: int = dataclasses.field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
         """Check the name, and normalize shape and type.
@@ -107,6 +116,14 @@ class Field:
         object.__setattr__(self, "dtype", dtype.newbyteorder("<").str)
         if self.shape is not None:
             object.__setattr__(self, "shape", _shape(self.name, self.shape))
+        first, *_ = self.shape or (0,)
+        free = first if isinstance(first, str) else ""
+        entry = (self.shape or ())[1 if free else 0 :]
+        count = math.prod(entry) if self.shape is not None else 0
+        object.__setattr__(self, "numpy_dtype", np.dtype(self.dtype))
+        object.__setattr__(self, "free_axis", free)
+        object.__setattr__(self, "entry_shape", entry)
+        object.__setattr__(self, "nbytes", count * dtype.itemsize)
         object.__setattr__(self, "axes", _axes(self.name, self.axes, self.shape))
         if not isinstance(self.like, str) or (self.like and not self.like.isidentifier()):
             raise ConfigError(
@@ -119,22 +136,6 @@ class Field:
             )
 
     @cached_property
-    def numpy_dtype(self) -> np.dtype[Any]:
-        """The type as a NumPy object."""
-        return np.dtype(self.dtype)
-
-    @cached_property
-    def free_axis(self) -> str:
-        """Name of the free axis; empty if there is none."""
-        first = self.shape[0] if self.shape else 0
-        return first if isinstance(first, str) else ""
-
-    @cached_property
-    def entry_shape(self) -> tuple[int, ...]:
-        """Shape of an entry of the free axis; without one, that of a sample's value."""
-        return (self.shape or ())[1 if self.free_axis else 0 :]
-
-    @cached_property
     def of_entries(self) -> Field:
         """The field of an entry of the free axis; without one, the field itself."""
         if not self.free_axis:
@@ -145,12 +146,6 @@ class Field:
     def row_kind(self) -> tuple[tuple[int, ...], np.dtype[Any]]:
         """Shape and type of a row in an array of rows, an object with a free axis."""
         return ((), np.dtype(object)) if self.free_axis else (self.entry_shape, self.numpy_dtype)
-
-    @cached_property
-    def nbytes(self) -> int:
-        """Size of an entry, or without a free axis a value, in bytes; 0: the shape is unknown."""
-        count = math.prod(self.entry_shape) if self.shape is not None else 0
-        return count * self.numpy_dtype.itemsize
 
     @property
     def has_statistics(self) -> bool:

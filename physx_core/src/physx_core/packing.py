@@ -51,9 +51,27 @@ def join(field: Field, rows: Sequence[Array]) -> tuple[Array, Index]:
 
 def ranges(starts: Index, counts: Index) -> Index:
     """Return the numbers in ranges from some numbers on, one after another."""
-    ends = np.cumsum(counts)
-    found: Index = np.repeat(starts - ends + counts, counts) + np.arange(int(counts.sum()))
+    found: Index = (starts - counts.cumsum() + counts).repeat(counts)
+    found += np.arange(len(found))
     return found
+
+
+def copy_ranges(rows: Array, starts: Index, counts: Index, out: Array) -> None:
+    """Copy rows in ranges from some numbers on, one after another, into an array of their type.
+
+    They are copied as bytes, by slices of memory, which cost less than those of arrays.
+
+    Args:
+        rows: Contiguous rows of at least one byte.
+        starts: First number of each range.
+        counts: Number of rows of each range.
+        out: A contiguous array of as many rows as all ranges have.
+    """
+    size, end = out.nbytes // len(out), 0
+    source, target = (each.reshape(-1).view(np.uint8).data for each in (rows, out))
+    for start, count in zip((starts * size).tolist(), (counts * size).tolist(), strict=True):
+        begin, end = end, end + count
+        target[begin:end] = source[start : start + count]
 
 
 def check_sizes(
@@ -147,7 +165,7 @@ def pack(
     found = dict(rows)
     for axis, counts in known.items():
         ptr = np.zeros(len(counts) + 1, np.int64)
-        np.cumsum(counts, out=ptr[1:])
+        counts.cumsum(out=ptr[1:])
         found[axis + PTR] = ptr
         name, shape, kind = axis + BATCH, (int(ptr[-1]),), np.dtype(np.int64)
         if named is not None and name not in named:

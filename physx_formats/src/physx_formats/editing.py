@@ -23,7 +23,7 @@ from physx_core.dataset import (
     rows_per_block,
 )
 from physx_core.errors import ConfigError, DatasetError, listed, nearest
-from physx_core.fields import RESERVED, Field
+from physx_core.fields import RESERVED, Field, free_axes
 from physx_core.plugins import import_component
 from physx_core.typing import Array, Batch, Index
 from physx_core.views import Batches, Part, View
@@ -73,7 +73,7 @@ def edit(
         rows: Returns which rows to keep, booleans of shape (rows,). A reference
             ``"module:function"`` or ``"script.py:function"``, or the function itself.
         derive: Returns further fields, or new values of fields, by name: arrays of shape
-            (rows, *field shape). Likewise.
+            (rows, *field shape), or for a free axis a list of arrays, one for each row. Likewise.
         keep: The fields to keep; empty: all.
         drop: The fields to leave out.
         cast: New types of fields. Values are rounded as when they are stored: see `Field.convert`.
@@ -103,7 +103,7 @@ def edit(
         names = [name for name in names if name != EPISODES or not source.has_episodes]
         fields = _Fields(keep, drop, cast or {}, units or {}, rename or {})
         origin = {"dataset": Path(directory).resolve().name, "digest": _digest(source, names)}
-        said = _said(view, part, drop_episodes, rows, derive) | fields.said()
+        said = _said(modes, view, part, drop_episodes, rows, derive) | fields.said()
         done, draft = {}, Path(folder) / "dataset"
         with Dataset.create(draft, session="edit") as target:
             history = source.info.get("edits", [])
@@ -113,10 +113,7 @@ def edit(
                 edited = _Mode(source, name, Path(folder))
                 if derive is not None:
                     edited.derive(*_function(derive))
-                numbers = edited.choose(view, part)
-                if rows is not None:
-                    numbers = edited.filter(*_function(rows), numbers)
-                numbers = edited.without(numbers, drop_episodes)
+                numbers = edited.choose(view, part, rows, drop_episodes)
                 chooses = part != "all" or bool(view.episodes or view.where)
                 failed = None if chooses else drop_episodes
                 done[name] = edited.copy(target, fields.of(edited.fields), numbers, advance, failed)
@@ -231,11 +228,13 @@ class _Mode:
             if not isinstance(found, Mapping) or not found:
                 raise ExchangeError(f"{what} returned {found!r:.80}, not arrays by field name.")
             for name, given in found.items():
-                values = np.asarray(given)
+                known = fields.get(name)
+                is_free = known.free_axis if known is not None else free_axes(fields.values())
+                values = _as_rows(given) if is_free else np.asarray(given)
                 if name not in derived:
-                    fields[name], derived[name] = self._begin(name, values)
+                    fields[name], derived[name] = self._begin(name, values, numbers)
                 field = fields[name]
-                if values.shape != (len(numbers), *(field.shape or ())):
+                if values.shape != (len(numbers), *field.row_kind[0]):
                     raise ExchangeError(
                         f'{what} returned "{name}" of shape {values.shape} for {len(numbers)} '
                         f"rows of {field.shape}."
@@ -246,9 +245,14 @@ class _Mode:
                 raise ExchangeError(f'{what} did not return "{lacks}" for each trajectory.')
         self._derived, self.fields = derived, fields
 
-    def _begin(self, name: str, values: Array) -> tuple[Field, Array]:
-        """Return a derived field, and room for its values."""
+    def _begin(self, name: str, values: Array, numbers: Index) -> tuple[Field, Array]:
+        """Return a derived field, and room for its values, given those of some rows."""
         known = self.fields.get(name)
+        if values.dtype.hasobject and name not in RESERVED:
+            if known is None:
+                shape = self._axis(name, values, numbers), *values[0].shape[1:]
+                known = Field(name, shape, values[0].dtype)
+            return known, np.empty(self.count, object)
         if name in RESERVED or values.dtype.kind not in "biufc" or not values.ndim:
             raise ExchangeError(f'"{name}" of {values.dtype} cannot be derived as a field.')
         field = known or Field(name, values.shape[1:], values.dtype)
@@ -258,7 +262,28 @@ class _Mode:
             return field, np.zeros(shape, kind)
         return field, np.memmap(place, kind, "w+", shape=shape)
 
-    def choose(self, view: View, part: Part) -> Index:
+    def _axis(self, name: str, values: Array, numbers: Index) -> str:
+        """Return the free axis that has the sizes of the values of some rows."""
+        sizes = [np.shape(each)[:1] for each in values]
+        axes = free_axes(self.fields.values())
+        for axis, (first, *_) in axes.items():
+            if [(len(each),) for each in self.read(first, numbers)] == sizes:
+                return axis
+        raise ExchangeError(
+            f'"{name}" has an array of another size for each row, and these are the sizes of no '
+            f"free axis: there are {listed(axes) or 'none'}."
+        )
+
+    def choose(
+        self, view: View, part: Part, rows: Function | None, dropped: Collection[int]
+    ) -> Index:
+        """Return the numbers of the rows that are kept, ascending: see `edit`."""
+        numbers = self._of_view(view, part)
+        if rows is not None:
+            numbers = self._filter(*_function(rows), numbers)
+        return self._without(numbers, dropped)
+
+    def _of_view(self, view: View, part: Part) -> Index:
         """Return the numbers of the rows that a view has, ascending."""
         if view.stride > 1 and "step" in self.fields:
             self._number_steps(view.stride)
@@ -276,7 +301,7 @@ class _Mode:
             steps[numbers] = steps[numbers[0]] + np.arange(len(numbers)) // stride
         self._derived["step"] = steps
 
-    def filter(
+    def _filter(
         self, function: Callable[[Mapping[str, Array]], Any], what: str, numbers: Index
     ) -> Index:
         """Return those of some rows that a function keeps."""
@@ -301,7 +326,7 @@ class _Mode:
             )
         return numbers[keeps[numbers]]
 
-    def without(self, numbers: Index, episodes: Collection[int]) -> Index:
+    def _without(self, numbers: Index, episodes: Collection[int]) -> Index:
         """Return those of some rows that do not belong to some episodes."""
         if not episodes:
             return numbers
@@ -400,6 +425,13 @@ class _Column:
         return self._field.convert(values, axes=1)
 
 
+def _as_rows(given: Any) -> Array:
+    """Return values as an array; a list of arrays as an array of objects, as of free axes."""
+    if isinstance(given, list) and any(np.ndim(each) for each in given):
+        return np.fromiter(map(np.asarray, given), object, len(given))
+    return np.asarray(given)
+
+
 def _records_of(table: Batch, numbers: Index, lost: Collection[int] | None) -> Batch:
     """Return the records of the episodes of some rows, with as many rows as these.
 
@@ -444,6 +476,7 @@ def _name_of(given: Function) -> str:
 
 
 def _said(
+    modes: Sequence[str],
     view: View,
     part: Part,
     drop_episodes: Iterable[int],
@@ -451,7 +484,7 @@ def _said(
     derive: Function | None,
 ) -> dict[str, Any]:
     """Return what chooses rows, and what computes fields, as plain data."""
-    found: dict[str, Any] = {}
+    found: dict[str, Any] = {"modes": list(modes)} if modes else {}
     for name in ("episodes", "where", "stride"):
         if getattr(view, name) != getattr(_ALL, name):
             found[name] = getattr(view, name)

@@ -13,13 +13,13 @@ import rerun as rr
 import rerun.blueprint as rrb
 
 from physx_core import Dataset, Field
+from physx_core.dataset import EPISODES
 from physx_core.errors import printable
 from physx_core.typing import Array
 from physx_rerun.drawing import colors
 from physx_rerun.drawing.legends import legend
+from physx_rerun.stored_meshes import TIMELINE, StoredMesh, find_meshes, views_of, write_meshes
 
-TIMELINE = "row"
-"""Timeline of the recording: the number of the row in its mode."""
 LIMIT_BYTES = 500_000_000
 """Size of the rows after which the rest of a mode is omitted."""
 _BLOCK_BYTES = 8_000_000
@@ -99,7 +99,9 @@ def write_dataset(directory: Path, stream: rr.RecordingStream) -> None:
 
     The field ``points`` of the second instance in the mode ``training`` is the entity
     ``training/env_2/points``. Fields are drawn according to their shapes: (n, 3) and (n, 2) as
-    points, a few numbers as curves, and the first rows of all others as arrays.
+    points, a few numbers as curves, and the first rows of all others as arrays. Of free axes with
+    points and, by `Field.indexes`, cells, each row or episode has its own mesh, colored by the
+    values on it: one window for each number of them.
 
     Args:
         directory: The folder of the dataset or its session.
@@ -111,10 +113,12 @@ def write_dataset(directory: Path, stream: rr.RecordingStream) -> None:
     stream.set_log_time_enabled(False)
     with Dataset.open(directory) as dataset:
         tabs = []
-        for mode in filter(dataset.num_samples, dataset.modes):
-            columns = _columns(dataset, mode)
-            instances = _write_mode(dataset, mode, columns, stream)
-            tabs.append(rrb.Grid(*_views(columns, instances), name=mode))
+        modes = sorted(dataset.modes, key=EPISODES.__eq__)  # the table of episodes comes last
+        for mode in filter(dataset.num_samples, modes):
+            columns, meshes = _columns(dataset, mode), find_meshes(dataset, mode)
+            instances = _write_mode(dataset, mode, columns, meshes, stream)
+            views = views_of(dataset, meshes, instances[:_MOST_INSTANCES])
+            tabs.append(rrb.Grid(*views, *_views(columns, instances), name=mode))
         if tabs:
             stream.send_blueprint(rrb.Blueprint(rrb.Tabs(*tabs), collapse_panels=True))
 
@@ -124,18 +128,22 @@ def _columns(dataset: Dataset, mode: str) -> list[_Column]:
         _Column(mode, field, field.shape)
         for field in dataset.fields(mode).values()
         if field.shape is not None
+        and not field.free_axis
         and np.dtype(field.dtype).kind in "biuf"
         and field.name not in _BOOKKEEPING
     ]
 
 
 def _write_mode(
-    dataset: Dataset, mode: str, columns: Sequence[_Column], stream: rr.RecordingStream
+    dataset: Dataset,
+    mode: str,
+    columns: Sequence[_Column],
+    meshes: Sequence[StoredMesh],
+    stream: rr.RecordingStream,
 ) -> list[int]:
     """Write the rows of a mode and return the numbers of their instances."""
     view, count, known = dataset[mode], dataset.num_samples(mode), set[int]()
-    sizes = (math.prod(c.shape) * np.dtype(c.field.dtype).itemsize for c in columns)
-    row_bytes = max(1, sum(sizes))
+    row_bytes = max(1, dataset.rows(mode).row_nbytes)
     shown = min(count, max(1, LIMIT_BYTES // row_bytes))
     if shown < count:
         text = f"physx: only the first {shown} of {count} rows of the mode {mode} are shown\n"
@@ -154,6 +162,7 @@ def _write_mode(
                     column.write_look(stream, instance)
                 column.write(stream, instance, rows[mine], values[column][mine])
             known.add(instance)
+        write_meshes(stream, dataset, meshes, rows, owners)
     return sorted(known)
 
 

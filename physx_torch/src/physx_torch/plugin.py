@@ -13,6 +13,7 @@ def physx_networks() -> dict[str, str]:
         "encoder_decoder": "physx_torch.networks.encoder_decoder:EncoderDecoder",
         "graph": "physx_torch.networks.graph:GraphNetwork",
         "module": "physx_torch.networks.module_network:ModuleNetwork",
+        "padded": "physx_torch.networks.padded:PaddedNetwork",
         "unet": "physx_torch.networks.unet:UNet",
     }
 

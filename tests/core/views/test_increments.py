@@ -79,6 +79,19 @@ def test_stored_fields_of_one_row_are_increments():
         assert_allclose(found.maximum, (later - x).max(0))
 
 
+def test_changes_of_values_of_any_size_are_those_of_their_entries(tmp_path):
+    before = [np.arange(size, dtype=float) for size in (3, 0, 5)]
+    after = [values + 2 * values**2 for values in before]
+    with Dataset.create(tmp_path / "free") as dataset:
+        free = [Field("before", ("node",)), Field("after", ("node",), like="before")]
+        dataset.define_fields("training", free)
+        dataset.append("training", {"before": before, "after": after})
+        with View(hold_back=False).open(2, data=dataset) as batches:
+            found = batches.normalization({"after": "increment"})["after"]
+    changes = np.concatenate(after) - np.concatenate(before)
+    assert_allclose([found.mean, found.std], [changes.mean(), changes.std()])
+
+
 def test_windows_of_fields_that_are_one_quantity_are_increments():
     train({"next": "increment"}, view=View(window={"past": ("later", 0), "next": ("x", 1)}))
 

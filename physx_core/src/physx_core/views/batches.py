@@ -528,10 +528,11 @@ class Batches(Closeable):
 
     def _statistics_of_increments(self, source: Source, of: Measured) -> RunningStatistics:
         total, both = RunningStatistics(of.pooled), self.reading(of.names)
+        values = both._pack if both._axes else both._values
         step = rows_per_block(sum(field.nbytes for field in both.fields.values()))
         for start in range(0, source.count, step):
             items = np.arange(start, min(start + step, source.count))
-            total.update(of.of(both._values(source, source.items.locate(items))))
+            total.update(of.of(values(source, source.items.locate(items))))
         return total
 
     @property

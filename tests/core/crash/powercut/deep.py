@@ -83,6 +83,7 @@ def _write(folder: Path, seen: Seen) -> str:
         wanted = Seen(fields=seen.fields, info=seen.info)
         for mode, fields in seen.fields.items():
             if any(of.shape is None for of in fields.values()):
+                wanted.values[mode] = seen.values[mode]
                 continue
             block = {name: encode(of, rows, 0) for name, of in fields.items()}
             dataset.append(mode, block)

@@ -66,6 +66,7 @@ class ModeRows:
         self._numbering = self._reader.manifest.numbering
         self.loads = False
         self._used: dict[str, tuple[int, MemoryColumn | MappedColumn]] = {}
+        self._ends: dict[str, tuple[int, Index]] = {}
         orders = self._reader.orders
         if snapshot is None:
             self.order = self._reader.order(mode)
@@ -184,17 +185,20 @@ class ModeRows:
             The entries, and how many each row has, shape (n,).
         """
         field, column = self.fields[name], self._column(name)
-        bounds = self._reader.bounds(self.mode, field.free_axis)
+        bounds = self._bounds(field.free_axis)
         stored = rows if self.stored is None else self.stored(rows)
         starts = bounds[stored]
         counts = bounds[stored + 1] - starts
         out = allocate((int(counts.sum()), *field.entry_shape), field.converted_dtype(dtype))
         if not out.size:
             return out, counts
+        plain = out if out.dtype == column.dtype else np.empty(out.shape, column.dtype)
         if len(out) * field.nbytes < _SMALL_ROW * len(rows):
-            column.gather(ranges(starts, counts), plain := np.empty(out.shape, column.dtype))
-            return plain.astype(out.dtype, copy=False), counts
-        np.concatenate(column.slices(starts, counts), out=out, casting="same_kind")
+            column.gather(ranges(starts, counts), plain)
+        else:
+            column.copy(starts, counts, plain)
+        if plain is not out:
+            out[:] = plain
         return out, counts
 
     def packed(
@@ -230,6 +234,14 @@ class ModeRows:
                 found = self.gather(name, (first[:, None] + np.arange(count)).ravel())
                 return found.reshape(len(first), count, *found.shape[1:])
         return self._column(name).windows(begin, count)
+
+    def _bounds(self, axis: str) -> Index:
+        """Return the first stored entry of each stored row, and the end; kept while rows stay."""
+        generation = self._reader.manifest.generation
+        known = self._ends.get(axis)
+        if known is None or known[0] != generation:
+            known = self._ends[axis] = generation, self._reader.bounds(self.mode, axis)
+        return known[1]
 
     def _column(self, name: str) -> MemoryColumn | MappedColumn:
         """Return a field; it is in memory if it was, or may be and fits when it is first used."""

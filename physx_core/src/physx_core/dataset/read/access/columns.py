@@ -13,7 +13,7 @@ from physx_core.dataset.read.access.mapping import MappedColumn, Runs
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.read.shuffling import LARGE_ROW
 from physx_core.fields import Field
-from physx_core.packing import join, split
+from physx_core.packing import copy_ranges, split
 from physx_core.typing import Array, Index
 
 
@@ -65,11 +65,9 @@ class MemoryColumn:
             .reshape(len(first), count, *self.shape[1:])
         )
 
-    def slices(self, starts: Index, counts: Index) -> list[Array]:
-        """Return runs of rows as views, valid while this is not closed."""
-        begins, array = starts.tolist(), self._array
-        ends = (starts + counts).tolist()
-        return [array[begin:end] for begin, end in zip(begins, ends, strict=True)]
+    def copy(self, starts: Index, counts: Index, out: Array) -> None:
+        """Copy runs of rows into an array of as many, at least one: see `copy_ranges`."""
+        copy_ranges(self._array, starts, counts, out)
 
     def gather(self, index: Index, out: Array) -> None:
         """Copy the rows of an index array, all in range, into `out`."""
@@ -164,7 +162,10 @@ class ColumnCache:
         if field.free_axis:
             bounds = self.reader.bounds(mode, field.free_axis)
             starts, counts = bounds[index], bounds[index + 1] - bounds[index]
-            return split(join(field, column.slices(starts, counts))[0], counts)
+            entries = np.empty((int(counts.sum()), *field.entry_shape), column.dtype)
+            if entries.size:
+                column.copy(starts, counts, entries)
+            return split(entries, counts)
         out = np.empty((len(index), *column.shape[1:]), column.dtype)
         column.gather(index, out)
         return out

@@ -21,6 +21,7 @@ from physx_core.dataset.store.partition.segment import Segment
 from physx_core.dataset.store.partition.spans import FlatIndex
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
+from physx_core.packing import copy_ranges
 from physx_core.typing import Array, Index
 
 _FIXED = 0x10  # MAP_FIXED, which the module mmap does not define
@@ -95,13 +96,12 @@ class MappedColumn:
             index = self._slots[numbers] + places
         self._array.take(index, 0, out, "clip")
 
-    def slices(self, starts: Index, counts: Index) -> list[Array]:
-        """Return runs of rows within partitions as views, valid while this exists."""
-        if not self._single and len(starts):
+    def copy(self, starts: Index, counts: Index, out: Array) -> None:
+        """Copy runs of rows within partitions into an array of as many, at least one."""
+        if not self._single:
             numbers, places = self._index.locate(starts)
             starts = self._slots[numbers] + places
-        begins, ends, array = starts.tolist(), (starts + counts).tolist(), self._array
-        return [array[begin:end] for begin, end in zip(begins, ends, strict=True)]
+        copy_ranges(self._array, starts, counts, out)
 
     def windows(self, first: Index, count: int) -> Array:
         """Return consecutive rows from each of some rows on, shape (n, count, *field shape)."""
