@@ -5,14 +5,14 @@ A step is repeated with adjusted torques until it ends with the desired velociti
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import mujoco
 import numpy as np
 
 from physx_core.typing import Vector
 from physx_mujoco.robot import Running
-from physx_sim import Layout
+from physx_sim import Layout, Mimic
 
 _STIFF = 1e6
 """Inertia, in kg m² or kg, with which joints that follow others move together."""
@@ -25,15 +25,27 @@ class Drives:
 
     Args:
         layout: The joints.
+        followers: Those that follow others, with their leaders and how: the velocity limit of a
+            follower limits its leader.
         running: The world.
         step: Simulates a physics step.
     """
 
-    def __init__(self, layout: Layout, running: Running, step: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        layout: Layout,
+        followers: Iterable[tuple[int, int, Mimic]],
+        running: Running,
+        step: Callable[[], None],
+    ) -> None:
         self._running, self._step, modes = running, step, np.array(layout.modes)
         self._driven = modes != "force"
         self._places = np.array(list(layout.velocity_index.values()), np.intp)
-        self._fastest = np.where(self._driven, np.inf, layout.max_velocity)
+        fastest = layout.max_velocity.copy()
+        for follower, leader, mimic in followers:
+            fastest[leader] = min(fastest[leader], fastest[follower] / abs(mimic.multiplier))
+            fastest[follower] = np.inf
+        self._fastest = np.where(self._driven, np.inf, fastest)
         self._strongest = np.where(modes == "velocity", np.inf, layout.max_torque)
         self.idle = not (self._driven.any() or np.isfinite(self._fastest).any())
 
