@@ -55,7 +55,8 @@ class Drives:
         model, data = running.model, running.data
         q, v = running.positions, running.velocities
         q[:], v[:], warm = data.qpos, data.qvel, data.qacc_warmstart.copy()
-        wanted, torques, inverse = data.qfrc_applied[at].copy(), np.zeros(len(at)), None
+        wanted, torques = data.qfrc_applied[at].copy(), np.zeros(len(at))
+        response, tried, before = None, torques, v[at]
         for _ in range(_MOST):
             data.qfrc_applied[at] = np.where(driven, 0.0, wanted) + torques
             data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = q, v, warm
@@ -71,8 +72,13 @@ class Drives:
             free = np.flatnonzero(active & ~stuck)
             if not (np.abs(error[free]) > _EXACT * (1 + np.abs(now[free]))).any():
                 break
-            inverse = self._inverse() if inverse is None else inverse
-            more = np.linalg.solve(inverse[np.ix_(free, free)], error[free] / model.opt.timestep)
+            if response is None:
+                response = model.opt.timestep * self._inverse()
+            elif (change := torques - tried).any():  # contacts resist, too: Broyden's method
+                missed = now - before - response @ change
+                response += np.outer(missed, change / change.dot(change))
+            more = np.linalg.solve(response[np.ix_(free, free)], error[free])
+            tried, before = torques.copy(), now
             torques[free] = np.clip(torques[free] + more, low[free], high[free])
         data.qfrc_applied[at] = wanted
 
