@@ -1,7 +1,6 @@
 """Domain randomization: what is drawn is what is simulated, from the seed, and in the log."""
 
 import copy
-import dataclasses
 
 import numpy as np
 import pytest
@@ -326,9 +325,7 @@ def test_masses_and_friction_change_without_a_build(backend):
         assert base.simulator.builds == 1
         assert world.ground.friction == env.drawn["RandomFriction"]["coefficient"]
         assert world.robots[0].mass_factors == factors
-        rebuilt = plugins.resolve("backend", backend).build(
-            world
-        )
+        rebuilt = plugins.resolve("backend", backend).build(world)
         simulation = base.simulator.simulation
         q = simulation.positions()
         np.testing.assert_allclose(

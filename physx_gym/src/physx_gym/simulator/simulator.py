@@ -182,7 +182,7 @@ class Simulator(SharedArrays, Closeable):
         backend = plugins.resolve("backend", self.backend)
         world = with_rotors(self._built_world, self._given_motors or ())
         simulation: Simulation = backend.build(world)
-        if self.world is not self._built_world and not _CHANGES <= simulation.features:
+        if self.world is not self._built_world and not simulation.features >= _CHANGES:
             simulation.close()
             self._built_world = self.world
             world = with_rotors(self.world, self._given_motors or ())
@@ -397,7 +397,7 @@ class Simulator(SharedArrays, Closeable):
         self.world, self.stepper_state.dt = world, world.period
         engine = self._engine
         if built is self._built_world and engine is not None and not self._stale:
-            if _CHANGES <= engine.simulation.features:
+            if engine.simulation.features >= _CHANGES:
                 self._change_world(engine)
                 return
             built = world
