@@ -16,7 +16,7 @@ from environments.sorting_line import COLORS, VIEW, drive, enter, line, sorted_c
 from physx_core import plugins
 from physx_sim import BodySettings, Weld
 
-SPEED, LAST, ENGINES = 0.5, 2.0, ("dart", "pinocchio", "mujoco")  # m/s; s at the end
+SPEED, LAST, ENGINES = 0.5, 3.0, ("dart", "pinocchio", "mujoco")  # m/s; s at the end
 HOME, LOW, OVER = (0.0, 0.1), (0.0, 0.35), (0.5, 0.1)  # m, places of the gantry: across, down
 
 

@@ -57,7 +57,7 @@ def lift(engine, coupled, film=None):
 
 def main():
     chosen, film, found = options(__doc__).parse_args(), [], {}
-    print(f"{'':32}" + "".join(f"{engine:>11}" for engine in ENGINES))
+    print(f"{'of 4 s':32}" + "".join(f"{engine:>11}" for engine in ENGINES))
     for name, task, works in (
         ("rocker off theory, mrad, no pin", turn, False),
         ("rocker off theory, mrad", turn, True),
