@@ -36,8 +36,8 @@ def take(simulation, crate, suction, scene):
 
 def run(simulation, seconds, scene):
     for _ in range(round(seconds / 0.01)):
-        simulation.step(5)
-        if scene and simulation.frame % 60 == 0:
+        simulation.step(2)
+        if scene and simulation.frame % 24 == 0:
             scene.add()
 
 

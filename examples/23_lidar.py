@@ -34,7 +34,7 @@ def corridors(distances):
 def steer(distances, away, goal):
     """Return speed in m/s and turn in rad/s; the goal is `away`, in the direction `goal`."""
     free = corridors(distances)
-    best = np.argmax(np.minimum(free, min(away, 2.0)) - 0.6 * np.abs(TURNS - goal))
+    best = np.argmax(np.minimum(free, min(away, 2.0)) - 0.6 * np.abs(TURNS - goal - 0.2))
     return 0.6 * min(1.0, free[len(TURNS) // 2]), 2.0 * TURNS[best]
 
 

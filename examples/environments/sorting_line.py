@@ -26,7 +26,7 @@ def line(crates: int) -> tuple[World, list[str]]:
     for number in range(crates):
         name, place = f"{'red' if number % 2 else 'blue'} {number}", (-3.0, 0.2 * number, 0.05)
         things.append(Box(name=name, size=(0.1, 0.1, 0.1), position=place, friction=0.6))
-    world = World([gantry], 2e-3, objects=things, ground=Ground())
+    world = World([gantry], 5e-3, objects=things, ground=Ground())
     return world, [thing.name for thing in things[2:]]
 
 
