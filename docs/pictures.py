@@ -1,6 +1,6 @@
 """Draws the documentation's pictures of environments and examples.
 
-python docs/pictures.py    # writes environments, replay, examples, learn/spring, all .png
+python docs/pictures.py    # writes environments, replay, examples, learn/spring .png, branch.webp
 python docs/pictures.py --demo PICTURE    # compares a picture of the demo with its kept film
 """
 
@@ -22,7 +22,7 @@ import physx_gym
 from physx_core import Visualizer
 from physx_core.components import Event, Factory
 from physx_core.pipelines import Learner
-from physx_rerun import RerunVisualizer, render_picture
+from physx_rerun import RerunVisualizer, render_film, render_picture
 
 HERE = Path(__file__).parent
 EXAMPLES = HERE.parent / "examples"
@@ -234,6 +234,15 @@ def spring() -> np.ndarray:
         return np.asarray(Image.open(path).convert("RGB"))
 
 
+def branch(path: Path) -> None:
+    """Film the branch of docs/howto/branch.md, made by the code of that page."""
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        run_pages.run([HERE / "howto" / "branch.md"], folder)
+        recording = folder / "sessions" / "branch" / "branch.rrd"
+        render_film(recording, path, (720, 300), frames=30, frame_rate=10.0)
+
+
 def shares(picture: np.ndarray) -> dict[str, float]:
     """Return the share of a picture's pixels that have each of these colors."""
     red, green, blue = np.moveaxis(picture.astype(int), 2, 0)
@@ -269,6 +278,7 @@ if __name__ == "__main__":
         check_demo(Path(sys.argv[2]))
         sys.exit(0)
     environments(HERE / "environments.png")
+    branch(HERE / "branch.webp")
     replay(HERE / "replay.png")
     sheet(examples()).save(HERE / "examples.png", optimize=True)
     Image.fromarray(spring()).quantize(256).save(HERE / "learn" / "spring.png", optimize=True)

@@ -120,6 +120,7 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
         "dataset_config": DatasetConfig(),
         "step_nb": 4,
     },
+    physx_core.Branch: {"data": "sessions/data", "row": 3, "step_nb": 4, "past": 5},
     RerunVisualizer: {},
     ExportOptions: {"fps": 30},
     Trajectory: {"times": [0.0, 1.0], "positions": [[1.0], [2.0]], "velocities": [[0.5], [0.0]]},
@@ -144,7 +145,7 @@ RECORDS = {
     *("CollisionShape", "Joint", "MovableBody", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
     "Bond",
     *("Agreement", "Cause", "Figure", "Parting", "Ranking"),
-    *("Kind", "Format", "Table", "Section", "RolloutResult", "Unseen", "Score"),
+    *("Kind", "Format", "Table", "Section", "RolloutResult", "Unseen", "Score", "Cursor"),
 }
 ABSTRACT = {"Attachment", "Pipeline", "RaySensor", "Sensor"}
 

@@ -29,6 +29,7 @@ from physx_core import (
 )
 from physx_core.cli import main
 from physx_core.errors import SessionError
+from physx_core.pipelines import load_learner
 from physx_core.results import PolicyResult, read_results, store_result
 from physx_report import Figure, Section, Table, Text, drawing, film, page, write_report
 from physx_report.errors import ReportError
@@ -214,6 +215,27 @@ def test_report_of_an_evaluation_draws_the_error_of_what_is_fed_back():
     assert any(text.startswith(caption) for text in captions(first))
     assert any(text.startswith("energy. How far it moves") for text in captions(first))
     assert written("sessions/net", path="other.html") == first
+
+
+def test_the_film_of_an_evaluation_shows_predictions_that_are_fed_back(monkeypatch):
+    monkeypatch.setattr(film, "_visualizers", lambda: [Painter])
+    generate()
+    train()
+    result = evaluate("sessions/net")
+    about = result.rollouts["next"].episode_errors["median"]
+    page = written("sessions/net", trust=True)
+    shown = next(each for each in page.split("<figure") if "predicted from the first" in each)
+    assert f"Film of the median episode, {about.text}" in shown
+    learner = load_learner("sessions/net", trust=True)
+    with Dataset.open("sessions/data") as dataset:
+        state = np.asarray(dataset["training"]["state"][about.about["first_row"]])[None]
+    for _ in range(11):
+        state = learner.predict({"past": state})["next"]
+    content = base64.b64decode(re.search(r"image/webp;base64,([^\"]+)", shown)[1])
+    picture = Image.open(io.BytesIO(content))
+    picture.seek(picture.n_frames - 1)
+    white = np.asarray(picture.convert("L"))[:, 32:36].mean(axis=1) > 128
+    assert abs(np.count_nonzero(white) - (128 + 100 * state[0, 0])) < 3
 
 
 def test_report_of_a_generation_says_what_was_simulated():

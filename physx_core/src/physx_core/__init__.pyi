@@ -22,6 +22,7 @@ from .fields import Field as Field
 from .normalization import Normalization as Normalization
 from .observers import read_scalars as read_scalars
 from .openmp import limit_openmp_spin as limit_openmp_spin
+from .pipelines import Branch as Branch
 from .pipelines import DataGeneration as DataGeneration
 from .pipelines import Prediction as Prediction
 from .pipelines import Replay as Replay

@@ -71,7 +71,7 @@ class Spring(Environment):
             [
                 Field("state", (2,), unit="m, m/s"),
                 Field("force", (1,), unit="N"),
-                Field("next_state", (2,), unit="m, m/s"),
+                Field("next_state", (2,), unit="m, m/s", like="state"),
             ]
         )
 

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Mapping, Sequence
+import warnings
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -12,9 +13,10 @@ from PIL import Image
 
 from physx_core import Closeable, Visualizer, plugins
 from physx_core.components import Event
-from physx_core.errors import VisualizerError
+from physx_core.errors import PhysxError, VisualizerError
 from physx_core.pipelines import Redrawing
 from physx_core.typing import Array, Batch, Sample
+from physx_report.blocks import Block, Text
 from physx_report.scenes import Link, Scene, begin_prediction, end_prediction, find_links
 
 SIZE = (480, 360)
@@ -167,6 +169,15 @@ def redraw(
     is_own = drawing.takes_predictions
     found = [] if is_own else find_links(drawn, truth) or list(links)
     return Film(frames, truth, prediction, found, is_own)
+
+
+def or_why_not(blocks: Iterable[Block]) -> list[Block]:
+    """Return blocks of films, or a sentence on why there are none."""
+    try:
+        with warnings.catch_warnings(action="ignore"):  # of environments that draw nothing
+            return list(blocks)
+    except PhysxError as error:
+        return [Text([f"There is no film: {str(error).rstrip('.')}."])]
 
 
 def as_file(pictures: Sequence[Array]) -> bytes:

@@ -17,7 +17,7 @@ from typing import Self
 import rerun as rr
 
 from physx_core import Visualizer
-from physx_core.components import Event
+from physx_core.components import Cursor, Event
 from physx_core.config import at_least, options
 from physx_core.errors import ConfigError, VisualizerError
 from physx_core.fields import Field
@@ -28,6 +28,7 @@ from physx_rerun.drawing.clock import SimulatedClock
 from physx_rerun.drawing.dashboard import Dashboard
 from physx_rerun.drawing.drawing import Drawing
 from physx_rerun.drawing.windows import WindowLayout
+from physx_rerun.viewer.cursor import USUAL_PORT, find_cursor
 from physx_rerun.viewer.headless import render_picture
 from physx_rerun.viewer.offscreen import OffscreenViewer
 from physx_rerun.viewer.streams import RecordingStreams
@@ -111,6 +112,12 @@ class RerunVisualizer(Visualizer):
     def offscreen(cls, size: tuple[int, int]) -> Self:
         """Return one for pictures: see `Visualizer.offscreen`."""
         return cls(mode="offscreen", save=False, picture_size=size)
+
+    @classmethod
+    def cursor(cls) -> Cursor:
+        """Return where the cursor stands: see `Visualizer.cursor`."""
+        address = f"127.0.0.1:{USUAL_PORT}"
+        return Cursor(*find_cursor(address), {"mode": "connect", "address": address})
 
     def _check_options(self) -> None:
         addresses = self._given_addresses()

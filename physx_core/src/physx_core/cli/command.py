@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from importlib.metadata import EntryPoint
 
 _ORDER = (
-    *("generate", "train", "predict", "replay", "info", "stats", "verify"),
+    *("generate", "train", "predict", "replay", "branch", "info", "stats", "verify"),
     *("export", "import", "export-network", "client", "include", "plugins", "new", "check"),
     "completion",
 )

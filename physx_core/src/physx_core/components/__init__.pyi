@@ -4,6 +4,7 @@ from .buffer import BatchSelection as BatchSelection
 from .buffer import Buffer as Buffer
 from .environment import Environment as Environment
 from .environment import options_of as options_of
+from .environment import set_number as set_number
 from .evaluation import Evaluation as Evaluation
 from .group import Group as Group
 from .launcher import ClientHandle as ClientHandle
@@ -23,5 +24,6 @@ from .scene.geometry import vertex_normals as vertex_normals
 from .scene.kinds import KINDS as KINDS
 from .services import Services as Services
 from .transformation import Transformation as Transformation
+from .visualizer import Cursor as Cursor
 from .visualizer import Observer as Observer
 from .visualizer import Visualizer as Visualizer

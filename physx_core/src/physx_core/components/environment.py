@@ -230,6 +230,21 @@ class Environment(Closeable):
     def apply_prediction(self, prediction: Sample) -> None:
         """Use the network's prediction, in physical units, in the simulation."""
 
+    def perturb(self, **values: Any) -> None:
+        """Change something between two steps, as `Branch` does in one of two futures.
+
+        By default, attributes that are numbers, texts or arrays get new values; arrays in place. A
+        subclass overrides it for what is no attribute, such as a push, or a mass in an engine.
+
+        Args:
+            values: New values by name.
+
+        Raises:
+            UsageError: If there is no such attribute, or the value does not fit.
+        """
+        for name, value in values.items():
+            set_number(self, name, value)
+
     def get_state(self) -> Any:
         """Return everything that `set_state` needs to go on exactly from here, between two steps.
 
@@ -741,6 +756,43 @@ def _is_finite(value: Any) -> bool:
         return is_finite(np.asarray(value))
     except NO_ARRAY:  # the network reports what is wrong
         return True
+
+
+def set_number(of: Any, name: str, value: Any) -> None:
+    """Change an attribute of an object that is a number, a text or an array.
+
+    Args:
+        of: The object.
+        name: The attribute.
+        value: Its value; arrays keep shape and type.
+
+    Raises:
+        UsageError: If there is no such attribute, or the value does not fit.
+    """
+    own = Environment.__annotations__.keys() | vars(Environment()).keys()
+    known = [
+        each for each, held in vars(of).items()
+        if not each.startswith("_") and each not in own
+        and isinstance(held, (int, float, str, np.number, np.ndarray))
+    ]  # fmt: skip
+    place = getattr(type(of), name, None)
+    if name not in known and getattr(place, "fset", None) is None:
+        raise UsageError(
+            f"{type(of).__name__} has no {name} that could be set. It has "
+            f"{listed(known) or 'nothing'}; perturb() may take more."
+        )
+    held = getattr(of, name)
+    try:
+        if isinstance(held, np.ndarray):
+            held[...] = np.asarray(value, held.dtype)
+            return
+    except (TypeError, ValueError):
+        raise UsageError(
+            f"{name} has the shape {held.shape} and the type {held.dtype}; {value!r} does not fit."
+        ) from None
+    if isinstance(held, str) is not isinstance(value, str) or not np.isscalar(value):
+        raise UsageError(f"{name} is {held!r}; {value!r} does not fit.")
+    setattr(of, name, value)
 
 
 def _constants_of(kind: type[Environment]) -> list[str]:

@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import TYPE_CHECKING, Self
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any, Self
 
 from physx_core.closeable import Closeable
 
@@ -109,6 +110,21 @@ class Observer(Closeable):
         return ()
 
 
+@dataclass(frozen=True)
+class Cursor:
+    """Where the cursor of an open viewer stands.
+
+    Attributes:
+        timeline: Name of the timeline, such as ``row``.
+        position: The position on it.
+        options: Arguments of a visualizer that draws in the same viewer.
+    """
+
+    timeline: str
+    position: int
+    options: Mapping[str, Any]
+
+
 class Visualizer(Observer):
     """An observer that draws the events of the environments' factories."""
 
@@ -120,6 +136,15 @@ class Visualizer(Observer):
 
         Args:
             size: Width and height of the pictures in pixels.
+        """
+        return None
+
+    @classmethod
+    def cursor(cls) -> Cursor | None:
+        """Return where the cursor of an open viewer stands; None if viewers have none.
+
+        Raises:
+            VisualizerError: If no viewer is open, or it shows nothing.
         """
         return None
 

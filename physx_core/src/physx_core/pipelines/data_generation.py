@@ -216,6 +216,8 @@ class DataGeneration(NewSessionPipeline):
                 store_sets(source, dataset, mode)
             if not self._is_described:
                 dataset.define_fields(mode, source.fields)
+                if streams is not None:
+                    streams.begin()
                 self._describe()
             if self.batch:
                 dataset.append(mode, self.batch, checked=True)

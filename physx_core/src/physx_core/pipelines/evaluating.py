@@ -11,10 +11,10 @@ from physx_core import plugins
 from physx_core.errors import DatasetError, SessionError, UsageError
 from physx_core.pipelines.learning.judging import predictor_of
 from physx_core.pipelines.learning.unseen import Unseen, open_unseen
-from physx_core.results import PartResult, Result, read_results
+from physx_core.results import EpisodeError, PartResult, Result, read_results
 from physx_core.results.judge import Judge, Judged
 from physx_core.results.rivals import NotRunError
-from physx_core.results.rollouts import roll_out
+from physx_core.results.rollouts import Trace, roll_out, trace
 from physx_core.results.stored import store_result
 from physx_core.typing import Array, Batch
 
@@ -97,6 +97,25 @@ def evaluate(
     with contextlib.suppress(SessionError):  # of somebody else, who may only read it
         store_result(Path(session), result)
     return result
+
+
+def trace_episode(unseen: Unseen, part: str, episode: EpisodeError) -> Trace:
+    """Feed predictions back in an episode of a result's rollouts, and keep them.
+
+    Args:
+        unseen: The network and the samples.
+        part: The part that has the episode: `RolloutResult.part`.
+        episode: The episode: one of `RolloutResult.episode_errors`.
+
+    Raises:
+        UsageError: If there is no such episode, or nothing to feed back.
+    """
+    network = predictor_of(unseen.learner)
+    try:
+        targets = Judge(network, unseen.training).targets
+        return trace(network, unseen.parts[part], targets, episode.about)
+    except NotRunError as error:
+        raise UsageError(f"Predictions cannot be fed back: {error}.") from error
 
 
 def _former(session: str | Path) -> Result | None:

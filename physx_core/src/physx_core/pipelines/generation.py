@@ -13,7 +13,7 @@ from physx_core.config import MODES, SETS, WRONG, EnvironmentConfig
 from physx_core.dataset import Dataset
 from physx_core.dataset.store.manifest import to_plain_info
 from physx_core.errors import ConfigError
-from physx_core.pipelines.storage import GENERATIONS, end_generation, keep_parameters
+from physx_core.pipelines.storage import GENERATIONS, end_generation
 from physx_core.workers.pasts import NOTHING, Skip
 
 _SAME = (
@@ -96,8 +96,7 @@ class Generation:
             return None
 
     def start(self, dataset: Dataset) -> None:
-        """Store it in the dataset, and back up the parameters that environments saved there."""
-        keep_parameters(dataset.directory)
+        """Store it in the dataset, in place of the descriptions of other runs."""
         end_generation(dataset, *(entry for entry in GENERATIONS if entry != self.entry))
         self.store(dataset)
 

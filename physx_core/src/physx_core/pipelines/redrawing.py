@@ -19,13 +19,10 @@ from physx_core.pipelines.campaign import recorded_campaigns
 from physx_core.pipelines.generation import Generation
 from physx_core.pipelines.pipeline import derive_seed
 from physx_core.pipelines.replay import recorded_environment
-from physx_core.pipelines.services import RunServices
+from physx_core.pipelines.services import Predict, RunServices, Show
 from physx_core.pipelines.storage import STREAMS
 from physx_core.typing import Sample
 from physx_core.workers.instance import Instance, instance_arguments
-
-_LONGEST = 60.0
-"""How long an environment may take, in s."""
 
 
 class Redrawing(Closeable):
@@ -40,19 +37,30 @@ class Redrawing(Closeable):
             `Environment.apply_prediction`; then it draws them itself.
     """
 
-    def __init__(self, dataset: Dataset, mode: str, *, trust: bool = False) -> None:
+    def __init__(
+        self,
+        dataset: Dataset,
+        mode: str,
+        *,
+        trust: bool = False,
+        predict: Predict | None = None,
+        patience: float | None = 60.0,
+    ) -> None:
         """Find out what generated the rows.
 
         Args:
             dataset: The dataset.
             mode: The mode of the rows.
             trust: Whether to import whatever code the dataset names.
+            predict: Answers the environment that asks a network; None: there is none.
+            patience: How long the environment may take, in s; None: any time.
 
         Raises:
             UntrustedReferenceError: If the environment is code that is not trusted.
             ConfigError: If the dataset does not name its environment.
         """
         self._dataset, self._mode, self._trust = dataset, mode, trust
+        self._predict, self._patience = predict, patience
         self._events: list[Event] = []
         self._instance: Instance | None = None
         self._episodes = dataset.recorded_episodes(mode)
@@ -83,14 +91,72 @@ class Redrawing(Closeable):
         steps = self._numbers(rows) if self._is_numbered(rows) else self._stream(rows)
         wanted = set(rows)
         for row, sample in steps:
-            if time.monotonic() - begin > _LONGEST:
-                raise UsageError(f"to simulate these rows again takes longer than {_LONGEST:g} s")
-            self._compare(row, sample)
+            if self._patience is not None and time.monotonic() - begin > self._patience:
+                raise UsageError(
+                    f"to simulate these rows again takes longer than {self._patience:g} s"
+                )
+            self.compare(row, sample)
             if predict is not None:
                 self._apply(predict(row))
             if row in wanted:
-                events, self._events = self._events, []
-                yield events
+                yield self._take_events()
+
+    def go_on(self, rows: int) -> Iterator[tuple[Sample, list[Event]]]:
+        """Simulate rows after the last one of `frames`, as long as its episode lasts.
+
+        Args:
+            rows: Largest number of rows.
+
+        Yields:
+            The data of each row, which is compared with nothing, and what was drawn.
+
+        Raises:
+            PhysxError: If the environment fails.
+        """
+        instance = self.instance
+        for _ in range(rows):
+            if not (sample := instance.step()):
+                return
+            yield sample, self._take_events()
+
+    @property
+    def instance(self) -> Instance:
+        """The environment at the last row of `frames`, or before the next one of `go_on`.
+
+        Raises:
+            UsageError: If no row was simulated.
+        """
+        if self._instance is None:
+            raise UsageError("No row was simulated.")
+        return self._instance
+
+    def around(self, row: int) -> tuple[list[int], list[int]]:
+        """Return the rows of a row's episode, or of its stream: to that row, and after it.
+
+        Raises:
+            DatasetError: If there is no such row.
+        """
+        stored = self._dataset.num_samples(self._mode)
+        if not 0 <= row < stored:
+            raise DatasetError(
+                f"{self._dataset.directory} has no row {row} in the mode {self._mode}: "
+                f"it has {stored:,} rows, from 0."
+            )
+        if self._is_numbered([row]):
+            known, entry = self._episodes, self._entry(row)
+            assert known is not None
+            if known.numbers[entry] > 1:
+                return [row], []
+            begin, end, step = int(known.first[entry]), int(known.rows[entry]), 1
+            end += begin
+        else:
+            begin, step = self._place(row)
+            end = stored
+        return list(range(begin, row + 1, step)), list(range(row + step, end, step))
+
+    def _take_events(self) -> list[Event]:
+        events, self._events = self._events, []
+        return events
 
     def close(self) -> None:
         """Close the environment."""
@@ -121,7 +187,7 @@ class Redrawing(Closeable):
             folder = self._dataset.directory
             instance = Instance(**instance_arguments(self._config, number, seed, False))
             self._instance = instance
-            instance.open(_Drawing(folder, self._show), draw=True)
+            instance.open(_Drawing(folder, self._show, self._predict), draw=True)
         return self._instance
 
     def _show(self, instance_id: int, step: int, events: list[Event]) -> None:
@@ -153,18 +219,28 @@ class Redrawing(Closeable):
 
     def _stream(self, rows: Sequence[int]) -> Iterator[tuple[int, Sample]]:
         """Simulate the stream of rows; yield all of them up to the last, and their data."""
+        begin, count = self._place(rows[0])
         streams = self._streams
-        if streams is None or streams.mode != self._mode or rows[0] < streams.first:
-            raise UsageError("the dataset does not say how these rows were generated")
-        count = self._config.num_clients
-        place = (rows[0] - streams.first) % count
+        assert streams is not None
         seed = derive_seed(streams.seed, self._mode, streams.offset)
-        instance = self._open(place + 1, seed)
-        for row in range(streams.first + place, rows[-1] + 1, count):
+        instance = self._open(begin - streams.first + 1, seed)
+        for row in range(begin, rows[-1] + 1, count):
             yield row, instance.step()
 
-    def _compare(self, row: int, sample: Sample) -> None:
-        """Check that a row is the stored one."""
+    def _place(self, row: int) -> tuple[int, int]:
+        """Return the first row of a row's stream, and the number of rows from one to the next."""
+        streams = self._streams
+        if streams is None or streams.mode != self._mode or row < streams.first:
+            raise UsageError("the dataset does not say how these rows were generated")
+        count = self._config.num_clients
+        return streams.first + (row - streams.first) % count, count
+
+    def compare(self, row: int, sample: Sample) -> None:
+        """Check that what was simulated is a stored row.
+
+        Raises:
+            UsageError: If it is not, in any bit.
+        """
         stored = self._dataset[self._mode]
         for name, value in sample.items():
             known = np.asarray(stored[name][row])
@@ -178,8 +254,8 @@ class Redrawing(Closeable):
 class _Drawing(RunServices):
     """Answers an environment that draws: what was saved in its run is there, nothing is stored."""
 
-    def __init__(self, folder: Path, show: Callable[[int, int, list[Event]], None]) -> None:
-        super().__init__(folder, show, None)
+    def __init__(self, folder: Path, show: Show, predict: Predict | None) -> None:
+        super().__init__(folder, show, predict)
         self._saved: dict[int, dict[str, Any]] = {}
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:

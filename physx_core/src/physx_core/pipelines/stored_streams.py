@@ -11,6 +11,7 @@ from physx_core.pipelines.generation import Generation
 from physx_core.pipelines.storage import (
     STREAMS,
     describe_environment,
+    keep_parameters,
     last_steps,
     restore_parameters,
 )
@@ -40,7 +41,7 @@ class StoredStreams(Closeable):
         former: Generation | None,
         needed: int,
     ) -> None:
-        """Record what the rows depend on, or check that they go on.
+        """Find out what is stored, and check that the rows go on.
 
         Args:
             session: Where the states are kept.
@@ -61,9 +62,10 @@ class StoredStreams(Closeable):
         run = f"{known.mode} {known.first} {known.seed}"
         self._files = PastFiles(session.path / "states", run)
         self.skip, self.earlier = NOTHING, dict[int, int]()
+        self._dataset = dataset
+        self._new = now if former is None else None
         if former is None:
-            self._files.clear()
-            now.start(dataset)
+            keep_parameters(dataset.directory)
             return
         count = config.num_clients
         self.skip = skip = former.resume(dataset, config, now, needed, _ADVICE)
@@ -87,6 +89,13 @@ class StoredStreams(Closeable):
         if former is None or former.mode != mode or (others and former.ended is not None):
             return None
         return former
+
+    def begin(self) -> None:
+        """Record what the rows depend on, just before the first of them is stored."""
+        new, self._new = self._new, None
+        if new is not None:
+            self._files.clear()
+            new.start(self._dataset)
 
     def missing(self, wanted: int, size: int) -> int:
         """Return how many rows of a batch are not stored.

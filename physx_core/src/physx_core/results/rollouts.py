@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from typing import Any, Self
 
 import numpy as np
 
@@ -37,6 +38,21 @@ class Loop:
     offsets: Mapping[str, Sequence[int]]
     stride: int
     follows: Sequence[str]
+
+
+@dataclass(frozen=True, eq=False)
+class Trace:
+    """Predictions of an episode that were fed back.
+
+    Attributes:
+        rows: Rows of the mode in which the true values are, ascending.
+        truth: The true values by field, arrays of shape (rows, ...).
+        prediction: The predicted ones.
+    """
+
+    rows: Sequence[int]
+    truth: Batch
+    prediction: Batch
 
 
 def find_loop(network: Predictor, batches: Batches) -> Loop:
@@ -109,20 +125,56 @@ def roll_out(
         NotRunError: If there is nothing to feed back, or no two items of an episode.
         ConfigError: If an invariant does not return one number for each row.
     """
-    if len(batches.datasets) > 1:
-        raise NotRunError("the samples are of several sources; evaluate on one of them")
-    loop = find_loop(network, batches)
-    reading = batches.reading(network.names)
-    known = {name: targets[name].at(reading.fields[name]) for name in loop.feeds}
-    for name, target in known.items():
-        if target.classes is not None:
-            raise NotRunError(f"{name} has classes, not real numbers")
-    runs = _Runs(network, reading, loop, known, dict(invariants or {}))
-    return runs.run(part, _MOST_PREDICTIONS * loop.stride if steps is None else steps)
+    runs = _Runs.open(network, batches, targets, invariants or {})
+    return runs.run(part, _MOST_PREDICTIONS * runs.stride if steps is None else steps)
+
+
+def trace(
+    network: Predictor,
+    batches: Batches,
+    targets: Mapping[str, Target],
+    about: Mapping[str, Any],
+    steps: int | None = None,
+) -> Trace:
+    """Feed predictions back in one of the episodes of `roll_out`, and keep them.
+
+    Args:
+        network: The network.
+        batches: Batches of a single source, in the order of writing.
+        targets: How errors are measured, by predicted field.
+        about: The episode: see `EpisodeError`.
+        steps: Largest number of rows to predict; None: to the end of the episode.
+
+    Raises:
+        NotRunError: If there is nothing to feed back, or no such episode.
+    """
+    runs = _Runs.open(network, batches, targets, {})
+    return runs.trace(
+        about["first_row"], _MOST_PREDICTIONS * runs.stride if steps is None else steps
+    )
 
 
 class _Runs:
     """The rollouts of all episodes, side by side."""
+
+    @classmethod
+    def open(
+        cls,
+        network: Predictor,
+        batches: Batches,
+        targets: Mapping[str, Target],
+        invariants: Mapping[str, Invariant],
+    ) -> Self:
+        """Find out what is fed back in which episodes."""
+        if len(batches.datasets) > 1:
+            raise NotRunError("the samples are of several sources; evaluate on one of them")
+        loop = find_loop(network, batches)
+        reading = batches.reading(network.names)
+        known = {name: targets[name].at(reading.fields[name]) for name in loop.feeds}
+        for name, target in known.items():
+            if target.classes is not None:
+                raise NotRunError(f"{name} has classes, not real numbers")
+        return cls(network, reading, loop, known, dict(invariants))
 
     def __init__(
         self,
@@ -134,11 +186,34 @@ class _Runs:
     ) -> None:
         self._network, self._batches, self._loop = network, batches, loop
         self._targets, self._invariants = targets, invariants
-        self._episodes, self._item_at = self._find_episodes()
+        self._episodes, self._starts, self._item_at = self._find_episodes()
         self._about = [batches.describe_group(int(group)) for group in self._episodes]
+        self._kept: dict[int, Sequence[Batch]] | None = None
 
-    def _find_episodes(self) -> tuple[Index, list[dict[int, int]]]:
-        """Return episodes, and the items of each by their distance from the first, in rows."""
+    @property
+    def stride(self) -> int:
+        """Number of rows from a prediction to the next."""
+        return self._loop.stride
+
+    def trace(self, first_row: int, steps: int) -> Trace:
+        """Predict the episode that begins at a row of the mode."""
+        place = next((k for k, a in enumerate(self._about) if a["first_row"] == first_row), None)
+        if place is None:
+            raise NotRunError(f"no episode begins at row {first_row}")
+        one = slice(place, place + 1)
+        self._episodes, self._item_at = self._episodes[one], self._item_at[one]
+        self._about, self._kept = self._about[one], {}
+        self.run("", steps)
+        start = self._starts[place] - int(bool(self._loop.follows))
+        truth, prediction = (
+            {name: np.concatenate([row[k][name] for row in self._kept.values()])
+             for name in self._loop.feeds}
+            for k in (0, 1)
+        )  # fmt: skip
+        return Trace([start + row for row in self._kept], truth, prediction)
+
+    def _find_episodes(self) -> tuple[Index, list[int], list[dict[int, int]]]:
+        """Return episodes, their first reference rows, and their items by the distance to it."""
         count = len(self._batches)
         groups = np.concatenate([self._batches.groups(number) for number in range(count)])
         rows = np.concatenate([self._batches.rows(number)[0] for number in range(count)])
@@ -147,12 +222,13 @@ class _Runs:
         if not len(known):
             raise NotRunError("no episode has two rows")
         most = np.unique(np.linspace(0, len(known) - 1, _MOST_EPISODES).astype(int))
-        chosen, found = known[most], []
+        chosen, starts, found = known[most], [], []
         for group in chosen:
             items = np.flatnonzero(groups == group)
-            places = (rows[items] - rows[items[0]]).tolist()
+            starts.append(int(rows[items[0]]))
+            places = (rows[items] - starts[-1]).tolist()
             found.append(dict(zip(places, items.tolist(), strict=True)))
-        return chosen, found
+        return chosen, starts, found
 
     def _read(self, row: int, alive: Index) -> tuple[Index, Batch]:
         """Return which episodes have an item at a row, and their values."""
@@ -249,6 +325,7 @@ class _Runs:
         common = set.intersection(*(set(each) for each in later.values()))
         rows = [offset for offset in sorted(common) if row + offset <= steps]
         truth = {name: self._values(name, batch[name]) for name in later}
+        self._keep(row, rows, truth, later)
         for label in self._invariants:
             first = self._first[label][alive]
             for offset in rows:
@@ -259,6 +336,16 @@ class _Runs:
                 for record in records.values():
                     record.drift(label, row + offset, *moved)
         return later
+
+    def _keep(
+        self, row: int, offsets: Sequence[int], *values: Mapping[str, Mapping[int, Array]]
+    ) -> None:
+        """Keep values at offsets from a row, if they are traced."""
+        if self._kept is not None:
+            for offset in offsets:
+                self._kept[row + offset] = [
+                    {name: each[offset] for name, each in of.items()} for of in values
+                ]
 
     def _invariant(self, label: str, values: Mapping[str, Array], alive: Index) -> Array:
         """Return what a function makes of values and the episodes' parameters, shape (rows,)."""

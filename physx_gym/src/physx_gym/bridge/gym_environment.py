@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 
 from physx_core import Field
-from physx_core.components import Environment
+from physx_core.components import Environment, set_number
 from physx_core.errors import ConfigError
 from physx_core.plugins import import_component
 from physx_gym.bridge.make_env import make_env
@@ -66,7 +66,7 @@ class GymEnvironment(Environment):
         self._observations = SpaceFields(self.env.observation_space, "observation")
         self._next = SpaceFields(self.env.observation_space, "next_observation")
         self._actions = SpaceFields(self.env.action_space, "action")
-        self._act = self._choose_policy()
+        self.policy = self._policy
         self._draw_seeds()
 
     def init_database(self) -> None:
@@ -159,24 +159,48 @@ class GymEnvironment(Environment):
         if env is not None:
             env.close()
 
+    def perturb(self, **values: Any) -> None:
+        """Change the ``policy``, or what the environment's own ``perturb`` takes, or an attribute.
+
+        Args:
+            values: New values by name.
+
+        Raises:
+            UsageError: If there is no such thing, or the value does not fit.
+        """
+        if "policy" in values:
+            self.policy = values.pop("policy")
+        env: Any = self.env.unwrapped
+        if hasattr(env, "perturb"):
+            env.perturb(**values)
+            return
+        for name, value in values.items():
+            set_number(env, name, value)
+
     # Actions --------------------------------------------------------------------------------
 
-    def _choose_policy(self) -> Callable[[Any], Any]:
-        policy = self._policy
+    @property
+    def policy(self) -> str | Callable[..., Any]:
+        """What chooses the actions: see the constructor."""
+        return self._policy
+
+    @policy.setter
+    def policy(self, policy: str | Callable[..., Any]) -> None:
         if policy == "random":
             space = self.env.action_space  # a snapshot of a robot leaves its random numbers out
-            return lambda _: space.sample()
-        if policy == "network":
-            return self._ask_network
-        if not isinstance(policy, str):
-            return policy
-        if ":" not in policy:
+            self._act: Callable[[Any], Any] = lambda _: space.sample()
+        elif policy == "network":
+            self._act = self._ask_network
+        elif not isinstance(policy, str):
+            self._act = policy
+        elif ":" not in policy:
             raise ConfigError(
                 f'policy is "{policy}" but must be "random", "network" or '
                 '"package.module:function".'
             )
-        found: Callable[[Any], Any] = import_component("policy", policy)
-        return found
+        else:
+            self._act = import_component("policy", policy)
+        self._policy = policy
 
     def _ask_network(self, observation: Any) -> Any:
         predicted = self.get_prediction(**self._observations.arrays(observation))

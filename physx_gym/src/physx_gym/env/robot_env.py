@@ -13,7 +13,7 @@ from gymnasium.envs.registration import EnvSpec
 
 from physx_core import checks
 from physx_core.components import Factory
-from physx_core.errors import ConfigError, EpisodeError, UsageError
+from physx_core.errors import ConfigError, EpisodeError, UnknownOptionError, UsageError
 from physx_core.typing import Vector
 from physx_gym.env import subclass_checks
 from physx_gym.env.control_loop import ControlLoop
@@ -28,7 +28,10 @@ from physx_gym.env.timing import StepTiming
 from physx_gym.simulator.simulator import make_simulator, simulator_options
 from physx_gym.spaces import copy_tree, fill, neutral
 from physx_gym.telemetry.episode_recorder import EpisodeRecorder
+from physx_sim import BodySettings, Wrench
 from physx_sim.errors import SimulationError
+
+_PUSH_SECONDS = 0.1
 
 
 class RobotEnv(PipelineEnv):
@@ -626,6 +629,30 @@ class RobotEnv(PipelineEnv):
         from physx_gym.visualization.environment_drawing import EnvironmentDrawing
 
         return EnvironmentDrawing(self, factory).draw
+
+    def perturb(self, **values: Any) -> None:
+        """Change something in a running episode: see `physx_core.Environment.perturb`.
+
+        Args:
+            values: ``push``: forces by body, which act for 0.1 s, in N, shape (3,), world frame;
+                ``gravity``: in m/s^2, shape (3,); ``bodies``: options of `physx_sim.BodySettings`
+                by body, such as ``{"box": {"mass": 2.0}}``.
+
+        Raises:
+            UnknownOptionError: If there is no such value, or option of a body.
+            SimulationError: If there is no such body, or the engine cannot change it.
+            ConfigError: If a value is out of range.
+        """
+        known = ("push", "gravity", "bodies")
+        if unknown := values.keys() - set(known):
+            raise UnknownOptionError("perturb()", unknown, known)
+        simulation = self.simulator.simulation
+        for name, force in values.get("push", {}).items():
+            simulation.apply_wrench(Wrench(name, force, duration=_PUSH_SECONDS))
+        if "gravity" in values:
+            simulation.set_gravity(values["gravity"])
+        for name, settings in values.get("bodies", {}).items():
+            simulation.set_body(name, BodySettings(**settings))
 
     # State -------------------------------------------------------------------------------------
 

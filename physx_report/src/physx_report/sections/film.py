@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterator, Mapping, Sequence
 
 import numpy as np
@@ -14,7 +13,7 @@ from physx_core.results import EpisodeError, PartResult
 from physx_core.typing import Array, Index, Sample
 from physx_report import wording
 from physx_report.blocks import Block, Picture, Text
-from physx_report.film import MOST, Film, as_file, redraw
+from physx_report.film import MOST, Film, as_file, or_why_not, redraw
 from physx_report.run import Run
 from physx_report.scenes import Link
 from physx_report.section import Section
@@ -39,12 +38,7 @@ def _blocks(run: Run) -> Iterator[Block]:
     name = next((each for each in parts if each in unseen.parts), None)
     if name is None or not run.training.parts[name].fields:
         return
-    try:
-        with warnings.catch_warnings(action="ignore"):  # of environments that draw nothing
-            found = list(_Films(run, unseen, name).blocks(run.training.parts[name]))
-    except PhysxError as error:
-        found = [Text([f"There is no film: {str(error).rstrip('.')}."])]
-    yield from found
+    yield from or_why_not(_Films(run, unseen, name).blocks(run.training.parts[name]))
 
 
 class _Films:

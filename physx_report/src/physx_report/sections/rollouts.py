@@ -4,9 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
+import numpy as np
+
+from physx_core.pipelines import Redrawing, trace_episode
 from physx_core.results import RolloutResult, rollout_notes
 from physx_report import drawing, wording
-from physx_report.blocks import Block, Table, Text
+from physx_report.blocks import Block, Picture, Table, Text
+from physx_report.film import MOST, as_file, or_why_not, redraw
 from physx_report.run import Run
 from physx_report.section import Section
 
@@ -18,6 +22,8 @@ def _blocks(run: Run) -> Iterator[Block]:
     yield Text(list(result.summary))
     for name, rollout in result.rollouts.items():
         yield from _rollout(name, rollout)
+        if name == next(iter(result.rollouts)):
+            yield from or_why_not(_film(run, rollout))
 
 
 def _rollout(name: str, of: RolloutResult) -> Iterator[Block]:
@@ -61,6 +67,29 @@ def _rollout(name: str, of: RolloutResult) -> Iterator[Block]:
             axes.set_ylabel(label)
             axes.legend(frameon=False)
         yield from found
+
+
+def _film(run: Run, of: RolloutResult) -> Iterator[Block]:
+    """Yield a film of the median episode."""
+    episode, unseen = of.episode_errors.get("median"), run.unseen
+    if episode is None or unseen is None or of.part not in unseen.parts:
+        return
+    batches = unseen.parts[of.part]
+    [dataset] = batches.datasets.values()
+    found = trace_episode(unseen, of.part, episode)
+    shown = np.unique(np.linspace(0, len(found.rows) - 1, MOST).astype(int))
+    rows = [found.rows[k] for k in shown]
+    truth, prediction = (
+        {name: values[shown] for name, values in each.items()}
+        for each in (found.truth, found.prediction)
+    )
+    with Redrawing(dataset, batches.mode, trust=run.trust) as drawing:
+        film = redraw(drawing, rows, truth, prediction, {})
+    if film.look:
+        pictures = film.pictures(run.camera, range(len(rows)))
+        told = f"{len(rows)} of {len(found.rows):,} rows, predicted from the first"
+        about = f"Film of the median episode, {episode.text} ({of.part}; {told})"
+        yield Picture(as_file(pictures), f"{about}; {film.look}")
 
 
 SECTION = Section("What becomes of it over time", _blocks, 15)

@@ -13,6 +13,7 @@ import tyro
 from physx_core.cli import show
 from physx_core.errors import VisualizerError
 from physx_rerun.recordings import recording_of
+from physx_rerun.viewer.cursor import USUAL_PORT
 from physx_rerun.viewer.viewer import Viewer, has_display, start_web_viewer
 
 
@@ -24,6 +25,8 @@ class View:
 
     physx view sessions/data_generation/dataset --web
 
+    physx view sessions/data_generation/dataset --live
+
     physx view run.rrd --web --port 9876 --page-port 9090
     """
 
@@ -32,6 +35,8 @@ class View:
     folder, or one of its files."""
     web: bool = False
     """Serve a page for browsers on this machine, and print its address; Ctrl-C stops it."""
+    live: bool = False
+    """Listen where physx branch DATASET cursor finds the viewer."""
     port: int = 0
     """Port of the viewer; 0: any free one."""
     page_port: int = 0
@@ -56,8 +61,9 @@ def run(words: Sequence[str]) -> None:
 
 
 def _open(recording: Path, options: View) -> Viewer:
+    port = options.port or (USUAL_PORT if options.live else 0)
     if options.web:
-        viewer = start_web_viewer(options.port, options.page_port, str(recording))
+        viewer = start_web_viewer(port, options.page_port, str(recording))
         show(f"viewer: {viewer.page}  (Ctrl-C stops it)")
         return viewer
     if not has_display():
@@ -65,6 +71,6 @@ def _open(recording: Path, options: View) -> Viewer:
             "There is no display to open a window on. Add --web to view it in a browser, or render "
             "a picture: physx snapshot FILE|SESSION -o PICTURE.png"
         )
-    viewer = Viewer(options.port, (str(recording),))
+    viewer = Viewer(port, (str(recording),))
     viewer.wait_until_ready()
     return viewer

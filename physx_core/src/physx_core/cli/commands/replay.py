@@ -6,10 +6,10 @@ import itertools
 from collections.abc import Sequence
 from typing import Any
 
-from physx_core import plugins
 from physx_core.cli.pipeline_options import pipeline_from
+from physx_core.cli.visualizers import visualizer_plugins
 from physx_core.dataset import Dataset
-from physx_core.errors import PhysxError, UsageError, listed
+from physx_core.errors import UsageError, listed
 from physx_core.pipelines.replay import Replay, recorded_environment
 
 _VISUALIZER = "--environment.visualizer"
@@ -25,7 +25,7 @@ def run(words: Sequence[str]) -> None:
     words = ["--dataset.mode" if word == "--mode" else word for word in words]
     place = ("dataset.existing_dir", "environment.environment")
     is_given = any(word.partition("=")[0] == _VISUALIZER for word in words)
-    viewers = [] if is_given else _visualizer_plugins()  # finding them imports all plugins
+    viewers = [] if is_given else visualizer_plugins()  # finding them imports all plugins
     viewer = {"visualizer": viewers[0]} if len(viewers) == 1 else {}
     pipeline = pipeline_from(
         Replay,
@@ -47,19 +47,6 @@ def run(words: Sequence[str]) -> None:
             f"installed. Installed: {listed(viewers)}. (None: draw nothing.)"
         )
     pipeline.execute()
-
-
-def _visualizer_plugins() -> list[str]:
-    """Return the names of the installed plugins that contain nothing but visualizers."""
-    found = []
-    for name in plugins.available():
-        try:
-            components = plugins.load(name).components
-        except PhysxError:  # `physx plugins` reports broken ones
-            continue
-        if components.keys() == {"visualizer"}:
-            found.append(name)
-    return found
 
 
 def _given(words: Sequence[str], plain: dict[str, Any]) -> dict[str, Any]:

@@ -35,6 +35,7 @@ from physx_core.pipelines.storage import (
     GENERATION,
     copy_existing,
     describe_environment,
+    keep_parameters,
     open_existing,
     open_own,
     reject_episode_fields,
@@ -311,6 +312,7 @@ class DataOpening:
         former = self.start.generation
         self._generation = former or now
         if former is None:
+            keep_parameters(dataset.directory)
             now.start(dataset)
             return now, NOTHING
         advice = advise(self.session.path)
