@@ -99,7 +99,7 @@ def body_changes(
         layout: Its layout.
         masses: See `link_masses`; of the built world.
     """
-    found: dict[str, dict[str, float]] = {}
+    found: dict[str, dict[str, Any]] = {}
     for old, new in zip(built.robots, wanted.robots, strict=True):
         for name in layout.bodies[layout.parts[old.name].bodies] if old is not new else ():
             link, own = name.removeprefix(f"{old.name}/"), found.setdefault(name, {})
