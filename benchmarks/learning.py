@@ -29,10 +29,9 @@ from typing import Any
 import torch
 from measure import claim, finish
 
-from physx_gym import Policy, RobotEnv
+from physx_gym import Policy, RobotEnv, write_film
 from physx_gym.bridge.make_env import make_env
 from physx_gym.cli.evaluate import evaluate, summary
-from physx_gym.visualization.film import write_film
 from physx_sim.errors import FeatureNotSupportedError
 
 TRAIN = Path(__file__).parent.parent / "examples" / "12_reinforcement_learning.py"

@@ -34,6 +34,9 @@ PRINTED = {  # what an example has to print, as patterns
     "16_deploy_onnx": ("loaded of physx and PyTorch: None", r"100 guesses: [\d.e-]+ m"),
     "17_two_machines": ("physx client --connect", r"instances \[1 2\], as in one process: True"),
     "20_policy_on_a_cluster": ("equal to those learned here: True",),
+    "21_sorting_line": (r"without suction +1 +1 +1", r"with suction +2 +2 +2"),
+    "22_mechanisms": (r"theory, mrad +0\.\d\d", r"not coupled +0\.", r"box lifted, mm +1[89]"),
+    "23_lidar": (r"straight ahead +0 +0 +0", r"with lidar +1 +1 +1"),
 }
 SMALL_FILMS = ("10_quadruped", "11_pushing")
 """Examples whose film is the same at any size, so that it can be compared with the one kept."""

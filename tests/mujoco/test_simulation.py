@@ -432,3 +432,15 @@ def test_things_rest_on_scenery_from_a_file(backend, tmp_path, contacts):
     with backend.build(World([shelf], objects=[box], contacts=contacts)) as simulation:
         simulation.step(500)
         assert simulation.body_poses(["box"])[0, 2] == pytest.approx(0.65, abs=1e-3)
+
+
+def test_servos_of_wheels_on_the_ground_reach_their_velocities(backend):
+    wheels = ("left_wheel_joint", "right_wheel_joint")
+    joints = {name: JointSettings(mode="servo") for name in wheels}
+    robot = Robot("wheeled_base", fixed_base=False, position=(0, 0, 0.15), joints=joints)
+    with backend.build(World([robot], ground=Ground())) as simulation:
+        at = [simulation.layout.velocity_index[name] for name in wheels]
+        commands = [0.01 if name in wheels else 0.0 for name in simulation.layout.joints]
+        simulation.set_commands(commands)
+        simulation.step(5)
+        np.testing.assert_allclose(simulation.velocities()[at], 0.01, rtol=1e-8)

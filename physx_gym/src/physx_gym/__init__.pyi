@@ -31,5 +31,7 @@ from .telemetry.episode_log import Log as Log
 from .telemetry.log_file import read_log as read_log
 from .vector.vector_env import ParallelVectorEnv as ParallelVectorEnv
 from .version import __version__ as __version__
+from .visualization.drawing import WorldDrawing as WorldDrawing
+from .visualization.film import write_film as write_film
 from .visualization.plotting import plot as plot
 from .visualization.replaying import replay as replay

@@ -5,14 +5,14 @@ A step is repeated with adjusted torques until it ends with the desired velociti
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 
 import mujoco
 import numpy as np
 
 from physx_core.typing import Vector
 from physx_mujoco.robot import Running
-from physx_sim import Layout
+from physx_sim import Layout, Mimic
 
 _STIFF = 1e6
 """Inertia, in kg m² or kg, with which joints that follow others move together."""
@@ -25,15 +25,27 @@ class Drives:
 
     Args:
         layout: The joints.
+        followers: Those that follow others, with their leaders and how: the velocity limit of a
+            follower limits its leader.
         running: The world.
         step: Simulates a physics step.
     """
 
-    def __init__(self, layout: Layout, running: Running, step: Callable[[], None]) -> None:
+    def __init__(
+        self,
+        layout: Layout,
+        followers: Iterable[tuple[int, int, Mimic]],
+        running: Running,
+        step: Callable[[], None],
+    ) -> None:
         self._running, self._step, modes = running, step, np.array(layout.modes)
         self._driven = modes != "force"
         self._places = np.array(list(layout.velocity_index.values()), np.intp)
-        self._fastest = np.where(self._driven, np.inf, layout.max_velocity)
+        fastest = layout.max_velocity.copy()
+        for follower, leader, mimic in followers:
+            fastest[leader] = min(fastest[leader], fastest[follower] / abs(mimic.multiplier))
+            fastest[follower] = np.inf
+        self._fastest = np.where(self._driven, np.inf, fastest)
         self._strongest = np.where(modes == "velocity", np.inf, layout.max_torque)
         self.idle = not (self._driven.any() or np.isfinite(self._fastest).any())
 
@@ -43,7 +55,8 @@ class Drives:
         model, data = running.model, running.data
         q, v = running.positions, running.velocities
         q[:], v[:], warm = data.qpos, data.qvel, data.qacc_warmstart.copy()
-        wanted, torques, inverse = data.qfrc_applied[at].copy(), np.zeros(len(at)), None
+        wanted, torques = data.qfrc_applied[at].copy(), np.zeros(len(at))
+        response, tried, before = None, torques, v[at]
         for _ in range(_MOST):
             data.qfrc_applied[at] = np.where(driven, 0.0, wanted) + torques
             data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = q, v, warm
@@ -59,8 +72,13 @@ class Drives:
             free = np.flatnonzero(active & ~stuck)
             if not (np.abs(error[free]) > _EXACT * (1 + np.abs(now[free]))).any():
                 break
-            inverse = self._inverse() if inverse is None else inverse
-            more = np.linalg.solve(inverse[np.ix_(free, free)], error[free] / model.opt.timestep)
+            if response is None:
+                response = model.opt.timestep * self._inverse()
+            elif (change := torques - tried).any():  # contacts resist, too: Broyden's method
+                missed = now - before - response @ change
+                response += np.outer(missed, change / change.dot(change))
+            more = np.linalg.solve(response[np.ix_(free, free)], error[free])
+            tried, before = torques.copy(), now
             torques[free] = np.clip(torques[free] + more, low[free], high[free])
         data.qfrc_applied[at] = wanted
 

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from gymnasium.utils.env_checker import check_env
 
+from physx_core import plugins
 from physx_core.errors import ComponentNotFoundError, ConfigError
 from physx_gym import (
     ComposedEnv,
@@ -312,3 +313,23 @@ def test_own_randomizations():
     env = RandomizedEnv(ant(), randomizations=[Tilted("slope")])
     env.reset(seed=0)
     assert env.simulator.world.gravity[0] == 9.81 * np.sin(env.drawn["slope"]["angle"])
+
+
+def test_masses_and_friction_change_without_a_build(backend):
+    given = [RandomMasses([0.5, 2.0]), RandomFriction([0.4, 1.0])]
+    env = RandomizedEnv(ant(backend=backend), randomizations=given)
+    base, totals = env.unwrapped, set()
+    for number in range(3):
+        env.reset(seed=number)
+        world, factors = base.simulator.world, env.drawn["RandomMasses"]
+        assert base.simulator.builds == 1
+        assert world.ground.friction == env.drawn["RandomFriction"]["coefficient"]
+        assert world.robots[0].mass_factors == factors
+        rebuilt = plugins.resolve("backend", backend).build(world)
+        simulation = base.simulator.simulation
+        q = simulation.positions()
+        np.testing.assert_allclose(
+            simulation.mass_matrix(q), rebuilt.mass_matrix(q), rtol=1e-12, atol=1e-14
+        )
+        totals.add(simulation.mass_matrix(q)[0, 0])
+    assert len(totals) == 3

@@ -17,11 +17,11 @@ from physx_core import plugins
 from physx_core.components import Factory, Visualizer
 from physx_core.errors import ConfigError, PluginNotFoundError, UnknownOptionError, VisualizerError
 from physx_core.rotations import from_axis_angle, to_matrix
-from physx_gym import RobotEnv, Simulator, replay
+from physx_gym import RobotEnv, Simulator, WorldDrawing, replay
 from physx_gym.errors import LogError
-from physx_gym.visualization.drawing import WorldDrawing
 from physx_gym.visualization.film import write_film
 from physx_sim import (
+    BodySettings,
     Box,
     Capsule,
     Cylinder,
@@ -205,10 +205,10 @@ def drawn(world, turn=None):
     engine = plugins.resolve("backend", "dart")
     simulation, factory = engine.build(world), Factory()
     drawing = WorldDrawing(factory, world, engine, simulation.layout, "world")
-    drawing.add(simulation.body_poses())
+    drawing.show(simulation)
     if turn is not None:
         turn(simulation)
-        drawing.move(simulation.body_poses())
+        drawing.show(simulation)
     found = {}
     for event in (one for several in factory.take_events() for one in several.each()):
         found.setdefault(event.name, {}).update(event.values)
@@ -255,6 +255,27 @@ def test_objects_of_all_kinds_are_drawn_where_they_are(tmp_path):
     assert found["robot"]["urdf"].endswith("cartpole.urdf")
 
 
+def test_static_objects_that_move_and_hidden_ones_are_drawn_so():
+    world = World(
+        [Robot("cartpole", name="robot")],
+        objects=[
+            Box(name="door", size=(0.2, 0.4, 0.6), static=True, position=(0.0, -5.0, 0.0)),
+            Box(name="wall", size=(0.2, 0.4, 0.6), static=True, position=(3.0, 0.0, 0.0)),
+            Box(name="crate", size=(0.1, 0.1, 0.1), position=(0.0, 5.0, 1.0)),
+        ],
+    )
+
+    def move(simulation):
+        simulation.set_body("door", BodySettings(velocity=(0.0, 1.0, 0.0)))
+        simulation.set_body("crate", BodySettings(hidden=True))
+        simulation.step(100)
+
+    found = drawn(world, move)
+    np.testing.assert_allclose(found["door"]["position"], (0.0, -4.9, 0.0), atol=1e-6)
+    np.testing.assert_allclose(found["wall"]["position"], (3.0, 0.0, 0.0))
+    assert [found[name].get("visible", True) for name in ("door", "crate")] == [True, False]
+
+
 def test_a_robot_from_mjcf_is_drawn_by_its_collision_shapes(tmp_path):
     pytest.importorskip("mujoco")
     (tmp_path / "a.obj").write_text(CUBE)
@@ -269,7 +290,7 @@ def test_a_robot_from_mjcf_is_drawn_by_its_collision_shapes(tmp_path):
     world = World([Robot(path, collisions="none")])
     with engine.build(world) as simulation:
         drawing = WorldDrawing(factory, world, engine, simulation.layout, "world")
-        drawing.add(simulation.body_poses())
+        drawing.show(simulation)
         events = [one for several in factory.take_events() for one in several.each()]
         (robot,) = [event.values for event in events if event.name == "robot"]
         tree = UrdfTree(parse_urdf(Path(robot["urdf"])))

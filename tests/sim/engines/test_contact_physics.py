@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 
 from physx_core import plugins
+from physx_core.rotations import from_axis_angle
 from physx_sim import Box, Cylinder, Ground, HeightField, Robot, Sphere, Stairs, World, Wrench
 
 DETECTORS = [("dart", name, None) for name in ("dart", "fcl", "bullet", "ode")]
@@ -267,3 +268,26 @@ def test_a_tilted_cylinder_lands_on_the_deepest_point_of_its_rim():
         while not len(simulation.contacts()):
             simulation.step()
         assert abs(simulation.positions()[2] - low) < 2e-3
+
+
+@pytest.mark.slow
+def test_friction_does_no_work_on_a_disk_that_rolls_along_its_rim():
+    radius, tilt = 0.1, 0.3
+    height = radius * np.sin(tilt) + 0.005 * np.cos(tilt)
+    disk = Cylinder(
+        name="disk",
+        radius=radius,
+        length=0.01,
+        position=(0, 0, height),
+        orientation=from_axis_angle((1, 0, 0), tilt),
+    )
+    with build(BOTH[1], disk) as simulation:
+        v = np.zeros(6)
+        v[4] = np.sqrt(4 * 9.81 / (radius * np.sin(tilt))) * np.sin(tilt)  # Euler's disk
+        simulation.set_state(simulation.positions(), v)
+        energies = []
+        for _ in range(20):
+            q, v = simulation.positions(), simulation.velocities()
+            energies.append(0.5 * v @ simulation.mass_matrix(q) @ v + 9.81 * q[2])
+            simulation.step(25)
+    assert np.ptp(energies) < 5e-3 * energies[0]

@@ -86,6 +86,19 @@ def test_a_driven_leader_takes_its_follower_along(engine, gripper, mode):
     assert left == pytest.approx(0.2, abs=0.02) and right == pytest.approx(-left, abs=3e-4)
 
 
+@pytest.mark.parametrize("multiplier", [-1.0, 0.5, -2.0])
+def test_the_velocity_limits_of_both_hold(engine, gripper, multiplier):
+    fast = follows("left", multiplier)
+    robot = gripper(("left", ""), ("right", fast), joints={})
+    text = robot.urdf.read_text().replace('effort="50"', 'effort="50" velocity="0.5"')
+    robot.urdf.write_text(text)
+    with build(engine, robot) as simulation:
+        simulation.set_torques([20.0, 0.0])
+        simulation.step(200)
+        left = 0.5 / max(1.0, abs(multiplier))
+        np.testing.assert_allclose(simulation.velocities(), [left, multiplier * left], atol=2e-3)
+
+
 def test_the_limits_and_resistance_of_a_follower_hold_its_leader(engine, gripper):
     robot = gripper(
         ("left", ""),

@@ -29,6 +29,8 @@ _FASTEST_RETURN = 0.1
 """Maximum speed of this correction, in m/s: a body that is pushed out faster jumps visibly."""
 _BOUNCE = 0.1
 """Approach speed, in m/s, above which contacts bounce."""
+_FARTHEST_RUN = 0.3
+"""Angle, in rad, that the deepest point of a rim may run along it in a step to count as rolling."""
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _THIRDS = np.array([[1.0, 0.0], [-0.5, 0.75**0.5], [-0.5, -(0.75**0.5)]])
 """Cosines and sines of three directions around a rim."""
@@ -188,6 +190,7 @@ class ContactFinder:
         for weights, (joint, center, *_) in zip(self._weights, anchors, strict=True):
             weights[4 * joint : 4 * joint + 4] = *center, 1.0
         self._rim_radii = np.array([row[2] for row in rims])
+        self._rim_moved = moved[joints[len(points) :]]
         self._rim_axes = np.array([row[5] for row in rims]).reshape(-1, 3, 3)
         spread = np.repeat(np.arange(len(anchors)), [1] * len(points) + [around] * len(rims))
         self._links = np.array([row[3] for row in anchors], np.intp)[spread]
@@ -212,9 +215,10 @@ class ContactFinder:
             period: Length of the step, in s.
         """
         motions = twists_of(pinocchio.computeJointJacobians(self._model, self._data, q))
-        points = self._weights.dot(self._poses.reshape(-1, 3))
+        points, rolling = self._weights.dot(self._poses.reshape(-1, 3)), None
         if self._first_rim < len(points):
-            points = np.concatenate([points[: self._first_rim], self._rims(points)])
+            rims, rolling = self._rims(points, motions[3:].dot((self._rim_moved * v).T).T, period)
+            points = np.concatenate([points[: self._first_rim], rims])
         found = []
         for place, surface in self._surfaces:
             gaps, axes = surface.distances(points)
@@ -230,24 +234,37 @@ class ContactFinder:
             rows = (np.minimum(gaps, ahead) < MARGIN).nonzero()[0]
             if not len(rows):
                 continue
-            numbers = place * len(points) + rows
+            numbers, normals = place * len(points) + rows, frames.take(rows, 0)[:, :, :3]
             found.append(
                 ContactPoints(
                     numbers,
                     touched.take(rows, 0),
-                    frames.take(rows, 0)[:, :, :3],
+                    normals,
                     gaps.take(rows),
                     self._friction.take(numbers),
                     self._restitution.take(numbers),
                     jacobian.reshape(len(points), 3, -1).take(rows, 0).reshape(3 * len(rows), -1),
-                    self._drift(place, frames.take(rows, 0)[:, :, :3]) if self._drifts else None,
+                    self._drift(place, normals, rows, rolling),
                 )
             )
         return _together(found) if found else None
 
-    def _drift(self, static: int, axes: Vector) -> Vector:
-        """Return the velocities of a surface along the axes (k, 3, 3) of points, shape (3 k,)."""
+    def _drift(
+        self, static: int, axes: Vector, points: Indices, rolling: Vector | None
+    ) -> Vector | None:
+        """Return the velocities along the axes (k, 3, 3) that points stick to, shape (3 k,).
+
+        Args:
+            static: The surface, whose velocity it is.
+            axes: Two tangents and the normal of each point.
+            points: The points.
+            rolling: What `_rims` adds for points on rims.
+        """
+        if rolling is None and not self._drifts:
+            return None
         found: Vector = axes @ self._drifts.get(static, np.zeros(3))
+        if rolling is not None:
+            found += np.einsum("kij,kj->ki", axes, rolling[points])
         found[:, 2] = 0.0
         return found.ravel()
 
@@ -256,18 +273,42 @@ class ContactFinder:
         statics, points = np.divmod(numbers, len(self._links))
         return self._links[points], statics
 
-    def _rims(self, points: Vector) -> Vector:
-        """Return three points on each rim, including the deepest, shape (3 rims, 3)."""
-        first = self._first_rim
-        turns = self._poses[self._joints[first:], :3].transpose(0, 2, 1)
-        axes = turns @ self._rim_axes
+    def _rims(self, points: Vector, turns: Vector, period: float) -> tuple[Vector, Vector]:
+        """Return three points on each rim, including the deepest, and how these roll.
+
+        Where a rim rolls, the point that touches runs along it, so the velocity that friction has
+        just stopped is not that of the next point, and friction would do work on it: Euler's disk
+        would gain energy. If each point ends its step with half the difference, in the other
+        direction, no work is done.
+
+        Args:
+            points: Centers of spheres and rims.
+            turns: Angular velocities of the rims, in rad/s, shape (rims, 3).
+            period: Length of the step, in s.
+
+        Returns:
+            The points, shape (3 rims, 3), and for all points the velocity with which they end a
+            step if they stick, in m/s, shape (points, 3).
+        """
+        first, up = self._first_rim, self._up
+        poses = self._poses[self._joints[first:], :3].transpose(0, 2, 1)
+        axes = poses @ self._rim_axes
         along = axes[:, :, 2]
-        downward = (along @ self._up)[:, None] * along - self._up
+        downward = (along @ up)[:, None] * along - up
         lengths = np.sqrt(np.einsum("ij,ij->i", downward, downward))[:, None]
         upright = lengths <= 1e-9
-        beside = np.where(upright, axes[:, :, 0], downward / np.where(upright, 1.0, lengths))
+        divisors = np.where(upright, 1.0, lengths)
+        beside = np.where(upright, axes[:, :, 0], downward / divisors)
         around = _THIRDS @ np.stack([beside, np.cross(along, beside)], axis=1)
-        return (points[first:, None] + self._rim_radii[:, None, None] * around).reshape(-1, 3)
+        found = (points[first:, None] + self._rim_radii[:, None, None] * around).reshape(-1, 3)
+        tilting = np.cross(turns, along)
+        pace = (tilting @ up)[:, None] * along + (along @ up)[:, None] * tilting
+        pace -= np.einsum("ij,ij->i", beside, pace)[:, None] * beside
+        run = period * (pace / divisors - np.cross(turns, beside))
+        run[upright[:, 0] | (np.einsum("ij,ij->i", run, run) > _FARTHEST_RUN**2)] = 0.0
+        rolling = np.zeros((first + len(found), 3))
+        rolling[first :: len(_THIRDS)] = -0.5 * self._rim_radii[:, None] * np.cross(turns, run)
+        return found, rolling
 
 
 def supports_of(model: Any) -> Vector:

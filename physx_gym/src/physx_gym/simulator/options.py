@@ -7,13 +7,20 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from physx_core.errors import ConfigError, UnknownOptionError
-from physx_sim import JointSettings, Motor, Robot, Sensor, World
+from physx_sim import BodySettings, JointSettings, Layout, Motor, Robot, Sensor, World
+from physx_sim.engines import read_robot
 
 _NAMES = frozenset(
     {"name", "joint", "urdf", "package_dirs", "joints", "feet", "path", "heights", "mimic"}
 )
 """Fields that identify a thing rather than configure it; these are not options."""
 _PARTS = ("robots", "objects")
+_CHANGEABLE = {
+    "ground": ("friction",),
+    "robots": ("friction", "mass_factors"),
+    "objects": ("friction", "mass"),
+}
+"""Options that `Simulation.set_body` changes without a rebuild."""
 
 
 def world_options(world: World) -> dict[str, Any]:
@@ -57,6 +64,65 @@ def change_world(world: World, options: Mapping[str, Any]) -> World:
                 changes[part] = tuple(new.values())
     changed: World = _change("world", world, options, (*_PARTS, "ground"))
     return dataclasses.replace(changed, **changes) if changes else changed
+
+
+def needing_a_build(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Return the options of a world without those that a running engine takes over."""
+    left = {name: value for name, value in options.items() if name != "gravity"}
+    if isinstance(left.get("ground"), Mapping):
+        left["ground"] = _without("ground", left["ground"])
+    for part in _PARTS:
+        if isinstance(left.get(part), Mapping):
+            left[part] = {name: _without(part, given) for name, given in left[part].items()}
+    return left
+
+
+def _without(part: str, given: Any) -> Any:
+    if not isinstance(given, Mapping):
+        return given
+    return {name: value for name, value in given.items() if name not in _CHANGEABLE[part]}
+
+
+def link_masses(world: World, layout: Layout) -> dict[str, float]:
+    """Return the masses of the links of all robots of a world, in kg, by the names of bodies."""
+    found: dict[str, float] = {}
+    for robot in world.robots:
+        masses = {body.name: body.mass for body in read_robot(robot).bodies}
+        for name in layout.bodies[layout.parts[robot.name].bodies]:
+            found[name] = masses[name.removeprefix(f"{robot.name}/")]
+    return found
+
+
+def body_changes(
+    built: World, wanted: World, layout: Layout, masses: Mapping[str, float]
+) -> dict[str, BodySettings]:
+    """Return what turns a built world into the wanted one, by the names of bodies.
+
+    Args:
+        built: The world as built.
+        wanted: It with other masses and friction.
+        layout: Its layout.
+        masses: See `link_masses`; of the built world.
+    """
+    found: dict[str, dict[str, Any]] = {}
+    for old, new in zip(built.robots, wanted.robots, strict=True):
+        for name in layout.bodies[layout.parts[old.name].bodies] if old is not new else ():
+            link, own = name.removeprefix(f"{old.name}/"), found.setdefault(name, {})
+            ratio = new.mass_factors.get(link, 1.0) / old.mass_factors.get(link, 1.0)
+            if ratio != 1.0 and masses[name] > 0:
+                own["mass"] = ratio * masses[name]
+            own |= _differing(old, new, ("friction",))
+    for one, other in zip(built.objects, wanted.objects, strict=True):
+        options = ("friction",) if one.static else ("mass", "friction")
+        found[one.name] = _differing(one, other, options)
+    if built.ground is not None:
+        found["ground"] = _differing(built.ground, wanted.ground, ("friction",))
+    return {name: BodySettings(**given) for name, given in found.items() if given}
+
+
+def _differing(old: Any, new: Any, options: Sequence[str]) -> dict[str, float]:
+    pairs = ((name, getattr(old, name), getattr(new, name)) for name in options)
+    return {name: after for name, before, after in pairs if before != after}
 
 
 def change_each(where: str, things: Mapping[str, Any], options: Any) -> dict[str, Any]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import inspect
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
 
@@ -36,6 +36,8 @@ from physx_sim import (
 )
 from physx_sim.errors import SimulationError
 
+_CHANGES = {"changes", "gravity"}
+"""Features of an engine whose world can get other masses, friction and gravity."""
 _STEPPER = ("control_period", "observe_period")
 
 
@@ -47,13 +49,15 @@ class Engine:
         simulation: The engine's simulation.
         equipment: The motors and sensors on it.
         part: The controlled robot's part of the state.
-        first: The state right after building.
+        first: The state right after building, with the masses, friction and gravity of now.
+        masses: Masses of the robots' links as built, by the names of bodies, once needed.
     """
 
     simulation: Simulation
     equipment: Equipment
     part: Part
     first: State
+    masses: dict[str, float] = field(default_factory=dict)
 
 
 class Simulator(SharedArrays, Closeable):
@@ -113,7 +117,8 @@ class Simulator(SharedArrays, Closeable):
             raise ConfigError("The world has no robot to control: World([Robot(...)], ...).")
         if robot is not None and robot not in names:
             raise ComponentNotFoundError("robot", str(robot), "The world", names)
-        self.world, self.backend = world, backend
+        self.world = self._built_world = world
+        self.backend = backend
         self._robot_name = names[0] if robot is None else robot
         self._given_motors = _check_list("motors", Motor, motors)
         self._given_sensors = _check_list("sensors", Sensor, sensors)
@@ -174,8 +179,14 @@ class Simulator(SharedArrays, Closeable):
     def _build(self) -> Engine:
         """Build engine, motors and sensors."""
         self._drop()
-        world = with_rotors(self.world, self._given_motors or ())
-        simulation: Simulation = plugins.resolve("backend", self.backend).build(world)
+        backend = plugins.resolve("backend", self.backend)
+        world = with_rotors(self._built_world, self._given_motors or ())
+        simulation: Simulation = backend.build(world)
+        if self.world is not self._built_world and not simulation.features >= _CHANGES:
+            simulation.close()
+            self._built_world = self.world
+            world = with_rotors(self.world, self._given_motors or ())
+            simulation = backend.build(world)
         part = simulation.layout.parts[self._robot_name]
         if self._given_motors is None:
             self._motors = default_motors(simulation.layout, part)
@@ -187,7 +198,20 @@ class Simulator(SharedArrays, Closeable):
         self._engine = Engine(simulation, equipment, part, simulation.snapshot())
         self._stale = False
         self.builds += 1
+        self._change_world(self._engine)
         return self._engine
+
+    def _change_world(self, engine: Engine) -> None:
+        """Give the built engine the masses, friction and gravity of the world."""
+        if self.world is self._built_world and not engine.first.bodies:
+            return
+        simulation, built, masses = engine.simulation, self._built_world, engine.masses
+        if not masses:
+            masses.update(nested_options.link_masses(built, simulation.layout))
+        bodies = nested_options.body_changes(built, self.world, simulation.layout, masses)
+        first = replace(engine.first, bodies=bodies, gravity=np.array(self.world.gravity))
+        simulation.restore(first)
+        self._engine = replace(engine, first=first)
 
     def _drop(self) -> None:
         if self._engine is not None:
@@ -334,7 +358,9 @@ class Simulator(SharedArrays, Closeable):
         }
 
     def set_options(self, options: Mapping[str, Any]) -> None:
-        """Change options; omitted ones stay the same. The engine is rebuilt if necessary.
+        """Change options; omitted ones stay the same.
+
+        Masses, friction and gravity change in the built engine; others need a new build.
 
         Args:
             options: In the form that `get_options` returns.
@@ -356,13 +382,26 @@ class Simulator(SharedArrays, Closeable):
         for name, value in stepper.items():
             setattr(self, name, _positive_or_none(name, value))
         if world is not self.world:
-            self.world, self._stale, self.stepper_state.dt = world, True, world.period
+            self._take(world, options["world"])
         if tuple(motors.values()) != self.motors:
             self._motors = self._given_motors = tuple(motors.values())
             self._stale = True
         if tuple(sensors.values()) != self.sensors:
             self._sensors = self._given_sensors = tuple(sensors.values())
             self._stale = True
+
+    def _take(self, world: World, options: Mapping[str, Any]) -> None:
+        """Take over a changed world: in the running engine, if that can."""
+        needed = nested_options.needing_a_build(options)
+        built = nested_options.change_world(self._built_world, needed)
+        self.world, self.stepper_state.dt = world, world.period
+        engine = self._engine
+        if built is self._built_world and engine is not None and not self._stale:
+            if engine.simulation.features >= _CHANGES:
+                self._change_world(engine)
+                return
+            built = world
+        self._built_world, self._stale = built, True
 
     def seed(self, seed: Any) -> None:
         """Seed the sensors' errors, from the next start on."""

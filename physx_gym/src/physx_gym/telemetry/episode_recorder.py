@@ -75,7 +75,7 @@ class EpisodeRecorder:
     def _describe(self, name: str, constants: Mapping[str, Any]) -> dict[str, Any]:
         """Register the simulator; return its and the environment's description."""
         simulator = self._simulator
-        now = simulator.builds, simulator.control_period, simulator.observe_period
+        now = simulator.builds, simulator.control_period, simulator.observe_period, simulator.world
         if now != self._described_when:
             register_simulator(self.telemetry, simulator)
             self._described, self._described_when = describe_simulator(simulator), now

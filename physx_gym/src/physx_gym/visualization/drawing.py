@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping, Sequence
+from collections.abc import Container, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 from xml.sax.saxutils import quoteattr
@@ -23,6 +23,7 @@ from physx_sim import (
     Layout,
     Mesh,
     Robot,
+    Simulation,
     Sphere,
     Stairs,
     World,
@@ -55,7 +56,7 @@ class WorldDrawing:
         view: Mapping[str, Sequence[float]] | None = None,
         look: Mapping[str, Any] | None = None,
     ) -> None:
-        """Store the world; `add` draws it.
+        """Store the world; `show`, or `add`, draws it.
 
         Args:
             factory: Factory to draw with.
@@ -72,14 +73,31 @@ class WorldDrawing:
         self._factory, self._world, self._layout, self._backend = factory, world, layout, backend
         floating = (robot.name for robot in world.robots if not robot.fixed_base)
         self._title, self._followed = title, next(floating, None) if follow else None
+        self._places = {name: place for place, name in enumerate(layout.names)}
+        self._drawn: dict[str, tuple[list[float], bool]] = {}
         self._folder: TemporaryFolder | None = None
+        self._is_added = False
+
+    def show(self, simulation: Simulation) -> None:
+        """Draw the present state of a simulation of the world.
+
+        The first call adds everything, later ones move it.
+        """
+        poses, first = simulation.body_poses(self._layout.names), not self._is_added
+        named = self._world.objects if "changes" in simulation.features else ()
+        hidden = [each.name for each in named if simulation.body_settings(each.name).hidden]
+        if first:
+            self.add(poses)
+        if hidden or not first:
+            self.move(poses, hidden)
 
     def add(self, poses: Vector) -> None:
         """Add everything to the scene.
 
         Args:
-            poses: Of all bodies, in the layout's order, shape (bodies, 7).
+            poses: Of everything in `Layout.names`, static bodies too, shape (names, 7).
         """
+        self._is_added = True
         if self._world.ground is not None:
             _add_ground(self._factory, self._world.ground)
         if self._title is not None:
@@ -87,29 +105,33 @@ class WorldDrawing:
         for robot in self._world.robots:
             self._add_robot(robot, poses[self._layout.parts[robot.name].bodies])
         for each in self._world.objects:
-            self._add_object(each, self._pose(each, poses))
+            pose = poses[self._places[each.name]]
+            self._add_object(each, pose)
+            self._drawn[each.name] = pose.tolist(), False
 
-    def move(self, poses: Vector) -> None:
-        """Move everything to its present pose; see `add`."""
+    def move(self, poses: Vector, hidden: Container[str] = ()) -> None:
+        """Move everything to its present pose.
+
+        Args:
+            poses: As for `add`.
+            hidden: Names of objects that are absent at present.
+        """
         parts, factory = self._layout.parts, self._factory
         for robot in self._world.robots:
             factory.update_robot(robot.name, poses=poses[parts[robot.name].bodies])
         for each in self._world.objects:
-            if not each.static:
-                self._move_object(each, self._pose(each, poses))
+            pose = poses[self._places[each.name]]
+            shown, before = (pose.tolist(), each.name in hidden), self._drawn[each.name]
+            if shown != before:
+                look = {} if shown[1] == before[1] else {"visible": not shown[1]}
+                self._move_object(each, pose, **look)
+                self._drawn[each.name] = shown
 
     def close(self) -> None:
         """Delete temporary files."""
         if self._folder is not None:
             self._folder.close()
             self._folder = None
-
-    def _pose(self, each: WorldObject, poses: Vector) -> Vector:
-        """Return the pose of an object: x, y, z and quaternion x, y, z, w."""
-        if each.static:
-            return np.array([*each.position, *each.orientation])
-        pose: Vector = poses[self._layout.parts[each.name].bodies.start]
-        return pose
 
     def _add_robot(self, robot: Robot, poses: Vector) -> None:
         bodies = self._layout.bodies[self._layout.parts[robot.name].bodies]
@@ -162,12 +184,12 @@ class WorldDrawing:
         file.write_text(text, encoding="utf-8")
         return file
 
-    def _move_object(self, each: WorldObject, pose: Vector) -> None:
+    def _move_object(self, each: WorldObject, pose: Vector, **look: bool) -> None:
         factory = self._factory
         if isinstance(each, Mesh):
-            factory.update_robot(each.name, poses=pose[None])
+            factory.update_robot(each.name, poses=pose[None], **look)
         else:
-            place = {"position": pose[:3], "orientation": pose[3:]}
+            place: dict[str, Any] = {"position": pose[:3], "orientation": pose[3:], **look}
             if isinstance(each, Box):
                 factory.update_box(each.name, **place)
             elif isinstance(each, Sphere):

@@ -31,9 +31,8 @@ class EnvironmentDrawing:
     def draw(self) -> None:
         """Draw the present state: add everything at first, later move it."""
         simulator = self._env.simulator
-        poses = simulator.simulation.body_poses()
         if self._drawing is not None:
-            self._drawing.move(poses)
+            self._drawing.show(simulator.simulation)
             self._env._redraw(self._factory)
             return
         self.world = simulator.world
@@ -46,7 +45,7 @@ class EnvironmentDrawing:
             follow=self._follow,
             view=self._env.view,
         )
-        self._drawing.add(poses)
+        self._drawing.show(simulator.simulation)
         self._env._draw(self._factory)
 
     def close(self) -> None:

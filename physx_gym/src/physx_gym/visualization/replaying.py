@@ -158,7 +158,8 @@ class _Body:
 
     def draw(self, time: float) -> None:
         """Draw it at a time."""
-        (self._drawing.move if self._is_drawn else self._drawing.add)(self.poses(time))
+        poses = self.poses(time, self.simulation.layout.names)
+        (self._drawing.move if self._is_drawn else self._drawing.add)(poses)
         self._is_drawn = True
 
     def close(self) -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from typing import Any, ClassVar
 
 import numpy as np
@@ -19,8 +19,8 @@ class RandomizedEnv(Layer):
 
     The draws depend only on the environment's seed and the number of the episode: initial states,
     noise and all other randomness stay as they are without this layer. Factors apply to the values
-    that the environment had when this layer was put on it. New masses, friction, delays and noise
-    require a new simulation, which takes some milliseconds; gains and pushes do not.
+    that the environment had when this layer was put on it. New delays and noise require a new
+    simulation, which takes some milliseconds; masses, friction, gains and pushes do not.
 
     Attributes:
         randomizations: What is drawn.
@@ -109,10 +109,10 @@ class RandomizedEnv(Layer):
         elif rest == 0 or not before:
             self.drawn = self._draw(number)
         if self.drawn != before:
+            options: dict[str, Any] = {}
             for each in self.randomizations:
-                options = each.options(self._nominal, self.drawn[each.name])
-                if options:
-                    self.simulator.set_options(options)
+                _merge(options, each.options(self._nominal, self.drawn[each.name]))
+            self.simulator.set_options(options)
         for each in self.randomizations:
             each.apply(self.env, self.drawn[each.name])
 
@@ -130,3 +130,12 @@ class RandomizedEnv(Layer):
 
     def _constants(self) -> dict[str, Any]:
         return {"randomization": self.drawn}
+
+
+def _merge(options: dict[str, Any], more: Mapping[str, Any]) -> None:
+    """Add nested options to others; of the same option the last value stays."""
+    for name, value in more.items():
+        if isinstance(value, Mapping):
+            _merge(options.setdefault(name, {}), value)
+        else:
+            options[name] = value
