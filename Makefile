@@ -4,6 +4,7 @@
 # make lint    ruff, mypy and import-linter
 # make docs    build the site: docs/_build/docs/index.html
 # make bench   print the measured ratios of benchmarks/: 20 minutes
+# make wheels  build all packages, and an index of them: dist/, dist/simple/
 # make clean   remove .venv and everything that was built
 
 PYTHON ?= $(shell command -v python3.11 || command -v python3)
@@ -14,10 +15,10 @@ DIST := --dist loadgroup --no-loadscope-reorder
 ROOM = $(wildcard tests/$(P) tests/*/$(P) tests/*/*/$(P))
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check
 COMPILE := $(BIN)/python -m compileall -q -j 0 .venv/lib >/dev/null 2>&1 || true  # pip uses one core
-PACKAGES := -e ./physx_core -e ./physx_testing -e "./physx_sim[robots,meshes,mjcf]" -e ./physx_formats -e "./physx_dart[robots]" -e ./physx_mujoco -e "./physx_torch[export]" -e ./physx_rerun -e ./physx_gym -e ./physx_remote -e ./physx_cluster -e ./physx_report -e ./physx_agree
-PROJECTS := $(wildcard physx_*/pyproject.toml) constraints.txt
+PACKAGES := -e ./physx -e ./physx_core -e ./physx_testing -e "./physx_sim[robots,meshes,mjcf]" -e ./physx_formats -e "./physx_dart[robots]" -e ./physx_mujoco -e "./physx_torch[export]" -e ./physx_rerun -e ./physx_gym -e ./physx_remote -e ./physx_cluster -e ./physx_report -e ./physx_agree -e ./physx_identify
+PROJECTS := $(wildcard physx*/pyproject.toml) constraints.txt
 
-.PHONY: demo test quick lint docs bench clean
+.PHONY: demo test quick lint docs bench wheels clean
 
 demo: .venv/packages
 	$(BIN)/python examples/09_robot_arm.py $(DEMO_ARGS)
@@ -61,14 +62,22 @@ bench: .venv/packages
 	$(BIN)/python benchmarks/differentiable.py
 	$(BIN)/python benchmarks/physics.py
 	$(BIN)/python benchmarks/agree.py
+	$(BIN)/python benchmarks/identify.py
 	$(BIN)/python benchmarks/gym.py
 	$(BIN)/python benchmarks/idle_threads.py
 	$(BIN)/python benchmarks/remote.py
 	$(BIN)/python benchmarks/viewer.py
 	$(BIN)/python benchmarks/cluster.py
 
+wheels: build/tools/bin/hatchling
+	build/tools/bin/python .ci/wheels.py dist
+
+build/tools/bin/hatchling:
+	$(PYTHON) -m venv build/tools
+	build/tools/bin/python -m pip install --quiet --disable-pip-version-check hatchling
+
 clean:
-	rm -rf docs/_build .venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
+	rm -rf build dist docs/_build .venv .pytest_cache .mypy_cache .ruff_cache .import_linter_cache .hypothesis
 	find . -name __pycache__ -prune -exec rm -rf {} +
 
 .venv/packages: $(PROJECTS)

@@ -5,8 +5,8 @@ and a damped cloth of 6 by 6 masses that hangs from two corners, in steps of 0.0
 connected network learns the change in a step from 60 episodes of 60 rows: exact ones, and of
 Lorenz-96 also measured ones, with an error of 1 % of the standard deviation. Each network predicts
 100 steps of 20 unseen episodes from their first states; its error is the root mean square over
-them, in standard deviations. Unrolled training (1, 2, 4 and 8 steps, more by epoch) competes with training on single
-steps for half as many epochs more; the seconds are those of one training.
+them, in standard deviations. Unrolled training (1, 2, 4 and 8 steps, more by epoch) competes with
+training on single steps for half as many epochs more; the seconds are those of one training.
 
     python benchmarks/unrolled.py --check
 """
@@ -41,7 +41,7 @@ def slope(x: np.ndarray) -> np.ndarray:
 
 
 def lorenz(episodes: int, rows: int, seed: int) -> np.ndarray:
-    """Return states of Lorenz-96, shape (episodes, rows, SIZE), after a time in which the start is forgotten."""
+    """Return states of Lorenz-96, shape (episodes, rows, SIZE), once the start is forgotten."""
     x = FORCING + np.random.default_rng(seed).normal(size=(episodes, SIZE))
     states = np.empty((episodes, rows, SIZE))
     for row in range(-1000, rows):

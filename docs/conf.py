@@ -19,11 +19,11 @@ extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphin
 root_doc = "docs/index"
 include_patterns = [
     "docs/**.md",
-    "physx_*/README.md",
+    "physx*/README.md",
     "examples/*/README.md",
-    *(f"{name}.md" for name in ("README", "CHANGELOG", "CONTRIBUTING", "SECURITY")),
+    *(f"{name}.md" for name in ("README", "CHANGELOG", "CONTRIBUTING", "RELEASING", "SECURITY")),
 ]
-exclude_patterns = ["docs/_build", ".venv", "sessions", "tests", "physx_*/src"]
+exclude_patterns = ["docs/_build", ".venv", "sessions", "tests", "physx*/src"]
 myst_heading_anchors = 4
 default_role = "code"
 nitpicky = False  # annotations name types of libraries whose pages are not included

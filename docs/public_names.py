@@ -50,6 +50,7 @@ FACES = {
     "physx_cluster": ("", "sweep", "errors"),
     "physx_report": ("", "drawing", "errors"),
     "physx_agree": ("",),
+    "physx_identify": ("", "errors"),
 }
 MODULES = [f"{root}.{name}".rstrip(".") for root, names in FACES.items() for name in names]
 

@@ -45,7 +45,7 @@ ROOT = Path(__file__).resolve().parent.parent
 LEARN = sorted((ROOT / "docs/learn").glob("*.md"))
 PAGES = [
     ROOT / "README.md",
-    *sorted(ROOT.glob("physx_*/README.md")),
+    *sorted(ROOT.glob("physx*/README.md")),
     *sorted(page for page in (ROOT / "docs").rglob("*.md") if "_build" not in page.parts),
 ]
 BOOKS = [LEARN, *([page] for page in PAGES if page not in LEARN)]

@@ -15,6 +15,7 @@ PACKAGES = (
     "remote",
     "cluster",
     "agree",
+    "identify",
 )
 
 

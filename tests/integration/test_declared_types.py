@@ -20,6 +20,7 @@ from hypothesis import strategies as st
 from sizes import size
 
 import physx_core
+import physx_identify
 import physx_sim
 from physx_core import (
     DatasetConfig,
@@ -56,6 +57,7 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     physx_sim.Ground: {"normal": (0.1, 0.2, 0.7)},
     physx_sim.Stairs: {},
     physx_sim.HeightField: {"heights": [[0.0, 1.0], [0.5, 0.25]], "origin": (1.0, 0.5)},
+    physx_identify.Unknown: {"kind": "mass", "of": "hand", "mean": 0.5, "deviation": 0.25},
     physx_sim.JointSettings: {
         **{"damping": 0.5, "friction": 0.25, "stiffness": 2.0, "rest": 0.5, "armature": 0.125}
     },
@@ -144,6 +146,7 @@ RECORDS = {
     *("UrdfShape", "Episode", "StepperState", "Result", "Comparison", "Trial", "Normalization"),
     *("CollisionShape", "Joint", "MovableBody", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
     "Bond",
+    *("Combination", "Estimate", "Identification", "Log", "LogNoise", "Motion", "ResidualTest"),
     *("Agreement", "Cause", "Figure", "Parting", "Ranking"),
     *("Kind", "Format", "Table", "Section", "RolloutResult", "Unseen", "Score", "Cursor"),
 }

@@ -20,7 +20,8 @@ pytest.importorskip("torch")
 
 LONG = {
     "docs/gym.md", "docs/online.md", "docs/sweep.md", "docs/testing.md", "docs/howto/network.md",
-    "docs/howto/other_tools.md", "docs/learn/9_scale.md", "physx_rerun/README.md",
+    "docs/howto/film.md", "docs/howto/other_tools.md", "docs/learn/9_scale.md",
+    "physx_rerun/README.md",
 }  # fmt: skip
 """Pages whose commands take many seconds; they run with the campaigns."""
 

@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -10,14 +11,10 @@ from pathlib import Path
 
 import filelock
 import pytest
+from PIL import Image
 
 pytestmark = [pytest.mark.slow, pytest.mark.processes]
 
-PACKAGES = (
-    *("physx_core", "physx_testing", "physx_sim", "physx_formats", "physx_dart", "physx_mujoco"),
-    *("physx_torch", "physx_rerun", "physx_gym", "physx_remote", "physx_cluster"),
-    *("physx_report", "physx_agree"),
-)
 PHYSX = ("-m", "physx_core")
 GENERATE = "--batch-nb 2 --batch-size 10"
 CONSTRAINTS = Path(__file__).parents[2] / "constraints.txt"
@@ -96,15 +93,9 @@ def wheels(tmp_path_factory, request):
     folder = (own.parent if "PYTEST_XDIST_WORKER" in os.environ else own) / "wheels"
     with filelock.FileLock(folder.with_suffix(".lock")):
         if not folder.exists():
-            build_wheels(root, own / "building").rename(folder)
-    return folder
-
-
-def build_wheels(root, folder):
-    for name in PACKAGES:
-        source = shutil.copytree(root / name, folder / "src" / name)
-        command = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "-o", folder, source]
-        subprocess.run(list(map(str, command)), check=True, capture_output=True)
+            command = [sys.executable, root / ".ci/wheels.py", own / "built"]
+            subprocess.run(list(map(str, command)), check=True, capture_output=True)
+            (own / "built").rename(folder)
     return folder
 
 
@@ -175,6 +166,22 @@ def test_the_core_alone_generates_and_trains(python, run, wheels):
     assert missing.returncode == 1 and hint("physx_dart") in missing.stderr
     missing = run(*PHYSX, "serve", python=python, ok=False)
     assert missing.returncode == 1 and hint("physx_remote") in missing.stderr
+
+
+@pytest.mark.faults
+def test_the_demo_from_the_index_makes_a_film(tmp_path, wheels, run):
+    venv.create(tmp_path / "environment", with_pip=False)
+    python = tmp_path / "environment/bin/python"
+    pip(python, "install", *OPTIONS, "--extra-index-url", (wheels / "simple").as_uri(), "physx")
+    said = run("demo", python=python.with_name("physx")).stdout
+    errors = dict(re.findall(r"^  (PD.*?) +([0-9.]+) mm$", said, re.MULTILINE))
+    alone, network, exact = map(float, errors.values())
+    assert exact < network < alone / 10
+    with Image.open(tmp_path / "physx_demo/film.gif") as film:
+        assert film.n_frames > 50
+    assert (tmp_path / "physx_demo/arm.py").is_file()
+    run("report", "physx_demo/sessions/network", python=python.with_name("physx"))
+    assert (tmp_path / "physx_demo/sessions/network/report.html").is_file()
 
 
 @pytest.mark.faults

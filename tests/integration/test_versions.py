@@ -14,7 +14,7 @@ import pytest
 pytestmark = pytest.mark.processes
 
 ROOT = Path(__file__).parents[2]
-PACKAGES = sorted(path.parent.name for path in ROOT.glob("physx_*/pyproject.toml"))
+PACKAGES = sorted(path.parent.name for path in ROOT.glob("physx*/pyproject.toml"))
 
 
 def test_all_distributions_have_the_same_version():
@@ -28,7 +28,7 @@ def test_all_distributions_have_the_same_version():
 
 @pytest.mark.parametrize("name", PACKAGES)
 def test_a_package_reads_its_version_from_the_metadata(name):
-    package = pytest.importorskip(name)
+    package = pytest.importorskip("physx_demo" if name == "physx" else name)
     assert package.__version__ == version(name.replace("_", "-"))
     assert "__version__" in dir(package)
 

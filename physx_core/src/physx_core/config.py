@@ -17,7 +17,7 @@ from pathlib import Path
 from types import FunctionType
 from typing import Any, Literal, TypeVar, dataclass_transform
 
-from physx_core import checks
+from physx_core import cells, checks
 from physx_core.errors import (
     ConfigError,
     ConfigFileError,
@@ -84,7 +84,29 @@ def options(cls: type[T]) -> type[T]:
         _validate(self, cls)
 
     cls.__init__ = checked  # type: ignore[method-assign]
+    cls._repr_pretty_ = _show  # type: ignore[attr-defined]
     return cls
+
+
+def _show(self: Any, printer: Any, cycle: bool) -> None:
+    """Print the options that differ from their defaults, for notebooks."""
+    shown = []
+    for each in dataclasses.fields(self):
+        usual = each.default
+        if each.default_factory is not dataclasses.MISSING:
+            usual = each.default_factory()
+        value = getattr(self, each.name) if each.init else usual
+        if value is usual or (type(value) is type(usual) and value == usual):
+            continue
+        short = reference_of(value) if isinstance(value, type) else value
+        shown.append((each.name, short))
+    with printer.group(4, f"{type(self).__name__}(", ")"):
+        for number, (name, value) in enumerate(shown):
+            if number:
+                printer.text(",")
+                printer.breakable()
+            printer.text(f"{name}=")
+            printer.pretty(value)
 
 
 @functools.cache
@@ -470,6 +492,8 @@ def reference_of(component: Any) -> str:
     if spec is not None and spec.name:
         return f"{spec.name}:{name}"
     if not file or not Path(file).is_file():
+        if cells.has_source(component):
+            return cells.register(name)
         raise UsageError(
             f"{name} is defined in an interactive session, where no other process can find it. "
             "Move it to a file, or run with as_tcp_ip_client=False."

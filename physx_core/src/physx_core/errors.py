@@ -44,8 +44,34 @@ def printable(text: object) -> str:
     )
 
 
+def own_line(error: BaseException) -> str:
+    """Return the innermost line of the user's own code that an error came through.
+
+    Own code is what is neither installed nor part of physx's core.
+
+    Returns:
+        The line, as in ``cloth.py:14: self.force = forces[3]``; empty if there is none.
+    """
+    import linecache
+    import sysconfig
+    import traceback
+    from pathlib import Path
+
+    foreign = ("<", *(sysconfig.get_path(name) for name in ("stdlib", "purelib", "platlib")))
+    for frame, number in reversed(list(traceback.walk_tb(error.__traceback__))):
+        file, module = frame.f_code.co_filename, str(frame.f_globals.get("__name__"))
+        if not file.startswith(foreign) and module.partition(".")[0] != "physx_core":
+            text = linecache.getline(file, number).strip()
+            return f"{Path(file).name}:{number}: {text}".removesuffix(": ")
+    return ""
+
+
 class PhysxError(Exception):
     """Base class of all physx errors."""
+
+    def _render_traceback_(self) -> list[str]:
+        """Return what a notebook shows: the message, as a terminal does."""
+        return [f"{type(self).__name__}: {self}", *getattr(self, "__notes__", [])]
 
 
 # Configuration ------------------------------------------------------------------------------

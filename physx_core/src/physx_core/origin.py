@@ -67,7 +67,7 @@ def _place(where: dict[str, Any], distribution: str, named: str) -> str | None:
             url = f"{vcs['vcs']}+{url}@{revision}"
         return _quoted(f"{named} @ {url}#subdirectory={beside_core}")
     if url.startswith("file:"):
-        files = sorted(_local(url).parent.glob(f"{folder}-*"))
+        files = sorted(_local(url).parent.glob(f"{folder}-*"), key=lambda f: f.suffix == ".whl")
         return _quoted(f"{files[-1]}{extra}") if files else None
     return None
 

@@ -144,9 +144,9 @@ class Linear(Network):
     def bind(self, fields: dict[str, Field]) -> None:  # type: ignore[override]
         """Set the sizes from the fields; existing weights are kept."""
         super().bind(fields)
-        inputs = sum(int(np.prod(fields[name].shape or ())) for name in self.net_fields)
+        row = {name: np.zeros((1, *(fields[name].shape or ()))) for name in self.net_fields}
         self._shape = fields[self.opt_fields[0]].shape or ()
-        size = (inputs + 1, int(np.prod(self._shape)))
+        size = (self.rows(row).shape[1], int(np.prod(self._shape)))
         if self.weights.size == 0:
             self.weights = np.zeros(size, self._dtype)
         elif self.weights.shape != size:

@@ -206,3 +206,48 @@ def test_an_option_that_may_be_left_open_is_switched_on_by_its_name(words, expec
 def test_a_switch_that_is_neither_on_nor_off_is_an_error(capsys):
     assert main(["generate", "toy/spring", "--environment.independent-episodes", "maybe"]) != 0
     assert "neither True nor False" in " ".join(capsys.readouterr().err.split())
+
+
+FAILS = """
+from physx_core import Dataset, Environment
+
+class Fails(Environment):
+    def create(self):
+        pass
+    def init_database(self):
+        self.define_training_fields([("x", float)])
+    def step(self):
+        self.set_training_data(x=[1.0][self.step_index])
+"""
+
+
+@pytest.mark.parametrize("clients", [1, 2])
+def test_an_error_names_the_line_of_the_users_own_code(capsys, clients):
+    Path("fails.py").write_text(FAILS)
+    words = ["generate", "fails.py:Fails", "--batch-nb", "2", "--batch-size", "4"]
+    assert main([*words, "--environment.num-clients", str(clients)]) == 1
+    line = "self.set_training_data(x=[1.0][self.step_index])"
+    said = capsys.readouterr().err
+    assert f"IndexError: list index out of range (fails.py:10: {line})" in said
+    Path("fails.py").write_text(FAILS.replace("[1.0][self.step_index]", 'Dataset.open("nowhere")'))
+    assert main([*words, *LOCAL]) == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert "in step() of instance 1, at fails.py:10" in said
+
+
+@pytest.mark.slow  # imports all commands
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        ("train x --lr 3", "physx: --lr: did you mean --network.lr?"),
+        ("verify x --epoch_nb 3", "physx: --epoch-nb is an option of physx train."),
+    ],
+)
+def test_an_option_of_another_command_or_configuration_is_suggested(capsys, words, said):
+    assert main(words.split()) == 1
+    assert said in capsys.readouterr().err
+
+
+def test_info_without_a_folder_names_the_doctor(capsys):
+    assert main(["info"]) == 1
+    assert "physx doctor" in capsys.readouterr().err

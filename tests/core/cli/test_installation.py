@@ -1,4 +1,4 @@
-"""What `physx info` tells of the installation: what a report of a bug needs."""
+"""What `physx doctor` tells of the installation: what a report of a bug needs."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ from physx_core.cli import installation
 pytestmark = pytest.mark.processes
 
 
-def info(**variables):
+def doctor(**variables):
     """Return what the command prints in a process of its own."""
     done = subprocess.run(
-        [sys.executable, "-m", "physx_core", "info"],
+        [sys.executable, "-m", "physx_core", "doctor"],
         env={**os.environ, **{name: str(text) for name, text in variables.items()}},
         capture_output=True,
         text=True,
@@ -41,7 +41,7 @@ def package(folder, name, version, files=(), entries=""):
 
 
 def test_it_names_interpreter_versions_and_places():
-    text = info(PHYSX_TOKEN="0123secret", PHYSX_IMPORT_TIMEOUT="50")
+    text = doctor(PHYSX_TOKEN="0123secret", PHYSX_IMPORT_TIMEOUT="50")
     assert sys.executable in text and __version__ in text
     assert "physx-core" in text and "numpy" in text
     assert "vulkan" in text and "display" in text
@@ -54,7 +54,7 @@ def test_a_module_in_another_place_is_named(tmp_path):
     pytest.importorskip("zarr")
     (tmp_path / "zarr").mkdir()
     (tmp_path / "zarr/__init__.py").touch()
-    text = info(PYTHONPATH=tmp_path, ROS_DISTRO="humble")
+    text = doctor(PYTHONPATH=tmp_path, ROS_DISTRO="humble")
     assert f"zarr: import zarr loads {tmp_path / 'zarr'}, not " in text
     assert f"PYTHONPATH   {tmp_path}" in text and "ROS_DISTRO   humble" in text
 
@@ -62,13 +62,13 @@ def test_a_module_in_another_place_is_named(tmp_path):
 def test_an_older_copy_that_comes_first_is_named(tmp_path):
     pytest.importorskip("zarr")
     package(tmp_path, "zarr", "0.1", ["zarr/__init__.py"])
-    assert "zarr: 0.1 hides " in info(PYTHONPATH=tmp_path)
+    assert "zarr: 0.1 hides " in doctor(PYTHONPATH=tmp_path)
 
 
 def test_a_broken_plugin_and_a_package_without_its_files_are_named(tmp_path):
     package(tmp_path, "bad", "2.0", ["bad/__init__.py"], "[physx]\nbad = bad.plugin\n")
     (tmp_path / "bad/__init__.py").unlink()
-    text = info(PYTHONPATH=tmp_path)
+    text = doctor(PYTHONPATH=tmp_path)
     assert "bad: its files are missing: reinstall it" in text
     assert "bad  (bad 2.0)\n  broken: " in text
 

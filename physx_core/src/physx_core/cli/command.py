@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import faulthandler
+import functools
 import importlib.util
 import io
 import os
@@ -33,9 +34,11 @@ if TYPE_CHECKING:
 _ORDER = (
     *("generate", "train", "predict", "replay", "branch", "info", "stats", "verify"),
     *("export", "import", "export-network", "client", "include", "plugins", "new", "check"),
+    "doctor",
     "completion",
 )
 """Order of the core's commands in the overview; others follow alphabetically."""
+_USAGE = 2  # the status of a parser that does not understand its words
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -131,10 +134,32 @@ def _run(name: str, words: list[str]) -> None:
     try:
         run(words)
     except SystemExit as end:
+        if end.code == _USAGE:
+            for line in _suggestions(name, words):
+                print(f"physx: {printable(line)}", file=sys.stderr)
         ours = entry.value.partition(".")[0]
         if end.code or not ours.startswith("physx_") or ends_in(end, "argparse", "tyro", ours):
             raise
         raise UsageError(f"{describe_ending(end)}, but the command is not finished.") from end
+
+
+def _suggestions(name: str, words: list[str]) -> Iterator[str]:
+    """Yield what may be meant by options that a command does not have."""
+    from physx_core.cli.help_texts import help_of, options_in, suggest
+
+    @functools.cache
+    def options_of(command: str) -> set[str]:
+        return {each for each, _ in options_in(help_of(commands[command][0].load().run))}
+
+    def find(option: str) -> list[str]:
+        found = []
+        for command in commands:
+            with contextlib.suppress(Exception):  # a broken command breaks only itself
+                found += [f"physx {command}"] if option in options_of(command) else []
+        return found
+
+    commands = find_entries(COMMANDS)
+    yield from suggest(words, options_of(name), find)
 
 
 def _overview() -> str:

@@ -1,4 +1,4 @@
-"""Describes the installation for `physx info`: versions, plugins, drivers, and problems."""
+"""Describes the installation for `physx doctor`: versions, plugins, drivers, and problems."""
 
 from __future__ import annotations
 
@@ -8,7 +8,11 @@ import importlib.util
 import os
 import platform
 import re
+import resource
+import shutil
 import sys
+import tempfile
+import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import Distribution, distributions
@@ -21,6 +25,7 @@ _SHOWN = (
     *("DISPLAY", "WAYLAND_DISPLAY", "VK_DRIVER_FILES", "VK_ICD_FILENAMES", "CUDA_VISIBLE_DEVICES"),
     *("OMP_NUM_THREADS", "RANK", "WORLD_SIZE", "SLURM_JOB_ID", "TMPDIR"),
 )
+_FEW_FILES = 1024
 _DRIVERS = ("/usr/share/vulkan", "/usr/local/share/vulkan", "/etc/vulkan")
 
 
@@ -74,10 +79,15 @@ def describe_drivers(variables: Mapping[str, str], root: Path = Path("/")) -> di
         told = (root / "proc/driver/nvidia/version").read_text(encoding="utf-8", errors="replace")
         found = re.search(r"\b\d+\.\d+(\.\d+)?\b", told)
         version = f", NVIDIA driver {found[0]}" if found else ""
+    models = [
+        match[1]
+        for path in sorted(root.glob("proc/driver/nvidia/gpus/*/information"))
+        if (match := re.search(r"^Model:\s*(.+)$", path.read_text(errors="replace"), re.MULTILINE))
+    ]
     return {
         "display": display or "none: no viewer windows; images, files, and web pages work",
         "vulkan": _describe_vulkan(variables, root),
-        "cards": (", ".join(cards) or "none") + version,
+        "cards": ", ".join([*cards, *models] or ["none"]) + version,
     }
 
 
@@ -94,6 +104,49 @@ def _describe_vulkan(variables: Mapping[str, str], root: Path) -> str:
     if ctypes.util.find_library("vulkan") is None:
         return f"{names}, but no loader: apt install libvulkan1"
     return names
+
+
+def describe_disk(folder: Path) -> dict[str, str]:
+    """Return how large and how fast a folder's disk is, by name.
+
+    Args:
+        folder: Where 64 MiB are written, and removed again.
+    """
+    free = f"{shutil.disk_usage(folder).free / 2**30:.1f} GiB free"
+    block = os.urandom(2**20)  # of what no disk can compress
+    try:
+        with tempfile.TemporaryFile(dir=folder) as file:
+            began = time.perf_counter()
+            for _ in range(64):
+                file.write(block)
+            file.flush()
+            os.fsync(file.fileno())
+            seconds = time.perf_counter() - began
+            began = time.perf_counter()
+            for _ in range(8):
+                os.pwrite(file.fileno(), block[:4096], 0)
+                os.fsync(file.fileno())
+            sync = (time.perf_counter() - began) / 8
+    except OSError as error:
+        return {"space": free, "speed": f"nothing can be written here: {error}"}
+    speed = f"{64 / seconds:.0f} MiB/s written; {1000 * sync:.1f} ms for a row to be safe"
+    return {"space": free, "speed": speed}
+
+
+def describe_limits() -> dict[str, str]:
+    """Return how much of what a run needs this process may use, by name."""
+    limits = {"open files": resource.RLIMIT_NOFILE, "processes": resource.RLIMIT_NPROC}
+    found = {name: resource.getrlimit(number)[0] for name, number in limits.items()}
+    texts = {
+        name: "unlimited" if limit == resource.RLIM_INFINITY else str(limit)
+        for name, limit in found.items()
+    }
+    if 0 <= found["open files"] < _FEW_FILES:
+        texts["open files"] += ": few for a run with many clients; ulimit -n 4096 allows more"
+    with contextlib.suppress(OSError):
+        shared = shutil.disk_usage("/dev/shm")
+        texts["/dev/shm"] = f"{shared.free / 2**30:.1f} GiB free of {shared.total / 2**30:.1f}"
+    return texts
 
 
 def describe_variables(variables: Mapping[str, str]) -> dict[str, str]:

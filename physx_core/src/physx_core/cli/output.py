@@ -4,7 +4,8 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Collection, Sequence
+import textwrap
+from collections.abc import Collection, Mapping, Sequence
 
 from physx_core.errors import printable
 
@@ -20,6 +21,20 @@ def show(text: object = "") -> None:
 def width() -> int:
     """Return the maximum line width in columns."""
     return shutil.get_terminal_size().columns if sys.stdout.isatty() else WIDTH
+
+
+def show_values(values: Mapping[str, str]) -> None:
+    """Print texts by name, indented, and wrapped where they are longer than a line."""
+    for name, text in values.items():
+        show(
+            textwrap.fill(
+                printable(f"  {name:<12} {text}"),
+                width(),
+                subsequent_indent=" " * 15,
+                break_long_words=False,
+                break_on_hyphens=False,
+            )
+        )
 
 
 def show_table(

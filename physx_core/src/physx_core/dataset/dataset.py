@@ -62,6 +62,12 @@ class Dataset(EpisodeReading, Closeable):
         self._closed = False
         self._look_for_writer()
 
+    def __repr__(self) -> str:
+        if self._closed:
+            return f"<Dataset {self.directory}: closed>"
+        counts = [f"{self.num_samples(mode):,} {mode}" for mode in self.modes]
+        return f"<Dataset {self.directory}: {', '.join(counts) or 'empty'}>"
+
     # Opening and closing --------------------------------------------------------------------
 
     @classmethod

@@ -8,9 +8,14 @@ from typing import Any
 
 from physx_core.components.visualizer import Observer
 
+_EPOCHS = "{desc}:{percentage:4.0f}%|{bar}| {remaining} left{postfix}"
+_AMOUNT = "{desc}:{percentage:4.0f}%|{bar}| {n_fmt} of {total_fmt}{unit}, {remaining} left{postfix}"
+_ENDLESS = "{desc}: {n_fmt}{unit} in {elapsed}, {rate_fmt}{postfix}"
+_LOSSES = {"loss/training": "loss", "loss/validation": "validation"}
+
 
 class ProgressBar(Observer):
-    """A bar on a terminal; otherwise, for logs, one line per minute and one at the end."""
+    """A bar as wide as the terminal; otherwise, for logs, a line per minute and one at the end."""
 
     def __init__(self) -> None:
         self._bar: Any = None
@@ -30,6 +35,8 @@ class ProgressBar(Observer):
             desc=task,
             total=total,
             unit=f" {unit}",
+            bar_format=_ENDLESS if total is None else _EPOCHS if unit == "batches" else _AMOUNT,
+            dynamic_ncols=self._is_terminal,
             mininterval=interval,
             maxinterval=interval,
             miniters=None if self._is_terminal else 0,
@@ -44,14 +51,15 @@ class ProgressBar(Observer):
             self._bar.update(count)
 
     def scalars(self, values: Mapping[str, float], step: int, timeline: str) -> None:
-        """Show an epoch's statistics after the bar, except those over several epochs.
+        """Show an epoch's number and losses after the bar.
 
         While environments generate, show their statistics instead.
         """
         if self._bar is None:
             return
         if timeline == "epoch":
-            shown = {k: v for k, v in values.items() if not k.endswith(("_mean", "_variance"))}
+            shown = {name: values[key] for key, name in _LOSSES.items() if key in values}
+            shown = {"epoch": float(step), **shown}
         else:
             shown = {k[7:]: v for k, v in values.items() if k.startswith("online/")}
         if shown:

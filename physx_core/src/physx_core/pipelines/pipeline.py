@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import sys
+import textwrap
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -15,6 +17,7 @@ from typing import TYPE_CHECKING, Any, ClassVar, Self
 
 import numpy as np
 
+from physx_core.cells import in_notebook
 from physx_core.components.visualizer import Observer
 from physx_core.config import EnvironmentConfig, to_plain
 from physx_core.dataset.write.delegation import Delegation
@@ -209,11 +212,17 @@ class Pipeline(ABC):
             store_result(self.session.path, self.result)
 
     def _say(self, *lines: str) -> None:
-        """Print lines to stderr, in the process that writes the session."""
-        if self._is_main and not self.quiet and sys.stderr is not None:
-            with contextlib.suppress(OSError, ValueError):  # a closed stderr must not end a run
-                sys.stderr.write("".join(f"{line}\n" for line in lines))
-                sys.stderr.flush()
+        """Print lines, in the process that writes the session.
+
+        They go to stderr, in a notebook to stdout, as it shows stderr as if all of it were errors;
+        on a terminal they are wrapped.
+        """
+        stream = sys.stdout if in_notebook() else sys.stderr
+        if self._is_main and not self.quiet and stream is not None:
+            with contextlib.suppress(OSError, ValueError):  # a closed stream must not end a run
+                columns = shutil.get_terminal_size().columns if stream.isatty() else 0
+                stream.write("".join(f"{_wrapped(line, columns)}\n" for line in lines))
+                stream.flush()
 
     def _describe_components(self) -> None:
         components = self._components()
@@ -425,3 +434,19 @@ def derive_seed(seed: int, mode: str, offset: int) -> list[int]:
             generate them again.
     """
     return [seed, _STREAMS[mode], offset]
+
+
+def _wrapped(line: str, columns: int) -> str:
+    """Return a line in pieces of a width at most; a command can be copied with its pieces."""
+    if not columns or len(line) <= columns:
+        return line
+    ending = " \\" if line.startswith("next: ") else ""
+    indent = " " * (len(line) - len(line.lstrip()) + 4)
+    pieces = textwrap.wrap(
+        line,
+        max(20, columns - len(ending)),
+        subsequent_indent=indent,
+        break_long_words=False,
+        break_on_hyphens=False,
+    )
+    return f"{ending}\n".join(pieces)

@@ -297,7 +297,7 @@ class Training(NewSessionPipeline):
         if self.epoch_id == self._resumed.epoch:
             self._batches_read = self.data.stored.count
             left = (self.epoch_nb - self.epoch_id) * self._epoch_batches - self.batch_id
-            self.observers.begin("training", max(0, left), "batches")
+            self.observers.begin(f"{self.epoch_nb} epochs", max(0, left), "batches")
 
     def epoch_begin(self) -> None:
         """Called before each epoch, when its batches are prepared."""

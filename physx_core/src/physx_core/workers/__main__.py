@@ -6,6 +6,7 @@ import argparse
 import os
 import sys
 
+from physx_core import cells
 from physx_core.errors import PhysxError
 from physx_core.net.handshake import TOKEN_VARIABLE
 from physx_core.processes import kill_descendants, prepare_worker
@@ -19,6 +20,7 @@ def main() -> int:
     parser.add_argument("--instance", type=int, help="number of the instance; any by default")
     options = parser.parse_args()
     prepare_worker()
+    cells.take()
     token = os.environ.pop(TOKEN_VARIABLE, "")
     try:
         return run_client(options.connect, token, options.instance)

@@ -24,6 +24,7 @@ from physx_core.errors import (
     StateError,
     UsageError,
     WrongSamplesError,
+    own_line,
 )
 from physx_core.fields import Field, check_together
 from physx_core.processes.endings import describe_ending, is_ending
@@ -589,15 +590,19 @@ class Instance(Closeable):
             step = -1
         else:
             step = environment.step_index if self._is_numbered else environment._step_count
+        place = own_line(error)
         if isinstance(error, PhysxError):
             if method != "import":
-                error.add_note(f"in {method}() of instance {self.instance_id}")
+                at = f", at {place}" if place else ""
+                error.add_note(f"in {method}() of instance {self.instance_id}{at}")
             return error
         summary = "".join(traceback.format_exception_only(error)).strip()
         if exits:
             summary = describe_ending(error)
         if isinstance(error, AttributeError):
             summary += explain_missing_attribute(error)
+        if place:
+            summary += f" ({place})"
         text = "".join(traceback.format_exception(error))
         return EnvironmentFailedError(self.instance_id, method, step, summary, text)
 

@@ -11,6 +11,7 @@ from collections import Counter
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
+from physx_core import cells
 from physx_core.components.launcher import ClientHandle, Launcher
 from physx_core.errors import ClientError, ConfigError
 from physx_core.net.handshake import TOKEN_VARIABLE
@@ -73,12 +74,14 @@ class ClientProcess(ClientHandle):
         try:
             # If this process ended, a pipe would make each line that the client writes an error.
             self._file = OutputFile() if self._detached else None
-            self._process = ChildProcess(
-                self._command,
-                variables=self._variables,
-                stderr=subprocess.PIPE if self._file is None else self._file.descriptor,
-                detached=self._detached,
-            )
+            with cells.lent() as (variables, descriptors):
+                self._process = ChildProcess(
+                    self._command,
+                    variables={**self._variables, **variables},
+                    stderr=subprocess.PIPE if self._file is None else self._file.descriptor,
+                    pass_fds=descriptors,
+                    detached=self._detached,
+                )
         except OSError as error:
             raise ClientError(self.instance_id, f"could not be started: {error}.") from error
         if self._core is not None:

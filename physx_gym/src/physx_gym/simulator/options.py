@@ -7,10 +7,20 @@ from collections.abc import Mapping, Sequence
 from typing import Any
 
 from physx_core.errors import ConfigError, UnknownOptionError
-from physx_sim import BodySettings, Layout, Motor, Sensor, World
+from physx_sim import (
+    BodySettings,
+    JointSettings,
+    Layout,
+    Motor,
+    Robot,
+    Sensor,
+    World,
+)
 from physx_sim.engines import read_robot
 
-_NAMES = frozenset({"name", "joint", "urdf", "package_dirs", "joints", "feet", "path", "heights"})
+_NAMES = frozenset(
+    {"name", "joint", "urdf", "package_dirs", "joints", "feet", "path", "heights", "mimic"}
+)
 """Fields that identify a thing rather than configure it; these are not options."""
 _PARTS = ("robots", "objects")
 _CHANGEABLE = {
@@ -27,6 +37,9 @@ def world_options(world: World) -> dict[str, Any]:
     found["ground"] = {} if world.ground is None else _fields_of(world.ground)
     for part in _PARTS:
         found[part] = {thing.name: _fields_of(thing) for thing in getattr(world, part)}
+    for robot in world.robots:
+        joints = {name: _fields_of(settings) for name, settings in robot.joints.items()}
+        found["robots"][robot.name]["joints"] = joints
     return found
 
 
@@ -145,9 +158,21 @@ def _fields_of(thing: Any, without: set[str] | None = None) -> dict[str, Any]:
 
 def _change(where: str, thing: Any, options: Any, without: Sequence[str] = ()) -> Any:
     known = _fields_of(thing, set(without))
+    if isinstance(thing, Robot):
+        known["joints"] = thing.joints
+        options = {**options, "joints": _joints(where, thing, options.get("joints", {}))}
     check_known(where, options, (*known, *without))
     new = {name: value for name, value in options.items() if not _same(value, known.get(name))}
     return dataclasses.replace(thing, **new) if new else thing
+
+
+def _joints(where: str, robot: Robot, options: Any) -> Mapping[str, JointSettings]:
+    """Return the settings of a robot's joints, by name, with some options changed."""
+    found, where = dict(robot.joints), f"{where}.joints"
+    for name, own in _mapping(where, options).items():
+        found[name] = _change(f"{where}.{name}", found.get(name, JointSettings()), own)
+    same = all(found[name] is robot.joints.get(name) for name in found)
+    return robot.joints if same else found
 
 
 def _same(value: Any, known: Any) -> bool:

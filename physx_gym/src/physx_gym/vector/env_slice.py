@@ -9,7 +9,7 @@ from typing import Any, cast
 import gymnasium
 from gymnasium.vector import AutoresetMode
 
-from physx_core.errors import ConfigError, EnvironmentFailedError, PhysxError, UsageError
+from physx_core.errors import ConfigError, EnvironmentFailedError, PhysxError, UsageError, own_line
 from physx_core.net import Kind, encode, encode_error
 from physx_core.typing import Array
 from physx_gym.bridge.make_env import make_env
@@ -124,6 +124,8 @@ class EnvSlice:
     def _wrap(self, error: Exception, method: str, place: int) -> EnvironmentFailedError:
         step = self._steps[place] - 1 if method == "step" else -1
         summary = "".join(traceback.format_exception_only(error)).strip()
+        if line := own_line(error):
+            summary += f" ({line})"
         text = "".join(traceback.format_exception(error))
         return EnvironmentFailedError(self._first + place + 1, method, step, summary, text)
 

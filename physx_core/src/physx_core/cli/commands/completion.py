@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import contextlib
-import io
-import os
 import re
 from collections.abc import Iterator, Sequence
 
 from physx_core import plugins
 from physx_core.cli.arguments import METAVAR
 from physx_core.cli.command import main
+from physx_core.cli.help_texts import help_of, options_in
 from physx_core.errors import PhysxError, UsageError
 from physx_core.plugins.kinds import kind_names
 
@@ -58,9 +57,6 @@ _KIND_OF = {"online": "buffer", "statistics": "visualizer"}
 """Name of an option to the kind of component that it takes, where the two differ."""
 _WORD = re.compile(r"[\w.][\w./@+-]*|--[\w.-]+")
 """Text that a shell takes as a literal word: names in metadata are not trusted."""
-_OPTION = re.compile(
-    r"^[│ ]*(?:-\w, )?(--[a-z][\w.-]*)(?:, (--[a-z][\w.-]*))?(?: (\S.*?))?(?:  |│|$)"
-)
 _GROUP = re.compile(r"\[-[^][]*(?:\[[^][]*(?:\[[^][]*\])?\])?[^][]*\]|\[OPTIONS\]")
 
 
@@ -83,7 +79,7 @@ def _after(words: Sequence[str]) -> Iterator[str]:
         yield from re.findall(r"^  ([a-z][a-z-]*)  ", _help(), re.MULTILINE)
         return
     text = _help(words[0])
-    options = dict(_options(text))
+    options = dict(options_in(text))
     arguments = [f"{name}." for name, (metavar, _) in options.items() if metavar == METAVAR]
     options |= {f"{name}NAME": ("VALUE", "") for name in arguments}
     option, place = "", 0
@@ -107,28 +103,7 @@ def _after(words: Sequence[str]) -> Iterator[str]:
 
 def _help(*command: str) -> str:
     """Return the output of ``--help``."""
-    os.environ["COLUMNS"] = "80"  # each option on its own line
-    printed = io.StringIO()
-    with contextlib.redirect_stdout(printed):
-        main([*command, "--help"])
-    return printed.getvalue()
-
-
-def _options(text: str) -> Iterator[tuple[str, tuple[str, str]]]:
-    """Yield the options of a help text, each with its metavariable and its description."""
-    names: tuple[str, ...] = ()
-    metavar = description = ""
-    for line in [*text.splitlines(), "╰"]:
-        match = _OPTION.match(line)
-        if match or line.startswith("╰"):
-            for name in names:
-                yield name, (metavar, description)
-            names, description = (), ""
-        if match:
-            names = tuple(name for name in match.groups()[:2] if name)
-            metavar, description = match[3] or "", line[match.end() :]
-        else:
-            description += line
+    return help_of(lambda words: main([*command, *words]))
 
 
 def _values(name: str, metavar: str, description: str) -> Iterator[str]:

@@ -1,8 +1,7 @@
-"""``physx info``: show a session or dataset; without a folder, what is installed, and where."""
+"""``physx info``: show what a session or dataset contains."""
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -11,10 +10,8 @@ from typing import Annotated
 import tyro
 
 from physx_core import checkpoint
-from physx_core.cli import installation
-from physx_core.cli.commands.plugins import load_all
 from physx_core.cli.dataset_tables import print_dataset
-from physx_core.cli.output import show, show_table
+from physx_core.cli.output import show
 from physx_core.errors import CheckpointError, DatasetNotFoundError, PhysxError, UsageError
 from physx_core.pipelines.learning.data_record import (
     describe_changes,
@@ -26,50 +23,26 @@ from physx_core.results import read_results
 
 @dataclass
 class Info:
-    """Show the contents of a session or dataset.
+    """Show the contents of a session or dataset; physx doctor shows what is installed."""
 
-    Without a folder, show what a bug report needs: the interpreter, versions, where each package
-    comes from, drivers, broken plugins, and packages that hide others.
-    """
-
-    directory: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="[DIR]")] = None
+    directory: Annotated[tyro.conf.Positional[str | None], tyro.conf.arg(metavar="DIR")] = None
     """A session's or a dataset's folder."""
     verify: bool = False
     """Check every byte, not only sizes and headers."""
 
 
 def run(words: Sequence[str]) -> None:
-    """Print a folder's dataset and checkpoints, or what is installed."""
+    """Print a folder's dataset and checkpoints.
+
+    Raises:
+        UsageError: If no folder is named.
+    """
     options = tyro.cli(Info, args=words, prog="physx info")
-    if options.directory is not None:
-        _show_session(Path(options.directory), options)
-    elif options.verify:
-        raise UsageError("--verify needs a folder: physx info SESSION --verify.")
-    else:
-        _show_installation()
-
-
-def _show_installation() -> None:
-    """Print what a bug report needs, without secrets."""
-    packages = installation.find_packages()
-    for title, values in (
-        ("machine", installation.describe_machine()),
-        ("drivers", installation.describe_drivers(os.environ)),
-        ("environment variables", installation.describe_variables(os.environ)),
-    ):
-        show(title if values else f"{title}: none relevant")
-        for name, text in values.items():
-            show(f"  {name:<12} {text}")
-    show("packages")
-    rows = [(each.name, each.version, each.place) for each in packages]
-    show_table(("name", "version", "imported from"), rows, indent=2)
-    problems = [f"{each.name}: {text}" for each in packages for text in each.problems]
-    show(f"conflicts: {'' if problems else 'none'}")
-    for text in problems:
-        show(f"  {text}")
-    show("plugins")
-    for _ in load_all():
-        pass
+    if options.directory is None:
+        raise UsageError(
+            "physx info needs a folder: physx info SESSION. What is installed: physx doctor."
+        )
+    _show_session(Path(options.directory), options)
 
 
 def _data_of(place: Path, found: checkpoint.Checkpoint) -> Iterator[str]:

@@ -1,0 +1,233 @@
+"""Intervals of `physx identify`: do they hold, and does it say when they do not?
+
+    python benchmarks/identify.py [--check] [--draws 100] [coverage] [panda] [engines] [structure]
+                                  [excitation]
+
+Coverage: the share of nominal 95 % intervals that hold the true value: an arm of two links that
+tracks a motion for 4 s at 200 Hz, six parameters, noise of torques (5 % of their deviation) with a
+correlation from sample to sample, of encoders, of both. The peer's own function, of MuJoCo's sysid,
+gets the least-squares residual and Jacobian along the true path, where only torques are noisy.
+Panda: seven joints, 20 s at 100 Hz, 5 % noise. Engines: logs of each engine, all fitted on
+Pinocchio. Structure: friction that the model lacks, and logs without model error. Excitation:
+expected errors of the proposed motion relative to a sweep in frequency of equal length and reach.
+"""
+
+from __future__ import annotations
+
+import importlib
+import sys
+import time
+from collections.abc import Callable
+from concurrent.futures import ProcessPoolExecutor
+from pathlib import Path
+from typing import Any
+from unittest.mock import MagicMock
+
+import numpy as np
+from measure import claim, finish
+
+sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "shared"))
+import logged_arm as arm
+
+from physx_core.typing import Vector
+from physx_dart import PinocchioBackend
+from physx_identify import Identification, Log, Model, identify, propose
+from physx_identify.excitation import expected_errors
+from physx_identify.model import Path as Motion
+from physx_identify.unknowns import as_unknowns
+from physx_sim import JointSettings, Robot
+
+UNKNOWN = ("mass", "damping", "friction")
+SAMPLES = 800
+HIDDEN = 2.0
+"""Stribeck friction, in N m."""
+CORRELATIONS = (0.0, 0.9, 0.98)
+CELLS = {"torque": (1e-6, 0.05), "encoder": (1e-3, 0.005), "both": (1e-4, 0.05)}
+"""Noise of encoders in rad, and of torques relative to their deviation."""
+_CLEAN: dict[str, tuple[Vector, Vector]] = {}
+
+
+def clean(engine: type = PinocchioBackend) -> tuple[Vector, Vector]:
+    """Return the arm's motion and torques without noise, simulated once."""
+    name = engine.__name__
+    if name not in _CLEAN:
+        _CLEAN[name] = arm.simulated(samples=SAMPLES, engine=engine)
+    return _CLEAN[name]
+
+
+def found(cell: str, correlation: float, seed: int) -> Identification:
+    """Return what a log with a draw of noise says."""
+    encoder, torque = CELLS[cell]
+    log = arm.noisy(clean(), encoder, torque, correlation, seed)
+    return identify(log, arm.KNOWN, UNKNOWN)
+
+
+def draw(job: tuple[str, float, int]) -> tuple[list[bool] | None, bool]:
+    """Return which intervals of a draw hold, None without convergence; whether a test failed."""
+    result = found(*job)
+    held = [result[n].low <= true <= result[n].high for n, true in arm.HIDDEN.items()] \
+        if result.converged else None  # fmt: skip
+    return held, bool(result.lacks)
+
+
+def sysid() -> Any:
+    """Return the module of MuJoCo's intervals, without what it prints and plots with."""
+    while True:
+        try:
+            return importlib.import_module("mujoco.sysid._src.optimize")
+        except ModuleNotFoundError as error:
+            sys.modules[str(error.name)] = MagicMock()
+
+
+def peer(correlation: float, seed: int) -> list[bool]:
+    """Return which intervals of MuJoCo's sysid hold."""
+    positions, torques = clean()
+    log = arm.noisy((positions, torques), 0.0, 0.05, correlation, seed)
+    model = Model(arm.KNOWN)
+    parameters = model.parameters(as_unknowns(UNKNOWN))
+    path = Motion(positions, arm.PERIOD)
+    directions = np.stack([model.direction(each) for each in parameters], axis=1)
+    nominal = np.array([each.nominal for each in parameters])
+    given = np.column_stack([directions, model.numbers - directions @ nominal])
+    columns = model.columns(path, given, path.ends)
+    scale = 1 / torques.std(axis=0)[None, :, None]
+    jacobian = (columns[..., :-1] * scale).reshape(-1, len(parameters))
+    target = ((log.torques[1:-1] - columns[..., -1]) * scale[..., 0]).ravel()
+    values = np.linalg.lstsq(jacobian, target, rcond=None)[0]
+    _, half = sysid().calculate_intervals([target - jacobian @ values], jacobian)
+    true = np.array(list(arm.HIDDEN.values()))
+    inside: list[bool] = (np.abs(values - true) <= half).tolist()
+    return inside
+
+
+def coverage(draws: int) -> bool:
+    """Print the share of intervals that hold in each cell."""
+    print(f"Intervals that hold the true value, {draws} draws of 6 parameters")
+    good = True
+    with ProcessPoolExecutor(2) as pool:
+        for correlation in CORRELATIONS:
+            share = np.mean([peer(correlation, seed) for seed in range(draws)])
+            print(f"  MuJoCo sysid      noise of torques, correlation {correlation:4}: {share:.3f}")
+        for cell in CELLS:
+            for correlation in CORRELATIONS:
+                jobs = [(cell, correlation, seed) for seed in range(draws)]
+                results = list(pool.map(draw, jobs, chunksize=4))
+                held = np.array([each for each, _ in results if each is not None])
+                false = sum(failed for _, failed in results)
+                print(
+                    f"  physx identify    noise of {cell:8}correlation {correlation:4}: "
+                    f"{held.mean():.3f}, worst parameter {held.mean(axis=0).min():.2f}, without an "
+                    f"interval {draws - len(held)}, called model error {false}",
+                    flush=True,
+                )
+                good &= claim(f"{cell}, {correlation}: pooled", held.mean(), at_least=0.90)
+    return good
+
+
+PANDA, FINGERS = "panda/panda", ("panda_finger_joint1", "panda_finger_joint2")
+
+
+def panda() -> bool:
+    """Print how well a Panda is found from 20 s, and how long it takes."""
+    known = Robot(PANDA, collisions="none")
+    names = Model(known, held=FINGERS).joints
+    true = {name: JointSettings(damping=0.5, friction=0.8, armature=0.1) for name in names}
+    model = Model(Robot(PANDA, collisions="none", joints=true), held=FINGERS)
+    random, period = np.random.default_rng(0), 0.01
+    time_ = np.arange(2000) * period
+    joints = model.movable.model.joints
+    middle = np.array([0.5 * (each.lower + each.upper) for each in joints])
+    reach = np.array([0.3 * (each.upper - each.lower) for each in joints])
+    rates = 2 * np.pi * np.linspace(0.05, 0.5, 8)
+    phases = random.uniform(0, 6.28, (len(joints), len(rates)))
+    waves = np.stack([np.sin(np.outer(time_, rates) + own).sum(axis=1) / 4 for own in phases], 1)
+    positions = middle + reach * waves
+    motion = Motion(positions, period)
+    torques = model.columns(motion, model.numbers[:, None], motion.ends)[..., 0]
+    torques += 0.05 * torques.std(axis=0) * random.standard_normal(torques.shape)
+    torques = np.pad(torques, ((1, 1), (0, 0)), mode="edge")
+    noisy = positions + 1e-5 * random.standard_normal(positions.shape)
+    log = Log(model.joints, period, noisy, torques)
+    unknown = [f"{kind}:{name}" for kind in ("damping", "friction", "armature") for name in names]
+    links = [b.name for b in model.movable.model.bodies if b.name in LINKS]
+    begin = time.process_time()
+    result = identify(log, known, [*unknown, *(f"mass:{link}" for link in links)], held=FINGERS)
+    seconds = time.process_time() - begin
+    inside = []
+    for each in result.estimates:
+        if each.error is None:
+            print(f"  {each.name}: inseparable")
+            continue
+        value = {"damping": 0.5, "friction": 0.8, "armature": 0.1}.get(each.kind, each.nominal)
+        inside.append(each.low is not None and each.low <= value <= (each.high or 0.0))
+        if each.kind == "mass":
+            print(f"  {each.name}: {100 * (each.error / each.nominal):.2f} % standard error")
+    print(f"  converged: {result.converged}; lacks {result.lacks or 'nothing'}")
+    print(f"  {np.sum(inside)} of {len(inside)} intervals hold; {seconds:.0f} s of processor time")
+    good = claim("Panda: intervals that hold", float(np.mean(inside)), at_least=0.85)
+    return claim("Panda: seconds of processor time", seconds, at_most=60) and good
+
+
+LINKS = tuple(f"panda_link{number}" for number in range(1, 8))
+
+
+def engines() -> bool:
+    """Print whether logs of other engines are told, or called model error."""
+    good = True
+    for engine in arm.ENGINES:
+        log = arm.noisy(clean(engine))
+        result = identify(log, arm.KNOWN, UNKNOWN)
+        inside = [result[n].low <= true <= result[n].high for n, true in arm.HIDDEN.items()]
+        lacks = result.lacks or "nothing"
+        print(f"  log of {engine.__name__}: {sum(inside)} of 6 hold; lacks {lacks}")
+        good &= sum(inside) >= 5 or not result.holds
+    return claim("told or called model error", float(good), at_least=1)
+
+
+def structure(draws: int) -> bool:
+    """Print how often a hidden friction is named."""
+    positions, torques = clean()
+    speed = np.gradient(positions[:, 0], arm.PERIOD)
+    more = np.stack([HIDDEN * np.sign(speed) * np.exp(-np.abs(speed) / 0.1), 0 * speed], axis=1)
+    flagged = 0
+    for seed in range(draws):
+        log = arm.noisy((positions, torques + more), seed=seed)
+        flagged += bool(identify(log, arm.KNOWN, UNKNOWN).lacks)
+    log = arm.noisy((positions, torques + more))
+    error = identify(log, arm.KNOWN, [*UNKNOWN, "stribeck:shoulder"])["stribeck shoulder"].error
+    size = HIDDEN / (error or np.inf)
+    print(f"  Stribeck friction of {size:.1f} standard errors: named {flagged} of {draws}")
+    return claim("hidden friction named", flagged / draws, at_least=0.95)
+
+
+def excitation() -> bool:
+    """Print how much the proposed motion tells relative to a sweep."""
+    result = found("both", 0.9, 0)
+    motion = propose(result, arm.KNOWN)
+    moments = result.period * np.arange(len(motion.positions))
+    sweep = np.sin(2 * np.pi * (0.2 + 0.15 * moments) * moments)[:, None] * result.farthest
+    speed = np.abs(np.gradient(sweep, result.period, axis=0)).max(axis=0)
+    sweep *= 0.9 * np.minimum(1, result.fastest / speed)
+    swept = expected_errors(result, arm.KNOWN, sweep)
+    ratios = [motion.errors[name] / swept[name] for name in motion.errors]
+    mean = float(np.exp(np.mean(np.log(ratios))))
+    print(f"  expected errors relative to a sweep: {mean:.2f} (geometric mean)")
+    return claim("proposed relative to a sweep", mean, at_most=0.5)
+
+
+def main(words: list[str]) -> None:
+    """Run the parts that are named, or all."""
+    draws = int(words[words.index("--draws") + 1]) if "--draws" in words else 100
+    parts: dict[str, Callable[[], bool]] = {
+        "coverage": lambda: coverage(draws),
+        "panda": panda,
+        "engines": engines,
+        "structure": lambda: structure(min(draws, 20)),
+        "excitation": excitation,
+    }
+    chosen = [name for name in parts if name in words] or list(parts)
+    finish([parts[name]() for name in chosen])
+
+
+if __name__ == "__main__":
+    main(sys.argv[1:])

@@ -1,0 +1,100 @@
+"""``physx identify``: parameters of a robot from a log, with intervals."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from typing import Annotated
+
+import tyro
+
+from physx_core.cli import show
+from physx_identify import (
+    Model,
+    identify,
+    propose,
+    read_log,
+    store_identification,
+    write_identification,
+    write_motion,
+)
+from physx_sim import Robot
+
+
+@dataclass
+class Identify:
+    """Find parameters of a robot in a log, with intervals that hold."""
+
+    log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")]
+    """File or folder with positions and torques of the joints: CSV, Parquet, npz, HDF5, a physx
+    dataset, an episode's log, or a LeRobot dataset."""
+    robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT")]
+    """URDF or MJCF file, or the name of a robot; see physx robots."""
+    free: tuple[str, ...] = ("mass", "damping", "friction")
+    """What is unknown: mass, inertia, payload (of links); damping, friction, stribeck, armature,
+    gain, bias, encoder (of joints); delay. mass:hand names one; mass:hand=0.7,0.1 is known to be
+    0.7 +- 0.1 beforehand."""
+    output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
+    """TOML file with values, intervals and draws, which training can draw from."""
+    session: str | None = None
+    """Folder that keeps the result, for physx report."""
+    propose: str | None = None
+    """CSV file for a motion of the same length that would tell more."""
+    period: float | None = None
+    """Time between samples, in s; by default from the log's column of times."""
+    columns: dict[str, str] = field(default_factory=dict)
+    """Columns of positions, torques, velocities and time, where they have unusual names."""
+    episode: int | None = None
+    """Episode of a dataset with several."""
+    gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
+    """In m/s^2."""
+    held: tuple[str, ...] = ()
+    """Joints that did not move and are not in the log, such as a gripper's: they are at 0."""
+    instant: bool = False
+    """Torques are those at the instants of the samples, instead of held from each to the next."""
+    level: float = 0.95
+    """Nominal probability of the intervals."""
+    json: bool = False
+    """Print JSON instead of text."""
+
+
+def run(words: Sequence[str]) -> None:
+    """Print what the log says, and store it if requested."""
+    options = tyro.cli(Identify, args=words, prog="physx identify")
+    robot = Robot(options.robot)
+    begin = time.monotonic()
+    log = read_log(
+        options.log,
+        Model(robot, options.gravity, options.held).joints,
+        period=options.period,
+        columns=options.columns,
+        episode=options.episode,
+    )
+    found = identify(
+        log,
+        robot,
+        options.free,
+        level=options.level,
+        gravity=options.gravity,
+        held=options.held,
+        instant=options.instant,
+    )
+    show(found.to_json() if options.json else found)
+    notes = []
+    if log.left_out:
+        notes.append(f"columns not used: {', '.join(log.left_out)}")
+    if options.output is not None:
+        write_identification(options.output, found)
+        notes.append(f"identification: {options.output}")
+    if options.session is not None:
+        store_identification(options.session, found, time.monotonic() - begin)
+        notes.append(
+            f"result: {options.session}; physx report {options.session} makes a page of it"
+        )
+    if options.propose is not None:
+        motion = propose(found, robot, gravity=options.gravity, held=options.held)
+        write_motion(options.propose, motion)
+        notes += ["", *str(motion).splitlines(), f"motion: {options.propose}"]
+    if not options.json:
+        show("\n".join(["", *notes]) if notes else "")

@@ -1,0 +1,85 @@
+"""Estimates: what a log says about parameters and its own noise, one by one."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class Estimate:
+    """What the log says about one parameter.
+
+    Attributes:
+        name: Such as ``"friction elbow"``.
+        kind: As in `Unknown`.
+        of: Name of the link or joint.
+        part: Which number of an inertia.
+        unit: Its unit.
+        nominal: In the robot's file and settings.
+        value: The most likely value that is physical.
+        verdict: ``"told"``; ``"hardly told"``: the interval is wider than the value; or
+            ``"inseparable"``.
+        error: Standard error; None: the parameter cannot be told from others.
+        low: Lower end of the interval; None likewise, or if the fit did not converge.
+        high: Upper end.
+        blocks: Standard error from the spread between blocks of the log, relative to `error`: a
+            check, about 1.
+    """
+
+    name: str
+    kind: str
+    of: str
+    part: str
+    unit: str
+    nominal: float
+    value: float
+    verdict: str
+    error: float | None = None
+    low: float | None = None
+    high: float | None = None
+    blocks: float | None = None
+
+
+@dataclass(frozen=True)
+class Combination:
+    """A sum of parameters that the log tells, although it cannot tell them apart.
+
+    Attributes:
+        factors: Factor of each parameter, by name.
+        value: Of the sum.
+        low: Lower end of its interval.
+        high: Upper end.
+    """
+
+    factors: Mapping[str, float]
+    value: float
+    low: float | None = None
+    high: float | None = None
+
+    def __str__(self) -> str:
+        return " + ".join(
+            name if factor == 1 else f"{factor:.4g} x {name}"
+            for name, factor in self.factors.items()
+        ).replace("+ -", "- ")
+
+
+@dataclass(frozen=True)
+class LogNoise:
+    """Noise of a log.
+
+    Attributes:
+        encoder: Standard deviation of the positions, in rad or m.
+        torque: Standard deviation of each torque, in N m or N.
+        correlation: Of each torque, from sample to sample.
+        order: Order of the autoregression.
+        innovations: Deviation of the autoregression's innovations, of each torque.
+        regression: Its coefficients, of each torque.
+    """
+
+    encoder: float
+    torque: Sequence[float]
+    correlation: Sequence[float]
+    order: int
+    innovations: Sequence[float]
+    regression: Sequence[Sequence[float]]

@@ -1,0 +1,343 @@
+"""The fit: unknowns from torques, with instruments from a path that the noise does not reach.
+
+Torques are linear in the unknowns, but their columns are made of measured positions, so ordinary
+least squares is biased. The instruments are columns along another path: the measured one, corrected
+by what the torques say about the encoders' errors, and smoothed. What is left of those errors is
+uncorrelated with the residual, so no controller and no commanded motion have to be known.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.linalg import qr, solve_triangular
+
+from physx_core.typing import Array, Vector
+from physx_identify.errors import IdentificationError
+from physx_identify.model import Model, Path
+from physx_identify.noise import ORDERS, Noise, Whitener
+from physx_identify.smooth import Smoother
+from physx_identify.unknowns import Parameter
+
+_STEPS = 20
+_WHITE_STEPS, _NOISE_STEPS, _PATH_STEPS = 2, 5, 7
+"""Steps that take the noise of torques as white; that look at it, the last by its exact likelihood;
+that correct the path. What wrong values leave looks like correlated noise, so that comes second."""
+_CLOSE = 0.1
+"""Change of a value between two steps, in standard errors, that ends them."""
+_LOWEST = 0.2
+"""Share of a nominal value below which the path is not corrected with a value."""
+_EDGE = 4
+"""Samples left out at both ends, where the smoothed path is uncertain."""
+_SEPARABLE = 1e-6
+"""Relative length of what is left of a column without the others, below which it is one of them."""
+_STILL = 0.02
+"""Velocity below which dry friction is unknown, in rad/s or m/s."""
+
+
+@dataclass(frozen=True)
+class Data:
+    """Measured motion and torques.
+
+    Attributes:
+        positions: Shape (samples, joints), in rad or m.
+        torques: Shape (samples, joints), in N m or N.
+        period: In s.
+        instant: As in `Path`.
+    """
+
+    positions: Vector
+    torques: Vector
+    period: float
+    instant: bool = False
+
+    def part(self, rows: slice) -> Data:
+        """Return a part of the samples."""
+        return Data(self.positions[rows], self.torques[rows], self.period, self.instant)
+
+
+@dataclass(frozen=True)
+class Fit:
+    """What a fit found.
+
+    Attributes:
+        values: Of all parameters; those that cannot be told apart stay as they were.
+        independent: Places of the parameters that were fitted, the others held.
+        dependent: Places of the held ones.
+        mixing: What a unit of each held parameter adds to the fitted ones, shape (independent,
+            dependent).
+        covariance: Of the fitted values, shape (independent, independent).
+        noise: The log's noise.
+        steps: Number of steps.
+        converged: Whether the last step was smaller than a tenth of the standard errors.
+        white: Whitened residual, shape (rows,).
+        instruments: Whitened columns along the other path, shape (rows, parameters).
+        columns: Whitened columns of what was measured, shape (rows, parameters).
+        torques: Torques of the model along the other path, shape (samples - 2, joints).
+        residual: Of the torques, shape (samples - 2, joints), in N m or N.
+        used: Which torques count, shape (samples - 2, joints).
+        path: The path of the instruments.
+        whitener: What whitens.
+    """
+
+    values: Vector
+    independent: Array
+    dependent: Array
+    mixing: Vector
+    covariance: Vector
+    noise: Noise
+    steps: int
+    converged: bool
+    white: Vector
+    instruments: Vector
+    columns: Vector
+    torques: Vector
+    residual: Vector
+    used: Array
+    path: Path
+    whitener: Whitener
+
+    @property
+    def freedom(self) -> int:
+        """Number of residuals minus that of fitted values."""
+        return int(self.used.sum()) - len(self.independent)
+
+
+def fit(
+    model: Model,
+    parameters: Sequence[Parameter],
+    data: Data,
+    start: Vector | None = None,
+    noise: Noise | None = None,
+) -> Fit:
+    """Fit parameters.
+
+    Args:
+        model: The robot.
+        parameters: What is unknown.
+        data: The log.
+        start: Values to start at; None: those of least squares along the smoothed path.
+        noise: Noise of the log to start with; None: found from the first residual.
+    """
+    return _Problem(model, parameters, data).solve(start, noise)
+
+
+@dataclass(frozen=True)
+class _Equation:
+    """Torques that are linear in parameters: target = columns @ values + residual.
+
+    Attributes:
+        instruments: Columns along a path that the noise does not reach, shape (samples, joints,
+            parameters).
+        columns: Columns of what was measured, of the same shape.
+        target: Shape (samples, joints).
+        stencil: As in `Model.stencil`, along the same path as the instruments.
+    """
+
+    instruments: Vector
+    columns: Vector
+    target: Vector
+    stencil: Vector
+
+
+class _Problem:
+    def __init__(self, model: Model, parameters: Sequence[Parameter], data: Data) -> None:
+        self._model, self._parameters, self._data = model, parameters, data
+        self._nominal = np.array([each.nominal for each in parameters])
+        self._directions = np.stack([model.direction(each) for each in parameters], axis=1)
+        self._known = model.numbers - self._directions @ self._nominal
+        self._lowest = np.array([
+            -np.inf if each.lowest is None else _LOWEST * each.nominal for each in parameters
+        ])  # fmt: skip
+        self._special = [
+            (place, each) for place, each in enumerate(parameters)
+            if each.kind in ("gain", "bias", "encoder", "delay")
+        ]  # fmt: skip
+        joints = model.joints
+        dry = np.zeros(len(joints), bool)
+        rubbing = model.numbers[11 * len(joints) : 13 * len(joints)].reshape(2, -1)
+        dry |= rubbing.any(axis=0)
+        for each in parameters:
+            if each.kind in ("friction", "stribeck"):
+                dry[joints.index(each.of)] = True
+        self._dry = dry
+
+    def _positions(self, values: Vector) -> Vector:
+        """Return measured positions without the encoders' offsets."""
+        found = self._data.positions
+        for place, each in self._special:
+            if each.kind == "encoder":
+                offset = values[place] * (np.array(self._model.joints) == each.of)
+                found = found - offset
+        return found
+
+    def _torques(self, values: Vector) -> Vector:
+        """Return measured torques at the times of the positions, shape (samples - 2, joints)."""
+        torques = self._data.torques
+        for place, each in self._special:
+            if each.kind == "delay" and values[place]:
+                time = np.arange(len(torques)) * self._data.period
+                late = time + values[place]
+                torques = np.stack([np.interp(late, time, own) for own in torques.T], axis=1)
+        return torques[1:-1]
+
+    def _equation(self, path: Path, raw: Path, values: Vector) -> _Equation:
+        """Return what is linear in the parameters, near values of them.
+
+        Args:
+            path: That of the instruments.
+            raw: As measured.
+            values: Values of the parameters.
+        """
+        numbers = self._known + self._directions @ np.maximum(values, self._lowest)
+        stencil = self._model.stencil(path, numbers)
+        torques = self._torques(values)
+        instruments, known = self._columns(path, path.ends, stencil, torques)
+        instruments = self._endogenous(instruments, known, values)
+        columns, known = self._columns(raw, path.ends, stencil, torques)
+        target = torques - known
+        for place, each in self._special:
+            if each.kind == "gain":
+                target = target + columns[..., place]
+            elif each.kind in ("delay", "encoder"):
+                columns[..., place] = instruments[..., place]
+                target = target + columns[..., place] * values[place]
+        return _Equation(instruments, columns, target, stencil)
+
+    def _columns(
+        self, path: Path, signs: Vector, stencil: Vector, torques: Vector
+    ) -> tuple[Vector, Vector]:
+        """Return columns, shape (samples, joints, parameters), and what is known beside them."""
+        given = np.column_stack([self._directions, self._known])
+        found = self._model.columns(path, given, signs)
+        columns, known = found[..., :-1], found[..., -1]
+        for place, each in self._special:
+            if each.kind == "delay":
+                columns[..., place] = -np.gradient(torques, path.period, axis=0)
+                continue
+            joint = self._model.joints.index(each.of)
+            if each.kind == "encoder":
+                columns[..., place] = -stencil.sum(axis=0)[:, :, joint]
+            else:
+                columns[:, joint, place] = -torques[:, joint] if each.kind == "gain" else 1.0
+        return columns, known
+
+    def solve(self, start: Vector | None, noise: Noise | None) -> Fit:
+        """Repeat: noise of the residual, values, path."""
+        values = self._nominal if start is None else start
+        smoother, fixed = Smoother(self._positions(values)), noise is not None
+        corrections: Vector | float = 0.0
+        found: Fit | None = None
+        for step in range(1, _STEPS + 1):
+            measured = self._positions(values)
+            raw = Path(measured, self._data.period, self._data.instant)
+            if step <= _PATH_STEPS:  # then it stays, or the sign of slow motions may never settle
+                path = dataclasses.replace(raw, positions=smoother(measured + corrections))
+                used = ~(self._dry & (np.abs(path.ends) < _STILL))
+                used[:_EDGE] = used[-_EDGE:] = False
+            equation = self._equation(path, raw, values)
+            if start is None and step == 1:
+                values = self._first(path, smoother, used)
+            whitener = Whitener(equation.stencil, used)
+            residual = equation.target - equation.columns @ values
+            if not fixed:
+                if step == _NOISE_STEPS:
+                    assert noise is not None
+                    noise, fixed = whitener.fit(residual, noise), True
+                else:
+                    noise = whitener.guess(residual, ORDERS if step > _WHITE_STEPS else 0)
+            assert noise is not None
+            found = self._step(whitener, equation, values, noise, step, path, used)
+            moved = np.abs(found.values - values)[found.independent]
+            values = found.values
+            if step > _PATH_STEPS and (moved < _CLOSE * np.sqrt(np.diag(found.covariance))).all():
+                return dataclasses.replace(found, converged=True)
+            corrections = whitener.corrections(found.residual, noise)
+        assert found is not None
+        return found
+
+    def _endogenous(self, columns: Vector, known: Vector, values: Vector) -> Vector:
+        """Return columns whose torques are the model's own instead of measured ones."""
+        plain = [p.kind not in ("gain", "delay", "encoder") for p in self._parameters]
+        own = known + columns[..., plain] @ values[plain]
+        found = columns.copy()
+        for place, each in self._special:
+            if each.kind == "delay":
+                found[..., place] = -np.gradient(own, self._data.period, axis=0)
+            elif each.kind == "gain":
+                joint = self._model.joints.index(each.of)
+                found[:, joint, place] = -own[:, joint]
+        return found
+
+    def _first(self, path: Path, smoother: Smoother, used: Array) -> Vector:
+        """Return the values of least squares along a smoothed path, for torques smoothed alike."""
+        smooth = dataclasses.replace(self._data, torques=smoother(self._data.torques))
+        equation = _Problem(self._model, self._parameters, smooth)._equation(
+            path, path, self._nominal
+        )
+        target, flat = equation.target, equation.columns[used]
+        weights = 1 / np.sqrt(np.mean(np.where(used, target, 0.0) ** 2, axis=0) + 1e-12)
+        weights = np.broadcast_to(weights, used.shape)[used]
+        rows, goal = flat * weights[:, None], target[used] * weights
+        prior, mean = self._priors()
+        rows, goal = np.concatenate([rows, prior]), np.concatenate([goal, mean])
+        scale = np.linalg.norm(rows, axis=0)
+        scale[scale == 0] = 1.0
+        change = np.linalg.lstsq(rows / scale, goal - rows @ self._nominal, rcond=1e-6)[0]
+        found: Vector = self._nominal + change / scale
+        return found
+
+    def _priors(self) -> tuple[Vector, Vector]:
+        given = [(n, each) for n, each in enumerate(self._parameters) if each.deviation is not None]
+        rows, mean = np.zeros((len(given), len(self._parameters))), np.zeros(len(given))
+        for row, (place, each) in enumerate(given):
+            assert each.deviation is not None
+            rows[row, place], mean[row] = 1 / each.deviation, each.mean / each.deviation
+        return rows, mean
+
+    def _step(
+        self,
+        whitener: Whitener,
+        equation: _Equation,
+        before: Vector,
+        noise: Noise,
+        step: int,
+        path: Path,
+        used: Array,
+    ) -> Fit:
+        target, columns = equation.target, equation.columns
+        factor = whitener.factor(noise)
+        prior, mean = self._priors()
+        z, a = (
+            np.concatenate([whitener.whitened(each, noise, factor), prior])
+            for each in (equation.instruments, columns)
+        )
+        y = np.concatenate([whitener.whitened(target, noise, factor), mean])
+        scale = np.linalg.norm(z, axis=0)
+        scale[scale == 0] = 1.0
+        _, triangle, order = qr(z / scale, mode="economic", pivoting=True)
+        sizes = np.abs(np.diag(triangle))
+        rank = int((sizes > _SEPARABLE * sizes[:1]).sum()) if sizes[:1].any() else 0
+        if not rank:
+            raise IdentificationError(
+                "Nothing unknown acts on the torques of this log. Move the joints concerned."
+            )
+        free, held = order[:rank], order[rank:]
+        mixing = solve_triangular(triangle[:rank, :rank], triangle[:rank, rank:])
+        mixing *= scale[held] / scale[free][:, None]
+        values = self._nominal.copy()
+        values[free] = before[free] + mixing @ (before[held] - values[held])
+        # As in Fisher's scoring: unlike z.T @ a, this is positive definite whatever the noise.
+        square = z[:, free].T @ z[:, free]
+        values[free] += np.linalg.solve(square, z[:, free].T @ (y - a @ values))
+        inner = np.linalg.inv(z[:, free].T @ a[:, free])
+        covariance = inner @ square @ inner.T
+        sort = np.argsort(free)
+        return Fit(
+            values, free[sort], held, mixing[sort], covariance[np.ix_(sort, sort)], noise, step,
+            False, y - a @ values, z, a, equation.target - target + equation.instruments @ values,
+            target - columns @ values, used, path, whitener,
+        )  # fmt: skip

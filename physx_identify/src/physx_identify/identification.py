@@ -1,0 +1,142 @@
+"""Identification: what a log says about a robot; a plain value that is printed and stored."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import textwrap
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from physx_identify import wording
+from physx_identify.errors import IdentificationError
+from physx_identify.estimates import Combination, Estimate, LogNoise
+from physx_identify.structure import ResidualTest
+from physx_sim import JointSettings, Robot
+
+SETTINGS = ("damping", "friction", "armature")
+"""Kinds that are settings of a robot's joints."""
+
+
+@dataclass(frozen=True)
+class Identification:
+    """What a log says about a robot.
+
+    Attributes:
+        robot: Its file, or name.
+        source: The log.
+        joints: Names of the joints.
+        samples: Number of samples.
+        period: Time between them, in s.
+        level: Nominal probability of the intervals, such as 0.95.
+        estimates: The parameters.
+        combinations: What is told of those that are inseparable.
+        noise: Of the log.
+        tests: Of what is left.
+        converged: Whether the fit converged, from two starts, to the same values.
+        residual: Root mean square of what is left of each torque, in N m or N.
+        farthest: Largest position of each joint from 0, in rad or m.
+        fastest: Largest velocity of each joint, in rad/s or m/s.
+        mean: Posterior mean of all parameters.
+        covariance: Posterior covariance.
+        draws: Physical draws from the posterior, one a row.
+    """
+
+    robot: str
+    source: str
+    joints: Sequence[str]
+    samples: int
+    period: float
+    level: float
+    estimates: Sequence[Estimate]
+    combinations: Sequence[Combination]
+    noise: LogNoise
+    tests: Sequence[ResidualTest]
+    converged: bool
+    residual: Sequence[float]
+    farthest: Sequence[float]
+    fastest: Sequence[float]
+    mean: Sequence[float]
+    covariance: Sequence[Sequence[float]]
+    draws: Sequence[Sequence[float]]
+
+    @property
+    def lacks(self) -> list[str]:
+        """What the model lacks, according to the tests that failed."""
+        failed = sorted((each for each in self.tests if each.failed), key=lambda x: x.probability)
+        return [f"{each.lacks} ({each.joint})" if each.joint else each.lacks for each in failed]
+
+    @property
+    def holds(self) -> bool:
+        """Whether the intervals may be called by their level."""
+        return self.converged and not self.lacks
+
+    @property
+    def verdict(self) -> list[str]:
+        """Whether the intervals may be called by their level, and why not, as sentences."""
+        return wording.verdict_lines(self.level, self.converged, self.lacks)
+
+    def __getitem__(self, name: str) -> Estimate:
+        """Return the estimate of a parameter.
+
+        Raises:
+            IdentificationError: If it was not unknown.
+        """
+        for each in self.estimates:
+            if each.name == name:
+                return each
+        names = ", ".join(each.name for each in self.estimates)
+        raise IdentificationError(f'"{name}" was not unknown; that was: {names}.')
+
+    def applied_to(self, robot: Robot, values: Sequence[float] | None = None) -> Robot:
+        """Return a robot with the values of masses, damping, friction and armature.
+
+        Args:
+            robot: The robot.
+            values: Of all parameters; None: the most likely ones.
+
+        Raises:
+            IdentificationError: If something else was unknown of the robot itself, which no option
+                of a robot holds: inertia, payload, Stribeck friction.
+        """
+        given = [each.value for each in self.estimates] if values is None else list(values)
+        odd = [e.name for e in self.estimates if e.kind in ("inertia", "payload", "stribeck")]
+        if odd:
+            raise IdentificationError(
+                f'No option of a robot holds "{odd[0]}": edit its file, or identify its mass.'
+            )
+        masses, joints = dict(robot.mass_factors), dict(robot.joints)
+        for each, value in zip(self.estimates, given, strict=True):
+            if each.kind == "mass":
+                masses[each.of] = masses.get(each.of, 1.0) * value / each.nominal
+            elif each.kind in SETTINGS:
+                settings = joints.get(each.of, JointSettings())
+                changed: Any = {each.kind: value}
+                joints[each.of] = dataclasses.replace(settings, **changed)
+        return dataclasses.replace(robot, mass_factors=masses, joints=joints)
+
+    def to_plain(self) -> dict[str, Any]:
+        """Return all of it as plain data."""
+        plain: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(self)))
+        return plain
+
+    def to_json(self) -> str:
+        """Return all of it as JSON, with what it amounts to: ``holds`` and ``lacks``."""
+        return json.dumps({"holds": self.holds, "lacks": self.lacks, **self.to_plain()}, indent=1)
+
+    def __str__(self) -> str:
+        begin = wording.origin_text(self.robot, self.source, self.samples, self.period)
+        lines = textwrap.wrap(begin, wording.WIDTH)
+        lines += ["", *wording.columns([wording.HEAD, *map(wording.row_of, self.estimates)])]
+        if self.combinations:
+            lines += ["", f"{wording.TOGETHER}:"]
+        for each in self.combinations:
+            text = wording.combination_text(each)
+            lines += textwrap.wrap(
+                f"  {text}", wording.WIDTH, subsequent_indent="    ", break_on_hyphens=False
+            )
+        lines.append("")
+        for text in (wording.noise_text(self.noise), *self.verdict):
+            lines += textwrap.wrap(text, wording.WIDTH)
+        return "\n".join(lines)

@@ -1,0 +1,322 @@
+"""Log: positions and torques of a robot's joints, from a file of any format that physx reads."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from physx_core.dataset import Dataset, holds_dataset
+from physx_core.errors import listed, nearest
+from physx_core.typing import Array, Vector
+from physx_formats import all_formats
+from physx_gym import read_log as read_episode
+from physx_gym.errors import LogError
+from physx_identify.errors import IdentificationError
+
+NAMES: Mapping[str, Sequence[str]] = {
+    "time": ("time", "t", "timestamp", "stamp"),
+    "positions": (
+        *("positions", "position", "q", "qpos", "joint_positions", "joint_position", "state.q"),
+        "observation.state",
+    ),
+    "velocities": (
+        *("velocities", "velocity", "v", "dq", "qd", "qvel", "joint_velocities", "joint_velocity"),
+        "state.v",
+    ),
+    "torques": (
+        *("torques", "torque", "tau", "effort", "efforts", "joint_torques", "joint_torque"),
+        *("motor.torque", "commands", "command", "u", "action"),
+    ),
+}
+"""Names that columns have, by what they are."""
+_NEEDED = ("positions", "torques")
+_FACTORS = {
+    "rad": 1.0, "deg": np.pi / 180, "degree": np.pi / 180, "°": np.pi / 180, "mrad": 1e-3,
+    "m": 1.0, "mm": 1e-3, "cm": 1e-2, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9,
+    "N m": 1.0, "Nm": 1.0, "N*m": 1.0, "mN m": 1e-3, "N mm": 1e-3, "kN m": 1e3, "N": 1.0, "kN": 1e3,
+    "rad/s": 1.0, "deg/s": np.pi / 180, "°/s": np.pi / 180, "m/s": 1.0, "mm/s": 1e-3,
+    "rpm": np.pi / 30,
+}  # fmt: skip
+"""Units by their names, in rad, m, s, N m, N."""
+_MOST = 2**30
+_EVEN = 0.01
+"""Largest deviation of a time step, in steps, of a log that is not resampled."""
+
+
+@dataclass(frozen=True)
+class Log:
+    """What was measured of a robot's joints at equal intervals.
+
+    Attributes:
+        joints: Names of the joints; columns are in this order.
+        period: Time between samples, in s.
+        positions: Shape (samples, joints), in rad or m.
+        torques: Measured or commanded, shape (samples, joints), in N m or N.
+        velocities: Shape (samples, joints), in rad/s or m/s; None: not measured. They are compared
+            with the positions, to notice wrong units, signs and orders, and not fitted.
+        source: Where it comes from.
+        left_out: Columns of the source that are none of these.
+
+    Raises:
+        IdentificationError: If shapes differ, a number is not finite, or the period not positive.
+    """
+
+    joints: tuple[str, ...]
+    period: float
+    positions: Vector
+    torques: Vector
+    velocities: Vector | None = None
+    source: str = "log"
+    left_out: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        if not self.period > 0 or not np.isfinite(self.period):
+            raise IdentificationError(f"{self.source}: the period is {self.period:g} s.")
+        object.__setattr__(self, "joints", tuple(self.joints))
+        for name in ("positions", "torques", "velocities"):
+            given = getattr(self, name)
+            if given is None:
+                continue
+            values = np.array(given, np.float64)
+            if values.ndim != 2 or values.shape != (len(self.positions), len(self.joints)):
+                raise IdentificationError(
+                    f"{self.source}: {name} have the shape {values.shape} instead of "
+                    f"({len(self.positions)}, {len(self.joints)}): samples, joints."
+                )
+            wrong = np.argwhere(~np.isfinite(values))
+            if len(wrong):
+                row, joint = wrong[0]
+                raise IdentificationError(
+                    f"{self.source}: {name} of {self.joints[joint]} are {values[row, joint]} in "
+                    f"row {row}; {len(wrong)} numbers are not finite. Cut the log there."
+                )
+            values.flags.writeable = False
+            object.__setattr__(self, name, values)
+
+    def __len__(self) -> int:
+        return len(self.positions)
+
+
+def read_log(
+    path: str | Path,
+    joints: Sequence[str],
+    *,
+    period: float | None = None,
+    columns: Mapping[str, str] | None = None,
+    episode: int | None = None,
+) -> Log:
+    """Read a log.
+
+    A column is found by its usual names, such as ``q``, ``tau`` and ``time``, as an array with a
+    number for each joint in order, or as one column a joint: ``q.elbow``, ``q_elbow``,
+    ``robot.elbow``. Units in the file are converted.
+
+    Args:
+        path: A file or folder of a format that physx imports (CSV, Parquet, npz, HDF5,
+            safetensors), a physx dataset, an episode's log, or the folder of a LeRobot dataset.
+        joints: Names of the joints, in the order of arrays.
+        period: Time between samples, in s; None: from the column of times.
+        columns: Name of the column of ``"time"``, ``"positions"``, ``"velocities"`` or
+            ``"torques"``, where it is not the usual one.
+        episode: Which episode of a dataset with the column ``episode`` or ``episode_index``; None:
+            the only one.
+
+    Raises:
+        IdentificationError: If columns are missing, not of these joints or in an unknown unit; if
+            there is no time, it does not increase or has gaps; or if there are several episodes.
+        ExchangeError: If the file cannot be read.
+    """
+    path = Path(path)
+    table, units = _table_of(path)
+    table = _episode(path, table, episode)
+    given = dict(columns or {})
+    wrong = [name for name in given if name not in NAMES]
+    if wrong:
+        raise IdentificationError(f'There is no column "{wrong[0]}" to choose: {listed(NAMES)}.')
+    used: set[str] = set()
+    found = {name: _find(path, table, units, name, given.get(name), joints, used) for name in NAMES}
+    for name in _NEEDED:
+        if found[name] is None:
+            raise IdentificationError(
+                f"{path} has no column of {name} of all joints ({listed(joints)}). It has: "
+                f"{listed(table)}. Name it with columns (--columns {name}=NAME)."
+            )
+    left_out = tuple(name for name in table if name not in used)
+    assert found["positions"] is not None
+    assert found["torques"] is not None
+    series = [found["positions"], found["torques"]]
+    if found["velocities"] is not None:
+        series.append(found["velocities"])
+    time = found["time"]
+    if period is None:
+        if time is None:
+            raise IdentificationError(
+                f"{path} has no column of times. Give the time between samples: period (--period)."
+            )
+        period, series = _even(path, time[:, 0], series)
+    velocities = series[2] if len(series) > 2 else None
+    return Log(tuple(joints), period, series[0], series[1], velocities, str(path), left_out)
+
+
+def _table_of(path: Path) -> tuple[dict[str, Vector], dict[str, str]]:
+    """Return the columns of a file, each of shape (rows, numbers), and their units."""
+    if not path.exists():
+        raise IdentificationError(f"There is no log {path}.")
+    if (path / "meta" / "info.json").is_file():
+        return _lerobot(path)
+    if holds_dataset(path) or holds_dataset(path / "dataset"):
+        with Dataset.open(path) as dataset:
+            mode = "training" if "training" in dataset.modes else dataset.modes[0]
+            fields = dataset.fields(mode)
+            values = {name: _flat(dataset[mode][name][:]) for name in fields}
+            return values, {name: field.unit for name, field in fields.items()}
+    if path.suffix in (".h5", ".hdf5"):
+        try:
+            episode = read_episode(path)
+        except LogError:  # a table of another program
+            return _file(path)
+        return {n: _flat(each) for n, each in episode.variables.items()}, dict(episode.units)
+    return _file(path)
+
+
+def _lerobot(path: Path) -> tuple[dict[str, Vector], dict[str, str]]:
+    tables = [_file(part)[0] for part in sorted((path / "data").rglob("*.parquet"))]
+    if not tables:
+        raise IdentificationError(f"{path} has no files data/**/*.parquet.")
+    return {name: np.concatenate([each[name] for each in tables]) for name in tables[0]}, {}
+
+
+def _file(path: Path) -> tuple[dict[str, Vector], dict[str, str]]:
+    begin = b""
+    if not path.is_dir():
+        with path.open("rb") as file:
+            begin = file.read(8)
+    for each in all_formats().values():
+        if each.open is None or not each.recognizes(path, begin):
+            continue
+        with each.open(path, _MOST) as (columns, notes):
+            numbers = {
+                name: column
+                for name, column in columns.items()
+                if not column.problem and column.dtype.kind in "biuf" and column.shape
+            }
+            units = {name: column.unit for name, column in numbers.items()}
+            for mode in notes.modes.values():
+                units |= {name: field.unit for name, field in mode.items() if field.unit}
+            return {n: _flat(c.read(0, c.shape[0])) for n, c in numbers.items()}, units
+    raise IdentificationError(f"{path} is of no known format: {listed(all_formats())}.")
+
+
+def _flat(values: Array) -> Vector:
+    found = np.asarray(values)
+    return found.reshape(len(found), -1).astype(np.float64)
+
+
+def _episode(path: Path, table: dict[str, Vector], wanted: int | None) -> dict[str, Vector]:
+    name = next((name for name in ("episode", "episode_index") if name in table), None)
+    if name is None:
+        if wanted is not None:
+            raise IdentificationError(f"{path} has no column of episodes.")
+        return table
+    numbers = table[name][:, 0]
+    known = np.unique(numbers)
+    if wanted is None and len(known) > 1:
+        raise IdentificationError(
+            f"{path} has {len(known)} episodes. Choose one: episode (--episode)."
+        )
+    rows = numbers == (known[0] if wanted is None else wanted)
+    if not rows.any():
+        raise IdentificationError(f"{path} has no episode {wanted}; its first is {known[0]:g}.")
+    return {key: values[rows] for key, values in table.items() if key != name}
+
+
+def _find(
+    path: Path,
+    table: Mapping[str, Vector],
+    units: Mapping[str, str],
+    kind: str,
+    given: str | None,
+    joints: Sequence[str],
+    used: set[str],
+) -> Vector | None:
+    """Return what is of a kind, shape (rows, joints), in the units of `Log`."""
+    width = 1 if kind == "time" else len(joints)
+    names = NAMES[kind] if given is None else (given,)
+    for name in names:
+        if name in table:
+            values = table[name]
+            if values.shape[1] != width:
+                if given is None and kind == "time":
+                    continue
+                raise IdentificationError(
+                    f'{path}: "{name}" has {values.shape[1]} numbers a row, but there are {width} '
+                    f"joints: {listed(joints)}."
+                )
+            used.add(name)
+            return values * _factors(path, name, units.get(name, ""), width)
+        if kind != "time":
+            columns = [_of_joint(table, name, joint) for joint in joints]
+            if all(columns):
+                used.update(filter(None, columns))
+                factors = [_factors(path, c, units.get(c, ""), 1) for c in columns if c]
+                return np.column_stack([table[c] for c in columns if c]) * np.concatenate(factors)
+            if any(columns):
+                missing = joints[columns.index(None)]
+                near = nearest(f"{name}.{missing}", table)
+                raise IdentificationError(
+                    f'{path}: {kind} of the joint "{missing}" are missing.{near}'
+                )
+    if given is not None:
+        raise IdentificationError(
+            f'{path} has no column "{given}".{nearest(given, table)} It has: {listed(table)}.'
+        )
+    return None
+
+
+def _of_joint(table: Mapping[str, Vector], name: str, joint: str) -> str | None:
+    for column in table:
+        begins = column.startswith((f"{name}.", f"{name}_", f"{name}/"))
+        if begins and column.endswith((f".{joint}", f"_{joint}", f"/{joint}")):
+            return column
+    return None
+
+
+def _factors(path: Path, name: str, unit: str, width: int) -> Vector:
+    own = [each.strip() for each in unit.split(",")] if "," in unit else [unit.strip()] * width
+    if len(own) != width:
+        own = [own[0]] * width
+    for each in own:
+        if each and each not in _FACTORS:
+            raise IdentificationError(
+                f'{path}: the unit "{each}" of "{name}" is not known: {listed(_FACTORS)}.'
+            )
+    return np.array([_FACTORS.get(each, 1.0) if each else 1.0 for each in own])
+
+
+def _even(path: Path, time: Vector, values: list[Vector]) -> tuple[float, list[Vector]]:
+    """Return the period and values at equal intervals."""
+    steps = np.diff(time)
+    if len(steps) < 2:
+        raise IdentificationError(f"{path} has {len(time)} samples, too few for anything.")
+    if not (steps > 0).all():
+        row = int(np.argmin(steps))
+        raise IdentificationError(
+            f"{path}: time does not increase: it is {time[row]:g} s, then {time[row + 1]:g} s, in "
+            f"row {row + 1}."
+        )
+    period = float(np.median(steps))
+    worst = int(np.argmax(steps))
+    if steps[worst] > 1.5 * period:
+        raise IdentificationError(
+            f"{path} has a gap of {steps[worst]:.4g} s after {time[worst]:.4g} s, where samples "
+            f"are {period:.4g} s apart. Cut the log there."
+        )
+    if np.abs(steps - period).max() <= _EVEN * period:
+        return float((time[-1] - time[0]) / len(steps)), values
+    even = np.arange(time[0], time[-1], period)
+    from scipy.interpolate import CubicSpline
+
+    return period, [CubicSpline(time, each)(even) for each in values]

@@ -1,0 +1,73 @@
+"""Domain randomization that draws from what a log says, instead of from guessed ranges."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+
+from numpy.random import Generator
+
+from physx_core.errors import ComponentNotFoundError
+from physx_gym.tasks.randomizations import Randomization
+from physx_identify.errors import IdentificationError
+from physx_identify.identification import SETTINGS, Identification
+from physx_identify.stored import read_identification
+
+
+class Identified(Randomization):
+    """Gives the controlled robot parameters drawn from the posterior of an identification.
+
+    A draw is one of all parameters together, so errors that belong together stay together. Masses,
+    damping, friction and armature are drawn; what belongs to the log, such as biases and delay, is
+    not of the robot.
+    """
+
+    def __init__(self, path: str | Path | Identification, name: str | None = None) -> None:
+        """Choose the identification.
+
+        Args:
+            path: TOML file of ``physx identify -o``, or an identification.
+            name: Name in the log; None: that of the class.
+
+        Raises:
+            IdentificationError: If the file is missing or damaged, or the log told of nothing that
+                an environment can change.
+        """
+        super().__init__(name)
+        self.found = path if isinstance(path, Identification) else read_identification(path)
+        self._places = [
+            (place, each) for place, each in enumerate(self.found.estimates)
+            if each.kind in ("mass", *SETTINGS)
+        ]  # fmt: skip
+        if not self._places:
+            raise IdentificationError(
+                "The identification has no mass, damping, friction or armature to draw."
+            )
+
+    def draw(self, nominal: Any, random: Generator) -> dict[str, Any]:
+        """Return the value of each parameter."""
+        draw = self.found.draws[int(random.integers(len(self.found.draws)))]
+        drawn = {each.name: float(draw[place]) for place, each in self._places}
+        robot = nominal.env.robot
+        links = [
+            body.removeprefix(f"{robot.name}/")
+            for body in nominal.env.simulator.layout.bodies[robot.bodies]
+        ]
+        for _, each in self._places:
+            if each.kind == "mass" and each.of not in links:
+                raise ComponentNotFoundError("link", each.of, "The robot", links)
+        return drawn
+
+    def options(self, nominal: Any, drawn: Mapping[str, Any]) -> Mapping[str, Any]:
+        """Return factors of the masses, and settings of the joints."""
+        robot = nominal.env.robot.name
+        factors = dict(nominal.options["world"]["robots"][robot]["mass_factors"])
+        joints: dict[str, dict[str, float]] = {}
+        for _, each in self._places:
+            value = drawn[each.name]
+            if each.kind == "mass":
+                factors[each.of] = factors.get(each.of, 1.0) * value / each.nominal
+            else:
+                joints.setdefault(each.of, {})[each.kind] = value
+        return {"world": {"robots": {robot: {"mass_factors": factors, "joints": joints}}}}
