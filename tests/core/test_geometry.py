@@ -73,8 +73,8 @@ def test_voxels_of_a_cube_and_its_margin():
     wanted[2:-2, 2:-2, 2:-2] = True
     assert_array_equal(grid.inside, wanted)
     assert_allclose([grid.centers.min(), grid.centers.max()], [0.125, 0.875])
-    assert_array_equal(grid.number[tuple(grid.cubes.T)], np.arange(64))
-    assert (grid.number == -1).sum() == 8**3 - 64
+    assert_array_equal(grid.cube_at[tuple(grid.cubes.T)], np.arange(64))
+    assert (grid.cube_at == -1).sum() == 8**3 - 64
     height = np.indices(grid.inside.shape)[2] * grid.spacing + grid.origin[2]
     assert_allclose(grid.map_to(CORNERS)(height.ravel()), CORNERS[:, 2])
 

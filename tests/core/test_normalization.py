@@ -68,6 +68,13 @@ def check(found, values, axes, shape):
         assert_allclose(getattr(found, name), expected, rtol=1e-12)
 
 
+@pytest.mark.reported(
+    "careamics#679",
+    "careamics#777",
+    "n2v#32",
+    "neuraloperator#47",
+    about="fields on grids are normalized by channel, or together",
+)
 def test_by_default_channels_are_apart_and_other_named_axes_are_pooled(folder):
     with Dataset.open(folder) as dataset:
         found = dataset.normalization

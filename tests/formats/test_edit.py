@@ -84,6 +84,12 @@ def test_what_is_not_named_stays_as_it_is(data, tmp_path):
         assert other.info["edits"][0]["dataset"] == "data"
 
 
+@pytest.mark.reported(
+    "lerobot#630",
+    "lerobot#378",
+    "lerobot#2111",
+    about="episodes and frames are deleted from a dataset",
+)
 def test_episodes_and_rows_are_chosen(data, tmp_path):
     edit(data, tmp_path / "few", drop_episodes=[0], view=View(hold_back=False, stride=3))
     assert rows_of(tmp_path / "few") == [200, 300, 303, 306]
@@ -111,6 +117,11 @@ def test_episodes_and_rows_are_chosen(data, tmp_path):
         assert [each["dataset"] for each in dataset.info["edits"]] == ["data", "few"]
 
 
+@pytest.mark.reported(
+    "lerobot#2326",
+    "deepmind-research#655",
+    about="a feature is added to a dataset, or derived later",
+)
 def test_fields_are_derived_cast_renamed_and_dropped(data, tmp_path):
     edit(
         data,

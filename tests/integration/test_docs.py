@@ -10,6 +10,7 @@ import plain_pages
 import public_names
 import pytest
 import run_pages
+import troubles
 
 from physx_core import PhysxError, checkpoint
 
@@ -25,7 +26,7 @@ LONG = {
 }  # fmt: skip
 """Pages whose commands take many seconds; they run with the campaigns."""
 
-GENERATED = {"figures.md", "gallery.md"}
+GENERATED = {"figures.md", "gallery.md", "troubles.md"}
 """Pages that scripts write."""
 
 WIDTH = 92
@@ -180,6 +181,11 @@ def test_the_page_of_figures_is_what_the_benchmarks_say():
     assert figures.PAGE.path.read_text() == figures.PAGE.text()
     for page, table in figures.tables().items():
         assert page.read_text() == figures.with_table(page, table)
+
+
+def test_the_page_of_troubles_has_all_tests_that_are_marked():
+    assert troubles.PAGE.read_text() == troubles.page()
+    assert len(list(troubles.reports())) > 30
 
 
 def test_llms_txt_lists_every_page_and_each_page_is_plain_markdown(root, tmp_path):

@@ -99,6 +99,13 @@ def test_ctrl_c_within_an_epoch_and_resume(training):
     assert parameters("whole", 0) == parameters("cut", 1)
 
 
+@pytest.mark.reported(
+    "pytorch-lightning#1463",
+    "pytorch-lightning#18727",
+    "transformers#28544",
+    "fairseq#3531",
+    about="the patience of early stopping begins anew after resuming",
+)
 def test_halves_equal_the_whole_with_early_stopping_and_the_best(training):
     with Dataset.open("data", writable=True, session="data") as dataset:
         x = np.random.default_rng(1).standard_normal((30, 3))

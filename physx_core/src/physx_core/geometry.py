@@ -67,7 +67,7 @@ class VoxelGrid(NamedTuple):
         return np.argwhere(self.inside)
 
     @property
-    def number(self) -> Index:
+    def cube_at(self) -> Index:
         """Number of each cube among those inside, -1 of all others, shape (nx, ny, nz)."""
         found = np.full(self.inside.shape, -1, np.intp)
         found[self.inside] = np.arange(np.count_nonzero(self.inside))

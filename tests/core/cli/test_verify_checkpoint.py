@@ -71,6 +71,12 @@ def test_rows_that_were_added_change_nothing(capsys):
     assert status == 0 and "read again, with the same values" in text
 
 
+@pytest.mark.reported(
+    "autoresearch-ai#36",
+    "entrenar#119",
+    "openmed#1200",
+    about="nobody knows which data a checkpoint was trained on",
+)
 def test_other_values_are_named(capsys):
     train()
     with Dataset.open("data", writable=True) as dataset:

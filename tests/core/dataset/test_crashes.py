@@ -44,6 +44,13 @@ def kill(tmp_path, work, durability, seed, kills):
 
 
 @pytest.mark.parametrize("work", WORKS)
+@pytest.mark.reported(
+    "h5py#1807",
+    "lerobot#3631",
+    "lerobot#2529",
+    "lerobot#2495",
+    about="the file cannot be read after a crash; recorded episodes are lost",
+)
 def test_kill_9_loses_no_committed_row(tmp_path, work):
     kill(tmp_path, work, "durable" if work in ("append", "json") else "fast", 1, 2)
 

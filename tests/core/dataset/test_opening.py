@@ -71,6 +71,7 @@ def test_the_copy_that_a_killed_writer_left_may_take_a_moment_to_end(dataset, fo
         Dataset.open(folder, writable=True).close()
 
 
+@pytest.mark.reported("h5py#1804", about="a second writer damages the file")
 def test_two_writers_are_rejected_and_readers_are_not(dataset, folder):
     dataset.append("training", {"x": np.arange(3.0)})
     with pytest.raises(DatasetLockedError, match=f"Process {os.getpid()}"):

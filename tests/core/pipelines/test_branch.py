@@ -137,6 +137,11 @@ def stored(field):
 
 
 @pytest.mark.parametrize("row", [0, 12, 17, 46])
+@pytest.mark.reported(
+    "IsaacLab#2133",
+    "Genesis#1150",
+    about="an environment is copied, or goes back to an earlier moment",
+)
 def test_the_unchanged_future_is_the_stored_one_and_the_other_differs(row):
     run = branch(generate(), row, {"length": 0.0})
     left = 11 - row % 12

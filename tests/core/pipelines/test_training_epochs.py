@@ -207,6 +207,13 @@ def measured(**options):
 
 
 @pytest.mark.slow
+@pytest.mark.reported(
+    "keras#6217",
+    "unsloth#1147",
+    "mmsegmentation#1432",
+    "OpenNMT-py#1089",
+    about="validation runs out of memory where training does not",
+)
 def test_a_validation_takes_as_many_rows_at_once_as_the_training(many):
     sizes, losses = measured()
     assert sizes == {20, 1}

@@ -438,6 +438,12 @@ def test_metrics_of_the_user_are_means_over_whole_episodes_whatever_the_batches(
 
 
 @pytest.mark.parametrize("interleaved", [False, True])
+@pytest.mark.reported(
+    "pytorch-lightning#3732",
+    "keras#11440",
+    "scvi-tools#359",
+    about="one's own error decides which network is the best, and when to stop",
+)
 def test_a_metric_decides_which_network_is_the_best(interleaved):
     x, y = noisy(noise=0)
     number, step = np.divmod(np.arange(1000), 20)

@@ -25,6 +25,16 @@ def views(monkeypatch, tmp_path):
 
 
 @pytest.mark.parametrize("view", ["folds", "test_fold", "mixture", "weights"])
+@pytest.mark.reported(
+    "pytorch-lightning#19764",
+    "pytorch-lightning#18780",
+    "pytorch-lightning#2530",
+    "pytorch-lightning#1182",
+    "litData#775",
+    "datasets#7901",
+    "streaming#880",
+    about="a resumed training repeats samples or leaves some out",
+)
 def test_a_killed_training_on_a_view_resumes_bit_identically(view, run_killed, views):
     _, whole = run_killed(str(PROGRAM), Path.cwd(), [], "whole", view)
     random = np.random.default_rng(sum(view.encode()))

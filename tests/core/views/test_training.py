@@ -73,6 +73,9 @@ def test_a_folder_and_a_view_stand_for_their_configuration():
         train(3)
 
 
+@pytest.mark.reported(
+    "ace#448", "anemoi-core#543", about="lengths of windows as an option of the loader"
+)
 def test_windows_are_learned_from_and_validated_with():
     view = View(window=WINDOW, fold=0)
     training = train(DatasetConfig(existing_dir="a", view=view, normalize=True), epoch_nb=3)

@@ -186,6 +186,7 @@ def first_row(folder, x):
 # Folds ------------------------------------------------------------------------------------------
 
 
+@pytest.mark.reported("nnUNet#2431", about="other folds, and the same ones when samples are added")
 def test_more_episodes_never_move_one_between_folds():
     numbers = np.arange(1000)
     whole = folds_of(np.zeros(1000, int), numbers, 5, 3)
@@ -203,6 +204,9 @@ def numbers_in(batches):
     return {int(e) for batch in batches for e in batch["x"][:, 0]}
 
 
+@pytest.mark.reported(
+    "neuracore#155", about="parts of one trajectory are in training and validation"
+)
 def test_parts_share_no_episode_and_have_all(tmp_path):
     store(tmp_path, episodes([3] * 40))
     found = []
@@ -320,6 +324,7 @@ def test_mistakes_in_a_view_are_named(options, message):
     shares=st.lists(st.integers(1, 9), min_size=2, max_size=4), seed=st.integers(0, 9),
     epoch=st.sampled_from(["first", "all"]), size=st.integers(1, 40),
 )  # fmt: skip
+@pytest.mark.reported("lerobot#1158", "webdataset#244", about="datasets are mixed in shares")
 def test_each_batch_has_its_share_of_each_source(shares, seed, epoch, size):
     with TemporaryDirectory() as name:
         folders = [str(Path(name, str(k))) for k in range(len(shares))]
@@ -465,6 +470,7 @@ def test_folds_of_one_stream_are_its_pieces(tmp_path):
 
 @pytest.mark.processes
 @pytest.mark.parametrize("window", [{}, {"x": ("x", [-1, 0])}])
+@pytest.mark.reported("pytorch#73603", about="the order of samples depends on the workers")
 def test_other_processes_read_the_same(tmp_path, monkeypatch, window):
     monkeypatch.setattr(memory, "available_memory", lambda: 0)
     store(tmp_path, episodes([9] * 30))

@@ -73,6 +73,13 @@ def test_a_four_bar_turns_as_a_single_crank(engine, four_bar):
     np.testing.assert_allclose(q, [angle, -angle, angle], atol=1e-3)
 
 
+@pytest.mark.reported(
+    "mujoco#229",
+    "robosuite#104",
+    "Genesis#681",
+    "SAPIEN#26",
+    about="a gripper or a suction cup holds and releases while the simulation runs",
+)
 def test_a_weld_lifts_and_releases(engine):
     with engine.build(World(objects=[crate(), hand()], gravity=(0, 0, 0))) as simulation:
         simulation.step(10)

@@ -119,6 +119,12 @@ def test_shapes_rest_on_a_static_table(backend, shape):
         np.testing.assert_allclose(force, [0, 0, 9.81], atol=0.02)
 
 
+@pytest.mark.reported(
+    "gym#1193",
+    "mujoco#493",
+    "bullet3#2982",
+    about="a state that was saved in contact does not go on identically",
+)
 def test_restore_gives_the_same_bits_among_bodies(backend):
     boxes = [
         Box(name=f"box{i}", size=(0.2, 0.15, 0.1), position=(0.03 * i, 0.02 * i, 0.1 + 0.15 * i))

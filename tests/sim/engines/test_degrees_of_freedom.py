@@ -198,6 +198,11 @@ def test_a_slide_rests_on_the_ground(backend, write_urdf):
         assert np.mean(forces) == pytest.approx(2 * 9.81 - 5.0, rel=1e-2)
 
 
+@pytest.mark.reported(
+    "Genesis#1680",
+    "PhysX#476",
+    about="conveyors and moving ground",
+)
 def test_a_conveyor_carries_a_box(backend, write_urdf):
     """A slide with an imposed velocity, the usual model of a conveyor."""
     belt = DOOR.format(kind="prismatic").replace('axis xyz="0 0 1"', 'axis xyz="1 0 0"')

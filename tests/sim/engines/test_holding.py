@@ -74,6 +74,7 @@ def test_dart_says_which_solver_holds_heavy_bodies_on_light_ones(dart):
     ],
     ids=["box", "small box", "cylinder"],
 )
+@pytest.mark.reported("mujoco#236", about="boxes on height fields slide or sink")
 def test_objects_do_not_creep_down_a_height_field(engine, thing):
     with engine.build(World(objects=[thing], ground=terrain())) as simulation:
         if simulation.engine == "mujoco" and getattr(thing, "size", (1,))[0] < 0.1:

@@ -43,6 +43,12 @@ BASE = '<link name="base"/>'
 BARE = '<link name="bare"/>'
 
 
+@pytest.mark.reported(
+    "dart#1604",
+    "Genesis#3185",
+    "bullet3#3110",
+    about="links without inertia",
+)
 def test_joints_that_move_no_inertia_are_named(robot):
     tip = joint("tip", "bare", "end", "fixed")
     made = robot(BASE, BARE, '<link name="end"/>', joint("wrist", "base", "bare"), tip)

@@ -101,6 +101,9 @@ BLANKS = st.text(alphabet=" \t\n\r", max_size=3)
 
 @pytest.mark.parametrize("blank", [" ", "\n", "\t", "\r\n      ", "&#10;"])
 @pytest.mark.parametrize("where", ["mass", "ixz", "turn", "axis", "upper", "offset"])
+@pytest.mark.reported(
+    "urdf-rs#105", "urdf-rs#56", about="blanks in numbers of a URDF drop an inertia"
+)
 def test_blanks_around_a_number_change_nothing(write_urdf, where, blank):
     states = np.array([0.7, 0.2]), np.array([1.0, -2.0]), np.array([0.5, 0.25])
     plain = write_urdf(arm(), "plain.urdf")

@@ -47,6 +47,14 @@ def build(engine, robot, **options):
 
 @pytest.mark.parametrize("multiplier", [-1.0, 0.5, -3.0])
 @pytest.mark.parametrize("leader", ["left", "right"], ids=["leader first", "leader last"])
+@pytest.mark.reported(
+    "pinocchio#1290",
+    "pinocchio#2131",
+    "pinocchio#2753",
+    "SAPIEN#236",
+    "gz-physics#432",
+    about="mimic joints are limp",
+)
 def test_a_leader_carries_its_follower(engine, gripper, multiplier, leader):
     follower = {"left": "right", "right": "left"}[leader]
     robot = gripper((leader, ""), (follower, follows(leader, multiplier, 0.05)))

@@ -58,6 +58,11 @@ def cast(world, begins, ends):
     return caster.cast(np.array(begins, float), np.array(ends, float), np.zeros((0, 7)), ())
 
 
+@pytest.mark.reported(
+    "drake#15260",
+    "Genesis#1772",
+    about="lidar and height scans",
+)
 def test_rays_hit_what_mujoco_hits(engine):
     mujoco = pytest.importorskip("mujoco")
     rng = np.random.default_rng(1)

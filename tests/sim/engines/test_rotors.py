@@ -20,6 +20,7 @@ def acrobot(fixed=True, **settings):
 
 @pytest.mark.filterwarnings("ignore:.*armature")
 @pytest.mark.parametrize("fixed", [True, False], ids=["fixed", "floating"])
+@pytest.mark.reported("mjlab#290", about="rotor inertia")
 def test_rotors_move_alike_on_all_engines(fixed):
     found = []
     for name in ("dart", "pinocchio", "mujoco"):
@@ -56,6 +57,12 @@ def test_dart_says_that_its_impulses_do_not_know_rotors(dart):
 
 @pytest.mark.parametrize("mode", ["servo", "position"])
 @pytest.mark.parametrize("load", [0.0, 5.0], ids=["unloaded", "loaded"])
+@pytest.mark.reported(
+    "dart#1583",
+    "dart#1683",
+    "gz-sim#1684",
+    about="a servo that was pressed against its limit never leaves it",
+)
 def test_a_servo_leaves_its_limit(engine, bar, mode, load):
     limits = '<limit lower="-0.5" upper="0.5" effort="40" velocity="5"/>'
     robot = bar(limits, kind="revolute", joints={"hinge": JointSettings(mode=mode)})

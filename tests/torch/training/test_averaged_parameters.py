@@ -99,6 +99,12 @@ def test_a_network_learns_as_without_a_mean_and_predicts_with_it():
 
 
 @pytest.mark.parametrize("after", [3, 4, 8])
+@pytest.mark.reported(
+    "pytorch-lightning#10914",
+    "pytorch-lightning#20545",
+    "neural-lam#336",
+    about="averaged weights in validation and checkpoints",
+)
 def test_a_training_with_a_mean_that_was_stopped_goes_on_bit_for_bit(after):
     whole = training(session_name="whole")
     whole.execute()

@@ -73,6 +73,15 @@ def test_a_session_folder_relative_to_another_place(folder, tmp_path, monkeypatc
 
 
 @pytest.mark.parametrize(("workers", "method"), [(0, None), (2, "fork"), (1, "fork"), (2, "spawn")])
+@pytest.mark.reported(
+    "pytorch#11929",
+    "pytorch#11887",
+    "pytorch#1919",
+    "torchmd-net#84",
+    "datasets#5360",
+    "datasets#6594",
+    about="workers that share a file handle give errors, other samples' labels, or some samples twice",
+)
 def test_loaders_give_every_sample_once(folder, workers, method):
     samples = StoredDataset(folder)
     samples[0]  # opened in this process already

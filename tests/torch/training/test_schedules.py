@@ -75,6 +75,13 @@ def parameters(training):
 ONE_CYCLE = ("OneCycleLR", {"max_lr": 0.05, "total_steps": 12})
 
 
+@pytest.mark.reported(
+    "pytorch#65417",
+    "pytorch-lightning#3205",
+    "pytorch-lightning#20436",
+    "pytorch-lightning#6948",
+    about="a schedule that counts steps is stepped once an epoch, in silence",
+)
 def test_a_schedule_that_counts_steps_follows_the_optimizer(capsys):
     training = train(ONE_CYCLE)
     assert training.rates == rates_of_torch(lambda o: OneCycleLR(o, 0.05, total_steps=12), 12)
@@ -164,6 +171,13 @@ def test_overriding_epoch_end_keeps_the_schedule():
 
 
 @pytest.mark.parametrize("interval", ["epoch", "step"])
+@pytest.mark.reported(
+    "pytorch-lightning#15462",
+    "pytorch-lightning#850",
+    "pytorch-lightning#4655",
+    "pytorch-lightning#1772",
+    about="the learning rate is another one after resuming",
+)
 def test_schedules_resume_bit_for_bit(interval):
     scheduler = ("OneCycleLR", {"max_lr": 0.05, "total_steps": 16})
     whole = train(scheduler, 4, interval=interval, name="whole")

@@ -94,6 +94,11 @@ class GanOptimization(TorchOptimization):
             self.each[name].step()
 
 
+@pytest.mark.reported(
+    "pytorch-lightning#2737",
+    "pytorch-lightning#17801",
+    about="two optimizers, as for adversarial networks, and resuming with them",
+)
 def test_several_optimizers_resume_bit_for_bit():
     check_resumes(network=Gan, network_kwargs=FIELDS, optimization=GanOptimization)
 
