@@ -15,8 +15,10 @@ PAGE = HERE / "troubles.md"
 BEGIN = """\
 # Troubles of others
 
-What users of simulators, of datasets, and of trainers have reported, and what physx does there. Each line names the reports, as numbers in the projects' trackers, and a test that
-shows it; the tests run with all others. A report says what was so when it was written. Nothing here says how these projects are today.
+What users of simulators, of datasets, and of trainers have reported, and what physx does there.
+Each line names the reports, as numbers in the projects' trackers, and a test that shows it; the
+tests run with all others. A report says what was so when it was written, and nothing here says how
+these projects are today.
 
 | reported | by | test |
 |---|---|---|

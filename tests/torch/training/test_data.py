@@ -80,7 +80,7 @@ def test_a_session_folder_relative_to_another_place(folder, tmp_path, monkeypatc
     "torchmd-net#84",
     "datasets#5360",
     "datasets#6594",
-    about="workers that share a file handle give errors, other samples' labels, or some samples twice",
+    about="workers that share a file give errors, other samples' labels, or samples twice",
 )
 def test_loaders_give_every_sample_once(folder, workers, method):
     samples = StoredDataset(folder)
