@@ -14,6 +14,7 @@ HERE = Path(__file__).resolve().parent
 PAGES = {
     "generation": "sessions/cloth",
     "surrogate": "sessions/surrogate",
+    "meshes": "sessions/meshes",
     "online": "sessions/online",
     "policy": "sessions/policy",
     "sweep": "studies/sweep",
@@ -102,6 +103,26 @@ layers = [865, 128, 864]
 net_fields = ["x", "v", "wind_next"]
 opt_fields = ["x_next", "v_next"]
 """
+MESHES = """
+[training]
+epoch_nb = 10
+batch_size = 4
+seed = 0
+dataset = { existing_dir = "sessions/plate", normalize = true }
+
+[training.network]
+network = "torch/graph"
+loss = "MSELoss"
+optimizer = "Adam"
+lr = 5e-3
+
+[training.network.network_kwargs]
+nodes = 4
+outputs = 1
+hidden = 32
+net_fields = ["place", "edge", "before"]
+opt_fields = "after"
+"""
 ONLINE = """
 [training]
 epoch_nb = 8
@@ -160,6 +181,9 @@ physx generate cloth.py:Cloth --episodes 40 --environment.seed 1 --session-name 
 physx train --config surrogate.toml --session-name surrogate --quiet
 physx evaluate sessions/surrogate
 
+physx generate plate.py:Plate --episodes 200 --environment.seed 1 --session-name plate --quiet
+physx train --config meshes.toml --session-name meshes --quiet
+
 physx generate toy/spring --mode validation --batch-nb 10 --batch-size 40 --environment.seed 2 \\
       --session-name online --quiet
 physx train --config online.toml --session-name online --no-new-session --quiet
@@ -177,6 +201,8 @@ physx sweep sweep.toml
 FILES = {
     "cloth.py": CLOTH,
     "surrogate.toml": SURROGATE,
+    "plate.py": (HERE.parent / "examples/environments/plate.py").read_text(encoding="utf-8"),
+    "meshes.toml": MESHES,
     "online.toml": ONLINE,
     "learn.py": LEARN,
     "sweep.toml": SWEEP,

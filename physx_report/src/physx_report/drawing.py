@@ -133,6 +133,17 @@ def compare(
     _pictures(axes, shown, label, where)
 
 
+def scatter(axes: Axes, truth: Array, prediction: Array, label: str) -> None:
+    """Draw predicted values against the true ones, and where they would be equal."""
+    step = -(-truth.size // _MOST_POINTS)
+    true, guess = truth.ravel()[::step], prediction.ravel()[::step]
+    ends = min(true.min(), guess.min()), max(true.max(), guess.max())
+    axes.plot(ends, ends, color=MUTED, lw=0.8)
+    axes.plot(true, guess, ".", color=PREDICTION, ms=2)
+    axes.set_xlabel(f"true {label}")
+    axes.set_ylabel("predicted")
+
+
 def _lines(axes: Sequence[Axes], truth: Array, prediction: Array | None, x: str) -> None:
     steps = np.arange(len(truth))
     axes[0].plot(steps, truth, color=TRUTH, lw=1.2)

@@ -102,6 +102,15 @@ def test_a_prediction_does_not_depend_on_the_other_graphs_of_a_batch(tmp_path):
         np.testing.assert_allclose(alone["u"][0], together[row], rtol=1e-4, atol=1e-6)
 
 
+def test_the_report_draws_predicted_against_true_values_of_graphs_of_any_size(tmp_path):
+    report = pytest.importorskip("physx_report")
+    data = generate(tmp_path, "data")
+    errors = train(tmp_path, data, "net", 1).parts["validation"].fields["u"]
+    page = report.write_report(tmp_path / "net", trust=True).read_text(encoding="utf-8")
+    assert "u. Predicted against true values. Best episode: " in page
+    assert f"{errors.episodes['worst'].text}, error" in page
+
+
 @pytest.mark.parametrize(
     ("changed", "match"),
     [({"nodes": 5}, "nodes"), ({"net_fields": ["x", "load"]}, "edges")],

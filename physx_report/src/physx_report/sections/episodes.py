@@ -9,6 +9,7 @@ import numpy as np
 
 from physx_core import Batches
 from physx_core.errors import PhysxError
+from physx_core.fields import PTR
 from physx_core.pipelines import Unseen
 from physx_core.results import EpisodeError, FieldResult, PartResult
 from physx_core.typing import Array
@@ -45,11 +46,15 @@ def _errors(unseen: Unseen, part: str) -> Iterator[Block]:
     groups = np.concatenate([batches.groups(number) for number in chosen])
     squares: dict[str, list[Array]] = {}
     for number in chosen:
-        predicted, true = unseen.compare(batches[number])
+        batch = batches[number]
+        predicted, true = unseen.compare(batch)
         for name, values in predicted.items():
             if values.dtype.kind == "f":
                 error = (values - true[name]).astype(np.float64).reshape(len(values), -1)
-                squares.setdefault(name, []).append((error**2).mean(axis=1))
+                square = (error**2).mean(axis=1)
+                if axis := batches.fields[name].free_axis:
+                    square = _by_item(square, batch[axis + PTR])
+                squares.setdefault(name, []).append(square)
     known, place = np.unique(groups, return_inverse=True)
     about = [batches.describe_group(int(group)) for group in known]
     step = np.concatenate([batches.rows(number)[0] for number in chosen])
@@ -60,6 +65,12 @@ def _errors(unseen: Unseen, part: str) -> Iterator[Block]:
         yield from _by_step(name, label, step, square, part)
         by_episode = np.sqrt(np.bincount(place, square) / np.bincount(place))
         yield from _by_parameter(name, label, about, by_episode, part)
+
+
+def _by_item(values: Array, ptr: Array) -> Array:
+    """Return the mean of each item's values, which are joined end to end; NaN if it has none."""
+    sums = np.diff(np.concatenate([[0.0], np.cumsum(values)])[ptr])
+    return np.asarray(sums / np.where(np.diff(ptr), np.diff(ptr), np.nan))
 
 
 def _by_step(name: str, label: str, step: Array, square: Array, part: str) -> Iterator[Block]:
@@ -114,6 +125,14 @@ def _pictures(unseen: Unseen, part: str, judged: PartResult) -> Iterator[Block]:
         if not drawn:
             continue
         label = f"{name}{f' / {of.unit}' if of.unit and ',' not in of.unit else ''}"
+        if batches.fields[name].free_axis:
+            caption = f"{name}. Predicted against true values. {'. '.join(drawn)}."
+            with drawing.figure(caption, 1, len(drawn), width=9.0, height=3.0) as (found, axes):
+                for place, which, pair in zip(axes, known, drawn.values(), strict=False):
+                    drawing.scatter(place, *pair, label)
+                    place.set_title(which, fontsize=9)
+            yield from found
+            continue
         if drawing.are_lines(next(iter(drawn.values()))[0]):
             caption = f"{name}. {'. '.join(drawn)}."
             with drawing.figure(caption, 1, len(drawn), width=9.0) as (found, axes):

@@ -53,7 +53,8 @@ class _Films:
 
     def blocks(self, judged: PartResult) -> Iterator[Block]:
         """Yield a film of the median episode, and pictures of the best and the worst one."""
-        if len(self._batches.datasets) > 1:
+        is_joined = any(self._batches.fields[each].free_axis for each in judged.fields)
+        if len(self._batches.datasets) > 1 or is_joined:
             return
         name, of = next(iter(judged.fields.items()))
         median = of.episodes.get("median")
