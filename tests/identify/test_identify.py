@@ -67,15 +67,17 @@ def test_errors_agree_with_the_spread_between_blocks(found):
 @pytest.mark.slow
 @pytest.mark.parametrize("correlation", [0.0, 0.98])
 def test_intervals_cover_what_they_say(clean, correlation):
-    inside, false = [], 0
+    inside, false, refused = [], 0, 0
     for seed in range(12):
         log = arm.noisy(clean, correlation=correlation, seed=seed)
         found = identify(log, arm.KNOWN, UNKNOWN)
-        assert found.converged
         false += bool(found.lacks)
+        if not found.converged:  # then there are no intervals, and it says so
+            refused += 1
+            continue
         inside += [found[n].low <= true <= found[n].high for n, true in arm.HIDDEN.items()]
     assert np.mean(inside) > 0.85
-    assert false <= 3
+    assert false <= 3 and refused <= 2
 
 
 @pytest.mark.slow
