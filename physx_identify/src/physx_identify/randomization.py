@@ -46,7 +46,11 @@ class Identified(Randomization):
             )
 
     def draw(self, nominal: Any, random: Generator) -> dict[str, Any]:
-        """Return the value of each parameter."""
+        """Return the value of each parameter.
+
+        Raises:
+            ComponentNotFoundError: If the robot has no link of which there is a mass.
+        """
         draw = self.found.draws[int(random.integers(len(self.found.draws)))]
         drawn = {each.name: float(draw[place]) for place, each in self._places}
         robot = nominal.env.robot

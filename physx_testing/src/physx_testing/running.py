@@ -88,7 +88,8 @@ def plain_options(
     """Return check options as data that another process can read."""
     options: dict[str, Any] = {}
     if fields:
-        options["fields"] = [dataclasses.asdict(field) for field in fields]
+        given = [option.name for option in dataclasses.fields(Field) if option.init]
+        options["fields"] = [{name: getattr(field, name) for name in given} for field in fields]
     if network is not None:
         options["network"] = to_plain(network)
     return options

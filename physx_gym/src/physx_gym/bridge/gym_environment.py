@@ -181,7 +181,11 @@ class GymEnvironment(Environment):
 
     @property
     def policy(self) -> str | Callable[..., Any]:
-        """What chooses the actions: see the constructor."""
+        """What chooses the actions: see the constructor.
+
+        Raises:
+            ConfigError: If it is none, when it is set.
+        """
         return self._policy
 
     @policy.setter

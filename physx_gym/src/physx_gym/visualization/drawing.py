@@ -10,6 +10,7 @@ from xml.sax.saxutils import quoteattr
 
 import numpy as np
 
+from physx_core import Closeable
 from physx_core.components import Factory
 from physx_core.processes import TemporaryFolder
 from physx_core.typing import Vector
@@ -38,7 +39,7 @@ _ROBOT = """<robot name="mesh"><link name="mesh"><visual><geometry>
 </geometry></visual></link></robot>"""
 
 
-class WorldDrawing:
+class WorldDrawing(Closeable):
     """Draws a world with a factory: robots by their visual shapes, objects, and the ground.
 
     Robots from MJCF files are drawn by their collision shapes.

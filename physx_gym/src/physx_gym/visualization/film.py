@@ -30,6 +30,9 @@ def write_film(pictures: Iterable[Picture], path: Path, frame_rate: float) -> Pa
 
     Returns:
         The path.
+
+    Raises:
+        ConfigError: If the suffix is another one.
     """
     suffix = path.suffix.lower()
     if suffix not in SUFFIXES:
