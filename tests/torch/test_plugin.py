@@ -35,7 +35,8 @@ def test_defaults_of_networks_resolve():
 def test_unknown_network_names_the_nearest():
     with pytest.raises(ComponentNotFoundError, match="fc") as caught:
         plugins.resolve("network", "torch/fcc")
-    assert caught.value.known == ["encoder_decoder", "fc", "graph", "module", "unet"]
+    known = ["encoder_decoder", "fc", "graph", "module", "padded", "unet"]
+    assert caught.value.known == known
 
 
 def test_loading_the_plugin_does_not_import_torch():

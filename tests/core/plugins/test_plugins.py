@@ -258,9 +258,9 @@ def test_commands_of_other_packages(tmp_path):
     (tmp_path / "plugin_of_wrong_dist.py").unlink()
     overview = physx(tmp_path, "--help").stdout
     lines = {line.split()[0]: line for line in overview.splitlines() if line.startswith("  ")}
-    core = ["generate", "train", "predict", "replay", "info", "stats", "verify"]
+    core = ["generate", "train", "predict", "replay", "branch", "info", "stats", "verify"]
     core += ["export", "import", "export-network", "client", "include", "plugins", "new"]
-    core += ["check", "completion"]
+    core += ["check", "doctor", "completion"]
     assert list(lines)[: len(core)] == core
     others = list(lines)[len(core) :]
     assert others == sorted(others) and {"broken", "twice", "wave", "wrong"} <= {*others}
