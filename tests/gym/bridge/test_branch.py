@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from tests.shared import sizes
+import sizes
 
 from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.errors import UnknownOptionError
@@ -37,7 +37,9 @@ def test_the_past_has_the_same_bits_at_random_moments(backend):
     environment = EnvironmentConfig(
         "gym/physx/Ant-v0", {"backend": backend}, as_tcp_ip_client=False, seed=sizes.seed()
     )
-    with DataGeneration(environment, episodes=6, session_name="data", quiet=True) as run:
+    with DataGeneration(
+        environment, episodes=sizes.trials(6, 2), session_name="data", quiet=True
+    ) as run:
         run.execute()
     with Dataset.open("sessions/data") as dataset:
         rows = dataset["training"]
