@@ -649,7 +649,8 @@ class RobotSimulation(Simulation, Generic[Engine]):
         bodies = {self._checked_body(name, each): each for name, each in state.bodies.items()}
         if state.ground is not None:
             self._changes.check_ground(state.ground)
-        self.set_gravity(gravity.tolist())
+        if tuple(gravity.tolist()) != self.parts.world.gravity:  # not all engines can change it
+            self.set_gravity(gravity.tolist())
         self._restore_changes(state, bodies)
         self._write(q, v)
         for robot, pair in zip(self._robots, native, strict=False):
