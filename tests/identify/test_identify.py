@@ -9,7 +9,6 @@ import h5py
 import logged_arm as arm
 import numpy as np
 import pytest
-import sizes
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
@@ -69,16 +68,16 @@ def test_errors_agree_with_the_spread_between_blocks(found):
 @pytest.mark.parametrize("correlation", [0.0, 0.98])
 def test_intervals_cover_what_they_say(clean, correlation):
     inside, false, refused = [], 0, 0
-    for seed in range(sizes.trials(12, 5)):
+    for seed in range(12):
         log = arm.noisy(clean, correlation=correlation, seed=seed)
         found = identify(log, arm.KNOWN, UNKNOWN)
         false += bool(found.lacks)
-        if not found.converged:  # then there are no intervals, and it says so
+        if not found.converged:  # two starts end more than a standard error apart: no intervals
             refused += 1
             continue
         inside += [found[n].low <= true <= found[n].high for n, true in arm.HIDDEN.items()]
-    assert np.mean(inside) > 0.8
-    assert false <= 3 and refused <= 2
+    assert np.mean(inside) > 0.85
+    assert false <= 3 and refused <= 1
 
 
 @pytest.mark.slow

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import signal
+
 import numpy as np
 import pytest
 
@@ -281,6 +283,23 @@ def test_the_row_may_be_that_of_a_viewers_cursor(capsys, monkeypatch):
         words = ["sessions/data", "cursor", "--set", "length=0", "--trust"]
         assert main(["branch", *words]) == status
         assert message in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("at", [1, 9])
+def test_ctrl_c_in_the_past_or_the_first_future_ends_it(monkeypatch, at):
+    data, step, count = generate(), Walk.step, 0
+
+    def interrupted(self):
+        nonlocal count
+        count += 1
+        if count == at:
+            signal.raise_signal(signal.SIGINT)
+        step(self)
+
+    monkeypatch.setattr(Walk, "step", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        branch(data, 6, {"length": 0.0})
+    assert count == at
 
 
 @pytest.mark.parametrize(("kind", "row"), [(Walk, 47), (Single, 2)])

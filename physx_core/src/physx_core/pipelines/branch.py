@@ -42,6 +42,8 @@ class Branch(NewSessionPipeline):
     Attributes:
         futures: What the instances did after the row, by field, arrays of shape (rows, ...).
         rows_equal: Number of rows that are equal to the stored ones: to the row, and after it.
+        differences: Root mean square difference of the futures in each row that both have, by
+            field of floats, shape (rows,).
     """
 
     data: str | Path
@@ -71,6 +73,7 @@ class Branch(NewSessionPipeline):
     kind: ClassVar[str] = "branch"
     futures: tuple[Batch, Batch] = field(init=False, repr=False)
     rows_equal: tuple[int, int] = field(init=False, repr=False, default=(0, 0))
+    differences: dict[str, Array] = field(init=False, repr=False)
     _dataset: Dataset = field(init=False, repr=False)
     _learner: Learner | None = field(init=False, repr=False, default=None)
     _answers: int = field(init=False, repr=False, default=0)
@@ -81,6 +84,7 @@ class Branch(NewSessionPipeline):
         Raises:
             PhysxError: If there is no such row, or the environment makes other rows, cannot be
                 changed so, or fails.
+            KeyboardInterrupt: After Ctrl-C before the second future begins.
             SystemExit: After SIGTERM, with status 143.
         """
         with self._running(), deferred_interrupt() as interrupt:
@@ -89,10 +93,11 @@ class Branch(NewSessionPipeline):
             for number in (AS_IT_WAS, CHANGED):
                 with self._redrawing(number) as drawing:
                     futures.append(_stacked(self._samples(drawing, number, interrupt)))
-            if interrupt.number == signal.SIGTERM:
-                interrupt.end()
+                if interrupt and (number == AS_IT_WAS or interrupt.number == signal.SIGTERM):
+                    interrupt.end()
             self.futures = futures[0], futures[1]
             self._check_futures()
+            self.differences = _differences(*self.futures)
         return self.result
 
     def _redrawing(self, number: int) -> Redrawing:
@@ -105,6 +110,8 @@ class Branch(NewSessionPipeline):
         shown = before[-self.past :]
         for step, events in enumerate(drawing.frames(shown)):
             self._show(number, step, events)
+            if interrupt:
+                interrupt.end()
         if number == CHANGED:
             self._change(drawing.instance)
         equal = 0
@@ -197,26 +204,26 @@ class Branch(NewSessionPipeline):
         yield f"row {self.row:,} of {self.mode}, simulated again: {past:,} rows equal those stored"
         yield f"as it was: {was:,} rows, of which {future:,} are stored and equal"
         yield f"{self._difference}: {changed:,} rows"
-        for name, values in self._differences().items():
+        for name, values in self.differences.items():
             shown = sorted({0, len(values) // 4, len(values) - 1})
             each = ", ".join(f"{number(values[k])} after {k + 1:,}" for k in shown)
             yield f"  {name}: root mean square difference {each} rows"
 
     def _findings(self) -> dict[str, Any]:
-        found = self._differences().items()
+        found = self.differences.items()
         return {"numbers": {f"difference/{name}/rmse": float(values[-1]) for name, values in found}}
 
-    def _differences(self) -> dict[str, Array]:
-        """Return by how much the futures differ in each row that both have, by field."""
-        was, changed = self.futures
-        found = {}
-        for name, values in was.items():
-            other = changed.get(name, values[:0])
-            count = min(len(values), len(other))
-            if count and values.dtype.kind == "f" and values.shape[1:] == other.shape[1:]:
-                square = np.square(values[:count] - other[:count], dtype=np.float64)
-                found[name] = np.sqrt(square.reshape(count, -1).mean(axis=1))
-        return found
+
+def _differences(was: Batch, changed: Batch) -> dict[str, Array]:
+    """Return by how much futures differ in each row that both have, by field."""
+    found = {}
+    for name, values in was.items():
+        other = changed.get(name, values[:0])
+        count = min(len(values), len(other))
+        if count and values.dtype.kind == "f" and values.shape[1:] == other.shape[1:]:
+            square = np.square(values[:count] - other[:count], dtype=np.float64)
+            found[name] = np.sqrt(square.reshape(count, -1).mean(axis=1))
+    return found
 
 
 def _titled(events: Sequence[Event], title: str) -> Iterator[Event]:

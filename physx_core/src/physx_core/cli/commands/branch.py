@@ -25,9 +25,11 @@ def run(words: Sequence[str]) -> None:
     futures as well. ``--set NAME=VALUE ...`` is short for ``--change.NAME VALUE``.
     """
     words = list(_with_changes(words))
-    viewers = [] if "--visualizer" in words else visualizer_plugins()
+    is_given = any(word.partition("=")[0] == "--visualizer" for word in words)
+    at_cursor = words[1:2] == [_CURSOR]
+    viewers = [] if is_given and not at_cursor else visualizer_plugins()
     given: dict[str, Any] = {"visualizer": viewers[0]} if len(viewers) == 1 else {}
-    if len(words) > 1 and words[1] == _CURSOR:
+    if at_cursor:
         viewer, found = _cursor(viewers)
         words[1] = str(found.position)
         given = {"visualizer": viewer, "visualizer_kwargs": dict(found.options)}
