@@ -27,13 +27,8 @@ def store_agreement(session: str | Path, agreement: Agreement, seconds: float = 
     Raises:
         SessionError: If it cannot be written.
     """
-    folder = Path(session)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        files.replace(folder / FILE, f"{agreement.to_json()}\n".encode())
-    except OSError as error:
-        raise SessionError(f"{folder / FILE} cannot be written: {error}.") from error
-    store_result(folder, Result(KIND, folder.name, seconds, str(agreement).splitlines()))
+    result = Result(KIND, Path(session).name, seconds, str(agreement).splitlines())
+    store_result(session, result, {FILE: f"{agreement.to_json()}\n".encode()})
 
 
 def read_agreement(session: str | Path) -> Agreement | None:

@@ -20,8 +20,8 @@ from physx_identify.unknowns import Parameter, Unknown
 from physx_identify.wording import WIDTH, number
 from physx_sim import Robot
 
-_WAVES = 8
-_FASTEST_WAVE = 2.0
+_WAVES = 6
+_FASTEST_WAVE = 3.0
 """In Hz."""
 _STEP, _LONGER = 0.5, 1.5
 """First change of the best motion, relative to a random one; growth of changes that improve it."""

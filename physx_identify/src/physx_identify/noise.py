@@ -20,7 +20,7 @@ from physx_core.typing import Array, Vector
 
 ORDERS = 2
 """Highest order of the autoregression of torques."""
-_ITERATIONS = 6
+_ITERATIONS = 4
 _NEVER = 1e12
 _ANYTHING = 100.0
 """Deviation of what a torque that does not count may be, in deviations of its noise."""
@@ -29,6 +29,8 @@ _APART = 0.5
 """Distance along an axis, in standard deviations, at which likelihoods are compared."""
 _FLATTEST, _FARTHEST, _NOWHERE = 0.05, 2.0, 0.1
 """Least curvature along an axis; longest and shortest step, in standard deviations."""
+_NEAR_ENOUGH = 0.3
+"""Distance from the most likely noise, in its own standard deviations, that ends the search."""
 _USUAL = 0.75
 """Usual inverse hyperbolic tangent of an autocorrelation: between 0 and 0.94."""
 
@@ -254,7 +256,7 @@ class Whitener:
             slopes = (ends[:, 0] - ends[:, 1]) / (2 * _APART)
             curves = np.clip((ends.sum(axis=1) - 2 * lowest) / _APART**2, _FLATTEST, None)
             step = np.clip(-slopes / curves, -_FARTHEST, _FARTHEST)
-            if np.abs(step * np.sqrt(curves)).max() < _NOWHERE:
+            if np.abs(step * np.sqrt(curves)).max() < _NEAR_ENOUGH:
                 break
             while (found := loss(x + step @ axes)) > lowest and np.abs(step).max() > _NOWHERE:
                 step = 0.5 * step

@@ -24,11 +24,9 @@ def write_identification(path: str | Path, found: Identification) -> None:
     Raises:
         IdentificationError: If it cannot be written.
     """
-    import tomli_w
-
     path = Path(path)
     try:
-        files.replace(path, tomli_w.dumps(_without_none(found.to_plain())).encode())
+        files.replace(path, _content(found))
     except OSError as error:
         raise IdentificationError(f"{path} cannot be written: {error}.") from error
 
@@ -62,15 +60,16 @@ def store_identification(session: str | Path, found: Identification, seconds: fl
         seconds: How long it took, in s.
 
     Raises:
-        IdentificationError: If it cannot be written.
+        SessionError: If it cannot be written.
     """
-    folder = Path(session)
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise IdentificationError(f"{folder} cannot be made: {error}.") from error
-    write_identification(folder / FILE, found)
-    store_result(folder, Result(KIND, folder.name, seconds, str(found).splitlines()))
+    result = Result(KIND, Path(session).name, seconds, str(found).splitlines())
+    store_result(session, result, {FILE: _content(found)})
+
+
+def _content(found: Identification) -> bytes:
+    import tomli_w
+
+    return tomli_w.dumps(_without_none(found.to_plain())).encode()
 
 
 def _without_none(plain: Any) -> Any:

@@ -22,12 +22,26 @@ _LARGEST = 2**24
 _WRONG = ValueError, TypeError, AttributeError, LookupError
 
 
-def store_result(session: Path, result: Result) -> None:
+def store_result(
+    session: str | Path, result: Result, beside: Mapping[str, bytes] | None = None
+) -> None:
     """Write a result to a session, in place of that of the last run of the same pipeline.
+
+    Args:
+        session: Its folder, which is made if it does not exist.
+        result: The result.
+        beside: Contents of files that belong to it, by name.
 
     Raises:
         SessionError: If the session cannot be written to.
     """
+    session = Path(session)
+    for name, content in (beside or {}).items():
+        try:
+            session.mkdir(parents=True, exist_ok=True)
+            files.replace(session / name, content)
+        except OSError as error:
+            raise SessionError(f"{session / name} cannot be written: {error}.") from error
     known = {}
     with contextlib.suppress(OSError, ValueError, AttributeError):  # none yet, or damaged
         for name, each in parse_json(files.read_content(session / FILE, _LARGEST)).items():
