@@ -195,11 +195,13 @@ def constrained(
             missed |= part.add_missed(after[span])
     of_rows = np.zeros(len(columns))
     of_rows[rows] = impulses[len(bias) : len(bias) + len(rows)]
-    of_pairs, *of_points = np.split(impulses[: len(bias)], np.cumsum([len(each) for each in guess]))
-    of_joints = np.split(of_rows, np.cumsum([len(part.acts) for part in parts]))
-    for part, *own in zip(parts, of_points, of_joints, strict=False):
-        part.keep(*own)
-    return after, of_pairs.reshape(-1, 3)
+    point = ahead = len(guess[0])
+    row = 0
+    for part, warmed in zip(parts, guess[1:], strict=True):
+        ends = point + len(warmed), row + len(part.acts)
+        part.keep(impulses[point : ends[0]], of_rows[row : ends[1]])
+        point, row = ends
+    return after, impulses[:ahead].reshape(-1, 3)
 
 
 def _diagonal(blocks: Sequence[Vector], spans: Sequence[slice]) -> Vector:
