@@ -14,6 +14,7 @@ from __future__ import annotations
 
 import importlib.util
 import itertools
+import re
 import sys
 import tempfile
 import warnings
@@ -157,7 +158,12 @@ def readable() -> Iterator[tuple[str, list[Robot]]]:
         try:
             yield name, without_friction(mjcf_robots(path, collisions="none"))
         except PhysxError as error:
-            print(f"  {name}: {' '.join(str(error).split())}")
+            print(f"  {name}: {said(error)}")
+
+
+def said(error: PhysxError) -> str:
+    """Return an error in a line, with packages in the place of folders."""
+    return re.sub(rf"\S*/(?={'|'.join(FILES)})", "", " ".join(str(error).split()))
 
 
 def compared(kind: str, given: Iterator[tuple[str, list[Robot]]], *, own: bool) -> Iterator[bool]:
@@ -170,7 +176,7 @@ def compared(kind: str, given: Iterator[tuple[str, list[Robot]]], *, own: bool) 
                 plugins.resolve("backend", engine).build(World(each)) for engine in ENGINES
             ]
         except PhysxError as error:
-            print(f"  {name}: {' '.join(str(error).split())}")
+            print(f"  {name}: {said(error)}")
             continue
         theirs = Compiled(Path(each[0].urdf), simulations[0].layout) if own else None
         for what, value in errors(simulations, theirs).items():
