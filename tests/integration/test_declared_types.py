@@ -69,6 +69,7 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
         "urdf": "arm.urdf",
         "feet": {"foot": 0.25},
         "mass_factors": {"link": 1.25, "hand": 0.5},
+        **{"friction": 0.5, "torsional_friction": 0.25, "rolling_friction": 0.125},
     },
     physx_sim.World: {"robots": [physx_sim.Robot("arm.urdf")], "iterations": 3},
     physx_sim.Wrench: {
@@ -105,6 +106,7 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     | {"sources": {"a": 0.5}},
     EpisodeRecord: {"episode": 3, "rows": 2, "seconds": 0.5},
     physx_sim.BodySettings: {"mass": 2.5, "friction": 0.25, "hidden": True}
+    | {"torsional_friction": 0.5, "rolling_friction": 0.125}
     | {"position": (0.5, 1.0, 2.0), "orientation": (0.0, 0.0, 0.0, 1.0)}
     | {"velocity": (0.5, 1.0, 2.0), "angular_velocity": (0.5, 1.0, 2.0)}
     | {"surface_velocity": (0.5, 1.0, 2.0)},

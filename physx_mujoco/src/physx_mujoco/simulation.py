@@ -69,6 +69,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         "body_contacts": "soft",
         "joint_wrenches": "not while anything is attached",
         "mesh_contacts": "as convex hulls",
+        "torsional_friction": "soft; sliding, turning and rolling share one bound",
     }
 
     def __init__(self, world: World) -> None:
@@ -152,6 +153,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         self._world.write_masses(self.parts)
         if len(self._world.made):
             self._world.write_frictions(self.parts)
+            self._contact_rows.note_frictions()
         if self.parts.world.ground is not before.world.ground:
             self._world.write_heights(self.parts)
         self._world.derive()
@@ -220,6 +222,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         found["point"], found["depth"] = contact.pos, -contact.dist
         found["normal"] = sign * frames[:, 0]
         found["force"] = sign * (forces[:, None, :3] @ frames)[:, 0]
+        found["torque"] = sign * (forces[:, None, 3:] @ frames)[:, 0]
         return found
 
     def close(self) -> None:

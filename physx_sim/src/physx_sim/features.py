@@ -30,6 +30,7 @@ FEATURES = {
     "rk4": 'World(integrator="rk4")',
     "self_collisions": "Robot(self_collisions=True)",
     "springs": "springs and damping in joints",
+    "torsional_friction": "torsional and rolling friction of contacts",
     "wrenches": "external forces",
 }
 """Every feature that a simulation may have, with its meaning."""

@@ -271,8 +271,8 @@ def test_what_is_left_out_is_named_once(tmp_path):
     (text,) = [str(each.message) for each in caught]
     for part in (
         *('Robot "rich"', "actuators (1: command", "tendons (1", "equality constraints (1"),
-        *("the fluid", "gravity=(0.0, 0.0, -1.6)", "rolling friction", "ellipsoids"),
-        *("the friction of geoms", "fixed to the world (World(ground=", "fixed_base=False lets"),
+        *("the fluid", "gravity=(0.0, 0.0, -1.6)", "ellipsoids"),
+        *("fixed to the world (World(ground=", "fixed_base=False lets"),
     ):
         assert part in text
 

@@ -431,6 +431,8 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._changes.check(name, settings)
         if any(value is not None for value in motion_of(settings)):
             self._check_has("moving_statics")
+        if settings.torsional_friction is not None or settings.rolling_friction is not None:
+            self._check_has("torsional_friction")
         return body
 
     def _move_static(self, body: int, settings: BodySettings) -> None:
@@ -771,12 +773,13 @@ class RobotSimulation(Simulation, Generic[Engine]):
             return found
         poses = self._algorithms.body_poses(q, range(len(self.layout.bodies)))
         contacts = self.contacts() if "contacts" in self.features else np.zeros(0, CONTACT)
-        for first, second, (x, y, z), force, *_ in contacts.tolist():
+        for first, second, (x, y, z), force, _, _, torque in contacts.tolist():
             for body, sign in ((first, 1.0), (second, -1.0)):
                 if body < len(poses):
                     a, b, c = poses[body, :3].tolist()
                     acting = [sign * part for part in force]
                     _add(found, body, acting, cross(x - a, y - b, z - c, *acting))
+                    _add(found, body, (0.0, 0.0, 0.0), [sign * part for part in torque])
         for wrench, force, torque in self._wrenches.before(self._frame):
             body = self._checks.body(wrench.body)
             turn = to_matrix(poses[body, 3:])

@@ -143,7 +143,7 @@ class IdealContactSensors:
     def measure(self, simulation: Simulation, out: Vector) -> None:
         """Write touching, normal force, and force."""
         sums = [[0.0] * 5 for _ in out]
-        for first, second, _, (x, y, z), (a, b, c), _ in simulation.contacts().tolist():
+        for first, second, _, (x, y, z), (a, b, c), *_ in simulation.contacts().tolist():
             for place, sign in ((first, 1.0), (second, -1.0)):
                 for row in self._rows.get(place, ()):
                     mine = sums[row]
