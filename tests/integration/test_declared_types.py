@@ -86,6 +86,8 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     physx_sim.ForceTorqueSensor: {"name": "wrist", "joint": "wrist", "period": 0.25},
     physx_sim.Lidar: {"name": "lidar", "body": "head", "directions": [(1.0, 0.5, 0.0)]}
     | {"position": (1.0, 0.5, 0.25), "reach": 4.5, "period": 0.25},
+    physx_sim.Camera: {"name": "eye", "body": "head", "reach": 4.5, "near": 0.5, "height": 8}
+    | {"width": 16, "field_of_view": 0.5, "position": (1.0, 0.5, 0.25), "period": 0.25},
     physx_sim.HeightScan: {"name": "scan", "body": "head", "points": [(1.0, 0.5)], "reach": 4.5}
     | {"period": 0.25},
     physx_sim.EffortSensor: {"name": "knee", "joint": "knee", "period": 0.25},

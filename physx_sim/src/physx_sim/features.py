@@ -8,6 +8,7 @@ FEATURES = {
     "armature": "JointSettings.armature",
     "attachments": "Weld and Connect, in the world from the start or while it runs",
     "body_contacts": "contacts between moving bodies",
+    "cameras": "images of cameras: depth, segmentation, colors",
     "changes": "masses, friction, hidden objects and height fields that change while it runs",
     "contacts": "contacts with static bodies",
     "derivatives": "derivatives of the forward dynamics",

@@ -22,6 +22,7 @@ from physx_sim import (
     AppliedAttachment,
     Attachment,
     BodySettings,
+    Camera,
     HeightField,
     Hook,
     Simulation,
@@ -734,6 +735,30 @@ class RobotSimulation(Simulation, Generic[Engine]):
         poses = np.concatenate([poses, self._scenery.poses])
         passed = [*self._checks.bodies(ignored), *self._hidden]
         return self._caster.cast(first, last, poses, passed)
+
+    def take_images(self, camera: Camera) -> dict[str, Vector]:
+        """Return the images of a camera by their names, in the present state."""
+        self._check_has("cameras")
+        carriers = [camera.body] if camera.body else []
+        passed = [*self._checks.bodies([*carriers, *camera.ignored]), *self._hidden]
+        position, turn = np.array(camera.position), to_matrix(camera.rotation)
+        for x, y, z, *orientation in self.body_poses(carriers).tolist():
+            whole = to_matrix(orientation)
+            position, turn = whole @ position + (x, y, z), whole @ turn
+        return self.draw(camera, position, turn, passed)
+
+    def draw(
+        self, camera: Camera, position: Vector, turn: Vector, passed: Sequence[int]
+    ) -> dict[str, Vector]:
+        """Return the images of a camera; called only if the engine has the feature ``cameras``.
+
+        Args:
+            camera: The camera.
+            position: Its position in the world, shape (3,), in m.
+            turn: Its axes in the world, as columns, shape (3, 3).
+            passed: Bodies that it does not see, as indices into `Layout.names`.
+        """
+        raise self._lacks("cameras")
 
     def joint_wrenches(self) -> Vector:
         """Return the joint reactions in the last step, shape (joints, 6)."""
