@@ -36,6 +36,7 @@ from .motors.motor import Motor as Motor
 from .motors.motor import with_rotors as with_rotors
 from .motors.motors import Motors as Motors
 from .motors.motors import MotorState as MotorState
+from .sensors.sensor import Camera as Camera
 from .sensors.sensor import ContactSensor as ContactSensor
 from .sensors.sensor import EffortSensor as EffortSensor
 from .sensors.sensor import Encoder as Encoder
