@@ -30,6 +30,7 @@ FEATURES = {
     "rk4": 'World(integrator="rk4")',
     "self_collisions": "Robot(self_collisions=True)",
     "springs": "springs and damping in joints",
+    "step_derivatives": "derivatives of steps, through contacts, limits and motors",
     "wrenches": "external forces",
 }
 """Every feature that a simulation may have, with its meaning."""

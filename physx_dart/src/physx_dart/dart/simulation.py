@@ -86,6 +86,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
     """A world in DART."""
 
     engine = "dart"
+    lacks: ClassVar[frozenset[str]] = frozenset({"step_derivatives"})
     caveats: ClassVar[Mapping[str, str]] = {
         "armature": "impulses of contacts, limits and servos do not know it: a warning",
         "exact_restore": "not with the detector `dart` and an iterative solver",

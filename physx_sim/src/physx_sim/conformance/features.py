@@ -47,6 +47,7 @@ _CALLS: Mapping[str, _Call] = {
     "joint_wrenches": lambda one: one.joint_wrenches(),
     "mass_matrix": lambda one: one.mass_matrix(one.positions()),
     "raycast": lambda one: one.raycast(np.zeros((1, 3)), np.ones((1, 3))),
+    "step_derivatives": lambda one: one.step_with_derivatives(),
     "wrenches": lambda one: one.apply_wrench(Wrench("hand", force=(1.0, 0.0, 0.0))),
 }
 
