@@ -34,6 +34,7 @@ def _zeros(simulation: Simulation) -> tuple[Vector, Vector]:
 
 
 _CALLS: Mapping[str, _Call] = {
+    "step_derivatives": lambda one: one.step_with_derivatives(),  # none while there are hooks
     "accelerations": lambda one: one.accelerations(),
     "attachments": lambda one: one.detach(one.attach(Connect("hand"))),
     "changes": lambda one: one.set_body("hand", BodySettings(mass=2.0)),
@@ -47,7 +48,6 @@ _CALLS: Mapping[str, _Call] = {
     "joint_wrenches": lambda one: one.joint_wrenches(),
     "mass_matrix": lambda one: one.mass_matrix(one.positions()),
     "raycast": lambda one: one.raycast(np.zeros((1, 3)), np.ones((1, 3))),
-    "step_derivatives": lambda one: one.step_with_derivatives(),
     "wrenches": lambda one: one.apply_wrench(Wrench("hand", force=(1.0, 0.0, 0.0))),
 }
 
