@@ -4,6 +4,7 @@ from .backend import Backend as Backend
 from .backend import Hook as Hook
 from .backend import RobotInfo as RobotInfo
 from .backend import Simulation as Simulation
+from .derivatives import StepDerivatives as StepDerivatives
 from .description.attachment import Attachment as Attachment
 from .description.attachment import Connect as Connect
 from .description.attachment import Weld as Weld
