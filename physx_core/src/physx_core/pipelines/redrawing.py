@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 
 from physx_core.closeable import Closeable
+from physx_core.components.hand import HAND
 from physx_core.components.scene.event import Event
 from physx_core.config import EnvironmentConfig, from_plain
 from physx_core.dataset import Dataset
@@ -19,7 +20,7 @@ from physx_core.pipelines.campaign import recorded_campaigns
 from physx_core.pipelines.generation import Generation
 from physx_core.pipelines.pipeline import derive_seed
 from physx_core.pipelines.replay import recorded_environment
-from physx_core.pipelines.services import Predict, RunServices, Show
+from physx_core.pipelines.services import Predict, RunServices, Show, Touch
 from physx_core.pipelines.storage import STREAMS
 from physx_core.typing import Sample
 from physx_core.workers.instance import Instance, instance_arguments
@@ -73,6 +74,7 @@ class Redrawing(Closeable):
             EnvironmentConfig, recorded_environment(dataset, trust=trust, info=described)
         )
         self.takes_predictions = False
+        self._rows, self._at = range(0), 0  # of the episode or stream, and the next of them
 
     def frames(
         self, rows: Sequence[int], predict: Callable[[int], Sample | None] | None = None
@@ -115,7 +117,7 @@ class Redrawing(Closeable):
         """
         instance = self.instance
         for _ in range(rows):
-            if not (sample := instance.step()):
+            if not (sample := self._step(instance)):
                 return
             yield sample, self._take_events()
 
@@ -185,10 +187,19 @@ class Redrawing(Closeable):
         """Return an instance that draws; the events are kept."""
         if self._instance is None:
             folder = self._dataset.directory
-            instance = Instance(**instance_arguments(self._config, number, seed, False))
-            self._instance = instance
-            instance.open(_Drawing(folder, self._show, self._predict), draw=True)
+            arguments = instance_arguments(self._config, number, seed, False)
+            arguments["hand"] = HAND in self._dataset[self._mode]
+            instance = self._instance = Instance(**arguments)
+            services = _Drawing(folder, self._show, self._predict, lambda _: self._done())
+            instance.open(services, draw=True)
         return self._instance
+
+    def _done(self) -> Sequence[float]:
+        """Return what a person did before the next row; nothing if none is stored."""
+        if self._at >= len(self._rows):
+            return ()
+        done: Sequence[float] = self._dataset[self._mode][HAND][self._rows[self._at]]
+        return done
 
     def _show(self, instance_id: int, step: int, events: list[Event]) -> None:
         self._events += events
@@ -214,8 +225,10 @@ class Redrawing(Closeable):
             instance.begin(number, values)
             end = max(each for each in rows if self._entry(each) == entry)
             end = row if known.numbers[entry] > 1 else end
+            count = 1 if known.numbers[entry] > 1 else int(known.rows[entry])
+            self._rows, self._at = range(first, first + count), 0
             for last in range(first, end + 1):
-                yield last, instance.step()
+                yield last, self._step(instance)
 
     def _stream(self, rows: Sequence[int]) -> Iterator[tuple[int, Sample]]:
         """Simulate the stream of rows; yield all of them up to the last, and their data."""
@@ -224,8 +237,14 @@ class Redrawing(Closeable):
         assert streams is not None
         seed = derive_seed(streams.seed, self._mode, streams.offset)
         instance = self._open(begin - streams.first + 1, seed)
+        self._rows, self._at = range(begin, self._dataset.num_samples(self._mode), count), 0
         for row in range(begin, rows[-1] + 1, count):
-            yield row, instance.step()
+            yield row, self._step(instance)
+
+    def _step(self, instance: Instance) -> Sample:
+        sample = instance.step()
+        self._at += 1
+        return sample
 
     def _place(self, row: int) -> tuple[int, int]:
         """Return the first row of a row's stream, and the number of rows from one to the next."""
@@ -254,8 +273,8 @@ class Redrawing(Closeable):
 class _Drawing(RunServices):
     """Answers an environment that draws: what was saved in its run is there, nothing is stored."""
 
-    def __init__(self, folder: Path, show: Show, predict: Predict | None) -> None:
-        super().__init__(folder, show, predict)
+    def __init__(self, folder: Path, show: Show, predict: Predict | None, touch: Touch) -> None:
+        super().__init__(folder, show, predict, touch=touch)
         self._saved: dict[int, dict[str, Any]] = {}
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:

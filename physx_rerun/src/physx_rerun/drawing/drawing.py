@@ -129,6 +129,8 @@ class Drawing:
         return places
 
     def _draw(self, event: Event, times: Times) -> None:
+        if event.kind == "controls" and event.action == "add":
+            return
         if event.kind not in self._draw_kind and event.kind != "view":
             raise VisualizerError(
                 f'Rerun cannot draw "{event.name}" of the unknown kind "{event.kind}". '
