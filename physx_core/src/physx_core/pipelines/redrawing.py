@@ -16,26 +16,30 @@ from physx_core.components.scene.event import Event
 from physx_core.config import EnvironmentConfig, from_plain
 from physx_core.dataset import Dataset
 from physx_core.errors import DatasetError, UsageError
+from physx_core.net.values import decode
 from physx_core.pipelines.campaign import recorded_campaigns
 from physx_core.pipelines.generation import Generation
 from physx_core.pipelines.pipeline import derive_seed
 from physx_core.pipelines.replay import recorded_environment
 from physx_core.pipelines.services import Predict, RunServices, Show, Touch
 from physx_core.pipelines.storage import STREAMS
+from physx_core.pipelines.stored_streams import states_of
 from physx_core.typing import Sample
 from physx_core.workers.instance import Instance, instance_arguments
+from physx_core.workers.pasts import Past
 
 
 class Redrawing(Closeable):
     """Draws stored rows again, with the environment that generated them, in this process.
 
     The environment simulates them again: independent episodes by their numbers, the others from the
-    beginning of their stream. Each row is compared with the stored one, bit by bit, so that nothing
-    else is drawn in its place. Nothing is stored.
+    last state that their stream has left before, or from its beginning. Each row is compared with
+    the stored one, bit by bit, so that nothing else is drawn in its place. Nothing is stored.
 
     Attributes:
         takes_predictions: Whether the environment has got predictions, as it defines
             `Environment.apply_prediction`; then it draws them itself.
+        compared: Number of rows that were simulated again, and are equal to the stored ones.
     """
 
     def __init__(
@@ -73,7 +77,7 @@ class Redrawing(Closeable):
         self._config = from_plain(
             EnvironmentConfig, recorded_environment(dataset, trust=trust, info=described)
         )
-        self.takes_predictions = False
+        self.takes_predictions, self.compared = False, 0
         self._rows, self._at = range(0), 0  # of the episode or stream, and the next of them
 
     def frames(
@@ -98,6 +102,7 @@ class Redrawing(Closeable):
                     f"to simulate these rows again takes longer than {self._patience:g} s"
                 )
             self.compare(row, sample)
+            self.compared += 1
             if predict is not None:
                 self._apply(predict(row))
             if row in wanted:
@@ -156,6 +161,33 @@ class Redrawing(Closeable):
             end = stored
         return list(range(begin, row + 1, step)), list(range(row + step, end, step))
 
+    def shown(self, rows: Sequence[int], most: int) -> Sequence[int]:
+        """Return the last ones of a row's episode or stream that `frames` simulates quickly.
+
+        Args:
+            rows: The rows to that row.
+            most: Largest number.
+
+        Returns:
+            That many, but those after a state, if their stream has left one among them only.
+        """
+        last = rows[-most:]
+        if not self._is_numbered(last) and not self._state_before(last[0])[1]:
+            begin = self._state_before(rows[-1])[0]
+            return [row for row in last if row >= begin]
+        return last
+
+    def _state_before(self, row: int) -> tuple[int, bytes]:
+        """Return the row from which a stream can go on to a row, and the state there, if any."""
+        begin, count = self._place(row)
+        streams = self._streams
+        assert streams is not None
+        number, before = begin - streams.first + 1, (row - begin) // count
+        files = states_of(streams, self._dataset.directory.parent)
+        found = files.read(lambda of, past: of == number and past.rows <= before)
+        past = found.get(number, Past())
+        return begin + past.rows * count, past.state
+
     def _take_events(self) -> list[Event]:
         events, self._events = self._events, []
         return events
@@ -191,7 +223,7 @@ class Redrawing(Closeable):
             arguments["hand"] = HAND in self._dataset[self._mode]
             instance = self._instance = Instance(**arguments)
             services = _Drawing(folder, self._show, self._predict, lambda _: self._done())
-            instance.open(services, draw=True)
+            instance.open(services, draw=True, with_states=self._episodes is None)
         return self._instance
 
     def _done(self) -> Sequence[float]:
@@ -237,8 +269,11 @@ class Redrawing(Closeable):
         assert streams is not None
         seed = derive_seed(streams.seed, self._mode, streams.offset)
         instance = self._open(begin - streams.first + 1, seed)
-        self._rows, self._at = range(begin, self._dataset.num_samples(self._mode), count), 0
-        for row in range(begin, rows[-1] + 1, count):
+        start, state = self._state_before(rows[0])
+        if state:
+            instance.set_state(decode(state)["instance"])
+        self._rows, self._at = range(start, self._dataset.num_samples(self._mode), count), 0
+        for row in range(start, rows[-1] + 1, count):
             yield row, self._step(instance)
 
     def _step(self, instance: Instance) -> Sample:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from physx_core.closeable import Closeable
 from physx_core.components.hand import HAND
@@ -24,6 +25,11 @@ from physx_core.sources.source import Source
 from physx_core.workers.pasts import NOTHING, PastFiles
 
 _ADVICE = "Start another run for more of them."
+
+
+def states_of(streams: Generation, session: Path) -> PastFiles:
+    """Return the last states of streams, which are in the folder of their session."""
+    return PastFiles(session / "states", f"{streams.mode} {streams.first} {streams.seed}")
 
 
 class StoredStreams(Closeable):
@@ -63,8 +69,7 @@ class StoredStreams(Closeable):
         described = describe_environment(config, seed if config.seed is None else config.seed)
         now = replace(Generation.begin(STREAMS, dataset, mode, seed, described), offset=offset)
         known = former or now
-        run = f"{known.mode} {known.first} {known.seed}"
-        self._files = PastFiles(session.path / "states", run)
+        self._files = states_of(known, session.path)
         self.skip, self.earlier = NOTHING, dict[int, int]()
         self._dataset, self._mode = dataset, mode
         self._first, self._count = known.first, config.num_clients
