@@ -62,3 +62,6 @@ from .vectors import finite_rows as finite_rows
 from .vectors import finite_vector as finite_vector
 from .vectors import overwrite as overwrite
 from .version import __version__ as __version__
+from .visuals import VisualModel as VisualModel
+from .visuals import VisualShape as VisualShape
+from .visuals import read_visuals as read_visuals
