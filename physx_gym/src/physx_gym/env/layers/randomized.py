@@ -15,7 +15,6 @@ from physx_gym.env.pipeline_env import PipelineEnv
 from physx_gym.tasks.randomizations import Randomization
 from physx_gym.tasks.randomizations.randomization import Nominal
 
-
 _POSTERIOR = "physx_identify:Identified"
 """Draws from a file; of a package that builds on this one, so it is named, not imported."""
 
