@@ -146,6 +146,7 @@ RECORDS = {
         "MotorState",
         "SensorState",
         "RobotInfo",
+        "StepDerivatives",
     ),
     *("UrdfShape", "Episode", "StepperState", "Result", "Comparison", "Trial", "Normalization"),
     *("CollisionShape", "Joint", "MovableBody", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),

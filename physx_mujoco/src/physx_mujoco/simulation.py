@@ -63,7 +63,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
     """A world in MuJoCo."""
 
     engine = "mujoco"
-    lacks: ClassVar[frozenset[str]] = frozenset({"derivatives", "restitution"})
+    lacks: ClassVar[frozenset[str]] = frozenset({"derivatives", "restitution", "step_derivatives"})
     caveats: ClassVar[Mapping[str, str]] = {
         "attachments": f"while it runs, {SPARE} more than at the start; soft",
         "cameras": "with EGL or OSMesa",

@@ -4,6 +4,7 @@ from .backend import Backend as Backend
 from .backend import Hook as Hook
 from .backend import RobotInfo as RobotInfo
 from .backend import Simulation as Simulation
+from .derivatives import StepDerivatives as StepDerivatives
 from .description.attachment import Attachment as Attachment
 from .description.attachment import Connect as Connect
 from .description.attachment import Weld as Weld
@@ -61,3 +62,6 @@ from .vectors import finite_rows as finite_rows
 from .vectors import finite_vector as finite_vector
 from .vectors import overwrite as overwrite
 from .version import __version__ as __version__
+from .visuals import VisualModel as VisualModel
+from .visuals import VisualShape as VisualShape
+from .visuals import read_visuals as read_visuals

@@ -31,6 +31,7 @@ FEATURES = {
     "rk4": 'World(integrator="rk4")',
     "self_collisions": "Robot(self_collisions=True)",
     "springs": "springs and damping in joints",
+    "step_derivatives": "derivatives of steps, through contacts, limits and motors",
     "torsional_friction": "torsional and rolling friction of contacts",
     "wrenches": "external forces",
 }

@@ -8,6 +8,7 @@ from .networks.network import TorchNetwork as TorchNetwork
 from .networks.transformation import TorchTransformation as TorchTransformation
 from .networks.unet import UNet as UNet
 from .networks.unet_transformation import UNetTransformation as UNetTransformation
+from .step import Step as Step
 from .training.data import StoredDataset as StoredDataset
 from .training.optimization import TorchOptimization as TorchOptimization
 from .training.tensorboard import TensorBoard as TensorBoard

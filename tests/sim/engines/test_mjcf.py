@@ -6,11 +6,13 @@ import sys
 import warnings
 from pathlib import Path
 
+import gymnasium
+import mujoco
 import numpy as np
 import pytest
+from compiled import Compiled, states, without_friction
 
 from physx_core import plugins
-from physx_core.rotations import to_matrix
 from physx_sim import Ground, JointSettings, Robot, World, mjcf_robots
 from physx_sim.engines import read_robot
 from physx_sim.errors import ModelError
@@ -19,9 +21,6 @@ pytestmark = [
     pytest.mark.processes,
     pytest.mark.filterwarnings("ignore:.*leaves out"),
 ]
-
-mujoco = pytest.importorskip("mujoco")
-gymnasium = pytest.importorskip("gymnasium")
 
 ASSETS = Path(gymnasium.__file__).parent / "envs/mujoco/assets"
 ENGINES = ("dart", "pinocchio", "mujoco")
@@ -70,90 +69,15 @@ def odd(tmp_path):
     return path
 
 
-def states(layout, rng):
-    """Return random positions, velocities and torques."""
-    q = rng.uniform(-1, 1, layout.nq)
-    for part in layout.parts.values():
-        if part.floating:
-            turn = q[part.positions][3:7]
-            turn /= np.linalg.norm(turn)
-    return q, *rng.uniform(-1, 1, (2, layout.nv))
-
-
-class Theirs:
-    """A file in MuJoCo itself, without what no engine of physx has."""
-
-    def __init__(self, path, layout):
-        self.model = mujoco.MjModel.from_xml_path(str(path))
-        self.model.opt.density = self.model.opt.viscosity = 0.0
-        self.model.opt.gravity[:] = 0.0, 0.0, -9.81
-        self.model.dof_frictionloss[:] = 0.0
-        self.data, self.layout = mujoco.MjData(self.model), layout
-        at = [self.model.joint(name.rpartition("/")[2]) for name in layout.joints]
-        self.q, self.v = ([int(getattr(j, a)[0]) for j in at] for a in ("qposadr", "dofadr"))
-        bases = [j for j in range(self.model.njnt) if self.model.jnt_type[j] == 0]
-        self.bases = [(self.model.jnt_qposadr[j], self.model.jnt_dofadr[j]) for j in bases]
-        self.floating = [part for part in layout.parts.values() if part.floating]
-
-    def set(self, q, v, tau):
-        data, layout = self.data, self.layout
-        data.qpos[self.q] = q[list(layout.position_index.values())]
-        ours = list(layout.velocity_index.values())
-        data.qvel[self.v], data.qfrc_applied[self.v] = v[ours], tau[ours]
-        for (x, y), part in zip(self.bases, self.floating, strict=True):
-            pose, twist, wrench = q[part.positions], v[part.velocities], tau[part.velocities]
-            turn = to_matrix(pose[3:7])
-            data.qpos[x : x + 7] = pose[[0, 1, 2, 6, 3, 4, 5]]
-            data.qvel[y : y + 6] = *(turn @ twist[:3]), *twist[3:6]
-            data.qfrc_applied[y : y + 6] = *(turn @ wrench[:3]), *wrench[3:6]
-        mujoco.mj_forward(self.model, data)
-
-    def accelerations(self, q, v, tau):
-        """Return what physx's forward dynamics is."""
-        self.set(q, v, tau)
-        found = np.zeros(self.layout.nv)
-        found[list(self.layout.velocity_index.values())] = self.data.qacc_smooth[self.v]
-        for (_, y), part in zip(self.bases, self.floating, strict=True):
-            a, twist = self.data.qacc_smooth[y : y + 6], v[part.velocities]
-            linear = a[:3] @ to_matrix(q[part.positions][3:7]) - np.cross(twist[3:6], twist[:3])
-            found[part.velocities][:6] = *linear, *a[3:]
-        return found
-
-    def masses(self):
-        """Return the mass matrix of the joints, after `set`."""
-        found = np.zeros((self.model.nv, self.model.nv))
-        mujoco.mj_fullM(self.model, self.data, found)
-        return found[np.ix_(self.v, self.v)]
-
-    def poses(self, names):
-        """Return the poses of bodies, with quaternions x, y, z, w, after `set`."""
-        found = []
-        for name in names:
-            body = self.data.body(name)
-            w, *xyz = body.xquat * (1 if body.xquat[0] >= 0 else -1)
-            found.append([*body.xpos, *xyz, w])
-        return np.array(found)
-
-
 def check_close(found, expected, bound):
     assert np.abs(found - expected).max() <= bound * max(np.abs(expected).max(), 1.0)
-
-
-def without_friction(robots):
-    """Return robots without friction in their joints, which MuJoCo's smooth dynamics lack."""
-    found = []
-    for robot in robots:
-        names = [joint.name for joint in read_robot(robot).joints]
-        joints = {name: JointSettings(friction=0.0) for name in names}
-        found.append(Robot(**{**vars(robot), "joints": joints}))
-    return found
 
 
 def compare(path, engine):
     robots = without_friction(mjcf_robots(path, collisions="none"))
     with plugins.resolve("backend", engine).build(World(robots)) as simulation:
         layout, rng = simulation.layout, np.random.default_rng(0)
-        theirs = Theirs(path, layout)
+        theirs = Compiled(path, layout)
         named = [name for name in layout.bodies if name.rpartition("/")[2] in path.read_text()]
         named = [name for name in named if "." not in name and "world" not in name]
         for _ in range(3):
@@ -252,6 +176,22 @@ def test_a_mesh_collides_where_mujoco_has_it(tmp_path):
         for direction in np.eye(3):
             assert simulation.reach("robot", direction) == pytest.approx((theirs @ direction).max())
     assert shape.mesh == tmp_path / "shapes/wedge.obj"
+
+
+def test_what_is_fixed_to_the_world_is_there_beside_a_floating_tree(engine, tmp_path):
+    path = tmp_path / "step.xml"
+    path.write_text(
+        '<mujoco><worldbody><geom type="box" size="1 1 0.1"/><body name="ball" pos="0 0 1">'
+        '<freejoint/><geom size="0.1"/></body></worldbody></mujoco>',
+        encoding="utf-8",
+    )
+    step, ball = mjcf_robots(path)
+    assert (step.root, ball.root) == ("world", "ball")
+    with engine.build(World([step, ball])) as simulation:
+        simulation.step(2000)
+        assert simulation.body_poses(["ball/ball"])[0, 2] == pytest.approx(0.2, abs=1e-3)
+    with engine.build(World([Robot(path, fixed_base=False)])) as simulation:
+        assert simulation.layout.bodies == ("ball",)
 
 
 @pytest.mark.parametrize("engine", ["dart", "pinocchio", "mujoco"])
@@ -367,7 +307,6 @@ EQUALITIES = """
 
 @pytest.mark.filterwarnings("ignore:.*leaves out")
 def test_equality_constraints_hold_as_in_mujoco(engine, tmp_path):
-    mujoco = pytest.importorskip("mujoco")
     path = tmp_path / "equalities.xml"
     path.write_text(EQUALITIES)
     model = mujoco.MjModel.from_xml_path(str(path))

@@ -86,7 +86,9 @@ class DartSimulation(RobotSimulation[DartRobot]):
     """A world in DART."""
 
     engine = "dart"
-    lacks: ClassVar[frozenset[str]] = frozenset({"cameras", "torsional_friction"})
+    lacks: ClassVar[frozenset[str]] = frozenset(
+        {"cameras", "step_derivatives", "torsional_friction"}
+    )
     caveats: ClassVar[Mapping[str, str]] = {
         "armature": "impulses of contacts, limits and servos do not know it: a warning",
         "exact_restore": "not with the detector `dart` and an iterative solver",

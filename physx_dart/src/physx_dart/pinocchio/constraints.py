@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 
 import numpy as np
 
@@ -36,6 +37,39 @@ class Warmth:
         self.rows.fill(0.0)
 
 
+@dataclass(eq=False, slots=True)
+class Solved:
+    """What a step solved: impulses along rows, of contact points, then joints, then ties.
+
+    Attributes:
+        parts: Constraints of the robots; their velocities, one after the other, are the columns.
+        inverse: Inverse of their mass matrix, shape (nv, nv).
+        along: Jacobian of the rows, shape (n, nv).
+        spread: Velocities for unit impulses, shape (nv, n).
+        response: Velocities along the rows for unit impulses, shape (n, n).
+        free: Velocities along the rows without impulses minus the target ones, shape (n,).
+        friction: Coefficients of the points, shape (k,).
+        least: Smallest impulses of the other rows, shape (n - 3 k,).
+        most: Largest impulses of these rows, in the same form.
+        impulses: The solution, shape (n,).
+        rows: Which rows of the joints acted, as indices into those of all parts.
+        pace: Target velocities of the ties.
+    """
+
+    parts: Sequence[Constraints]
+    inverse: Vector
+    along: Vector
+    spread: Vector
+    response: Vector
+    free: Vector
+    friction: Vector
+    least: Vector
+    most: Vector
+    impulses: Vector
+    rows: Indices
+    pace: Vector
+
+
 class Constraints:
     """The constraints of one robot or object in a step.
 
@@ -46,6 +80,7 @@ class Constraints:
         acts: Which rows of the joints act, shape (rows,).
         impulses: Impulses of the touching points along their axes, shape (k, 3), once known.
         nv: Length of its velocities.
+        solved: What was solved, once it is, together with other robots that touch it.
     """
 
     def __init__(
@@ -79,6 +114,7 @@ class Constraints:
         self.acts = joints.acting(self._bounds, velocities, _REACH if touched else 0.0)
         self.nv = joints.base + len(velocities)
         self.impulses = np.zeros((0, 3))
+        self.solved: Solved | None = None
 
     def aims(self) -> Vector:
         """Return the target velocities of all rows, shape (rows,)."""
@@ -120,10 +156,16 @@ def limited(part: Constraints, v: Vector) -> Vector:
     part.clear_warm_start()
     if not len(rows):
         return v
-    column = joints.columns[rows]
-    spread = part.inverse().take(column, 1)
-    change = part.aims()[rows] - v[column]
-    return v + spread.dot(solve(spread[column], change, joints.least[rows], joints.most[rows]))
+    column, least, most = joints.columns[rows], joints.least[rows], joints.most[rows]
+    inverse = part.inverse()
+    spread = inverse.take(column, 1)
+    response, change = spread[column], part.aims()[rows] - v[column]
+    impulses, along = solve(response, change, least, most), unit(len(v)).take(column, 0)
+    none = change[:0]
+    part.solved = Solved(
+        [part], inverse, along, spread, response, -change, none, least, most, impulses, rows, none
+    )
+    return v + spread.dot(impulses)
 
 
 def constrained(
@@ -193,14 +235,22 @@ def constrained(
         missed = False
         for part, span in zip(parts, spans, strict=True):
             missed |= part.add_missed(after[span])
+    solved = Solved(
+        parts,
+        *(inverse, along, spread, response, free, friction, low, high, impulses, rows),
+        v[:0] if ties is None else ties[1],
+    )
     of_rows = np.zeros(len(columns))
     of_rows[rows] = impulses[len(bias) : len(bias) + len(rows)]
-    of_pairs, *of_points = np.split(impulses[: len(bias)], np.cumsum([len(each) for each in guess]))
-    of_joints = np.split(of_rows, np.cumsum([len(part.acts) for part in parts]))
     _keep_turning(touching, impulses)
-    for part, *own in zip(parts, of_points, of_joints, strict=False):
-        part.keep(*own)
-    return after, of_pairs.reshape(-1, 3)
+    point = ahead = len(guess[0])
+    row = 0
+    for part, warmed in zip(parts, guess[1:], strict=True):
+        ends = point + len(warmed), row + len(part.acts)
+        part.keep(impulses[point : ends[0]], of_rows[row : ends[1]])
+        part.solved = solved
+        point, row = ends
+    return after, impulses[:ahead].reshape(-1, 3)
 
 
 def _last_rows(

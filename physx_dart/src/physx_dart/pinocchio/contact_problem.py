@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
 from collections.abc import Sequence
@@ -111,6 +112,23 @@ class ContactProblem:
                 break
             impulses = impulses + eigenpy.PartialPivLU(slope).solve(change)
         return best, least_error
+
+    def slope(self, impulses: Vector) -> Vector:
+        """Return the derivative of the solution by the free velocities, shape (n, n).
+
+        At a switch, as between sticking and sliding, it is that of one side.
+
+        Args:
+            impulses: The solution.
+        """
+        _, slope = self._project(impulses)
+        # The projection alone: at the same place, but as if impulses had no response.
+        alone, n = copy.copy(self), len(impulses)
+        alone._start = self._back.dot(impulses) + self._start - impulses
+        alone._back, alone._scaled = self._unit, np.zeros((n, n))
+        _, rest = alone._project(impulses)
+        found: Vector = eigenpy.PartialPivLU(slope).solve((rest - self._unit) / self._rates)
+        return found
 
     def _error(self, change: Vector) -> float:
         velocities = change * self._rates

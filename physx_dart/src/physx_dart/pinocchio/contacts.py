@@ -19,7 +19,7 @@ from physx_dart.pinocchio.models import twists_of
 from physx_dart.pinocchio.surfaces import Heights, Plane, surface_of
 from physx_sim import CONTACT, Ground, HeightField, Stairs
 from physx_sim.engines import CollisionShape, MovableBody, Static
-from physx_sim.errors import FeatureNotSupportedError
+from physx_sim.errors import FeatureNotSupportedError, SimulationError
 
 MARGIN = 1e-4
 """Distance, in m, below which a point counts as touching."""
@@ -131,6 +131,12 @@ class ContactPoints:
             rows, impulses = self.spins.points, self.spins.impulses
             records["torque"][rows] = np.einsum("kij,ki->kj", self.axes[rows], impulses / period)
         return records
+
+    def bias_slopes(self, period: float) -> Vector:
+        """Return the derivatives of the normal biases by the gaps, in 1/s, shape (k,)."""
+        gaps = self.gaps
+        returning = np.where(_RETURN * gaps > -_FASTEST_RETURN * period, _RETURN, 0.0)
+        return np.where(gaps > 0, 1.0, returning) / period
 
     def bias(self, before: Vector, period: float) -> Vector:
         """Return the velocity bias along the axes, shape (3 k,).
@@ -245,6 +251,7 @@ class ContactFinder:
         spread = np.repeat(np.arange(len(anchors)), [1] * len(points) + [around] * len(rims))
         self._links = np.array([row[3] for row in anchors], np.intp)[spread]
         self._radii = np.array([row[2] for row in points] + [0.0] * (around * len(rims)))
+        self._joint_of = joints[spread]
         self._moved = np.repeat(moved[joints[spread]], 3, axis=0)
         self._frames = np.zeros((len(spread), 3, 6))
 
@@ -322,6 +329,33 @@ class ContactFinder:
             found += np.einsum("kij,kj->ki", axes, rolling[points])
         found[:, 2] = 0.0
         return found.ravel()
+
+    def anchors(self, found: ContactPoints, before: Vector) -> tuple[Indices, Vector]:
+        """Return the joints that carry points, and centers that move with these, shape (k, 3).
+
+        Args:
+            found: Points from `find`.
+            before: Velocities before the step, shape (nv,).
+
+        Raises:
+            SimulationError: If the velocities of the points after a step are not smooth.
+        """
+        numbers, points = np.divmod(found.numbers, len(self._links))
+        radii, normals = self._radii[points], found.axes[:, 2]
+        centers = found.points + (radii + 0.5 * np.minimum(found.gaps, 0.0))[:, None] * normals
+        bounces = (found.restitution > 0) & (found.jacobian[2::3] @ before < -_BOUNCE)
+        at_edges = np.zeros(len(points), np.bool_)
+        for place, surface in self._surfaces:
+            mine = numbers == place
+            at_edges[mine] = surface.at_edges(centers[mine])
+        for where, what in (
+            (points >= self._first_rim, "a cylinder rolls along its rim; use spheres or capsules"),
+            (bounces, "a contact bounces; use a restitution of 0"),
+            (at_edges, "a point touches an edge of a height field"),
+        ):
+            if where.any():
+                raise SimulationError(f"A step has no derivatives where {what}.")
+        return self._joint_of[points], centers
 
     def bodies(self, numbers: Indices) -> tuple[Indices, Indices]:
         """Return the robot's links and the static bodies for `ContactPoints.numbers`."""

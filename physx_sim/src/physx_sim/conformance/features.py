@@ -35,6 +35,7 @@ def _zeros(simulation: Simulation) -> tuple[Vector, Vector]:
 
 
 _CALLS: Mapping[str, _Call] = {
+    "step_derivatives": lambda one: one.step_with_derivatives(),  # none while there are hooks
     "accelerations": lambda one: one.accelerations(),
     "attachments": lambda one: one.detach(one.attach(Connect("hand"))),
     "changes": lambda one: one.set_body("hand", BodySettings(mass=2.0)),

@@ -22,6 +22,7 @@ RK4_LACKS = (
     "moving_statics",
     "restitution",
     "self_collisions",
+    "step_derivatives",
     "torsional_friction",
 )
 """Features that a simulation lacks with this integrator."""

@@ -7,12 +7,13 @@ abstract methods of `RobotSimulation` for stepping.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
 from physx_core.errors import listed
 from physx_core.typing import Records, Vector
-from physx_sim import CONTACT, Hook, State, Wrench, finite_vector
+from physx_sim import CONTACT, Hook, State, StepDerivatives, Wrench, finite_vector
 from physx_sim.engines.attachments import Attachments
 from physx_sim.engines.changing import ChangeableSimulation
 from physx_sim.engines.checks import integer
@@ -22,6 +23,8 @@ from physx_sim.errors import SimulationError
 
 _FASTEST = 1e8
 """Speed, in m/s or rad/s, above which a state counts as no longer finite."""
+_NEARBY = 1e-4
+"""Change of velocities, in m/s or rad/s, whose two signs are compared."""
 _DEEP = 5e-3
 """Depth, in m, above which a contact in the first step from a state is reported."""
 _BLOCK = 64
@@ -175,6 +178,50 @@ class RobotSimulation(ChangeableSimulation[Engine]):
             self._watch()
             if not self._closed and not len(self._wrenches):
                 self._release()
+
+    def step_with_derivatives(self, n: int = 1, *, compare_sides: bool = False) -> StepDerivatives:
+        """Simulate n physics steps; return how the result depends on what was before.
+
+        Raises:
+            SimulationError: If `n` is invalid, the state is no longer finite, or one of the steps
+                has no derivatives.
+        """
+        self._check_has("step_derivatives")
+        n = integer("n, the number of steps,", n, 1)
+        for acts, what in (
+            (len(self._hooks), "hooks, which may change anything"),
+            (len(self._wrenches), "wrenches"),
+            (len(self._attachments), "attachments"),
+            (len(self._positioned), 'joints with the mode "position"; "servo" has them'),
+            (self._movers, "static bodies that move"),
+            (self._frozen, "hidden objects"),
+            (self.parts.turning, "torsional or rolling friction"),
+        ):
+            if acts:
+                raise SimulationError(f"A step has no derivatives while there are {what}.")
+        sides = self._both_sides(n) if compare_sides else None
+        self.step(1)
+        found = self.derivatives_of_step()
+        for _ in range(n - 1):
+            self.step(1)
+            found = self.derivatives_of_step().after(found)
+        if sides is None:
+            return found
+        slower, faster = (side - self.velocities() for side in sides)
+        change = max(float(abs(faster - slower).max(initial=0.0)), 1e-12)
+        return replace(found, asymmetry=2 * float(abs(faster + slower).max(initial=0.0)) / change)
+
+    def _both_sides(self, n: int) -> tuple[Vector, Vector]:
+        """Return the velocities n steps after two opposite small changes of those now."""
+        state = self.snapshot()
+        change = _NEARBY * np.random.default_rng(0).uniform(-1.0, 1.0, self.layout.nv)
+        found = []
+        for velocities in (state.velocities - change, state.velocities + change):
+            self.set_state(state.positions, velocities)
+            self.step(n)
+            found.append(self.velocities())
+            self.restore(state)
+        return found[0], found[1]
 
     def _check_start(self) -> None:
         """Name bodies that are inside others when the first step from a state is made."""

@@ -9,7 +9,7 @@ from typing import ClassVar, Generic, TypeVar
 import numpy as np
 
 from physx_core.typing import Index, Records, Vector
-from physx_sim import CONTACT, FEATURES, Camera, Simulation, copy_to
+from physx_sim import CONTACT, FEATURES, Camera, Simulation, StepDerivatives, copy_to
 from physx_sim.engines.algorithms import Algorithms
 from physx_sim.engines.attachments import Attachments, Bond
 from physx_sim.engines.changes import Changes, Scenery
@@ -146,6 +146,14 @@ class SimulationCore(Simulation, Generic[Engine]):
             passed: Bodies that it does not see, as indices into `Layout.names`.
         """
         raise self._lacks("cameras")
+
+    def derivatives_of_step(self) -> StepDerivatives:
+        """Return the derivatives of the last physics step; feature `step_derivatives`.
+
+        Raises:
+            SimulationError: If it has none; the message names the reason.
+        """
+        raise self._lacks("step_derivatives")
 
     # State ----------------------------------------------------------------------------------
 

@@ -155,8 +155,9 @@ class _File:
     def root(self, robot: Robot) -> int:
         """Return the body that is a robot's root link; 0: the world."""
         names = {self.body_name(body): body for body in self.floating}
-        names |= {WORLD: 0} if self.attached or not names else {}
-        if not robot.root and len(names) > 1:
+        trees = len(names) + bool(self.attached)
+        names |= {WORLD: 0} if self.attached or self.solid(0) or not names else {}
+        if not robot.root and trees > 1:
             raise ModelError(
                 f"it has several trees: choose one with Robot(root=...), or take all with "
                 f"mjcf_robots(...). Roots: {listed(names)}"
