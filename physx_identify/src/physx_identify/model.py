@@ -262,8 +262,8 @@ class Model:
             numbers: Numbers of the robot.
 
         Returns:
-            Shape (samples, joints, joints); None, that of its own joint, for torques at the instants
-            of samples.
+            Shape (samples, joints, joints); None, that of its own joint, for torques at the
+            instants of samples.
         """
         if path.instant:
             return None

@@ -246,10 +246,10 @@ def constrained(
     point = ahead = len(guess[0])
     row = 0
     for part, warmed in zip(parts, guess[1:], strict=True):
-        ends = point + len(warmed), row + len(part.acts)
-        part.keep(impulses[point : ends[0]], of_rows[row : ends[1]])
+        end, last_row = point + len(warmed), row + len(part.acts)
+        part.keep(impulses[point:end], of_rows[row:last_row])
         part.solved = solved
-        point, row = ends
+        point, row = end, last_row
     return after, impulses[:ahead].reshape(-1, 3)
 
 
