@@ -117,6 +117,7 @@ def test_a_hidden_friction_is_named_and_the_level_refused(clean):
 # What cannot be told -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_inseparable_parameters_are_named_with_what_is_told_of_them(clean):
     log = arm.noisy(clean)
     found = identify(log, arm.hidden(), ["inertia:upper", "armature:shoulder"])
@@ -367,6 +368,7 @@ def test_a_proposed_motion_tells_more_than_a_sweep(found, tmp_path):
     assert table["q.elbow"] == pytest.approx(motion.positions[:, 1])
 
 
+@pytest.mark.slow
 def test_the_command_line_prints_stores_and_reports(clean, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_csv(tmp_path / "log.csv", arm.noisy(clean))

@@ -34,8 +34,10 @@ _EDGE = 4
 """Samples left out at both ends, where the smoothed path is uncertain."""
 _SEPARABLE = 1e-6
 """Relative length of what is left of a column without the others, below which it is one of them."""
-_STILL = 0.02
-"""Velocity below which dry friction is unknown, in rad/s or m/s."""
+_NEAR = 0.01
+"""Share of the encoders' errors in differences that derivatives are made of."""
+_STILL, _UNSURE = 0.02, 2.0
+"""Velocity below which dry friction is unknown: in rad/s or m/s, and in standard errors."""
 
 
 @dataclass(frozen=True)
@@ -194,10 +196,11 @@ class _Problem:
         """
         numbers = self._known + self._directions @ np.maximum(values, self._lowest)
         stencil = self._model.stencil(path, numbers)
+        dry = self._model.dry(path, stencil, numbers) if self._dry.any() else None
         torques = self._torques(values)
-        instruments, known = self._columns(path, path.ends, stencil, torques)
+        instruments, known = self._columns(path, path, stencil, dry, torques)
         instruments = self._endogenous(instruments, known, values)
-        columns, known = self._columns(raw, path.ends, stencil, torques)
+        columns, known = self._columns(path, raw, stencil, dry, torques)
         target = torques - known
         for place, each in self._special:
             if each.kind == "gain":
@@ -208,11 +211,20 @@ class _Problem:
         return _Equation(instruments, columns, target, stencil)
 
     def _columns(
-        self, path: Path, signs: Vector, stencil: Vector, torques: Vector
+        self, path: Path, raw: Path, stencil: Vector, dry: Vector | None, torques: Vector
     ) -> tuple[Vector, Vector]:
-        """Return columns, shape (samples, joints, parameters), and what is known beside them."""
+        """Return columns along a motion near a path, to first order in what it differs by.
+
+        Returns:
+            Shape (samples, joints, parameters); and what is known beside them.
+        """
         given = np.column_stack([self._directions, self._known])
-        found = self._model.columns(path, given, signs)
+        found = self._model.columns(path, given, path.ends, dry)
+        if raw is not path:
+            change = _NEAR * (raw.positions - path.positions)
+            for sign in (1, -1):
+                near = dataclasses.replace(path, positions=path.positions + sign * change)
+                found += sign / (2 * _NEAR) * self._model.columns(near, given, path.ends, dry)
         columns, known = found[..., :-1], found[..., -1]
         for place, each in self._special:
             if each.kind == "delay":
@@ -230,13 +242,14 @@ class _Problem:
         values = self._nominal if start is None else start
         smoother, fixed = Smoother(self._positions(values)), noise is not None
         corrections: Vector | float = 0.0
+        slow = np.full(len(self._model.joints), _STILL)
         found: Fit | None = None
         for step in range(1, _STEPS + 1):
             measured = self._positions(values)
             raw = Path(measured, self._data.period, self._data.instant)
             if step <= _PATH_STEPS:  # then it stays, or the sign of slow motions may never settle
                 path = dataclasses.replace(raw, positions=smoother(measured + corrections))
-                used = ~(self._dry & (np.abs(path.ends) < _STILL))
+                used = ~(self._dry & (np.abs(path.ends) < slow))
                 used[:_EDGE] = used[-_EDGE:] = False
             equation = self._equation(path, raw, values)
             if start is None and step == 1:
@@ -256,6 +269,10 @@ class _Problem:
             if step > _PATH_STEPS and (moved < _CLOSE * np.sqrt(np.diag(found.covariance))).all():
                 return dataclasses.replace(found, converged=True)
             corrections = whitener.corrections(found.residual, noise)
+            if self._dry.any() and step < _PATH_STEPS:
+                errors, left = whitener.draw(noise)
+                unsure = np.diff(smoother(errors + whitener.corrections(left, noise)), axis=0)
+                slow = np.maximum(_STILL, _UNSURE * unsure.std(axis=0) / self._data.period)
         assert found is not None
         return found
 

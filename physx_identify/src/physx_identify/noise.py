@@ -147,6 +147,21 @@ class Whitener:
             found[place : place + count] += np.einsum("kij,ki->kj", blocks, back)
         return noise.encoder**2 * found
 
+    def draw(self, noise: Noise) -> tuple[Vector, Vector]:
+        """Return errors of the encoders, shape (samples + 2, joints), and the residual they leave.
+
+        The latter has errors of the torques too. It is the same draw every time.
+        """
+        random, (count, joints) = np.random.default_rng(0), self._used.shape
+        errors = noise.encoder * random.standard_normal((count + 2, joints))
+        residual = noise.torque * random.standard_normal((count, joints))
+        for row in range(noise.order, count):
+            for lag, weights in enumerate(noise.regression.T, 1):
+                residual[row] += weights * residual[row - lag]
+        for place, blocks in enumerate(self._blocks):
+            residual -= np.einsum("kij,kj->ki", blocks, errors[place : place + count])
+        return errors, residual
+
     def loss(self, residual: Vector, noise: Noise) -> float:
         """Return minus the logarithm of the likelihood of a residual."""
         factor = self.factor(noise)

@@ -40,6 +40,7 @@ from .motors.motors import MotorState as MotorState
 from .motors.network import ActuatorNetwork as ActuatorNetwork
 from .motors.network import read_actuators as read_actuators
 from .motors.network import write_actuators as write_actuators
+from .sensors.sensor import Camera as Camera
 from .sensors.sensor import ContactSensor as ContactSensor
 from .sensors.sensor import EffortSensor as EffortSensor
 from .sensors.sensor import Encoder as Encoder
@@ -64,3 +65,6 @@ from .vectors import finite_rows as finite_rows
 from .vectors import finite_vector as finite_vector
 from .vectors import overwrite as overwrite
 from .version import __version__ as __version__
+from .visuals import VisualModel as VisualModel
+from .visuals import VisualShape as VisualShape
+from .visuals import read_visuals as read_visuals

@@ -22,6 +22,7 @@ from physx_sim.description.world import World
 from physx_sim.description.wrench import Wrench
 from physx_sim.errors import FeatureNotSupportedError
 from physx_sim.layout import Layout, State
+from physx_sim.sensors.sensor import Camera
 
 
 @dataclass(frozen=True)
@@ -351,6 +352,17 @@ class Simulation(Closeable):
                 one of these names.
         """
         raise self._lacks("raycast")
+
+    def take_images(self, camera: Camera) -> dict[str, Vector]:
+        """Return the images of a camera by their names, in the present state.
+
+        Args:
+            camera: The camera; its period and errors have no effect.
+
+        Raises:
+            SimulationError: If there is no body with one of its names, or nothing can draw here.
+        """
+        raise self._lacks("cameras")
 
     @abstractmethod
     def body_poses(

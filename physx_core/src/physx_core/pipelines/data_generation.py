@@ -345,6 +345,7 @@ class DataGeneration(NewSessionPipeline):
             skip=skip,
             delegation=delegation,
             keeps_pasts=self._streams is not None,
+            touch=self._streams and self._streams.touched(self.observers.touch),
         )
         if campaign is None and self._simulates_episodes():
             self._begin_campaign(config, seed)

@@ -5,13 +5,12 @@ from __future__ import annotations
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 
-from physx_core.typing import Vector
+from physx_core.typing import Index, Vector
 from physx_dart.pinocchio.contact_problem import unit
-from physx_dart.pinocchio.contacts import ContactPoints, Indices
+from physx_dart.pinocchio.contacts import ContactPoints, Indices, Spins, joined, together
 from physx_dart.pinocchio.limits import JointConstraints, solve
 from physx_dart.pinocchio.solver import ImpulseSolver
 
@@ -200,12 +199,13 @@ def constrained(
         if part.touching is not None:
             touching.append(part.touching.widened(span, len(v)))
         guess.append(part.last())
-    held, pace = (np.zeros((0, len(v))), np.zeros(0)) if ties is None else ties
-    points = joined([each.jacobian for each in touching]) if touching else held[:0]
-    bias = joined([each.bias(before, period) for each in touching]) if touching else pace[:0]
-    friction = joined([each.friction for each in touching]) if touching else pace[:0]
+    points = joined([each.jacobian for each in touching]) if touching else np.zeros((0, len(v)))
+    bias = joined([each.bias(before, period) for each in touching]) if touching else v[:0]
+    friction = joined([each.friction for each in touching]) if touching else v[:0]
     of_parts = zip(*(part.rows() for part in parts), strict=True)
     columns, least, most, aims, last = (joined(each) for each in of_parts)
+    spins = together(touching)
+    more, fixed, endless, turning = _last_rows(ties, spins, len(v))
     if len(parts) > 1:
         starts, counts = [span.start for span in spans], [len(part.acts) for part in parts]
         columns = columns + np.repeat(starts, counts)
@@ -218,17 +218,17 @@ def constrained(
         jacobian = [points, unit(len(v)).take(columns[rows], 0)]
         targets, low, high = [bias, -aims[rows]], least[rows], most[rows]
         begin = [*guess, last[rows]]
-        if len(pace):
-            jacobian.append(held)
-            targets.append(-pace)
-            begin.append(np.zeros(len(pace)))
-            low = np.concatenate([low, np.full(len(pace), -np.inf)])
-            high = np.concatenate([high, np.full(len(pace), np.inf)])
+        if len(fixed):
+            jacobian.append(more)
+            targets.append(fixed)
+            begin.append(np.zeros(len(fixed)))
+            low, high = np.concatenate([low, -endless]), np.concatenate([high, endless])
         along = np.concatenate(jacobian)
         spread = inverse.dot(along.T)
         response, free = along.dot(spread), along.dot(v) + np.concatenate(targets)
         if len(bias):
-            impulses = solver.solve(response, free, friction, low, high, np.concatenate(begin))
+            first = np.concatenate(begin)
+            impulses = solver.solve(response, free, friction, low, high, first, turning)
         else:
             impulses = solve(response, -free, low, high)
         after = v + spread.dot(impulses)
@@ -236,16 +236,43 @@ def constrained(
         for part, span in zip(parts, spans, strict=True):
             missed |= part.add_missed(after[span])
     solved = Solved(
-        parts, inverse, along, spread, response, free, friction, low, high, impulses, rows, pace
+        parts,
+        *(inverse, along, spread, response, free, friction, low, high, impulses, rows),
+        v[:0] if ties is None else ties[1],
     )
     of_rows = np.zeros(len(columns))
     of_rows[rows] = impulses[len(bias) : len(bias) + len(rows)]
-    of_pairs, *of_points = np.split(impulses[: len(bias)], np.cumsum([len(each) for each in guess]))
-    of_joints = np.split(of_rows, np.cumsum([len(part.acts) for part in parts]))
-    for part, *own in zip(parts, of_points, of_joints, strict=False):
-        part.keep(*own)
+    _keep_turning(touching, impulses)
+    point = ahead = len(guess[0])
+    row = 0
+    for part, warmed in zip(parts, guess[1:], strict=True):
+        end, last_row = point + len(warmed), row + len(part.acts)
+        part.keep(impulses[point:end], of_rows[row:last_row])
         part.solved = solved
-    return after, of_pairs.reshape(-1, 3)
+        point, row = end, last_row
+    return after, impulses[:ahead].reshape(-1, 3)
+
+
+def _last_rows(
+    ties: tuple[Vector, Vector] | None, spins: Spins | None, width: int
+) -> tuple[Vector, Vector, Vector, tuple[Index, Vector] | None]:
+    """Return Jacobian, velocities and bounds of the last rows, and what resists turning."""
+    held, pace = (np.zeros((0, width)), np.zeros(0)) if ties is None else ties
+    endless = np.full(len(pace), np.inf)
+    if spins is None:
+        return held, -pace, endless, None
+    jacobian = np.concatenate([held, spins.jacobian])
+    targets = -np.concatenate([pace, spins.drift])
+    return jacobian, targets, endless, (spins.points, spins.bounds)
+
+
+def _keep_turning(touching: Sequence[ContactPoints], impulses: Vector) -> None:
+    """Store angular impulses, the last of all, where the points can be read."""
+    for each in reversed(touching):
+        if each.spins is not None:
+            first = len(impulses) - len(each.spins.drift)
+            each.spins.impulses[:] = impulses[first:].reshape(-1, 3)
+            impulses = impulses[:first]
 
 
 def _diagonal(blocks: Sequence[Vector], spans: Sequence[slice]) -> Vector:
@@ -256,8 +283,3 @@ def _diagonal(blocks: Sequence[Vector], spans: Sequence[slice]) -> Vector:
     for block, span in zip(blocks, spans, strict=True):
         found[span, span] = block
     return found
-
-
-def joined(arrays: Sequence[Any]) -> Any:
-    """Concatenate arrays."""
-    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from physx_core.typing import Records, Vector
 from physx_dart.pinocchio.models import twists_of
 from physx_dart.pinocchio.surfaces import Heights, Plane, surface_of
-from physx_sim import CONTACT, HeightField
+from physx_sim import CONTACT, Ground, HeightField, Stairs
 from physx_sim.engines import CollisionShape, MovableBody, Static
 from physx_sim.errors import FeatureNotSupportedError, SimulationError
 
@@ -39,6 +39,45 @@ Indices = NDArray[np.intp]
 
 
 @dataclass(eq=False, slots=True)
+class Spins:
+    """Friction that acts against turning at contact points.
+
+    Attributes:
+        points: Which of the contact points have it, shape (s,).
+        bounds: Largest torques per normal force against rolling, and about the normal, in m, shape
+            (s, 2).
+        jacobian: Jacobian of the angular velocities along the axes of these points, shape
+            (3 s, nv).
+        drift: Angular velocities along the axes of what they touch, in rad/s, shape (3 s,).
+        impulses: Angular impulses on the first body along the axes, in N m s, shape (s, 3); filled
+            by the step, also where the points were widened.
+    """
+
+    points: Indices
+    bounds: Vector
+    jacobian: Vector
+    drift: Vector
+    impulses: Vector
+
+    @classmethod
+    def of(cls, bounds: Vector, axes: Vector, motions: Vector, moved: Vector) -> Spins | None:
+        """Return the friction against turning of points, or None.
+
+        Args:
+            bounds: For each point, as in `Spins`, shape (k, 2).
+            axes: Two tangents and the normal of each, shape (k, 3, 3).
+            motions: Twists for unit velocities, shape (6, nv).
+            moved: How much of each the points take part in, shape (k, nv).
+        """
+        rows = np.flatnonzero(bounds.any(axis=1))
+        if not len(rows):
+            return None
+        jacobian = axes[rows] @ motions[3:] * moved[rows, None]
+        flat = jacobian.reshape(3 * len(rows), -1)
+        return cls(rows, bounds[rows], flat, np.zeros(len(flat)), np.zeros((len(rows), 3)))
+
+
+@dataclass(eq=False, slots=True)
 class ContactPoints:
     """Points that touch, or may touch within the next step.
 
@@ -51,6 +90,7 @@ class ContactPoints:
         restitution: Coefficients of restitution, shape (k,).
         jacobian: Jacobian of the points along their axes, shape (3 k, nv).
         drift: Velocities along the axes of what they touch, in m/s, shape (3 k,); None: at rest.
+        spins: Friction against turning; None: nowhere.
     """
 
     numbers: Indices
@@ -61,14 +101,17 @@ class ContactPoints:
     restitution: Vector
     jacobian: Vector
     drift: Vector | None = None
+    spins: Spins | None = None
 
     def widened(self, span: slice, width: int) -> ContactPoints:
         """Return the points with a wider Jacobian, in which `span` holds their columns."""
         if self.jacobian.shape[1] == width:
             return self
-        wide = np.zeros((len(self.jacobian), width))
-        wide[:, span] = self.jacobian
-        return replace(self, jacobian=wide)
+        found = replace(self, jacobian=_widened(self.jacobian, span, width))
+        if self.spins is not None:
+            jacobian = _widened(self.spins.jacobian, span, width)
+            found.spins = replace(self.spins, jacobian=jacobian)
+        return found
 
     def records(self, body_a: Any, body_b: Any, impulses: Vector, period: float) -> Records:
         """Return the points as `CONTACT` records.
@@ -84,6 +127,9 @@ class ContactPoints:
         records["point"], records["normal"] = self.points, self.axes[:, 2]
         records["force"] = np.einsum("kij,ki->kj", self.axes, impulses / period)
         records["depth"] = np.maximum(-self.gaps, 0.0)
+        if self.spins is not None:
+            rows, impulses = self.spins.points, self.spins.impulses
+            records["torque"][rows] = np.einsum("kij,ki->kj", self.axes[rows], impulses / period)
         return records
 
     def bias_slopes(self, period: float) -> Vector:
@@ -171,6 +217,10 @@ class ContactFinder:
         of_materials = np.array([(x.what.friction, x.what.restitution) for x in statics])
         of_shapes = np.array([(shape.friction, shape.restitution) for shape in shapes])
         first, second = of_materials.reshape(-1, 1, 2), of_shapes.reshape(1, -1, 2)
+        self._spins = spins_of(
+            np.array([turning_of(x.what) for x in statics]).reshape(-1, 1, 2),
+            np.array([turning_of(shape) for shape in shapes]).reshape(1, -1, 2),
+        )
         self._friction = np.minimum(first[:, :, 0], second[:, :, 0])
         self._restitution = first[:, :, 1] * second[:, :, 1]
         for number, (place, surface) in enumerate(self._surfaces):
@@ -242,6 +292,10 @@ class ContactFinder:
             if not len(rows):
                 continue
             numbers, normals = place * len(points) + rows, frames.take(rows, 0)[:, :, :3]
+            spins = None
+            if self._spins is not None:
+                bounds, moved = self._spins[numbers], self._moved[3 * rows]
+                spins = Spins.of(bounds, normals, motions, moved)
             found.append(
                 ContactPoints(
                     numbers,
@@ -252,6 +306,7 @@ class ContactFinder:
                     self._restitution.take(numbers),
                     jacobian.reshape(len(points), 3, -1).take(rows, 0).reshape(3 * len(rows), -1),
                     self._drift(place, normals, rows, rolling),
+                    spins,
                 )
             )
         return _together(found) if found else None
@@ -366,16 +421,55 @@ def poses_of(data: Any) -> Vector:
     return np.lib.stride_tricks.as_strided(first, (len(data.oMi), 4, 3), strides)
 
 
+def turning_of(material: CollisionShape | Ground | Stairs | HeightField) -> tuple[float, float]:
+    """Return the rolling and the torsional friction of a material, in m."""
+    return material.rolling_friction, material.torsional_friction
+
+
+def spins_of(first: Vector, second: Vector) -> Vector | None:
+    """Return the bounds of all pairs of materials as in `Spins`, shape (pairs, 2); None: all 0."""
+    found = np.maximum(first, second).reshape(-1, 2)
+    return found if found.any() else None
+
+
+def together(points: Sequence[ContactPoints]) -> Spins | None:
+    """Return the friction against turning of points that are combined in this order."""
+    if all(each.spins is None for each in points):
+        return None
+    first, numbers, found = 0, [], []
+    for each in points:
+        if each.spins is not None:
+            numbers.append(first + each.spins.points)
+            found.append(each.spins)
+        first += len(each.gaps)
+    names = ("bounds", "jacobian", "drift", "impulses")
+    rest = (np.concatenate([getattr(spins, name) for spins in found]) for name in names)
+    return Spins(np.concatenate(numbers), *rest)
+
+
+def joined(arrays: Sequence[Any]) -> Any:
+    """Concatenate arrays."""
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+
+def _widened(jacobian: Vector, span: slice, width: int) -> Vector:
+    wide = np.zeros((len(jacobian), width))
+    wide[:, span] = jacobian
+    return wide
+
+
 def _together(found: list[ContactPoints]) -> ContactPoints:
     """Return the points of several surfaces combined."""
     if len(found) == 1:
         return found[0]
-    *names, _ = ContactPoints.__slots__
-    points = ContactPoints(
-        *(np.concatenate([getattr(each, name) for each in found]) for name in names)
-    )
+    *names, _, _ = ContactPoints.__slots__
+    whole: dict[str, Any] = {
+        name: np.concatenate([getattr(each, name) for each in found]) for name in names
+    }
+    points = ContactPoints(**whole)
     if found[0].drift is not None:
         points.drift = np.concatenate([each.drift for each in found if each.drift is not None])
+    points.spins = together(found)
     return points
 
 

@@ -62,6 +62,10 @@ class Coupling:
             contacts = touching.contacts
             wide = [contacts.jacobian[:, self.finder.columns[place]] for place in coupled]
             contacts.jacobian = np.concatenate(wide, axis=1)
+            if contacts.spins is not None:
+                whole = contacts.spins.jacobian
+                wide = [whole[:, self.finder.columns[place]] for place in coupled]
+                contacts.spins.jacobian = np.concatenate(wide, axis=1)
             share = self._warmth[touching.pairs] / np.bincount(touching.pairs)[touching.pairs, None]
             warm = np.einsum("kij,kj->ki", contacts.axes, share)
         ties = self.ties.rows(coupled) if self.ties else None

@@ -19,9 +19,9 @@ import pinocchio
 
 from physx_core.rotations import cross_rows, to_matrix
 from physx_core.typing import Vector
-from physx_dart.pinocchio.constraints import Solved, joined
+from physx_dart.pinocchio.constraints import Solved
 from physx_dart.pinocchio.contact_problem import ContactProblem, unit
-from physx_dart.pinocchio.contacts import ContactPoints
+from physx_dart.pinocchio.contacts import ContactPoints, joined
 from physx_dart.pinocchio.robot import PinocchioRobot
 from physx_dart.pinocchio.ties import FASTEST_FOLLOWER
 from physx_sim import StepDerivatives

@@ -54,7 +54,7 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
     """A world in Pinocchio."""
 
     engine = "pinocchio"
-    lacks: ClassVar[frozenset[str]] = frozenset({"mesh_contacts"})
+    lacks: ClassVar[frozenset[str]] = frozenset({"cameras", "mesh_contacts"})
     caveats: ClassVar[Mapping[str, str]] = {
         "joint_wrenches": "not while anything is attached",
         "step_derivatives": "not where shapes touch: [gradients](contacts.md#gradients)",

@@ -129,7 +129,9 @@ class Drawing:
         return places
 
     def _draw(self, event: Event, times: Times) -> None:
-        if event.kind not in self._draw_kind and event.kind != "view":
+        if event.kind == "controls" and event.action == "add":
+            return
+        if event.kind not in {*self._draw_kind, "view", "controls"}:
             raise VisualizerError(
                 f'Rerun cannot draw "{event.name}" of the unknown kind "{event.kind}". '
                 f"Kinds: {listed(self._draw_kind)}."

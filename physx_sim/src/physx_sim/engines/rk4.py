@@ -23,6 +23,7 @@ RK4_LACKS = (
     "restitution",
     "self_collisions",
     "step_derivatives",
+    "torsional_friction",
 )
 """Features that a simulation lacks with this integrator."""
 

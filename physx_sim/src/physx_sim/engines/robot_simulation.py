@@ -22,6 +22,7 @@ from physx_sim import (
     AppliedAttachment,
     Attachment,
     BodySettings,
+    Camera,
     HeightField,
     Hook,
     Simulation,
@@ -245,6 +246,7 @@ class RobotSimulation(Simulation, Generic[Engine]):
             (len(self._positioned), 'joints with the mode "position"; "servo" has them'),
             (self._movers, "static bodies that move"),
             (self._frozen, "hidden objects"),
+            (self.parts.turning, "torsional or rolling friction"),
         ):
             if acts:
                 raise SimulationError(f"A step has no derivatives while there are {what}.")
@@ -485,6 +487,8 @@ class RobotSimulation(Simulation, Generic[Engine]):
         self._changes.check(name, settings)
         if any(value is not None for value in motion_of(settings)):
             self._check_has("moving_statics")
+        if settings.torsional_friction is not None or settings.rolling_friction is not None:
+            self._check_has("torsional_friction")
         return body
 
     def _move_static(self, body: int, settings: BodySettings) -> None:
@@ -787,6 +791,30 @@ class RobotSimulation(Simulation, Generic[Engine]):
         passed = [*self._checks.bodies(ignored), *self._hidden]
         return self._caster.cast(first, last, poses, passed)
 
+    def take_images(self, camera: Camera) -> dict[str, Vector]:
+        """Return the images of a camera by their names, in the present state."""
+        self._check_has("cameras")
+        carriers = [camera.body] if camera.body else []
+        passed = [*self._checks.bodies([*carriers, *camera.ignored]), *self._hidden]
+        position, turn = np.array(camera.position), to_matrix(camera.rotation)
+        for x, y, z, *orientation in self.body_poses(carriers).tolist():
+            whole = to_matrix(orientation)
+            position, turn = whole @ position + (x, y, z), whole @ turn
+        return self.draw(camera, position, turn, passed)
+
+    def draw(
+        self, camera: Camera, position: Vector, turn: Vector, passed: Sequence[int]
+    ) -> dict[str, Vector]:
+        """Return the images of a camera; called only if the engine has the feature ``cameras``.
+
+        Args:
+            camera: The camera.
+            position: Its position in the world, shape (3,), in m.
+            turn: Its axes in the world, as columns, shape (3, 3).
+            passed: Bodies that it does not see, as indices into `Layout.names`.
+        """
+        raise self._lacks("cameras")
+
     def joint_wrenches(self) -> Vector:
         """Return the joint reactions in the last step, shape (joints, 6)."""
         return self._reactions(self._jointed)
@@ -825,12 +853,13 @@ class RobotSimulation(Simulation, Generic[Engine]):
             return found
         poses = self._algorithms.body_poses(q, range(len(self.layout.bodies)))
         contacts = self.contacts() if "contacts" in self.features else np.zeros(0, CONTACT)
-        for first, second, (x, y, z), force, *_ in contacts.tolist():
+        for first, second, (x, y, z), force, _, _, torque in contacts.tolist():
             for body, sign in ((first, 1.0), (second, -1.0)):
                 if body < len(poses):
                     a, b, c = poses[body, :3].tolist()
                     acting = [sign * part for part in force]
                     _add(found, body, acting, cross(x - a, y - b, z - c, *acting))
+                    _add(found, body, (0.0, 0.0, 0.0), [sign * part for part in torque])
         for wrench, force, torque in self._wrenches.before(self._frame):
             body = self._checks.body(wrench.body)
             turn = to_matrix(poses[body, 3:])

@@ -281,6 +281,10 @@ class Factory:
         """Set the curves' next ``values``, shape (labels,)."""
         self._update("scalars", name, {"values": values})
 
+    def add_controls(self, name: str, labels: Sequence[str], **values: Any) -> str:
+        """Add sliders, and say which objects can be pulled; `Environment.define_controls` does."""
+        return self._add("controls", name, labels=labels, **values)
+
     def set_view(self, title: str, follow: str | None = None, **camera: ArrayLike) -> None:
         """Set the title of the environment's window and place its camera; call it once.
 
