@@ -37,6 +37,9 @@ from .motors.motor import Motor as Motor
 from .motors.motor import with_rotors as with_rotors
 from .motors.motors import Motors as Motors
 from .motors.motors import MotorState as MotorState
+from .motors.network import ActuatorNetwork as ActuatorNetwork
+from .motors.network import read_actuators as read_actuators
+from .motors.network import write_actuators as write_actuators
 from .sensors.sensor import Camera as Camera
 from .sensors.sensor import ContactSensor as ContactSensor
 from .sensors.sensor import EffortSensor as EffortSensor

@@ -1,5 +1,7 @@
 """The physx plugin ``torch``: PyTorch networks, optimization and transformation."""
 
+from .actuator import LearnedActuator as LearnedActuator
+from .actuator import learn_actuator as learn_actuator
 from .forward_dynamics import ForwardDynamics as ForwardDynamics
 from .networks.encoder_decoder import EncoderDecoder as EncoderDecoder
 from .networks.fc import FC as FC

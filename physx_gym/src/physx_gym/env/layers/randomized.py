@@ -63,9 +63,9 @@ class RandomizedEnv(Layer):
             ComponentNotFoundError: If a randomization names something that is not there, or a file
                 is given and the package physx-identify is not installed.
         """
-        single = isinstance(randomizations, (Randomization, str, Path))
-        given = [randomizations] if single else randomizations
-        self.randomizations = tuple(map(_randomization, given))
+        if isinstance(randomizations, (Randomization, str, Path)):
+            randomizations = [randomizations]
+        self.randomizations = tuple(map(_randomization, randomizations))
         self.every = every
         self.drawn: dict[str, Any] = {}
         self._prepared: dict[str, Any] | None = None
