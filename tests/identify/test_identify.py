@@ -15,7 +15,7 @@ from hypothesis import strategies as st
 from physx_core import Dataset, Field
 from physx_core.cli import main
 from physx_core.errors import ComponentNotFoundError, ConfigError, UnknownOptionError
-from physx_gym import RandomizedEnv, RobotEnv, Simulator
+from physx_gym import RandomizedEnv, RobotEnv, Simulator, load_pipeline
 from physx_identify import (
     Identified,
     Log,
@@ -117,6 +117,7 @@ def test_a_hidden_friction_is_named_and_the_level_refused(clean):
 # What cannot be told -----------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_inseparable_parameters_are_named_with_what_is_told_of_them(clean):
     log = arm.noisy(clean)
     found = identify(log, arm.hidden(), ["inertia:upper", "armature:shoulder"])
@@ -333,6 +334,24 @@ def test_episodes_draw_from_the_posterior(found, tmp_path):
     assert env.drawn["Identified"] == drawn[0]
 
 
+@pytest.mark.parametrize("where", ["in the file", "in the call", "in code"])
+def test_a_file_is_all_that_randomization_needs(found, tmp_path, where):
+    write_identification(tmp_path / "arm.toml", found)
+    kwargs = 'kwargs = {simulator = "double_pendulum", step_dt = 0.01, period = 0.005}'
+    first = 'randomize = "arm.toml"\n' if where == "in the file" else ""
+    table = f'{first}[env_config]\ncls = "RobotEnv"\n{kwargs}\n'
+    (tmp_path / "swing.toml").write_text(table)
+    options = {"randomize": tmp_path / "arm.toml"} if where == "in the call" else {}
+    env = load_pipeline(tmp_path / "swing.toml")(**options)
+    if where == "in code":
+        env = RandomizedEnv(env, randomizations=tmp_path / "arm.toml")
+    env.reset(seed=0)
+    factors = env.simulator.world.robots[0].mass_factors
+    assert factors["lower"] == env.drawn["Identified"]["mass lower"] != 1
+    with pytest.raises(IdentificationError, match="There is no identification"):
+        load_pipeline(tmp_path / "swing.toml")(randomize="none.toml")
+
+
 def test_a_proposed_motion_tells_more_than_a_sweep(found, tmp_path):
     motion = propose(found, arm.KNOWN, trials=20)
     time = found.period * np.arange(len(motion.positions))
@@ -346,6 +365,7 @@ def test_a_proposed_motion_tells_more_than_a_sweep(found, tmp_path):
     assert table["q.elbow"] == pytest.approx(motion.positions[:, 1])
 
 
+@pytest.mark.slow
 def test_the_command_line_prints_stores_and_reports(clean, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     write_csv(tmp_path / "log.csv", arm.noisy(clean))
