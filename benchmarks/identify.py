@@ -110,7 +110,8 @@ def coverage(draws: int) -> bool:
     good, flagged = True, 0
     with ProcessPoolExecutor() as pool:
         for correlation in CORRELATIONS:
-            share = np.mean(list(pool.map(peer, [correlation] * draws, range(draws), chunksize=4)))
+            shares = pool.map(peer, [correlation] * draws, range(draws), chunksize=4)
+            share = float(np.mean(list(shares)))
             print(f"  MuJoCo sysid      noise of torques, correlation {correlation:4}: {share:.3f}")
         for cell in CELLS:
             for correlation in CORRELATIONS:
@@ -199,7 +200,8 @@ def rubbing(seed: int) -> Log:
     positions, torques = clean()
     speed = np.gradient(positions[:, 0], arm.PERIOD)
     more = np.stack([HIDDEN * np.sign(speed) * np.exp(-np.abs(speed) / 0.1), 0 * speed], axis=1)
-    return arm.noisy((positions, torques + more), seed=seed)
+    log: Log = arm.noisy((positions, torques + more), seed=seed)
+    return log
 
 
 def seen(seed: int) -> bool:
