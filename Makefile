@@ -15,7 +15,7 @@ DIST := --dist loadgroup --no-loadscope-reorder
 ROOM = $(wildcard tests/$(P) tests/*/$(P) tests/*/*/$(P))
 PIP := $(BIN)/python -m pip install --quiet --no-compile --disable-pip-version-check
 COMPILE := $(BIN)/python -m compileall -q -j 0 .venv/lib >/dev/null 2>&1 || true  # pip uses one core
-PACKAGES := -e ./physx -e ./physx_core -e ./physx_testing -e "./physx_sim[robots,meshes,mjcf]" -e ./physx_formats -e "./physx_dart[robots]" -e ./physx_mujoco -e "./physx_torch[export]" -e ./physx_rerun -e ./physx_gym -e ./physx_remote -e ./physx_cluster -e ./physx_report -e ./physx_agree -e ./physx_identify
+PACKAGES := -e ./physx -e ./physx_core -e ./physx_testing -e "./physx_sim[robots,meshes,mjcf]" -e ./physx_formats -e "./physx_dart[robots]" -e ./physx_mujoco -e "./physx_torch[export]" -e ./physx_rerun -e "./physx_viser[robots]" -e ./physx_gym -e ./physx_remote -e ./physx_cluster -e ./physx_report -e ./physx_agree -e ./physx_identify
 PROJECTS := $(wildcard physx*/pyproject.toml) constraints.txt
 
 .PHONY: demo test quick lint docs bench wheels clean

@@ -42,6 +42,7 @@ FACES = {
     "physx_mujoco": ("",),
     "physx_torch": ("",),
     "physx_rerun": ("",),
+    "physx_viser": ("",),
     "physx_gym": (
         "",
         *("blocks", "tasks.quantities", "tasks.rewards", "tasks.terminations"),

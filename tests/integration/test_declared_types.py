@@ -35,6 +35,7 @@ from physx_formats import ExportOptions
 from physx_gym import Trajectory
 from physx_gym.tasks import quantities
 from physx_rerun import RerunVisualizer
+from physx_viser import ViserVisualizer
 
 ENVIRONMENT = EnvironmentConfig("toy/spring")
 ERRORS = {
@@ -69,6 +70,7 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
         "urdf": "arm.urdf",
         "feet": {"foot": 0.25},
         "mass_factors": {"link": 1.25, "hand": 0.5},
+        **{"friction": 0.5, "torsional_friction": 0.25, "rolling_friction": 0.125},
     },
     physx_sim.World: {"robots": [physx_sim.Robot("arm.urdf")], "iterations": 3},
     physx_sim.Wrench: {
@@ -85,6 +87,8 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     physx_sim.ForceTorqueSensor: {"name": "wrist", "joint": "wrist", "period": 0.25},
     physx_sim.Lidar: {"name": "lidar", "body": "head", "directions": [(1.0, 0.5, 0.0)]}
     | {"position": (1.0, 0.5, 0.25), "reach": 4.5, "period": 0.25},
+    physx_sim.Camera: {"name": "eye", "body": "head", "reach": 4.5, "near": 0.5, "height": 8}
+    | {"width": 16, "field_of_view": 0.5, "position": (1.0, 0.5, 0.25), "period": 0.25},
     physx_sim.HeightScan: {"name": "scan", "body": "head", "points": [(1.0, 0.5)], "reach": 4.5}
     | {"period": 0.25},
     physx_sim.EffortSensor: {"name": "knee", "joint": "knee", "period": 0.25},
@@ -105,6 +109,7 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     | {"sources": {"a": 0.5}},
     EpisodeRecord: {"episode": 3, "rows": 2, "seconds": 0.5},
     physx_sim.BodySettings: {"mass": 2.5, "friction": 0.25, "hidden": True}
+    | {"torsional_friction": 0.5, "rolling_friction": 0.125}
     | {"position": (0.5, 1.0, 2.0), "orientation": (0.0, 0.0, 0.0, 1.0)}
     | {"velocity": (0.5, 1.0, 2.0), "angular_velocity": (0.5, 1.0, 2.0)}
     | {"surface_velocity": (0.5, 1.0, 2.0)},
@@ -124,6 +129,7 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     },
     physx_core.Branch: {"data": "sessions/data", "row": 3, "step_nb": 4, "past": 5},
     RerunVisualizer: {},
+    ViserVisualizer: {},
     ExportOptions: {"fps": 30},
     Trajectory: {"times": [0.0, 1.0], "positions": [[1.0], [2.0]], "velocities": [[0.5], [0.0]]},
     quantities.Masked: {"quantity": quantities.JointPositions(), "entries": [2, 0]},
@@ -142,8 +148,22 @@ RECORDS = {
         "MotorState",
         "SensorState",
         "RobotInfo",
+        "StepDerivatives",
+        "ActuatorNetwork",
+        "LearnedActuator",
+        "Actuators",
     ),
-    *("UrdfShape", "Episode", "StepperState", "Result", "Comparison", "Trial", "Normalization"),
+    *(
+        "UrdfShape",
+        "VisualShape",
+        "VisualModel",
+        "Episode",
+        "StepperState",
+        "Result",
+        "Comparison",
+        "Trial",
+        "Normalization",
+    ),
     *("CollisionShape", "Joint", "MovableBody", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
     "Bond",
     *("Combination", "Estimate", "Identification", "Log", "LogNoise", "Motion", "ResidualTest"),

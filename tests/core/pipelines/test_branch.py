@@ -165,6 +165,37 @@ def test_a_stream_of_several_instances_goes_on_beyond_its_stored_rows():
     assert np.allclose(steps, 2.0 * own)
 
 
+@pytest.mark.parametrize("past", [3, 100])
+def test_a_late_row_of_a_long_stream_is_reached_from_its_last_state(past):
+    environment = EnvironmentConfig(
+        Stream, as_tcp_ip_client=False, seed=5, num_clients=2, state_every=10
+    )
+    options = {"batch_nb": 10, "batch_size": 20, "session_name": "data", "quiet": True}
+    DataGeneration(environment, **options).execute()
+    run = branch("sessions/data", 191, {"length": 2.0}, past=past, step_nb=6)
+    assert run.rows_equal == (6, 4)  # from row 90 of 100 of the second instance
+    after = stored("after")
+    assert np.array_equal(run.futures[0]["after"][:4], after[193::2])
+    early = branch("sessions/data", 101, {"length": 2.0}, past=past, step_nb=6)
+    assert early.rows_equal[0] > 40 and early.rows_equal[1] == 6  # from one long before
+
+
+@pytest.mark.parametrize("kind", [Walk, Stream])
+def test_a_row_of_a_run_that_goes_on_can_be_branched_off(kind):
+    found = []
+
+    class Looking(DataGeneration):
+        def batch_end(self):
+            if self.batch_id == 2:
+                found.append(branch("sessions/data", 17, {"length": 0.0}, step_nb=3).rows_equal)
+
+    environment = EnvironmentConfig(kind, as_tcp_ip_client=False, seed=5)
+    options = {"batch_nb": 4, "batch_size": 12, "session_name": "data", "quiet": True}
+    Looking(environment, **options).execute()
+    assert found == [(6 if kind is Walk else 18, 3)]
+    assert len(stored("after")) == 48
+
+
 def test_arrays_are_changed_in_place_from_numbers_of_the_same_shape():
     run = branch(generate(), 3, {"place": [10.0, 20.0]})
     assert np.array_equal(run.futures[1]["before"][0], [10.0, 20.0])

@@ -4,11 +4,15 @@ import numpy as np
 import pytest
 
 from physx_core.errors import VisualizerError
-from physx_rerun.drawing import urdf
+from physx_rerun.drawing.robot import read_model
+
+
+def read(urdf, bodies, packages):
+    return read_model({"urdf": urdf, "bodies": bodies, "package_dirs": packages})
 
 
 def test_shapes_sit_on_their_bodies(arm):
-    model = urdf.read(arm, ["base", "upper"], {"arm_meshes": str(arm.parent / "meshes")})
+    model = read(arm, ["base", "upper"], {"arm_meshes": str(arm.parent / "meshes")})
     shapes = {shape.name: shape for shape in model.shapes}
     assert set(shapes) == {"base_0", "upper_0", "tool_0", "tool_1"}
     assert model.missing == []
@@ -25,11 +29,11 @@ def test_a_package_is_found_beside_the_file(arm, tmp_path):
     model_folder.mkdir(parents=True)
     (tmp_path / "arm_meshes" / "tool.obj").write_text("v 0 0 0\n")
     (model_folder / "arm.urdf").write_text(arm.read_text())
-    assert urdf.read(model_folder / "arm.urdf", ["base"], {}).missing == []
+    assert read(model_folder / "arm.urdf", ["base"], {}).missing == []
 
 
 def test_a_missing_mesh_is_listed(arm):
-    model = urdf.read(arm, ["base"], {})
+    model = read(arm, ["base"], {})
     assert model.missing == ["package://arm_meshes/tool.obj"]
 
 
@@ -39,13 +43,13 @@ def test_unreadable_files(tmp_path, text):
     if text is not None:
         path.write_text(text)
     with pytest.raises(VisualizerError, match=r"robot\.urdf"):
-        urdf.read(path, [], {})
+        read(path, [], {})
 
 
 def test_unknown_bodies_and_shapes(arm):
     with pytest.raises(VisualizerError, match="'elbow'.*upper"):
-        urdf.read(arm, ["elbow"], {})
+        read(arm, ["elbow"], {})
     arm.write_text('<robot name="r"><link name="a"><visual><geometry><cone/></geometry></visual>'
                    "</link></robot>")  # fmt: skip
     with pytest.raises(VisualizerError, match="cone"):
-        urdf.read(arm, ["a"], {})
+        read(arm, ["a"], {})

@@ -59,6 +59,7 @@ _COUNTERS = (
 _OF_THE_RUN = (
     *("factory", "step_time", "compute_training_data", "_sample", "_training", "_additional"),
     *("_services", "_choose_parameters", "_baseline", "_made_with", "_loaded", "_has_kept"),
+    *("_controls", "_control_values", "_pulls"),
 )
 """What an environment has from its run, for viewers, or only within a step."""
 
@@ -176,6 +177,9 @@ class Environment(Closeable):
         self._loaded: list[dict[str, Any]] = []  # parameters, while it was created
         self._has_kept = False  # parameters in the run
         self._defined_parameters: list[Parameter] = []
+        self._controls: list[Parameter] = []
+        self._control_values: dict[str, Any] = {}
+        self._pulls: list[str] = []
         self._choose_parameters: Choose | None = None
         self._has_begun_episodes = False
         self._episode_is_over = True  # there is no episode that a step can continue
@@ -244,6 +248,18 @@ class Environment(Closeable):
         """
         for name, value in values.items():
             set_number(self, name, value)
+
+    def pull(self, name: str, node: int, force: Array) -> None:
+        """Pull at a drawn object, as a person does in a viewer: see `define_controls`.
+
+        Called before each row while it is pulled, and with a force of zero once it is let go.
+
+        Args:
+            name: Name of the object.
+            node: Index of the vertex of a mesh, of the point, or of a robot's body; else 0.
+            force: In the world's frame, in N, shape (3,).
+        """
+        raise self._lacks("pull")
 
     def get_state(self) -> Any:
         """Return everything that `set_state` needs to go on exactly from here, between two steps.
@@ -414,6 +430,37 @@ class Environment(Closeable):
             if any(known.name == parameter.name for known in self._defined_parameters):
                 raise ConfigError(f'The parameter "{parameter.name}" is defined twice.')
             self._defined_parameters.append(parameter)
+
+    def define_controls(
+        self,
+        controls: Parameter | Iterable[Parameter] = (),
+        pulls: Iterable[str] = (),
+        **values: Any,
+    ) -> None:
+        """Define what a person can change while it runs, in a viewer with sliders.
+
+        Call it in `create` or `init`. Without such a viewer nothing happens. With one, `perturb`
+        gets new values between two steps, and `pull` is called; each row keeps what was done before
+        it in the additional field ``hand``, so `Branch` and reports can simulate it again.
+
+        Args:
+            controls: What has a slider, within its bounds; the distribution does not matter, but
+                ``integer`` has whole numbers. Attributes of these names have the first values.
+            pulls: Names of drawn objects that can be pulled.
+            values: First values of controls that are no attributes.
+
+        Raises:
+            ConfigError: If a control is malformed or defined twice.
+            UsageError: If something can be pulled, but there is no method `pull`.
+        """
+        for each in as_parameters(controls):
+            if any(known.name == each.name for known in self._controls):
+                raise ConfigError(f'The control "{each.name}" is defined twice.')
+            self._controls.append(each)
+        self._pulls += pulls
+        self._control_values |= values
+        if self._pulls and type(self).pull is Environment.pull:
+            raise self._lacks("pull")
 
     def set_training_data(self, **fields: Any) -> None:
         """Set this step's training data: every training field, as arrays or numbers."""

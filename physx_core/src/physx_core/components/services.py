@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, Protocol, Self, TypeAlias
 
 from physx_core.components.scene.event import Event
@@ -18,6 +18,10 @@ class Services(Protocol):
 
     def predict(self, fields: Sample) -> Sample:
         """Return the network's prediction for one sample, in physical units."""
+        ...
+
+    def touch(self, instance_id: int) -> Sequence[float]:
+        """Return what a person does to an instance: see `Observer.touch`."""
         ...
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
@@ -81,6 +85,10 @@ class Aside:
         if self._services is None:
             raise UsageError("This environment is not part of a run yet.")
         return self._services.predict(fields)
+
+    def touch(self, instance_id: int) -> Sequence[float]:
+        """Do nothing."""
+        return ()
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
         """Keep values."""

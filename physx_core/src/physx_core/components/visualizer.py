@@ -99,6 +99,18 @@ class Observer(Closeable):
     def events(self, instance_id: int, step: int, events: list[Event]) -> None:
         """Receive drawing events of one environment instance at one of its steps."""
 
+    def touch(self, instance_id: int) -> Sequence[float]:
+        """Return what a person does to an environment, before each of its rows.
+
+        An observer that overrides this gets the controls of each instance as an object of the kind
+        ``controls`` in its first `events`. It may wait here, to hold the simulation back.
+
+        Returns:
+            The values of the controls, one for each of its ``labels``; then the index of the pulled
+            object in ``pulls``, or -1, the node, and the force in N, (3,). Empty: nothing.
+        """
+        return ()
+
     def close(self) -> None:
         """Called at the end of the run, also after a failure."""
 
@@ -108,6 +120,11 @@ class Observer(Closeable):
         A command that shows it follows the path in brackets. Called after `close`.
         """
         return ()
+
+
+def takes_hand(visualizer: Any) -> bool:
+    """Return whether a person can touch environments in a visualizer of this class."""
+    return getattr(visualizer, "touch", Observer.touch) is not Observer.touch
 
 
 @dataclass(frozen=True)

@@ -94,6 +94,9 @@ class Kind(enum.IntEnum):
     STATE = 36
     """Client: its state before its next row [number of rows so far; 0: why there can be none]."""
 
+    TOUCH = 37
+    """Client: request for what a person does to its environment [number of the request]."""
+
 
 _KINDS = {int(kind): kind for kind in Kind}
 

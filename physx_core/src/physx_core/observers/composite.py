@@ -91,6 +91,10 @@ class Observers(Observer):
         """Pass on drawing events."""
         self._call("events", instance_id, step, events)
 
+    def touch(self, instance_id: int) -> Sequence[float]:
+        """Return what a person does in the first observer that has sliders and is touched."""
+        return next(filter(len, self._call("touch", instance_id)), ())
+
     def close(self) -> None:
         """Announce the end of the run."""
         self._call("close")

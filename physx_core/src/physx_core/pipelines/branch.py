@@ -34,10 +34,10 @@ AS_IT_WAS, CHANGED = 1, 2
 class Branch(NewSessionPipeline):
     """Goes back to a stored row, and on from there twice: as it was, and with a change.
 
-    In this process, the environment simulates the row's episode again, and each row is compared
-    with the stored one, bit by bit. From there, it goes on as it did, and is compared as far as
-    rows are stored. A second instance does the same, is changed at the row, and goes on. Both are
-    drawn, and the dataset is only read.
+    In this process, the environment simulates the row's episode again, or its stream from the last
+    state that is stored before it, and each row is compared with the stored one, bit by bit. From
+    there, it goes on as it did, and is compared as far as rows are stored. A second instance does
+    the same, is changed at the row, and goes on. Both are drawn, and the dataset is only read.
 
     Attributes:
         futures: What the instances did after the row, by field, arrays of shape (rows, ...).
@@ -107,7 +107,7 @@ class Branch(NewSessionPipeline):
     def _samples(self, drawing: Redrawing, number: int, interrupt: Interrupt) -> Iterator[Sample]:
         """Simulate the past and a future of an instance; yield the samples of the future."""
         before, after = drawing.around(self.row)
-        shown = before[-self.past :]
+        shown = drawing.shown(before, self.past)
         for step, events in enumerate(drawing.frames(shown)):
             self._show(number, step, events)
             if interrupt:
@@ -127,7 +127,7 @@ class Branch(NewSessionPipeline):
             if interrupt:
                 break
         if number == AS_IT_WAS:
-            self.rows_equal = len(before), equal
+            self.rows_equal = drawing.compared, equal
 
     def _change(self, instance: Instance) -> None:
         environment = instance.environment

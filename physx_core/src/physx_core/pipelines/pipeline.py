@@ -23,7 +23,7 @@ from physx_core.config import EnvironmentConfig, to_plain
 from physx_core.dataset.write.delegation import Delegation
 from physx_core.errors import UsageError
 from physx_core.observers import Observers, ProgressBar, ScalarsFile
-from physx_core.pipelines.services import Predict, RunServices, Show
+from physx_core.pipelines.services import Predict, RunServices, Show, Touch
 from physx_core.pipelines.storage import remove_unused
 from physx_core.plugins import resolve
 from physx_core.processes import (
@@ -327,6 +327,7 @@ class Pipeline(ABC):
         skip: Skip = NOTHING,
         delegation: Delegation | None = None,
         keeps_pasts: bool = False,
+        touch: Touch | None = None,
     ) -> Source:
         """Open the environments, in this process or in clients.
 
@@ -347,11 +348,11 @@ class Pipeline(ABC):
                 returned.
             delegation: Lets clients write their own rows; None: the source returns them.
             keeps_pasts: Whether the run keeps what a later one needs to go on from states.
+            touch: What a person does to an instance; None: what the observers say.
         """
         self._tell_repeated(config, skip)
-        services = RunServices(
-            self.session.dataset_dir, show or self.observers.events, predict, replayed
-        )
+        shown, touched = show or self.observers.events, touch or self.observers.touch
+        services = RunServices(self.session.dataset_dir, shown, predict, replayed, touched)
         source: Source
         if in_process or not config.as_tcp_ip_client:
             from physx_core.sources.local_source import LocalSource

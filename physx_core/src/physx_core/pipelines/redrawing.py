@@ -11,30 +11,35 @@ from typing import Any
 import numpy as np
 
 from physx_core.closeable import Closeable
+from physx_core.components.hand import HAND
 from physx_core.components.scene.event import Event
 from physx_core.config import EnvironmentConfig, from_plain
 from physx_core.dataset import Dataset
 from physx_core.errors import DatasetError, UsageError
+from physx_core.net.values import decode
 from physx_core.pipelines.campaign import recorded_campaigns
 from physx_core.pipelines.generation import Generation
 from physx_core.pipelines.pipeline import derive_seed
 from physx_core.pipelines.replay import recorded_environment
-from physx_core.pipelines.services import Predict, RunServices, Show
+from physx_core.pipelines.services import Predict, RunServices, Show, Touch
 from physx_core.pipelines.storage import STREAMS
+from physx_core.pipelines.stored_streams import states_of
 from physx_core.typing import Sample
 from physx_core.workers.instance import Instance, instance_arguments
+from physx_core.workers.pasts import Past
 
 
 class Redrawing(Closeable):
     """Draws stored rows again, with the environment that generated them, in this process.
 
     The environment simulates them again: independent episodes by their numbers, the others from the
-    beginning of their stream. Each row is compared with the stored one, bit by bit, so that nothing
-    else is drawn in its place. Nothing is stored.
+    last state that their stream has left before, or from its beginning. Each row is compared with
+    the stored one, bit by bit, so that nothing else is drawn in its place. Nothing is stored.
 
     Attributes:
         takes_predictions: Whether the environment has got predictions, as it defines
             `Environment.apply_prediction`; then it draws them itself.
+        compared: Number of rows that were simulated again, and are equal to the stored ones.
     """
 
     def __init__(
@@ -72,7 +77,8 @@ class Redrawing(Closeable):
         self._config = from_plain(
             EnvironmentConfig, recorded_environment(dataset, trust=trust, info=described)
         )
-        self.takes_predictions = False
+        self.takes_predictions, self.compared = False, 0
+        self._rows, self._at = range(0), 0  # of the episode or stream, and the next of them
 
     def frames(
         self, rows: Sequence[int], predict: Callable[[int], Sample | None] | None = None
@@ -96,6 +102,7 @@ class Redrawing(Closeable):
                     f"to simulate these rows again takes longer than {self._patience:g} s"
                 )
             self.compare(row, sample)
+            self.compared += 1
             if predict is not None:
                 self._apply(predict(row))
             if row in wanted:
@@ -115,7 +122,7 @@ class Redrawing(Closeable):
         """
         instance = self.instance
         for _ in range(rows):
-            if not (sample := instance.step()):
+            if not (sample := self._step(instance)):
                 return
             yield sample, self._take_events()
 
@@ -154,6 +161,33 @@ class Redrawing(Closeable):
             end = stored
         return list(range(begin, row + 1, step)), list(range(row + step, end, step))
 
+    def shown(self, rows: Sequence[int], most: int) -> Sequence[int]:
+        """Return the last ones of a row's episode or stream that `frames` simulates quickly.
+
+        Args:
+            rows: The rows to that row.
+            most: Largest number.
+
+        Returns:
+            That many, but those after a state, if their stream has left one among them only.
+        """
+        last = rows[-most:]
+        if not self._is_numbered(last) and not self._state_before(last[0])[1]:
+            begin = self._state_before(rows[-1])[0]
+            return [row for row in last if row >= begin]
+        return last
+
+    def _state_before(self, row: int) -> tuple[int, bytes]:
+        """Return the row from which a stream can go on to a row, and the state there, if any."""
+        begin, count = self._place(row)
+        streams = self._streams
+        assert streams is not None
+        number, before = begin - streams.first + 1, (row - begin) // count
+        files = states_of(streams, self._dataset.directory.parent)
+        found = files.read(lambda of, past: of == number and past.rows <= before)
+        past = found.get(number, Past())
+        return begin + past.rows * count, past.state
+
     def _take_events(self) -> list[Event]:
         events, self._events = self._events, []
         return events
@@ -185,10 +219,20 @@ class Redrawing(Closeable):
         """Return an instance that draws; the events are kept."""
         if self._instance is None:
             folder = self._dataset.directory
-            instance = Instance(**instance_arguments(self._config, number, seed, False))
-            self._instance = instance
-            instance.open(_Drawing(folder, self._show, self._predict), draw=True)
+            arguments = instance_arguments(self._config, number, seed, False)
+            arguments["hand"] = HAND in self._dataset[self._mode]
+            instance = self._instance = Instance(**arguments)
+            services = _Drawing(folder, self._show, self._predict, lambda _: self._done())
+            instance.open(services, draw=True, with_states=self._episodes is None)
         return self._instance
+
+    def _done(self) -> Sequence[float]:
+        """Return what a person did before the next row; nothing if none is stored."""
+        if self._at >= len(self._rows):
+            return ()
+        done = np.asarray(self._dataset[self._mode][HAND][self._rows[self._at]])
+        told: list[float] = done.tolist()
+        return told
 
     def _show(self, instance_id: int, step: int, events: list[Event]) -> None:
         self._events += events
@@ -214,8 +258,10 @@ class Redrawing(Closeable):
             instance.begin(number, values)
             end = max(each for each in rows if self._entry(each) == entry)
             end = row if known.numbers[entry] > 1 else end
+            count = 1 if known.numbers[entry] > 1 else int(known.rows[entry])
+            self._rows, self._at = range(first, first + count), 0
             for last in range(first, end + 1):
-                yield last, instance.step()
+                yield last, self._step(instance)
 
     def _stream(self, rows: Sequence[int]) -> Iterator[tuple[int, Sample]]:
         """Simulate the stream of rows; yield all of them up to the last, and their data."""
@@ -224,8 +270,17 @@ class Redrawing(Closeable):
         assert streams is not None
         seed = derive_seed(streams.seed, self._mode, streams.offset)
         instance = self._open(begin - streams.first + 1, seed)
-        for row in range(begin, rows[-1] + 1, count):
-            yield row, instance.step()
+        start, state = self._state_before(rows[0])
+        if state:
+            instance.set_state(decode(state)["instance"])
+        self._rows, self._at = range(start, self._dataset.num_samples(self._mode), count), 0
+        for row in range(start, rows[-1] + 1, count):
+            yield row, self._step(instance)
+
+    def _step(self, instance: Instance) -> Sample:
+        sample = instance.step()
+        self._at += 1
+        return sample
 
     def _place(self, row: int) -> tuple[int, int]:
         """Return the first row of a row's stream, and the number of rows from one to the next."""
@@ -254,8 +309,8 @@ class Redrawing(Closeable):
 class _Drawing(RunServices):
     """Answers an environment that draws: what was saved in its run is there, nothing is stored."""
 
-    def __init__(self, folder: Path, show: Show, predict: Predict | None) -> None:
-        super().__init__(folder, show, predict)
+    def __init__(self, folder: Path, show: Show, predict: Predict | None, touch: Touch) -> None:
+        super().__init__(folder, show, predict, touch=touch)
         self._saved: dict[int, dict[str, Any]] = {}
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:

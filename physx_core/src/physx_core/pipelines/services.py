@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -17,6 +17,8 @@ from physx_core.typing import Batch, Sample
 
 Predict: TypeAlias = Callable[[Batch], Batch]
 """The network's prediction for a batch, both in physical units."""
+Touch: TypeAlias = Callable[[int], Sequence[float]]
+"""What a person does to an instance: see `Observer.touch`."""
 Show: TypeAlias = Callable[[int, int, list[Event]], None]
 """Receives an instance, its step, and its drawing events."""
 
@@ -30,6 +32,7 @@ class RunServices:
         show: Show,
         predict: Predict | None,
         source_dir: Path | None = None,
+        touch: Touch | None = None,
     ) -> None:
         """Keep the receivers of the requests.
 
@@ -39,7 +42,9 @@ class RunServices:
             predict: The network's prediction; None: the pipeline has no network.
             source_dir: Folder of a read-only dataset, searched for parameters that are not in
                 `dataset_dir`.
+            touch: What a person does to an instance; None: there is nobody.
         """
+        self._touch = touch
         self._dir, self._source_dir = dataset_dir, source_dir
         self._show = show
         self._predict = predict
@@ -57,6 +62,10 @@ class RunServices:
                 "It works in training and prediction."
             )
         return self._predict(batch)
+
+    def touch(self, instance_id: int) -> Sequence[float]:
+        """Return what a person does to an instance."""
+        return () if self._touch is None else self._touch(instance_id)
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
         """Save an instance's values next to the dataset; earlier values of other names are kept.

@@ -2,12 +2,17 @@
 
 from __future__ import annotations
 
+from collections import Counter
+from collections.abc import Sequence
 from dataclasses import replace
+from pathlib import Path
 
 from physx_core.closeable import Closeable
+from physx_core.components.hand import HAND
 from physx_core.config import EnvironmentConfig
 from physx_core.dataset import Dataset
 from physx_core.pipelines.generation import Generation
+from physx_core.pipelines.services import Touch
 from physx_core.pipelines.storage import (
     STREAMS,
     describe_environment,
@@ -20,6 +25,11 @@ from physx_core.sources.source import Source
 from physx_core.workers.pasts import NOTHING, PastFiles
 
 _ADVICE = "Start another run for more of them."
+
+
+def states_of(streams: Generation, session: Path) -> PastFiles:
+    """Return the last states of streams, which are in the folder of their session."""
+    return PastFiles(session / "states", f"{streams.mode} {streams.first} {streams.seed}")
 
 
 class StoredStreams(Closeable):
@@ -59,15 +69,15 @@ class StoredStreams(Closeable):
         described = describe_environment(config, seed if config.seed is None else config.seed)
         now = replace(Generation.begin(STREAMS, dataset, mode, seed, described), offset=offset)
         known = former or now
-        run = f"{known.mode} {known.first} {known.seed}"
-        self._files = PastFiles(session.path / "states", run)
+        self._files = states_of(known, session.path)
         self.skip, self.earlier = NOTHING, dict[int, int]()
-        self._dataset = dataset
+        self._dataset, self._mode = dataset, mode
+        self._first, self._count = known.first, config.num_clients
         self._new = now if former is None else None
         if former is None:
             keep_parameters(dataset.directory)
             return
-        count = config.num_clients
+        count = self._count
         self.skip = skip = former.resume(dataset, config, now, needed, _ADVICE)
         restore_parameters(dataset.directory)
         stop = former.first + skip.rows
@@ -96,6 +106,27 @@ class StoredStreams(Closeable):
         if new is not None:
             self._files.clear()
             new.start(self._dataset)
+
+    def touched(self, touch: Touch) -> Touch:
+        """Return what a person did before rows that are repeated, and does before others.
+
+        Args:
+            touch: What a person does.
+        """
+        if not self.skip.rows or HAND not in self._dataset[self._mode]:
+            return touch
+        stored, count = self._dataset[self._mode][HAND], self._count
+        rows = Counter({number: past.rows for number, past in self.skip.pasts.items()})
+
+        def done(instance_id: int) -> Sequence[float]:
+            row = rows[instance_id]
+            rows[instance_id] += 1
+            if row >= self.skip.rows_of(instance_id, count):
+                return touch(instance_id)
+            before: Sequence[float] = stored[self._first + row * count + instance_id - 1].tolist()
+            return before
+
+        return done
 
     def missing(self, wanted: int, size: int) -> int:
         """Return how many rows of a batch are not stored.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import logging
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from functools import partial
 from typing import TYPE_CHECKING, Any
 
@@ -250,7 +250,7 @@ class LocalSource(Source):
 
 
 class _Remembering:
-    """The run's services for one instance; what they predict is noted, and told again."""
+    """The run's services for one instance; their answers are noted, and told again."""
 
     def __init__(self, services: Services, journal: Journal) -> None:
         self._services, self._journal = services, journal
@@ -260,20 +260,28 @@ class _Remembering:
 
     def predict(self, fields: Sample) -> Sample:
         """Return the prediction for one sample: see `Services.predict`."""
+        told: Sample = self._told(self._services.predict, fields)
+        return told
+
+    def touch(self, instance_id: int) -> Sequence[float]:
+        """Return what a person does, or did then: see `Services.touch`."""
+        told: Sequence[float] = self._told(self._services.touch, instance_id)
+        return told
+
+    def _told(self, ask: Callable[[Any], Any], of: Any) -> Any:
         answer = self._journal.tell()
         if answer is None:
             try:
-                found = self._services.predict(fields)
+                found = ask(of)
             except PhysxError as error:
                 self._keep((False, encode_error(error)))
                 raise
-            self._keep((True, encode(found, "the prediction")))
+            self._keep((True, encode(found, "the answer of the run")))
             return found
         self._keep(answer)
         if not answer[0]:
             raise decode_error(answer[1])
-        told: Sample = decode(answer[1])
-        return told
+        return decode(answer[1])
 
     def _keep(self, answer: Answer) -> None:
         kind = Kind.ANSWER if answer[0] else Kind.REFUSAL

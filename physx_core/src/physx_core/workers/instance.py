@@ -6,6 +6,7 @@ import copy
 import inspect
 import traceback
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from functools import partial
 from typing import TYPE_CHECKING, Any
 
 from physx_core.closeable import Closeable
@@ -14,9 +15,11 @@ from physx_core.components.environment import (
     PredictedFields,
     explain_missing_attribute,
 )
+from physx_core.components.hand import HAND, Hand
 from physx_core.components.parameter import Parameter
 from physx_core.components.scene.factory import Factory
 from physx_core.components.services import Choose, Services
+from physx_core.components.visualizer import takes_hand
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import (
     EnvironmentFailedError,
@@ -27,6 +30,7 @@ from physx_core.errors import (
     own_line,
 )
 from physx_core.fields import Field, check_together
+from physx_core.plugins import resolve
 from physx_core.processes.endings import describe_ending, is_ending
 from physx_core.rows import RejectedSamples
 from physx_core.typing import Array, Sample
@@ -51,7 +55,7 @@ _COUNTERS = (
     *("_next_episode", "_rows", "_counts", "_is_numbered"),
 )
 """What changes about an instance."""
-_STEPPING = ("reset_parameters", "step", "check_sample", "apply_prediction", "close")
+_STEPPING = ("reset_parameters", "perturb", "step", "check_sample", "apply_prediction", "close")
 
 
 def instance_arguments(
@@ -70,6 +74,8 @@ def instance_arguments(
         "max_wrong_samples": config.max_wrong_samples_per_step,
         "record_wrong": config.record_wrong_samples,
         "accept_all": accept_all,
+        "hand": config.visualizer is not None
+        and takes_hand(resolve("visualizer", config.visualizer)),
     }
 
 
@@ -100,6 +106,7 @@ class Instance(Closeable):
         max_wrong_samples: int = 10,
         record_wrong: bool = False,
         accept_all: bool = False,
+        hand: bool = False,
     ) -> None:
         """Store the arguments of the environment.
 
@@ -115,6 +122,8 @@ class Instance(Closeable):
             max_wrong_samples: How many consecutive samples `check_sample` may reject.
             record_wrong: Whether to keep the samples that it rejects in `rejected`.
             accept_all: Whether to ignore the verdict of `check_sample`, as in a replay.
+            hand: Whether to ask the run before each row what a person does, if the environment
+                defines controls.
         """
         self.instance_id = instance_id
         self.environment: Environment | None = None
@@ -142,6 +151,8 @@ class Instance(Closeable):
         self._drawing: Baseline | None = None
         self._refusal: StateError | None = None
         self._runner: Any = None
+        self._wants_hand = hand
+        self._hand: Hand | None = None
 
     @property
     def fields(self) -> list[Field]:
@@ -207,6 +218,8 @@ class Instance(Closeable):
         self._call("init", environment.init)
         self._call("init_database", environment.init_database)
         self._simulate = self._simulate_sub_steps if self._sub_steps else environment.step
+        if self._wants_hand and (environment._controls or environment._pulls):
+            self._take_hand(environment, services)
         if not any(field.role == "training" for field in environment.fields):
             raise UsageError(
                 f"{type(environment).__name__}.init_database() defined no training fields: "
@@ -220,10 +233,35 @@ class Instance(Closeable):
         if draw:
             environment.factory, before = Factory(), set(vars(environment))
             self._call("init_visualization", environment.init_visualization)
+            if self._hand is not None:
+                environment.factory.add_controls(HAND, **self._hand.describe())
             environment.update_visualization()
             if with_states:
                 self._try(self._track_drawing)
                 environment.leave_out_of_state(vars(environment).keys() - before)
+
+    def _take_hand(self, environment: Environment, services: Services | None) -> None:
+        """Have the environment told before each row what a person does."""
+        assert services is not None
+        hand = self._hand = Hand(
+            environment,
+            environment._controls,
+            environment._control_values,
+            environment._pulls,
+            partial(services.touch, self.instance_id),
+        )
+        self._call("init_database", environment.define_additional_fields, hand.field)
+        simulate = self._simulate
+
+        def simulate_by_hand() -> None:
+            done = self._call("perturb", hand.act)
+            result = simulate()
+            if result is not None:
+                self._finish(result)
+            if environment._training is not None:
+                environment._additional = {**(environment._additional or {}), HAND: done}
+
+        self._simulate = simulate_by_hand
 
     def _track_drawing(self) -> None:
         from physx_core.states import Baseline  # most runs take no states
@@ -273,6 +311,8 @@ class Instance(Closeable):
         if not self._is_numbered:
             self._count_episodes(environment)
         self._rows = 0
+        if self._hand is not None:
+            self._call("perturb", self._hand.let_go)
         try:
             environment.begin_number(number, values)
         except (Exception, SystemExit) as error:
@@ -286,7 +326,7 @@ class Instance(Closeable):
     def makes_single_rows(self) -> bool:
         """Whether each step is an episode, and nothing is asked of it but its sample."""
         kept = type(self._alive()).check_sample is Environment.check_sample
-        more = self._sub_steps or self._draws or self.episode_fields
+        more = self._sub_steps or self._draws or self._hand is not None or self.episode_fields
         return self._episode_steps == 1 and kept and not more
 
     def single_rows(
@@ -361,7 +401,7 @@ class Instance(Closeable):
                 raise self._failure(method, error) from error
             if sample is None:
                 empty += 1
-                _check_empty(environment, empty)
+                self._note_empty(environment, empty)
             else:
                 self.last_step = environment._earlier_steps + environment.step_index
                 self.last_episode = environment.sample_episode
@@ -410,6 +450,7 @@ class Instance(Closeable):
             "environment": self._call("get_state", environment.get_state),
             "place": environment.get_place(),
             "instance": {name: getattr(self, name) for name in _COUNTERS},
+            "hand": None if self._hand is None else self._hand.get_state(),
             "rejected": None if rejected is None else list(rejected.waiting),
             "drawing": None if self._drawing is None else self._drawing.capture(),
         }
@@ -426,6 +467,8 @@ class Instance(Closeable):
         environment.set_place(state["place"])
         for name in _COUNTERS:
             setattr(self, name, state["instance"][name])
+        if self._hand is not None and state.get("hand") is not None:
+            self._hand.set_state(state["hand"])
         if self.rejected is not None:
             self.rejected.waiting = list(state["rejected"] or [])
         if self._drawing is not None and state["drawing"] is not None:
@@ -447,7 +490,7 @@ class Instance(Closeable):
         fork.environment = environment = self._call("fork", self._alive().fork)
         fork._simulate = fork._simulate_sub_steps if self._sub_steps else environment.step
         fork.rejected = None if self.rejected is None else RejectedSamples()
-        fork._draws, fork._drawing, fork._runner = False, None, None
+        fork._draws, fork._drawing, fork._runner, fork._hand = False, None, None, None
         return fork
 
     def _check_tasks(self) -> None:
@@ -549,6 +592,8 @@ class Instance(Closeable):
 
     def _reject(self, sample: dict[str, Any], wrong: int) -> None:
         """Record a rejected sample, the `wrong`-th in a row; raise if there are too many."""
+        if self._hand is not None:
+            self._hand.repeat()
         if self.rejected is not None and not self._is_numbered:
             self.rejected.add(sample, self.last_episode, self.last_step)
         elif self.rejected is not None and not self.rejected.has(self.last_episode, MOST_REJECTED):
@@ -560,6 +605,16 @@ class Instance(Closeable):
                 f"max_wrong_samples_per_step is {self._max_wrong_samples}.",
                 instance_id=0 if self._is_numbered else self.instance_id,
                 step=self.last_step,
+            )
+
+    def _note_empty(self, environment: Environment, count: int) -> None:
+        """Check how many episodes in a row ended without a row."""
+        if self._hand is not None:
+            self._hand.repeat()
+        if count == _MOST_EMPTY:
+            raise UsageError(
+                f"{type(environment).__name__} ended {count} episodes in a row without a row: call "
+                "set_training_data() in the step that calls end_episode()."
             )
 
     def _finish(self, result: Any) -> None:
@@ -610,12 +665,3 @@ class Instance(Closeable):
         if self.environment is None:
             raise UsageError(f"Instance {self.instance_id} is not open.")
         return self.environment
-
-
-def _check_empty(environment: Environment, count: int) -> None:
-    """Check how many episodes in a row ended without a row."""
-    if count == _MOST_EMPTY:
-        raise UsageError(
-            f"{type(environment).__name__} ended {count} episodes in a row without a row: call "
-            "set_training_data() in the step that calls end_episode()."
-        )

@@ -9,10 +9,11 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from physx_core import Field
+from physx_core import Field, Parameter
 from physx_core.components import Environment, set_number
 from physx_core.errors import ConfigError
 from physx_core.plugins import import_component
+from physx_core.typing import Array
 from physx_gym.bridge.make_env import make_env
 from physx_gym.bridge.policy import single_action
 from physx_gym.spaces import SpaceFields
@@ -67,6 +68,11 @@ class GymEnvironment(Environment):
         self._next = SpaceFields(self.env.observation_space, "next_observation")
         self._actions = SpaceFields(self.env.action_space, "action")
         self.policy = self._policy
+        world = getattr(getattr(self.env.unwrapped, "simulator", None), "world", None)
+        if world is not None and hasattr(self.env.unwrapped, "pull"):
+            gravity = Parameter("gravity", -20, 20, shape=(3,), unit="m/s^2")
+            names = [each.name for each in (*world.robots, *world.objects)]
+            self.define_controls(gravity, names, gravity=world.gravity)
         self._draw_seeds()
 
     def init_database(self) -> None:
@@ -170,12 +176,21 @@ class GymEnvironment(Environment):
         """
         if "policy" in values:
             self.policy = values.pop("policy")
+        if self._observation is None and values:
+            self._begin_episode()  # which would undo it
         env: Any = self.env.unwrapped
         if hasattr(env, "perturb"):
             env.perturb(**values)
             return
         for name, value in values.items():
             set_number(env, name, value)
+
+    def pull(self, name: str, node: int, force: Array) -> None:
+        """Pull at a robot's body or an object: see `RobotEnv.pull`."""
+        if self._observation is None:
+            self._begin_episode()
+        env: Any = self.env.unwrapped
+        env.pull(name, node, force)
 
     # Actions --------------------------------------------------------------------------------
 

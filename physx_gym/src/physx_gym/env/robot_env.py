@@ -654,6 +654,20 @@ class RobotEnv(PipelineEnv):
         for name, settings in values.get("bodies", {}).items():
             simulation.set_body(name, BodySettings(**settings))
 
+    def pull(self, name: str, node: int, force: Vector) -> None:
+        """Pull at a robot's body or an object for a step: see `physx_core.Environment.pull`.
+
+        Args:
+            name: Name of the robot or object.
+            node: Index of the robot's body in the engine's layout; of an object 0.
+            force: In N, world frame, shape (3,).
+        """
+        simulator, layout = self.simulator, self.simulator.layout
+        part = layout.parts.get(name)
+        body = name if part is None else layout.names[part.bodies][node]
+        if force.any():
+            simulator.simulation.apply_wrench(Wrench(body, force, duration=self.step_dt))
+
     # State -------------------------------------------------------------------------------------
 
     def restore(self, state: Any) -> None:

@@ -4,23 +4,34 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Mapping, Sequence
-from typing import Any
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 import numpy as np
 import rerun as rr
 
-from physx_core.errors import MissingLibraryError
+from physx_core.errors import MissingLibraryError, VisualizerError
 from physx_core.rotations import from_matrix_rows, rotate_rows
 from physx_core.typing import Array
 from physx_rerun.drawing import colors
 from physx_rerun.drawing.chunks import ChunkBuilder, Times
 from physx_rerun.drawing.meshes import corners_of_mesh
 from physx_rerun.drawing.triangles import SimpleMesh, simple_mesh
-from physx_rerun.drawing.visual_shapes import MESH_TYPES, Model, VisualShape
+
+if TYPE_CHECKING:
+    from physx_sim import VisualModel, VisualShape
+
+MESH_TYPES = {
+    ".dae": "model/vnd.collada+xml",
+    ".glb": "model/gltf-binary",
+    ".gltf": "model/gltf+json",
+    ".obj": "model/obj",
+    ".stl": "model/stl",
+}
+"""Mesh files that Rerun can draw, by suffix, and their media types."""
 
 _SILVER = (0.75, 0.78, 0.81, 1.0)
 
-DrawnShape = tuple[str, VisualShape]
+DrawnShape: TypeAlias = "tuple[str, VisualShape]"
 """Entity of a shape, and the shape."""
 
 
@@ -46,7 +57,7 @@ def draw_robot(
     Returns:
         The shapes drawn, and the bodies' poses with all joints at zero, shape (bodies, 7).
     """
-    model = _read(values)
+    model = read_model(values)
     if model.missing:
         warnings.warn(
             f"{len(model.missing)} meshes of {values['urdf']} are not drawn: Rerun found no mesh "
@@ -66,15 +77,20 @@ def draw_robot(
     return drawn, model.rest
 
 
-def _read(values: Mapping[str, Any]) -> Model:
+def read_model(values: Mapping[str, Any]) -> VisualModel:
     """Read the robot's URDF file."""
     try:
-        from physx_rerun.drawing.urdf import read
+        from physx_sim import read_visuals
+        from physx_sim.errors import ModelError
     except ModuleNotFoundError as error:
         raise MissingLibraryError(
             "Drawing a robot", "physx-sim", "robots", "physx-rerun"
         ) from error
-    return read(values["urdf"], values["bodies"], values.get("package_dirs") or {})
+    urdf, packages = values["urdf"], values.get("package_dirs") or {}
+    try:
+        return read_visuals(urdf, values["bodies"], packages, MESH_TYPES)
+    except ModelError as error:
+        raise VisualizerError(f"The robot {urdf} cannot be drawn: {error}.") from error
 
 
 def place_shapes(
@@ -147,7 +163,7 @@ def corners_of(shapes: Sequence[VisualShape]) -> Array:
     return np.concatenate(found)
 
 
-def _extent(model: Model) -> float:
+def _extent(model: VisualModel) -> float:
     """Return the diagonal of the box around a robot at rest in m."""
     found = [model.rest[:, :3]]
     for shape in model.shapes:

@@ -71,7 +71,8 @@ class Factory:
             positions: Vertices, shape (n, 3), in m.
             cells: Indices of the vertices of each triangle, shape (m, 3).
             look: ``color``, ``alpha``, ``scalar_field`` (n,) shown through ``colormap``,
-                ``wireframe``, and the ``size`` of its lines: their radius in m.
+                ``wireframe``, by default beside the surface of a mesh of few triangles, and the
+                ``size`` of its lines: their radius in m.
         """
         return self._add("mesh", name, positions=positions, cells=cells, **look)
 
@@ -280,6 +281,10 @@ class Factory:
     def update_scalars(self, name: str, values: ArrayLike) -> None:
         """Set the curves' next ``values``, shape (labels,)."""
         self._update("scalars", name, {"values": values})
+
+    def add_controls(self, name: str, labels: Sequence[str], **values: Any) -> str:
+        """Add sliders, and say which objects can be pulled; `Environment.define_controls` does."""
+        return self._add("controls", name, labels=labels, **values)
 
     def set_view(self, title: str, follow: str | None = None, **camera: ArrayLike) -> None:
         """Set the title of the environment's window and place its camera; call it once.

@@ -161,6 +161,11 @@ KINDS: dict[str, Kind] = {
         ("bodies", "poses"),
         ("urdf", "bodies", "package_dirs", "in_view"),
     ),
+    "controls": Kind(
+        {"labels": texts, "pulls": texts},
+        {each: Numbers((None,), np.float64) for each in ("low", "high", "values")},
+        ("labels", "low", "high", "values"),
+    ),
     "view": Kind({"title": text}, {"eye": Numbers((3,)), "target": Numbers((3,)), "follow": text}),
 }
 """All kinds of objects by name."""

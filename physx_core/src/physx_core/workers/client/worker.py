@@ -6,7 +6,7 @@ import contextlib
 import os
 import re
 import sys
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -235,6 +235,11 @@ class RemoteServices:
         self._producer.announce_early()
         prediction: Sample = self._ask(Kind.PREDICT, fields, "get_prediction()")
         return prediction
+
+    def touch(self, instance_id: int) -> Sequence[float]:
+        """Return what a person does to the instance: see `Services.touch`."""
+        done: Sequence[float] = self._ask(Kind.TOUCH, None, "a person's hand")
+        return done
 
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
         """Save values of the instance: see `Services.save_parameters`."""

@@ -39,7 +39,7 @@ _MAX_STRANGERS = 128
 _TURNS = 64
 _LONG = 1 << 16
 _LOG = logging.getLogger("physx")
-_REQUESTS = (Kind.PREDICT, Kind.SAVE, Kind.LOAD, Kind.SHOW, Kind.CHOOSE)
+_REQUESTS = (Kind.PREDICT, Kind.SAVE, Kind.LOAD, Kind.SHOW, Kind.CHOOSE, Kind.TOUCH)
 
 
 class Server:

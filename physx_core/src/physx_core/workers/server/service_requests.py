@@ -25,6 +25,7 @@ from physx_core.workers.server.validation import (
 _MOST_UNREAD = 1 << 26
 _KEPT = "the saved parameters"
 _PREDICTION = "the prediction"
+_TOUCH = "what a person does"
 
 Signature: TypeAlias = tuple[tuple[str, tuple[int, ...], str], ...]
 Request: TypeAlias = tuple[Peer, int, Sample]
@@ -76,26 +77,20 @@ class ServiceRequests:
         Physx errors that the services raise are sent to the environment, others are raised. A
         request that this client's predecessor made gets the same answer.
         """
-        if frame.kind is not Kind.SHOW:
-            peer.pace.rest()
-            if len(peer.outgoing) > _MOST_UNREAD:
-                raise ConnectionRefusedByPeerError("It asks, but does not read the answers.")
-            peer.requests += 1
-            if frame.number != peer.requests:
-                raise ConnectionRefusedByPeerError("It numbered its requests wrongly.")
-            recorded = peer.journal.answer(frame.number) if peer.journal is not None else None
-            if recorded is not None:
-                peer.send_once(recorded)
-                peer.pace.go_on()
-                return
-        if frame.kind is Kind.PREDICT:
+        if frame.kind is not Kind.SHOW and self._repeat(peer, frame):
+            return
+        if frame.kind in (Kind.PREDICT, Kind.TOUCH):
             told = None if peer.journal is None else peer.journal.tell()
             if told is not None:
                 kind = Kind.ANSWER if told[0] else Kind.REFUSAL
                 peer.send(pack(kind, told[1], frame.number), is_prediction=True)
                 peer.pace.go_on()
                 return
-            self._keep(peer, frame)
+            if frame.kind is Kind.PREDICT:
+                self._keep(peer, frame)
+            else:
+                who, touch = peer.instance_id, self._services.touch
+                self._answer(peer, frame.number, _TOUCH, touch, who)
         elif frame.kind is Kind.SAVE:
             of_all, values = parse_saved(frame.payload)
             who = 0 if of_all else peer.instance_id
@@ -110,6 +105,21 @@ class ServiceRequests:
             events = parse_events(frame.payload)
             peer.shown += 1
             self._services.show(peer.instance_id, frame.number, events)
+
+    def _repeat(self, peer: Peer, frame: Frame) -> bool:
+        """Answer a request that this client's predecessor made; return whether it was one."""
+        peer.pace.rest()
+        if len(peer.outgoing) > _MOST_UNREAD:
+            raise ConnectionRefusedByPeerError("It asks, but does not read the answers.")
+        peer.requests += 1
+        if frame.number != peer.requests:
+            raise ConnectionRefusedByPeerError("It numbered its requests wrongly.")
+        recorded = peer.journal.answer(frame.number) if peer.journal is not None else None
+        if recorded is None:
+            return False
+        peer.send_once(recorded)
+        peer.pace.go_on()
+        return True
 
     def _choose(self, peer: Peer, frame: Frame) -> None:
         if not peer.parameters:
@@ -204,7 +214,7 @@ class ServiceRequests:
         except Exception as error:
             error.add_note(f"while handling {what} for instance {peer.instance_id}")
             raise
-        peer.send(message, is_prediction=what is _PREDICTION)
+        peer.send(message, is_prediction=what in (_PREDICTION, _TOUCH))
         peer.pace.go_on()
 
 

@@ -1,26 +1,66 @@
-"""Reads the visual shapes of a URDF file, and their poses on the robot's bodies.
-
-Rerun's `UrdfTree` finds packages only through environment variables, omits missing meshes without
-an error, and does not report sizes, which the camera needs.
-"""
+"""Reads the visual shapes of a URDF file, and their poses on the robot's bodies, for viewers."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
+from dataclasses import dataclass
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
 import numpy as np
 
-from physx_core.errors import VisualizerError
 from physx_core.rotations import from_matrix_rows
 from physx_core.typing import Vector
-from physx_rerun.drawing.visual_shapes import MESH_TYPES, Model, VisualShape
-from physx_sim import UrdfTree, link_of, mesh_path, numbers_of, origin_of, parse_urdf
 from physx_sim.errors import ModelError
+from physx_sim.urdf import UrdfTree, link_of, mesh_path, numbers_of, origin_of, parse_urdf
 
 
-def read(urdf: str | Path, bodies: Sequence[str], package_dirs: Mapping[str, str]) -> Model:
+@dataclass(frozen=True)
+class VisualShape:
+    """A visual shape of a link.
+
+    Attributes:
+        name: Name that is unique in the robot.
+        body: Index of the body that it is attached to; None: the world.
+        pose: Pose in the body's frame, a homogeneous matrix of shape (4, 4).
+        kind: ``mesh``, ``box``, ``cylinder``, ``sphere`` or ``capsule``.
+        size: In m: half edges of a box (3,); radius of a sphere (1,); radius and length (2,). For a
+            mesh: scale factors (3,).
+        mesh: File of a mesh.
+        color: Red, green, blue and alpha in [0, 1] from the URDF; None: not specified there.
+    """
+
+    name: str
+    body: int | None
+    pose: Vector
+    kind: str
+    size: tuple[float, ...]
+    mesh: Path | None
+    color: tuple[float, ...] | None
+
+
+@dataclass(frozen=True)
+class VisualModel:
+    """What of a robot is drawn.
+
+    Attributes:
+        shapes: The visual shapes whose files exist.
+        missing: Names of mesh files that do not exist or are of another type.
+        rest: Poses of the bodies with all joints at zero and the root at the origin,
+            shape (bodies, 7), x, y, z in m and quaternion x, y, z, w.
+    """
+
+    shapes: list[VisualShape]
+    missing: list[str]
+    rest: Vector
+
+
+def read_visuals(
+    urdf: str | Path,
+    bodies: Sequence[str],
+    package_dirs: Mapping[str, str],
+    mesh_types: Collection[str],
+) -> VisualModel:
     """Read the visual shapes of a URDF file; collision shapes are ignored.
 
     Args:
@@ -28,17 +68,13 @@ def read(urdf: str | Path, bodies: Sequence[str], package_dirs: Mapping[str, str
         bodies: Names of the links to place; other links move with their nearest ancestor among
             these, with joints at zero.
         package_dirs: Folder of each package that mesh names start with.
+        mesh_types: Suffixes of the mesh files that the viewer can draw, such as ``.stl``.
+
+    Raises:
+        ModelError: If the file cannot be read, or has no such body.
     """
     path = Path(urdf).absolute()
-    try:
-        return _read(path, UrdfTree(parse_urdf(path)), bodies, package_dirs)
-    except ModelError as error:
-        raise VisualizerError(f"The robot {path} cannot be drawn: {error}.") from error
-
-
-def _read(
-    path: Path, tree: UrdfTree, bodies: Sequence[str], package_dirs: Mapping[str, str]
-) -> Model:
+    tree = UrdfTree(parse_urdf(path))
     unknown = [name for name in bodies if name not in tree.elements]
     if unknown:
         raise ModelError(f"it has no link {unknown[0]!r}; links: {', '.join(tree.elements)}")
@@ -59,7 +95,7 @@ def _read(
             mesh = None
             if shape.kind == "mesh":
                 mesh = mesh_path(path, shape.mesh, package_dirs)
-                if mesh is None or not (mesh.is_file() and mesh.suffix.lower() in MESH_TYPES):
+                if mesh is None or not (mesh.is_file() and mesh.suffix.lower() in mesh_types):
                     missing.append(shape.mesh)
                     continue
             size = tuple(0.5 * edge for edge in shape.size) if shape.kind == "box" else shape.size
@@ -67,7 +103,7 @@ def _read(
             shapes.append(
                 VisualShape(f"{name}_{number}", body, pose, shape.kind, size, mesh, color)
             )
-    return Model(shapes, missing, rest)
+    return VisualModel(shapes, missing, rest)
 
 
 def _carrier(tree: UrdfTree, link: str, bodies: Sequence[str]) -> tuple[int | None, Vector]:
