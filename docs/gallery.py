@@ -97,19 +97,34 @@ def draw(name: str, drawn: Path) -> int:
 
 def section(name: str) -> str:
     """Return an example's section of the page."""
-    title, _, told = beginning(name).partition("\n")
+    title, told = title_of(name), beginning(name).partition("\n")[2]
     path, drawn = path_of(name), picture(name)
     place = f"../examples/{path.name}" + ("/README.md" if path.is_dir() else "")
     told = kept.markdown(told.strip(), f"{TEST}\n```sh")
-    parts = [f"## {title.rstrip('.')}", f"[examples/{path.name}]({place})", told]
+    parts = [f"## {title}", f"[examples/{path.name}]({place})", told]
     if drawn.is_file():
-        parts.append(f"![{title.rstrip('.')}](examples/{drawn.name})")
+        parts.append(f"![{title}](examples/{drawn.name})")
     if (PAGE.kept / f"{name}.txt").is_file():
         parts.append(PAGE.printed(name).rstrip("\n"))
     return "\n\n".join(part for part in parts if part) + "\n"
 
 
-PAGE = kept.Page(HERE / "gallery.md", HERE / "examples", names, run, section)
+def title_of(name: str) -> str:
+    """Return the title of an example's section."""
+    return beginning(name).partition("\n")[0].rstrip(".")
+
+
+def overview() -> str:
+    """Return a grid of the pictures, each of which leads to its example."""
+    cells = []
+    for name in filter(lambda each: picture(each).is_file(), names()):
+        title = title_of(name)
+        anchor = re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
+        cells.append(f"[![{title}](examples/{picture(name).name})](#{anchor})")
+    return "\n" + "\n".join(cells) + "\n"
+
+
+PAGE = kept.Page(HERE / "gallery.md", HERE / "examples", names, run, section, overview)
 
 if __name__ == "__main__":
     sys.exit(PAGE.main(__doc__ or ""))

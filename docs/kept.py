@@ -33,6 +33,7 @@ class Page:
         names: Returns the names of all programs.
         run: Runs a program and returns its exit status; its output goes through `keep`.
         section: Returns a program's section of the page.
+        overview: Returns what comes before the sections.
     """
 
     path: Path
@@ -40,6 +41,7 @@ class Page:
     names: Callable[[], list[str]]
     run: Callable[[str], int]
     section: Callable[[str], str]
+    overview: Callable[[], str] = str
 
     @property
     def mark(self) -> str:
@@ -49,7 +51,8 @@ class Page:
     def text(self) -> str:
         """Return the page as it should be, with its hand-written part unchanged."""
         written = self.path.read_text(encoding="utf-8").partition(self.mark)[0]
-        return "\n".join([f"{written}{self.mark}\n", *map(self.section, self.names())])
+        begin = f"{written}{self.mark}\n{self.overview()}"
+        return "\n".join([begin, *map(self.section, self.names())])
 
     def keep(self, name: str, words: Sequence[str], folder: Path | None = None) -> int:
         """Run a command in a folder, keep what it prints, and return its exit status."""

@@ -11,6 +11,7 @@ PACKAGES = (
     "mujoco",
     "torch",
     "rerun",
+    "viser",
     "gym",
     "remote",
     "cluster",

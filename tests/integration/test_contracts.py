@@ -13,7 +13,7 @@ from physx_testing import check_plugin
 
 pytestmark = [pytest.mark.slow, pytest.mark.processes]
 
-for library in ("torch", "dartpy", "pinocchio", "mujoco", "rerun", "gymnasium"):
+for library in ("torch", "dartpy", "pinocchio", "mujoco", "rerun", "viser", "gymnasium"):
     pytest.importorskip(library)
 
 PROGRAMS = Path(__file__).parents[1] / "core" / "programs" / "external"

@@ -35,6 +35,7 @@ from physx_formats import ExportOptions
 from physx_gym import Trajectory
 from physx_gym.tasks import quantities
 from physx_rerun import RerunVisualizer
+from physx_viser import ViserVisualizer
 
 ENVIRONMENT = EnvironmentConfig("toy/spring")
 ERRORS = {
@@ -128,6 +129,7 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     },
     physx_core.Branch: {"data": "sessions/data", "row": 3, "step_nb": 4, "past": 5},
     RerunVisualizer: {},
+    ViserVisualizer: {},
     ExportOptions: {"fps": 30},
     Trajectory: {"times": [0.0, 1.0], "positions": [[1.0], [2.0]], "velocities": [[0.5], [0.0]]},
     quantities.Masked: {"quantity": quantities.JointPositions(), "entries": [2, 0]},
@@ -151,7 +153,17 @@ RECORDS = {
         "LearnedActuator",
         "Actuators",
     ),
-    *("UrdfShape", "Episode", "StepperState", "Result", "Comparison", "Trial", "Normalization"),
+    *(
+        "UrdfShape",
+        "VisualShape",
+        "VisualModel",
+        "Episode",
+        "StepperState",
+        "Result",
+        "Comparison",
+        "Trial",
+        "Normalization",
+    ),
     *("CollisionShape", "Joint", "MovableBody", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
     "Bond",
     *("Combination", "Estimate", "Identification", "Log", "LogNoise", "Motion", "ResidualTest"),

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import io
 import warnings
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -134,10 +134,10 @@ class Film:
         return found
 
 
-def _visualizers() -> list[type[Visualizer]]:
+def _visualizers() -> Iterator[type[Visualizer]]:
     known = plugins.references_of("visualizer")
     found = (plugins.resolve("visualizer", each) for some in known.values() for each in some)
-    return [each for each in found if isinstance(each, type) and issubclass(each, Visualizer)]
+    yield from (each for each in found if isinstance(each, type) and issubclass(each, Visualizer))
 
 
 def redraw(

@@ -79,7 +79,7 @@ def _surface(scene: SceneApi, name: str, values: Values) -> Any:
     found, colors = trimesh.Trimesh(points, cells, process=False), rgb(values)
     if np.ndim(colors) == 1:
         return _solid(lambda _: found)(scene, name, values)
-    found.visual.vertex_colors = colors
+    found.visual = trimesh.visual.ColorVisuals(found, vertex_colors=colors)
     return scene.add_mesh_trimesh(name, found, **pose(values))
 
 
@@ -107,8 +107,14 @@ def point_size(positions: Array) -> float:
 def _arrows(scene: SceneApi, name: str, values: Values) -> Any:
     ends = values["positions"] + np.asarray(values["vectors"])
     radius = 0.02 * float(np.linalg.norm(values["vectors"], axis=-1).max(initial=0.1))
-    sizes = {"shaft_radius": radius, "head_radius": 2.5 * radius, "head_length": 5 * radius}
-    return scene.add_arrows(name, np.stack([values["positions"], ends], 1), rgb(values), **sizes)
+    return scene.add_arrows(
+        name,
+        np.stack([values["positions"], ends], 1),
+        rgb(values),
+        shaft_radius=radius,
+        head_radius=2.5 * radius,
+        head_length=5 * radius,
+    )
 
 
 def _lines(scene: SceneApi, name: str, values: Values) -> Any:

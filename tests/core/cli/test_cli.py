@@ -251,3 +251,9 @@ def test_an_option_of_another_command_or_configuration_is_suggested(capsys, word
 def test_info_without_a_folder_names_the_doctor(capsys):
     assert main(["info"]) == 1
     assert "physx doctor" in capsys.readouterr().err
+
+
+def test_the_list_of_commands_fits_into_80_columns(capsys):
+    assert main(["--help"]) == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert len(lines) > 20 and max(map(len, lines)) <= 80

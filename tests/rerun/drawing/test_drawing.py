@@ -72,6 +72,15 @@ def test_mesh_as_wireframe_and_back(scene):
     assert [len(v) for _, v in saved("plate", "Mesh3D:vertex_positions")] == [0, 4]
 
 
+def test_a_mesh_of_few_triangles_shows_its_edges(scene):
+    factory, show, saved = scene
+    factory.add_mesh("plate", SQUARE, CELLS)
+    show(0)
+    ((_, edges),) = saved("plate/edges", "LineStrips3D:strips")
+    assert len(edges) == 5
+    assert [len(v) for _, v in saved("plate", "Mesh3D:vertex_positions")] == [4]
+
+
 def test_points(scene):
     factory, show, saved = scene
     factory.add_points("cloud", SQUARE, color=(0, 1, 0), size=0.02)
@@ -225,7 +234,7 @@ def test_changed_looks_of_symbols(scene):
 
 def test_changed_looks_of_a_wireframe(scene):
     factory, show, saved = scene
-    factory.add_mesh("plate", SQUARE, CELLS, color="#00ff00")
+    factory.add_mesh("plate", SQUARE, CELLS, color="#00ff00", wireframe=False)
     show(0)
     factory.update_mesh("plate", wireframe=True)
     show(1)

@@ -37,6 +37,18 @@ def test_each_instance_has_a_window_of_its_name():
     assert names == ["alone", "environment 2", "error"]
 
 
+def test_instances_are_seen_from_the_same_distance():
+    layout = WindowLayout(3)
+    for instance_id, radius in ((1, 0.1), (2, 0.4), (3, 0.2)):
+        factory = Factory()
+        factory.add_sphere("ball", radius)
+        drawing = Drawing(instance_id, ChunkBuilder(), layout, draws_shapes=True)
+        drawing.draw(factory.take_events(), {"step": 0})
+    layout.blueprint()
+    distances = [np.linalg.norm(layout.frame(each)._position) for each in (1, 2, 3)]
+    assert np.allclose(distances, distances[0])
+
+
 def test_the_camera_is_placed_where_the_environment_wants_it():
     (scene, _) = views(drawn(1, title="t", eye=[1, 2, 3], target=[0, 0, 1]))
     eye = scene.properties["EyeControls3D"]

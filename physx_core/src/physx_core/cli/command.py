@@ -10,6 +10,7 @@ import io
 import os
 import signal
 import sys
+import textwrap
 import traceback
 import warnings
 from collections.abc import Iterator, Sequence
@@ -167,12 +168,21 @@ def _overview() -> str:
     names = [name for name in _ORDER if name in commands]
     names += [name for name in commands if name not in _ORDER]
     width = max(map(len, names), default=0)
-    lines = printable("\n".join(f"  {name:{width}}  {_summary(commands[name])}" for name in names))
+    indent = " " * (width + 4)
+    lines = "\n".join(
+        textwrap.fill(
+            printable(_summary(commands[name])),
+            80,
+            initial_indent=f"  {name:{width}}  ",
+            subsequent_indent=indent,
+        )
+        for name in names
+    )
     return (
         "physx: connect physics engines with deep learning (not NVIDIA PhysX)\n\n"
         f"usage: physx COMMAND [OPTIONS]\n\n{lines}\n\n"
-        "physx COMMAND --help lists the command's options. "
-        "--debug shows the traceback of an error.\n--version shows the version."
+        "physx COMMAND --help lists the command's options.\n"
+        "--debug shows the traceback of an error, --version the version."
     )
 
 

@@ -122,6 +122,11 @@ class Observer(Closeable):
         return ()
 
 
+def takes_hand(visualizer: Any) -> bool:
+    """Return whether a person can touch environments in a visualizer of this class."""
+    return getattr(visualizer, "touch", Observer.touch) is not Observer.touch
+
+
 @dataclass(frozen=True)
 class Cursor:
     """Where the cursor of an open viewer stands.

@@ -339,13 +339,14 @@ class DataGeneration(NewSessionPipeline):
             skip = self._streams.skip
             if former is not None and skip.rows >= (total or 0):
                 return
+        known = self._streams
         self.source = self._open_source(
             *(resources, config, seed),
             total=total,
             skip=skip,
             delegation=delegation,
             keeps_pasts=self._streams is not None,
-            touch=self._streams and self._streams.touched(self.observers.touch),
+            touch=None if known is None else known.touched(self.observers.touch),
         )
         if campaign is None and self._simulates_episodes():
             self._begin_campaign(config, seed)

@@ -230,8 +230,9 @@ class Redrawing(Closeable):
         """Return what a person did before the next row; nothing if none is stored."""
         if self._at >= len(self._rows):
             return ()
-        done: Sequence[float] = self._dataset[self._mode][HAND][self._rows[self._at]]
-        return done
+        done = np.asarray(self._dataset[self._mode][HAND][self._rows[self._at]])
+        told: list[float] = done.tolist()
+        return told
 
     def _show(self, instance_id: int, step: int, events: list[Event]) -> None:
         self._events += events

@@ -19,7 +19,7 @@ from physx_core.components.hand import HAND, Hand
 from physx_core.components.parameter import Parameter
 from physx_core.components.scene.factory import Factory
 from physx_core.components.services import Choose, Services
-from physx_core.components.visualizer import Observer
+from physx_core.components.visualizer import takes_hand
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import (
     EnvironmentFailedError,
@@ -74,13 +74,9 @@ def instance_arguments(
         "max_wrong_samples": config.max_wrong_samples_per_step,
         "record_wrong": config.record_wrong_samples,
         "accept_all": accept_all,
-        "hand": config.visualizer is not None and _takes_hand(config.visualizer),
+        "hand": config.visualizer is not None
+        and takes_hand(resolve("visualizer", config.visualizer)),
     }
-
-
-def _takes_hand(visualizer: Any) -> bool:
-    """Return whether a person can touch environments in a visualizer."""
-    return getattr(resolve("visualizer", visualizer), "touch", None) is not Observer.touch
 
 
 class Instance(Closeable):

@@ -191,5 +191,9 @@ class _MessageSink:
         """Refuse."""
         raise UsageError("A vector environment has no network.")
 
+    def touch(self, instance_id: int) -> Sequence[float]:
+        """Do nothing."""
+        return ()
+
     def show(self, instance_id: int, step: int, events: Any) -> None:
         """Draw nothing."""

@@ -179,6 +179,10 @@ class SampleEnv(gymnasium.Env[Any, Any]):
             )
         return {name: value.copy() for name, value in self._prediction.items()}
 
+    def touch(self, instance_id: int) -> Sequence[float]:
+        """Do nothing."""
+        return ()
+
     def save_parameters(self, instance_id: int, values: dict[str, Any]) -> None:
         """Store values of the environment for the lifetime of this object."""
         self._parameters.update(values)

@@ -24,6 +24,8 @@ from physx_rerun.drawing.windows import WindowLayout
 DEFAULT_COLOR = "silver"
 _SCREEN_POINTS = -3.0  # Rerun reads a negative radius as one in points of the screen.
 _SCREEN_LINES = -1.5
+_FEW = 600  # triangles of a mesh whose edges are drawn
+_EDGES = colors.rgba((0.1, 0.12, 0.16), 0.6)
 _REMEMBERED = 1000  # sets of names
 _SYMBOL_SIZE = 0.02  # as a fraction of the scene's size
 _BAR_PARTS = 64
@@ -331,8 +333,13 @@ class Drawing:
             if reshaped:
                 look["triangle_indices"] = cells[:0] if wireframe else cells
                 drawn.edges = None
-            if wireframe or "wireframe" in changes:
-                self._edges(drawn, positions if wireframe else None, cells, times)
+            few = drawn.kind == "mesh" and len(cells) <= _FEW
+            has_edges = bool(values.get("wireframe", few))
+            if has_edges or "wireframe" in changes:
+                self._edges(drawn, positions if has_edges else None, cells, times)
+                if has_edges and not wireframe and reshaped:
+                    edges = f"{drawn.entity}/edges"
+                    self._rows.add(edges, rr.LineStrips3D, times, colors=_EDGES)
         tint = self._colors(drawn, changes, times)
         if tint is not None:
             has_field = drawn.kind == "slice" or values.get("scalar_field") is not None

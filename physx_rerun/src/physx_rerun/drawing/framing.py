@@ -60,11 +60,14 @@ class Frame:
             return 0.0
         return float(np.linalg.norm(self._high - self._low))
 
-    def camera(self, target: Array | None = None) -> tuple[Array, Array, float]:
+    def camera(
+        self, target: Array | None = None, distance: float = 0.0
+    ) -> tuple[Array, Array, float]:
         """Return the position, target and distance of the camera that shows everything.
 
         Args:
             target: Where the camera looks; None: at the middle.
+            distance: Least distance, in m.
         """
         if self._shown is None and np.isfinite(self._low).all():
             self._shown = self._low, self._high
@@ -75,7 +78,8 @@ class Frame:
         half = half if half.any() else np.full(3, _POINT)
         corners = _corners(middle - half, middle + half) - look
         sides = np.maximum(np.abs(corners @ RIGHT), np.abs(corners @ _UP))
-        distance = float((corners @ VIEW_FROM + sides / (_FILLED * _SLOPE)).max())
+        needed = float((corners @ VIEW_FROM + sides / (_FILLED * _SLOPE)).max())
+        distance = max(needed, distance)
         self._position = look + distance * VIEW_FROM
         return self._position, look, distance
 

@@ -130,13 +130,15 @@ class WindowLayout:
     def blueprint(self, further: Sequence[rrb.View | Container] = ()) -> rrb.Blueprint:
         """Return the windows: the scenes, and next to or below them the plots and texts.
 
-        Two or three scenes are placed in a row above the rest, for easy comparison.
+        Two or three scenes are placed in a row above the rest, and cameras that are not placed by
+        the environment have the same distance, for easy comparison.
 
         Args:
             further: More plots.
         """
         self.changed = False
-        scenes = [self._scene_view(instance_id) for instance_id in sorted(self._scenes)]
+        zoom = max((self._distance(each) for each in self._scenes), default=0.0)
+        scenes = [self._scene_view(instance_id, zoom) for instance_id in sorted(self._scenes)]
         plots: list[rrb.View | Container] = [
             *(_plot_view(name, curves) for name, curves in self._plots.items()),
             *further,
@@ -193,9 +195,17 @@ class WindowLayout:
             )
         )
 
-    def _scene_view(self, instance_id: int) -> rrb.Spatial3DView:
+    def _distance(self, instance_id: int) -> float:
+        """Return the distance from which a camera shows all of its scene; 0 if it is placed."""
         camera = self._cameras.get(instance_id, {})
-        position, target, distance = self._scenes[instance_id].camera(camera.get("target"))
+        if "eye" in camera:
+            return 0.0
+        return self._scenes[instance_id].camera(camera.get("target"))[2]
+
+    def _scene_view(self, instance_id: int, zoom: float) -> rrb.Spatial3DView:
+        camera = self._cameras.get(instance_id, {})
+        frame = self._scenes[instance_id]
+        position, target, distance = frame.camera(camera.get("target"), zoom)
         eye = rrb.EyeControls3D(
             kind=rrb.Eye3DKind.Orbital,
             position=camera.get("eye", position),

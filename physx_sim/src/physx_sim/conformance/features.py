@@ -70,6 +70,11 @@ def _touching() -> World:
     return World(objects=boxes, ground=Ground(), period=PERIOD)
 
 
+def _turning() -> World:
+    top = Sphere(name="top", radius=0.1, position=(0.0, 0.0, 0.1), torsional_friction=0.01)
+    return World(objects=[top], ground=Ground(), period=PERIOD)
+
+
 _WORLDS: Mapping[str, Callable[[], World]] = {
     "actuators": lambda: _with_joint(JointSettings(mode="servo")),
     "armature": lambda: _with_joint(JointSettings(armature=0.1)),
@@ -79,7 +84,7 @@ _WORLDS: Mapping[str, Callable[[], World]] = {
     "springs": lambda: _with_joint(JointSettings(stiffness=1.0, damping=0.1)),
     "rk4": lambda: pendulum(integrator="rk4"),
     "self_collisions": _colliding,
-    "torsional_friction": lambda: box(torsional_friction=0.01),
+    "torsional_friction": _turning,
     "body_contacts": _touching,
     "contacts": box,
 }
@@ -141,8 +146,7 @@ def _spring(subject: Subject) -> None:
 
 def _stops_spins(subject: Subject) -> None:
     need(subject, "torsional_friction")
-    top = Sphere(name="top", radius=0.1, position=(0.0, 0.0, 0.1), torsional_friction=0.01)
-    with build(subject, World(objects=[top], ground=Ground(), period=PERIOD)) as simulation:
+    with build(subject, _turning()) as simulation:
         simulation.step(300)
         v = simulation.velocities()
         v[5] = 5.0

@@ -71,7 +71,8 @@ class Factory:
             positions: Vertices, shape (n, 3), in m.
             cells: Indices of the vertices of each triangle, shape (m, 3).
             look: ``color``, ``alpha``, ``scalar_field`` (n,) shown through ``colormap``,
-                ``wireframe``, and the ``size`` of its lines: their radius in m.
+                ``wireframe``, by default beside the surface of a mesh of few triangles, and the
+                ``size`` of its lines: their radius in m.
         """
         return self._add("mesh", name, positions=positions, cells=cells, **look)
 
