@@ -1,23 +1,26 @@
 """Planted differences that `physx agree` names; three engines on every robot file installed.
 
-    python benchmarks/agree.py [--check] [planted] [robots]
+    python benchmarks/agree.py [--check] [planted] [robots] [models]
 
 Planted: an engine simulates another world than it is asked to, or a task is a step late on it; the
 difference must be among the confirmed causes, with its link or joint and its sign. Robots: mass
 matrix, bias and forward dynamics of each pair of engines in random states, relative to the largest
-value of the state.
+value of the state. Models: the same of MJCF files, of which MuJoCo's own reader and simulation make
+a fourth, which knows nothing of physx: Gymnasium's, and those of dm_control and robosuite, if they
+are installed (`pip install --no-deps -r benchmarks/requirements-mjcf.txt`).
 """
 
 from __future__ import annotations
 
+import importlib.util
 import itertools
+import re
 import sys
 import tempfile
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
 
-import gymnasium
 import numpy as np
 from measure import claim, finish
 
@@ -27,6 +30,7 @@ from physx_sim import Robot, Simulation, World, mjcf_robots
 from physx_sim.engines import read_robot
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "shared"))
+from compiled import Compiled, states, without_friction
 from planted import BETWEEN, Stagger, late_on, planted, plants
 
 ENGINES = ("dart", "pinocchio", "mujoco")
@@ -79,69 +83,126 @@ def check_planted(folder: Path) -> Iterator[bool]:
     yield claim("nothing planted, no step above 10 x the floor, of 12", quiet, at_least=12)
 
 
-def worlds() -> Iterator[tuple[str, str, World]]:
-    """Yield each robot of the engines' catalog and of Gymnasium's MJCF files."""
+def robots() -> Iterator[tuple[str, list[Robot]]]:
+    """Yield each robot of the engines' catalog."""
     for info in plugins.resolve("backend", "pinocchio").robots():
         if not info.error:
             floats = read_robot(Robot(info.name)).bodies[0].mass > NEGLIGIBLE
-            robot = Robot(info.name, fixed_base=not floats, collisions="none")
-            yield "robots", info.name, World([robot])
-    for path in sorted((Path(gymnasium.__file__).parent / "envs/mujoco/assets").glob("*.xml")):
-        yield "MJCF models", path.stem, World(mjcf_robots(path, collisions="none"))
+            yield info.name, [Robot(info.name, fixed_base=not floats, collisions="none")]
 
 
-def errors(simulations: list[Simulation]) -> dict[str, float]:
-    """Return the largest relative differences of any two engines."""
+FILES = {
+    "gymnasium": ("envs/mujoco/assets/*.xml",),
+    "dm_control": (
+        "suite/*.xml", "locomotion/walkers/assets/*.xml", "locomotion/walkers/assets/*/*.xml",
+        "third_party/*/*.xml",
+    ),
+    "robosuite": ("models/assets/robots/*/robot.xml", "models/assets/grippers/*.xml"),
+}  # fmt: skip
+"""Where packages keep MJCF files."""
+
+
+def models() -> Iterator[tuple[str, Path]]:
+    """Yield each MJCF file of the installed packages."""
+    for package, patterns in FILES.items():
+        found = importlib.util.find_spec(package)
+        if found is None or found.origin is None:
+            print(f"  {package} is not installed: none of its files")
+            continue
+        folder = Path(found.origin).parent
+        for path in sorted(path for pattern in patterns for path in folder.glob(pattern)):
+            yield f"{package}/{path.relative_to(folder)}", path
+
+
+def errors(simulations: list[Simulation], theirs: Compiled | None = None) -> dict[str, float]:
+    """Return the largest relative differences of any two engines, and of any from MuJoCo's own."""
     rng, layout = np.random.default_rng(0), simulations[0].layout
-    found = {"mass matrix": 0.0, "bias": 0.0, "forward dynamics": 0.0}
-    joints = list(layout.position_index.values())
+    found: dict[str, float] = {}
+    ours = list(layout.velocity_index.values())
     for _ in range(STATES):
-        q, zero = simulations[0].positions(), np.zeros(layout.nv)
-        q[joints] = rng.uniform(-1, 1, len(joints))
-        v, tau = rng.uniform(-1, 1, (2, layout.nv))
-        for name, values in (
-            ("mass matrix", [each.mass_matrix(q) for each in simulations]),
-            ("bias", [each.inverse_dynamics(q, v, zero) for each in simulations]),
-            ("forward dynamics", [each.forward_dynamics(q, v, tau) for each in simulations]),
-        ):
-            largest = max(float(np.abs(value).max()) for value in values) or 1.0
-            for one, other in itertools.combinations(values, 2):
-                found[name] = max(found[name], float(np.abs(one - other).max()) / largest)
+        q, v, tau = states(layout, rng)
+        masses = [each.mass_matrix(q) for each in simulations]
+        biases = [each.inverse_dynamics(q, v, np.zeros(layout.nv)) for each in simulations]
+        motions = [each.forward_dynamics(q, v, tau) for each in simulations]
+        pairs = [
+            *(("mass matrix", *pair) for pair in itertools.combinations(masses, 2)),
+            *(("bias", *pair) for pair in itertools.combinations(biases, 2)),
+            *(("forward dynamics", *pair) for pair in itertools.combinations(motions, 2)),
+        ]
+        if theirs is not None:
+            other = theirs.accelerations(q, v, tau)
+            pairs += [("forward dynamics, MuJoCo's own", each, other) for each in motions]
+            joints = np.ix_(ours, ours)
+            pairs += [
+                ("mass matrix, MuJoCo's own", each[joints], theirs.masses()) for each in masses
+            ]
+        for what, one, other in pairs:
+            largest = float(np.abs(one).max()) or 1.0
+            found[what] = max(found.get(what, 0.0), float(np.abs(one - other).max()) / largest)
     return found
 
 
 def check_robots() -> Iterator[bool]:
     """Compare three engines on each robot."""
-    worst: dict[tuple[str, str], tuple[float, str]] = {}
-    counts: dict[str, int] = {}
-    for kind, name, world in worlds():
+    yield from compared("robots", robots(), own=False)
+
+
+def check_models() -> Iterator[bool]:
+    """Compare three engines, and MuJoCo's own reader, on each MJCF file."""
+    yield from compared("MJCF models", readable(), own=True)
+
+
+def readable() -> Iterator[tuple[str, list[Robot]]]:
+    """Yield the robots of each file; those that are no model of their own are named."""
+    for name, path in models():
         try:
-            simulations = [plugins.resolve("backend", engine).build(world) for engine in ENGINES]
-            found = errors(simulations)
+            yield name, without_friction(mjcf_robots(path, collisions="none"))
         except PhysxError as error:
-            print(f"  {name}: {str(error).splitlines()[0]}")
+            print(f"  {name}: {said(error)}")
+
+
+def said(error: PhysxError) -> str:
+    """Return an error in a line, with packages in the place of folders."""
+    return re.sub(rf"\S*/(?={'|'.join(FILES)})", "", " ".join(str(error).split()))
+
+
+def compared(kind: str, given: Iterator[tuple[str, list[Robot]]], *, own: bool) -> Iterator[bool]:
+    """Compare three engines on each of several robots, and with MuJoCo's own reader."""
+    worst: dict[str, tuple[float, str]] = {}
+    count = 0
+    for name, each in given:
+        try:
+            simulations = [
+                plugins.resolve("backend", engine).build(World(each)) for engine in ENGINES
+            ]
+        except PhysxError as error:
+            print(f"  {name}: {said(error)}")
             continue
+        theirs = Compiled(Path(each[0].urdf), simulations[0].layout) if own else None
+        for what, value in errors(simulations, theirs).items():
+            worst[what] = max(worst.get(what, (0.0, "")), (value, name))
         for simulation in simulations:
             simulation.close()
-        counts[kind] = counts.get(kind, 0) + 1
-        for quantity, value in found.items():
-            worst[kind, quantity] = max(worst.get((kind, quantity), (0.0, "")), (value, name))
+        count += 1
     print("Three engines, largest relative difference of any two")
-    for (kind, quantity), (value, name) in worst.items():
-        what = f"{quantity}, {counts[kind]} {kind}, worst {name}"
-        yield claim(what, value, at_most=1e-9)
+    for what, (value, name) in worst.items():
+        yield claim(f"{what}, {count} {kind}, worst {name}", value, at_most=1e-9)
+    if own:
+        yield claim("MJCF models", count, at_least=25)
 
 
 def main() -> None:
     """Print the tables."""
     warnings.simplefilter("ignore")
-    chosen = [each for each in ("planted", "robots") if each in sys.argv[1:]]
+    chosen = [each for each in ("planted", "robots", "models") if each in sys.argv[1:]]
     met: list[bool] = []
     if not chosen or "planted" in chosen:
         with tempfile.TemporaryDirectory() as folder:
             met += check_planted(Path(folder))
     if not chosen or "robots" in chosen:
         met += check_robots()
+    if not chosen or "models" in chosen:
+        met += check_models()
     finish(met)
 
 

@@ -220,6 +220,27 @@ def times() -> None:
             simulation.close()
 
 
+def rays(engine: str) -> float:
+    """Return the CPU time of 64 rays among 20 shapes, in ms."""
+    random = np.random.default_rng(0)
+    boxes = [
+        Box(name=f"box{i}", size=tuple(random.uniform(0.1, 0.4, 3)), position=place)
+        for i, place in enumerate(random.uniform((-5, -5, 0.5), (5, 5, 2), (20, 3)).tolist())
+    ]
+    around = np.linspace(0, 2 * np.pi, 64, endpoint=False)
+    begins = np.tile([0.0, 0.0, 1.0], (64, 1))
+    ends = begins + 10 * np.column_stack([np.cos(around), np.sin(around), 0 * around])
+    with build(engine, None, objects=boxes) as simulation:
+
+        def work() -> int:
+            for _ in range(20):
+                simulation.raycast(begins, ends)
+            return 20
+
+        [measured] = rates({engine: work}, 5, time.process_time).values()
+    return 1e3 / statistics.median(measured)
+
+
 def environments() -> float:
     """Print the steps per second of Ant-v0 on each engine; return Pinocchio's over DART's."""
     candidates = {engine: _episodes(engine) for engine in SOLVERS}
@@ -280,7 +301,10 @@ def main() -> None:
         met.append(claim(f"{engine}: worst case, of its limit", share, at_most=1.0))
     times()
     print()
-    met.append(claim("Ant-v0, pinocchio / dart", environments(), at_least=0.27))
+    met += [
+        claim(f"{each}: ms for 64 rays, 20 shapes", rays(each), at_most=0.5) for each in SOLVERS
+    ]
+    met.append(claim("Ant-v0, pinocchio / dart", environments(), at_least=0.4))
     finish(met)
 
 

@@ -283,6 +283,31 @@ def rolling_ball(engine: str) -> float:
         return abs(float(simulation.positions()[0]) / 5 - 1)
 
 
+def braked(engine: str, **friction: float) -> float:
+    """Time until a ball that rolls without slipping, or spins, stops."""
+    ball = Sphere(name="ball", radius=0.1, position=(0, 0, 0.1), **friction)
+    spins = "torsional_friction" in friction
+    slowing = 0.01 * GRAVITY / (0.4 if spins else 1.4) / 0.1**2  # of the angular velocity
+    with scene(engine, ball) as simulation:
+        simulation.step(200)
+        pace = 0.5 * slowing
+        moving(simulation, *((0, 0, 0, 0, 0, pace) if spins else (0.1 * pace, 0, 0, 0, pace)))
+        start = simulation.time
+        while np.abs(simulation.velocities()[3:]).max() > 2e-3 * pace and simulation.time < 2:
+            simulation.step()
+        return abs((simulation.time - start) / 0.5 - 1)
+
+
+def spinning_ball(engine: str) -> float:
+    """Time until torsional friction stops a ball that spins."""
+    return braked(engine, torsional_friction=0.01)
+
+
+def braked_ball(engine: str) -> float:
+    """Time until rolling friction stops a ball that rolls."""
+    return braked(engine, rolling_friction=0.01)
+
+
 _TOP = (
     '<robot name="top"><link name="top"><inertial><origin xyz="0 0 0.1"/><mass value="1"/>'
     '<inertia ixx="2e-3" iyy="2e-3" izz="4e-3" ixy="0" ixz="0" iyz="0"/></inertial></link></robot>'
@@ -380,6 +405,8 @@ CASES: dict[str, Case] = {
     "box that spins on its corners": spinning_box,
     "rolling cylinder": rolling_cylinder,
     "rolling ball": rolling_ball,
+    "ball that spins until it stops": spinning_ball,
+    "ball that rolls until it stops": braked_ball,
     "fast top": top,
     "creep at 95 % of friction, µm/s": creep,
     "creep on a height field, µm/s": creep_on_heights,

@@ -48,8 +48,8 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 APART = "pytest.mark.processes"  # in a file whose tests start processes
 STARTS = ("subprocess.Popen", "os.fork", "os.forkpty", "os.posix_spawn", "os.system")
 RUNNING = {"quick": False}  # what kind of test
-DAYS = 12
-"""After so many days each case was in a sample."""
+DAYS, SLOW = 11, 4
+"""In how many parts cases and slow tests are; in the days of their product all had a turn."""
 
 
 def pytest_addoption(parser):
@@ -114,18 +114,20 @@ def pytest_collection_modifyitems(config, items):
 def sampled(items):
     """Return a sample, another one each day: after some days, all cases had their turn.
 
-    Of tests marked `faults` it is a part, and of the cases of each other parametrized test that
-    starts processes, or of any in a run of quick tests, another part, or one.
+    Of tests marked `faults` it is a part; of the cases of each other parametrized test that starts
+    processes, or of any in a run of quick tests, another part, or one; and of those of them that
+    are marked `slow` a part again.
     """
     faults = [item for item in items if item.get_closest_marker("faults")]
     known = set(faults)
-    chosen = set(sizes.share(faults, DAYS))
-    others = (item for item in items if item not in known)
-    for _, group in itertools.groupby(others, key=lambda item: item.nodeid.partition("[")[0]):
+    others, slow = [], []
+    rest = (item for item in items if item not in known)
+    for _, group in itertools.groupby(rest, key=lambda item: item.nodeid.partition("[")[0]):
         cases = list(group)
         parts = DAYS if sizes.is_quick() or cases[0].get_closest_marker("processes") else 1
-        chosen.update(sizes.share(cases, min(parts, len(cases))))
-    return chosen
+        for item in sizes.share(cases, min(parts, len(cases))):
+            (slow if item.get_closest_marker("slow") else others).append(item)
+    return {*sizes.share(faults, DAYS), *others, *sizes.share(slow, SLOW)}
 
 
 @pytest.fixture

@@ -188,6 +188,7 @@ def store(tmp_path_factory):
             assert np.isfinite(dataset[mode]["x"][:]).all()
 
 
+@pytest.mark.slow
 @settings(max_examples=size(200, 25), deadline=None)
 @given(dtype=st.sampled_from(DTYPES), value=values, other=st.booleans())
 @example("int32", 3_000_000_000, False)
@@ -223,6 +224,7 @@ def test_every_way_in_has_the_same_rule(store, dtype, value, other):
             agrees(dtype, wanted, after[-1])
 
 
+@pytest.mark.slow
 @settings(max_examples=size(30, 4), deadline=None)
 @given(dtype=st.sampled_from(DTYPES), value=given_arrays())
 @example("int32", np.array(3_000_000_000))

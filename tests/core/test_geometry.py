@@ -79,6 +79,7 @@ def test_voxels_of_a_cube_and_its_margin():
     assert_allclose(grid.map_to(CORNERS)(height.ravel()), CORNERS[:, 2])
 
 
+@pytest.mark.slow
 def test_voxels_of_a_ball_have_its_volume():
     nodes, triangles = ball()
     grid = voxelize(nodes, triangles, 0.1, margin=1)

@@ -195,6 +195,7 @@ def test_interleaved_streams_keep_their_trajectories(tmp_path):
         assert [len(each.rows) for each in dataset.episodes("training")] == [3, 3]
 
 
+@pytest.mark.slow
 @pytest.mark.filterwarnings("ignore:.*gaps")
 @settings(max_examples=15, deadline=None)
 @given(

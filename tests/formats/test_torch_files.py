@@ -13,6 +13,7 @@ from physx_formats import ExchangeError, import_file
 pytestmark = pytest.mark.processes
 
 
+@pytest.mark.slow
 def test_a_file_of_pytorch_is_answered_with_the_line_that_converts_it(tmp_path):
     torch = pytest.importorskip("torch")
     x = torch.arange(6.0).reshape(3, 2)

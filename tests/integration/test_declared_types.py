@@ -70,6 +70,7 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
         "urdf": "arm.urdf",
         "feet": {"foot": 0.25},
         "mass_factors": {"link": 1.25, "hand": 0.5},
+        **{"friction": 0.5, "torsional_friction": 0.25, "rolling_friction": 0.125},
     },
     physx_sim.World: {"robots": [physx_sim.Robot("arm.urdf")], "iterations": 3},
     physx_sim.Wrench: {
@@ -86,6 +87,8 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     physx_sim.ForceTorqueSensor: {"name": "wrist", "joint": "wrist", "period": 0.25},
     physx_sim.Lidar: {"name": "lidar", "body": "head", "directions": [(1.0, 0.5, 0.0)]}
     | {"position": (1.0, 0.5, 0.25), "reach": 4.5, "period": 0.25},
+    physx_sim.Camera: {"name": "eye", "body": "head", "reach": 4.5, "near": 0.5, "height": 8}
+    | {"width": 16, "field_of_view": 0.5, "position": (1.0, 0.5, 0.25), "period": 0.25},
     physx_sim.HeightScan: {"name": "scan", "body": "head", "points": [(1.0, 0.5)], "reach": 4.5}
     | {"period": 0.25},
     physx_sim.EffortSensor: {"name": "knee", "joint": "knee", "period": 0.25},
@@ -106,6 +109,7 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     | {"sources": {"a": 0.5}},
     EpisodeRecord: {"episode": 3, "rows": 2, "seconds": 0.5},
     physx_sim.BodySettings: {"mass": 2.5, "friction": 0.25, "hidden": True}
+    | {"torsional_friction": 0.5, "rolling_friction": 0.125}
     | {"position": (0.5, 1.0, 2.0), "orientation": (0.0, 0.0, 0.0, 1.0)}
     | {"velocity": (0.5, 1.0, 2.0), "angular_velocity": (0.5, 1.0, 2.0)}
     | {"surface_velocity": (0.5, 1.0, 2.0)},
@@ -144,6 +148,10 @@ RECORDS = {
         "MotorState",
         "SensorState",
         "RobotInfo",
+        "StepDerivatives",
+        "ActuatorNetwork",
+        "LearnedActuator",
+        "Actuators",
     ),
     *(
         "UrdfShape",

@@ -76,6 +76,7 @@ def test_a_damaged_checkpoint_is_stepped_over(training, name):
     training(5, session_name="run", resume=True).execute()  # from network_2, without a warning
 
 
+@pytest.mark.slow
 def test_ctrl_c_within_an_epoch_and_resume(training):
     process = subprocess.Popen([sys.executable, "script.py"], stderr=subprocess.PIPE, text=True)
     stats, deadline = Path("sessions/cut/stats/scalars.csv"), time.monotonic() + 60

@@ -15,6 +15,7 @@ pytestmark = pytest.mark.processes
 pytest.importorskip("mujoco")
 
 
+@pytest.mark.slow
 def test_an_environment_generates_samples_with_it_in_clients(tmp_path):
     pytest.importorskip("gymnasium")
     words = ("generate", "gym/physx/Cartpole-v0", "--environment.env-kwargs")

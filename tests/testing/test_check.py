@@ -12,6 +12,7 @@ pytestmark = pytest.mark.processes
 PROGRAMS = Path(__file__).with_name("programs")
 
 
+@pytest.mark.slow
 def test_a_plugin_that_keeps_its_contracts(capsys):
     assert main(["check", "toy"]) == 0
     lines = capsys.readouterr().out.splitlines()

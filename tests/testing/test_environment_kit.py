@@ -36,6 +36,7 @@ def test_what_is_wrong_is_named(name, check, text, place, expect_named):
     expect_named(check_environment(place("wrong_environments", name)), check, text)
 
 
+@pytest.mark.slow
 def test_all_that_it_did_to_its_process_is_named(place, expect_named):
     report = check_environment(place("wrong_environments", "Meddles"))
     for text in (
@@ -49,6 +50,7 @@ def test_nothing_is_found_in_a_right_one(place, expect_right):
     expect_right(check_environment(place("wrong_environments", "Right")))
 
 
+@pytest.mark.slow
 def test_a_check_that_hangs_ends(place, expect_named):
     report = check_environment(place("wrong_environments", "Hangs"), timeout=8.0)
     expect_named(report, "draws without an effect on its rows", "had not ended after 8 s")

@@ -9,6 +9,7 @@ from physx_testing.process_state import process_state, unchanged
 pytestmark = pytest.mark.processes
 
 
+@pytest.mark.slow
 def test_this_process_stays_as_it_is(place):
     before = process_state()
     with unchanged(before):

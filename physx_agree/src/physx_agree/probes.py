@@ -64,9 +64,13 @@ def _sliding(pair: Pair, ratio: float) -> Repair:
     """Return what divides the friction of both bodies by a ratio; a contact uses the smaller."""
 
     def repair(one: World, other: World) -> tuple[World, World]:
-        return one, _changed(other, pair, lambda thing: {"friction": thing.friction / ratio})
+        return one, _changed(other, pair, lambda thing: {"friction": _friction(thing) / ratio})
 
     return repair
+
+
+def _friction(thing: Any) -> float:
+    return 1.0 if thing.friction is None else float(thing.friction)
 
 
 def _bouncing(pair: Pair, e: float, e_other: float) -> Repair:

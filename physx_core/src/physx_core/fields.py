@@ -49,6 +49,9 @@ PTR = "_ptr"
 BATCH = "_batch"
 """What is added to the name of a free axis for that of the samples of a batch's entries."""
 
+SIZES = "_sizes"
+"""What is added to the name of a free axis of a window for that of its rows' numbers of entries."""
+
 _FREE = 'Values of any size need a free axis, which is defined before: shape=("node", 3)'
 
 _SMALL = 8192  # elements
@@ -381,7 +384,7 @@ def _check_axes(fields: Mapping[str, Field]) -> None:
     """Check names of free axes, and that indexed ones exist."""
     axes = free_axes(fields.values())
     for axis in axes:
-        for name in (axis + suffix for suffix in (ENDS, PTR, BATCH)):
+        for name in (axis + suffix for suffix in (ENDS, PTR, BATCH, SIZES)):
             if name in fields:
                 raise ConfigError(f'Field "{name}" has a name that belongs to the axis "{axis}".')
     is_known = all(field.shape is not None for field in fields.values())

@@ -6,13 +6,13 @@ In an array of rows, a field with a free axis is an array of objects, one array 
 from __future__ import annotations
 
 import itertools
-from collections.abc import Collection, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
 from physx_core.errors import FieldShapeError
-from physx_core.fields import BATCH, PTR, Field
+from physx_core.fields import BATCH, PTR, SIZES, Field
 from physx_core.typing import Array, Batch, Index
 
 _LONG = 100  # entries of a sample from which filling a slice is faster
@@ -44,9 +44,14 @@ def join(field: Field, rows: Sequence[Array]) -> tuple[Array, Index]:
         rows: One array for each row, of its type.
     """
     counts = lengths(rows)
-    if not len(rows):
-        return np.empty((0, *field.entry_shape), field.numpy_dtype), counts
-    return np.concatenate(rows), counts
+    buffers: Any = rows
+    try:
+        content = bytearray().join(buffers)  # NumPy would copy entry by entry
+    except BufferError:  # not contiguous
+        buffers = [np.ascontiguousarray(row) for row in rows]
+        content = bytearray().join(buffers)
+    entries = np.frombuffer(content, field.numpy_dtype) if content else np.empty(0, field.dtype)
+    return entries.reshape(int(counts.sum()), *field.entry_shape), counts
 
 
 def ranges(starts: Index, counts: Index) -> Index:
@@ -147,6 +152,7 @@ def pack(
     known: Mapping[str, Index],
     named: Collection[str] | None = None,
     scratch: Scratch | None = None,
+    steps: Mapping[str, int] | None = None,
 ) -> Batch:
     """Return rows as a batch in which free axes are packed.
 
@@ -156,16 +162,23 @@ def pack(
         known: Number of entries of each row, by free axis.
         named: Which of the added fields are wanted besides ``node_ptr``; None: all.
         scratch: Arrays to reuse; None: all are new.
+        steps: How many rows a sample has, by free axis, if it has several.
 
     Returns:
         The fields, with numbers of entries counted from the first one of the batch, and for an
-        axis ``node`` also ``node_ptr``, the first entry of each row and the end, shape (rows + 1),
-        and ``node_batch``, the row of each entry.
+        axis ``node`` also ``node_ptr``, the first entry of each sample and the end, shape
+        (samples + 1), and ``node_batch``, the sample of each entry; of samples of several rows also
+        ``node_sizes``, the number of entries of each row, shape (samples, rows).
     """
     found = dict(rows)
+    starts: dict[str, Index] = {}
     for axis, counts in known.items():
         ptr = np.zeros(len(counts) + 1, np.int64)
         counts.cumsum(out=ptr[1:])
+        starts[axis] = ptr[:-1]
+        if steps and axis in steps:
+            found[axis + SIZES] = counts.reshape(-1, steps[axis])
+            ptr = ptr[:: steps[axis]]
         found[axis + PTR] = ptr
         name, shape, kind = axis + BATCH, (int(ptr[-1]),), np.dtype(np.int64)
         if named is not None and name not in named:
@@ -174,15 +187,17 @@ def pack(
         found[name] = _samples_of(ptr, out)
     for name, field in fields.items():
         if field.indexes:
-            shift = found[field.indexes + PTR][:-1]
+            shift, values = starts[field.indexes], found[name].astype(np.int64, copy=False)
             if field.free_axis:
                 shift = np.repeat(shift, known[field.free_axis])
-            values = found[name].astype(np.int64, copy=False)
-            found[name] = values + shift.reshape(-1, *(1,) * (values.ndim - 1))
+            elif steps and field.indexes in steps:
+                shift = shift.reshape(len(values), -1)
+            found[name] = values + shift.reshape(*shift.shape, *(1,) * (values.ndim - shift.ndim))
     return found
 
 
-def packed_fields(axes: Mapping[str, Sequence[str]]) -> dict[str, Field]:
-    """Return the fields that packing adds to a batch for free axes."""
-    names = [axis + suffix for axis in axes for suffix in (PTR, BATCH)]
-    return {name: Field(name, (), "int64", role="additional") for name in names}
+def packed_fields(axes: Iterable[str], steps: Mapping[str, int] | None = None) -> dict[str, Field]:
+    """Return the fields that packing adds to a batch for free axes: see `pack`."""
+    names = {axis + suffix: () for axis in axes for suffix in (PTR, BATCH)}
+    shapes = names | {axis + SIZES: (count,) for axis, count in (steps or {}).items()}
+    return {n: Field(n, shape, "int64", role="additional") for n, shape in shapes.items()}

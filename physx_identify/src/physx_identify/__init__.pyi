@@ -1,5 +1,8 @@
 """Identification: parameters of robots from logs, with intervals that hold."""
 
+from .actuator import Actuators as Actuators
+from .actuator import learn_actuators as learn_actuators
+from .actuator import write_learned as write_learned
 from .checks import check_log as check_log
 from .estimates import Combination as Combination
 from .estimates import Estimate as Estimate

@@ -20,7 +20,11 @@ from physx_identify.unknowns import Parameter, Unknown
 from physx_identify.wording import WIDTH, number
 from physx_sim import Robot
 
-_WAVES = 5
+_WAVES = 8
+_FASTEST_WAVE = 2.0
+"""In Hz."""
+_STEP, _LONGER = 0.5, 1.5
+"""First change of the best motion, relative to a random one; growth of changes that improve it."""
 _SHARE = 0.9
 """Share of the robot's limits that the motion uses."""
 _RAMP = 0.1
@@ -95,13 +99,16 @@ def propose(
         raise ConfigError(f"A motion of {seconds:g} s from {trials} trials cannot be found.")
     design = _Design(Model(robot, gravity, held), found, seconds)
     random = np.random.default_rng(seed)
-    best = min((design.random(random) for _ in range(max(1, trials // 2))), key=design.cost)
-    cost = design.cost(best)
-    for trial in range(trials - trials // 2):
-        other = best + 0.5 * 0.985**trial * random.standard_normal(best.shape) * np.abs(best).mean()
+    begun = max(1, trials // 4)
+    best = min((design.random(random) for _ in range(begun)), key=design.cost)
+    cost, step = design.cost(best), _STEP
+    for _ in range(trials - begun):
+        other = best + step * design.random(random)
         changed = design.cost(other)
-        if changed < cost:
+        better = changed < cost
+        if better:
             best, cost = other, changed
+        step *= _LONGER if better else _LONGER**-0.25  # in balance at one success in five
     errors, inseparable = design.errors(design.positions(best))
     before = {e.name: np.inf if e.error is None else e.error for e in found.estimates}
     return Motion(
@@ -157,7 +164,7 @@ class _Design:
         self._stride = max(1, self._count // _EVALUATED)
         time = np.arange(self._count) * found.period
         first = 1 / (self._count * found.period)
-        top = min(2.0, 0.1 / found.period)
+        top = min(_FASTEST_WAVE, 0.1 / found.period)
         self._rates = 2 * np.pi * np.linspace(max(first, 0.1), max(top, 2 * first), _WAVES)
         self._waves = np.concatenate([np.sin(np.outer(time, self._rates)),
                                       np.cos(np.outer(time, self._rates))], axis=1)  # fmt: skip

@@ -18,8 +18,9 @@ from scipy.linalg import qr, solve_triangular
 from physx_core.typing import Array, Vector
 from physx_identify.errors import IdentificationError
 from physx_identify.model import Model, Path
-from physx_identify.noise import ORDERS, Noise, Whitener
+from physx_identify.noise import ORDERS, LikelyNoise, Noise, Whitener
 from physx_identify.smooth import Smoother
+from physx_identify.uncertainty import values_of
 from physx_identify.unknowns import Parameter
 
 _STEPS = 20
@@ -34,8 +35,10 @@ _EDGE = 4
 """Samples left out at both ends, where the smoothed path is uncertain."""
 _SEPARABLE = 1e-6
 """Relative length of what is left of a column without the others, below which it is one of them."""
-_STILL = 0.02
-"""Velocity below which dry friction is unknown, in rad/s or m/s."""
+_NEAR = 0.01
+"""Share of the encoders' errors in differences that derivatives are made of."""
+_STILL, _UNSURE = 0.02, 2.0
+"""Velocity below which dry friction is unknown: in rad/s or m/s, and in standard errors."""
 
 
 @dataclass(frozen=True)
@@ -78,9 +81,15 @@ class Fit:
         columns: Whitened columns of what was measured, shape (rows, parameters).
         torques: Torques of the model along the other path, shape (samples - 2, joints).
         residual: Of the torques, shape (samples - 2, joints), in N m or N.
+        regressors: Columns of the fitted values along the other path, shape (samples - 2, joints,
+            independent).
         used: Which torques count, shape (samples - 2, joints).
         path: The path of the instruments.
         whitener: What whitens.
+        freedom: Degrees of freedom of the fitted values' errors, shape (independent,).
+        known: What is known of the fitted values beforehand, and is left of it, one a row, shape
+            (priors, independent + 1).
+        likely: The noise, and how uncertain it is; None: it was given.
     """
 
     values: Vector
@@ -96,14 +105,13 @@ class Fit:
     columns: Vector
     torques: Vector
     residual: Vector
+    regressors: Vector
     used: Array
     path: Path
     whitener: Whitener
-
-    @property
-    def freedom(self) -> int:
-        """Number of residuals minus that of fitted values."""
-        return int(self.used.sum()) - len(self.independent)
+    freedom: Vector
+    known: Vector
+    likely: LikelyNoise | None = None
 
 
 def fit(
@@ -194,10 +202,11 @@ class _Problem:
         """
         numbers = self._known + self._directions @ np.maximum(values, self._lowest)
         stencil = self._model.stencil(path, numbers)
+        dry = self._model.dry(path, stencil, numbers) if self._dry.any() else None
         torques = self._torques(values)
-        instruments, known = self._columns(path, path.ends, stencil, torques)
+        instruments, known = self._columns(path, path, stencil, dry, torques)
         instruments = self._endogenous(instruments, known, values)
-        columns, known = self._columns(raw, path.ends, stencil, torques)
+        columns, known = self._columns(path, raw, stencil, dry, torques)
         target = torques - known
         for place, each in self._special:
             if each.kind == "gain":
@@ -208,11 +217,20 @@ class _Problem:
         return _Equation(instruments, columns, target, stencil)
 
     def _columns(
-        self, path: Path, signs: Vector, stencil: Vector, torques: Vector
+        self, path: Path, raw: Path, stencil: Vector, dry: Vector | None, torques: Vector
     ) -> tuple[Vector, Vector]:
-        """Return columns, shape (samples, joints, parameters), and what is known beside them."""
+        """Return columns along a motion near a path, to first order in what it differs by.
+
+        Returns:
+            Shape (samples, joints, parameters); and what is known beside them.
+        """
         given = np.column_stack([self._directions, self._known])
-        found = self._model.columns(path, given, signs)
+        found = self._model.columns(path, given, path.ends, dry)
+        if raw is not path:
+            change = _NEAR * (raw.positions - path.positions)
+            for sign in (1, -1):
+                near = dataclasses.replace(path, positions=path.positions + sign * change)
+                found += sign / (2 * _NEAR) * self._model.columns(near, given, path.ends, dry)
         columns, known = found[..., :-1], found[..., -1]
         for place, each in self._special:
             if each.kind == "delay":
@@ -230,13 +248,15 @@ class _Problem:
         values = self._nominal if start is None else start
         smoother, fixed = Smoother(self._positions(values)), noise is not None
         corrections: Vector | float = 0.0
+        slow = np.full(len(self._model.joints), _STILL)
         found: Fit | None = None
+        likely: LikelyNoise | None = None
         for step in range(1, _STEPS + 1):
             measured = self._positions(values)
             raw = Path(measured, self._data.period, self._data.instant)
             if step <= _PATH_STEPS:  # then it stays, or the sign of slow motions may never settle
                 path = dataclasses.replace(raw, positions=smoother(measured + corrections))
-                used = ~(self._dry & (np.abs(path.ends) < _STILL))
+                used = ~(self._dry & (np.abs(path.ends) < slow))
                 used[:_EDGE] = used[-_EDGE:] = False
             equation = self._equation(path, raw, values)
             if start is None and step == 1:
@@ -244,20 +264,38 @@ class _Problem:
             whitener = Whitener(equation.stencil, used)
             residual = equation.target - equation.columns @ values
             if not fixed:
-                if step == _NOISE_STEPS:
+                if step in (_NOISE_STEPS, _PATH_STEPS):
                     assert noise is not None
-                    noise, fixed = whitener.fit(residual, noise), True
-                else:
+                    assert found is not None
+                    free = equation.instruments[..., found.independent]
+                    likely = whitener.fit(residual, noise, free, found.known)
+                    noise = likely.noise
+                elif step < _NOISE_STEPS:
                     noise = whitener.guess(residual, ORDERS if step > _WHITE_STEPS else 0)
             assert noise is not None
             found = self._step(whitener, equation, values, noise, step, path, used)
             moved = np.abs(found.values - values)[found.independent]
             values = found.values
             if step > _PATH_STEPS and (moved < _CLOSE * np.sqrt(np.diag(found.covariance))).all():
-                return dataclasses.replace(found, converged=True)
+                found = dataclasses.replace(found, converged=True)
+                break
             corrections = whitener.corrections(found.residual, noise)
+            if self._dry.any() and step < _PATH_STEPS:
+                errors, left = whitener.draw(noise)
+                unsure = np.diff(smoother(errors + whitener.corrections(left, noise)), axis=0)
+                slow = np.maximum(_STILL, _UNSURE * unsure.std(axis=0) / self._data.period)
         assert found is not None
-        return found
+        if likely is None:
+            return found
+        sure = values_of(whitener, likely, found.residual, found.regressors, found.known)[0]
+        return dataclasses.replace(
+            found, covariance=sure.covariance, freedom=sure.freedom, likely=likely
+        )
+
+    def _known_of(self, fitted: Array, values: Vector) -> Vector:
+        """Return what is known beforehand as rows: of the fitted values, and what is left."""
+        prior, mean = self._priors()
+        return np.column_stack([prior[:, fitted], mean - prior @ values])
 
     def _endogenous(self, columns: Vector, known: Vector, values: Vector) -> Vector:
         """Return columns whose torques are the model's own instead of measured ones."""
@@ -339,5 +377,6 @@ class _Problem:
         return Fit(
             values, free[sort], held, mixing[sort], covariance[np.ix_(sort, sort)], noise, step,
             False, y - a @ values, z, a, equation.target - target + equation.instruments @ values,
-            target - columns @ values, used, path, whitener,
+            target - columns @ values, equation.instruments[..., free[sort]], used, path, whitener,
+            np.full(rank, float(used.sum() - rank)), self._known_of(free[sort], values),
         )  # fmt: skip

@@ -89,7 +89,7 @@ def _summary(
     apart = np.abs(apart[found.independent] + found.mixing @ apart[found.dependent]) / errors
     same = len(found.independent) == len(again.independent) and bool((apart < _AGREE).all())
     converged = found.converged and again.converged and same
-    width = float(student.ppf(0.5 + 0.5 * level, found.freedom))
+    width = student.ppf(0.5 + 0.5 * level, found.freedom)
     values = _physical(parameters, found)
     return Identification(
         str(robot.urdf),
@@ -120,9 +120,11 @@ def _covariance(found: Fit) -> Vector:
 
 
 def _estimates(
-    parameters: Sequence[Parameter], found: Fit, values: Vector, width: float | None
+    parameters: Sequence[Parameter], found: Fit, values: Vector, width: Vector | None
 ) -> list[Estimate]:
-    errors = np.sqrt(np.diag(_covariance(found)))
+    errors, widths = np.sqrt(np.diag(_covariance(found))), np.full(len(parameters), 2.0)
+    if width is not None:
+        widths[found.independent] = width
     mixed = {int(place) for place in found.dependent}
     mixed |= {int(found.independent[row]) for row in np.argwhere(_shares(found))[:, 0]}
     blocks = _block_errors(found)
@@ -136,10 +138,11 @@ def _estimates(
         error, linear = float(errors[place]), float(found.values[place])
         low = high = None
         if width is not None:
-            low, high = linear - width * error, linear + width * error
+            half = float(widths[place]) * error
+            low, high = linear - half, linear + half
             if each.lowest is not None:
                 low, high = max(low, each.lowest), max(high, each.lowest)
-        hardly = 2 * (width or 2) * error > abs(linear) and each.lowest is not None
+        hardly = bool(2 * widths[place] * error > abs(linear)) and each.lowest is not None
         ratio = float(blocks[place] / error)
         verdict = "hardly told" if hardly else "told"
         estimates.append(Estimate(*told, value, verdict, error, low, high, ratio))
@@ -155,7 +158,7 @@ def _shares(found: Fit) -> Array:
 
 
 def _combinations(
-    parameters: Sequence[Parameter], found: Fit, width: float | None
+    parameters: Sequence[Parameter], found: Fit, width: Vector | None
 ) -> list[Combination]:
     names = [each.name for each in parameters]
     shares, errors = _shares(found), np.sqrt(np.diag(found.covariance))
@@ -168,7 +171,7 @@ def _combinations(
         factors |= {names[found.dependent[h]]: float(found.mixing[row, h]) for h in held}
         value = float(found.values[place])
         value += float(found.mixing[row, held] @ found.values[found.dependent[held]])
-        half = None if width is None else width * float(errors[row])
+        half = None if width is None else float(width[row] * errors[row])
         ends = (None, None) if half is None else (value - half, value + half)
         combinations.append(Combination(factors, value, *ends))
     for column, place in enumerate(found.dependent):
@@ -279,7 +282,8 @@ def _draws(
     for row in draws:
         for _ in range(_TRIES):
             row[:] = found.values
-            row[found.independent] += root @ random.standard_normal(len(root))
+            spread = np.sqrt(found.freedom / random.chisquare(found.freedom))
+            row[found.independent] += root @ random.standard_normal(len(root)) * spread
             if (row >= lowest).all() and all(is_physical(row[body]) for body in bodies):
                 break
         else:

@@ -216,13 +216,17 @@ class Model:
 
     # Torques --------------------------------------------------------------------------------
 
-    def columns(self, path: Path, directions: Vector, signs: Vector) -> Vector:
+    def columns(
+        self, path: Path, directions: Vector, signs: Vector, dry: Vector | None = None
+    ) -> Vector:
         """Return the torques of changes of `numbers` along a path.
 
         Args:
             path: The motion.
             directions: The changes, shape (numbers, columns).
             signs: Velocities that dry friction depends on, shape (samples, joints).
+            dry: What a unit of each joint's dry friction takes of the torques, as of `dry`; None:
+                that of its own joint.
 
         Returns:
             Shape (samples, joints, columns), in N m or N.
@@ -242,8 +246,31 @@ class Model:
         stribeck = sign * np.exp(-np.abs(signs) / STRIBECK)
         for motion, of in zip((path.ends, sign, stribeck, a), rest, strict=True):
             if of.any():
-                found += motion[:, :, None] * of
+                torques = motion[:, :, None] * of
+                found += torques if dry is None or motion is not sign else dry @ torques
         return found
+
+    def dry(self, path: Path, stencil: Vector, numbers: Vector) -> Vector | None:
+        """Return what a unit of each joint's dry friction takes of the torques.
+
+        Engines damp a step's velocity first, and then let dry friction change it: at the velocity
+        where the step ends, the damping was more by this.
+
+        Args:
+            path: The motion.
+            stencil: Its derivatives, as of `stencil`.
+            numbers: Numbers of the robot.
+
+        Returns:
+            Shape (samples, joints, joints); None, that of its own joint, for torques at the
+            instants of samples.
+        """
+        if path.instant:
+            return None
+        count = len(self.joints)
+        damping = path.period * np.diag(numbers[10 * count : 11 * count])
+        damped = path.period**2 * stencil[2]
+        return np.linalg.solve(damped - damping, damped).swapaxes(1, 2)
 
     def stencil(self, path: Path, numbers: Vector) -> Vector:
         """Return the derivatives of the torques by three neighboring positions.
@@ -263,8 +290,8 @@ class Model:
         derive = pinocchio.computeRNEADerivatives
         moving = zip(path.own, path.velocities, path.accelerations, strict=True)
         for place, state in enumerate(moving):
-            by_q[place], by_v[place], upper = derive(model, data, *state)
-            mass[place] = np.triu(upper) + np.triu(upper, 1).T
+            by_q[place], by_v[place], mass[place] = derive(model, data, *state)
+        mass = np.triu(mass) + np.triu(mass, 1).swapaxes(1, 2)
         second = (mass + armature) / h**2
         if path.instant:
             first = (by_v + damping) / (2 * h)

@@ -8,7 +8,8 @@ their covariance is a band: it is built, factorized and inverted exactly.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+import itertools
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -19,9 +20,17 @@ from physx_core.typing import Array, Vector
 
 ORDERS = 2
 """Highest order of the autoregression of torques."""
-_ITERATIONS = 8
+_ITERATIONS = 6
 _NEVER = 1e12
+_ANYTHING = 100.0
+"""Deviation of what a torque that does not count may be, in deviations of its noise."""
 _NEAR = 1e-6
+_APART = 0.5
+"""Distance along an axis, in standard deviations, at which likelihoods are compared."""
+_FLATTEST, _FARTHEST, _NOWHERE = 0.05, 2.0, 0.1
+"""Least curvature along an axis; longest and shortest step, in standard deviations."""
+_USUAL = 0.75
+"""Usual inverse hyperbolic tangent of an autocorrelation: between 0 and 0.94."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +53,27 @@ class Noise:
         return int(self.regression.shape[1])
 
 
+@dataclass(frozen=True)
+class LikelyNoise:
+    """The most likely noise, and how uncertain it is.
+
+    Attributes:
+        noise: The noise.
+        axes: Independent standard deviations of its logarithms and of the inverse hyperbolic
+            tangents of its partial autocorrelations, one a row.
+    """
+
+    noise: Noise
+    axes: Vector
+
+    def nearby(self) -> Iterator[tuple[Noise, Noise]]:
+        """Yield the noise half a standard deviation to both sides along each axis."""
+        x = _packed(self.noise)
+        for axis in self.axes:
+            ahead, behind = (_unpacked(x + sign * _APART * axis, self.noise) for sign in (1, -1))
+            yield ahead, behind
+
+
 class Whitener:
     """Turns residuals and columns into ones with independent errors of variance 1.
 
@@ -62,60 +92,61 @@ class Whitener:
             after[:-2] @ _turned(before[2:]),
         ]
 
-    def rows(self, order: int) -> Array:
-        """Return which filtered torques count, shape (samples - order, joints)."""
-        end = len(self._used) - order
-        found = self._used[order:].copy()
-        for back in range(1, order + 1):
-            found &= self._used[order - back : order - back + end]
-        return found
-
     def filtered(self, values: Vector, noise: Noise) -> Vector:
-        """Return values, shape (samples, joints, ...), filtered by the autoregression."""
-        order = noise.order
-        end = len(values) - order
-        found = values[order:].astype(np.float64, copy=True)
+        """Return values, shape (samples, joints, ...), filtered by the autoregression.
+
+        Values before the first ones count as 0.
+        """
+        found = values.astype(np.float64, copy=True)
         shape = (-1, *(1,) * (values.ndim - 2))
-        for back in range(1, order + 1):
-            weights = noise.regression[:, back - 1].reshape(shape)
-            found -= weights * values[order - back : order - back + end]
-        found[~self.rows(order)] = 0.0
+        for back, weights in enumerate(noise.regression.T, 1):
+            found[back:] -= weights.reshape(shape) * values[:-back]
         return found
 
     def factor(self, noise: Noise) -> Vector:
         """Return the Cholesky factor of the covariance of the filtered residual, banded."""
-        order, rows = noise.order, self.rows(noise.order)
-        count, joints = rows.shape
+        order, (count, joints) = noise.order, self._used.shape
         weights = np.concatenate([np.ones((joints, 1)), -noise.regression], axis=1)
-        width = 0 if noise.encoder == 0 else min(order + 2, count - 1)
+        width = min(order + (2 if noise.encoder else 0), count - 1)
         band = np.zeros(((width + 1) * joints, count * joints))
         columns = band.reshape(len(band), count, joints)
-        if noise.encoder:
-            for ahead in range(width + 1):
-                block = np.zeros((count - ahead, joints, joints))  # rows k, columns k + ahead
-                for a in range(order + 1):
-                    for b in range(order + 1):
-                        lag = ahead + a - b
-                        if abs(lag) > 2:
-                            continue
-                        start = order - a + min(lag, 0)
-                        part = self._products[abs(lag)][start : start + count - ahead]
-                        part = part if lag >= 0 else _turned(part)
-                        block += np.outer(weights[:, a], weights[:, b]) * part
-                block *= noise.encoder**2 * (rows[: count - ahead, :, None] & rows[ahead:, None, :])
-                for i in range(joints):
-                    for j in range(joints):
-                        place = ahead * joints + j - i
-                        if place >= 0:
-                            columns[place, : count - ahead, i] = block[:, i, j]
-        columns[0] += np.where(rows, noise.torque**2, 1.0)
+        own = np.arange(joints)
+        left_out = np.where(self._used, 0.0, self._anything(noise))
+        for ahead in range(width + 1):
+            block = np.zeros((count - ahead, joints, joints))  # rows k, columns k + ahead
+            for a, b in itertools.product(range(order + 1), repeat=2):
+                lag = ahead + a - b  # of row k - a and column k + ahead - b
+                if noise.encoder and abs(lag) <= 2:
+                    first = max(0, a, b - ahead)
+                    start = first - a + min(lag, 0)
+                    part = self._products[abs(lag)][start : start + count - ahead - first]
+                    part = part if lag >= 0 else _turned(part)
+                    scale = noise.encoder**2 * np.outer(weights[:, a], weights[:, b])
+                    block[first : first + len(part)] += scale * part
+                if lag == 0:
+                    scale = weights[:, a] * weights[:, b]
+                    block[a:, own, own] += scale * left_out[: count - ahead - a]
+            for i, j in itertools.product(range(joints), repeat=2):
+                place = ahead * joints + j - i
+                if place >= 0:
+                    columns[place, : count - ahead, i] = block[:, i, j]
+        columns[0] += noise.torque**2
         factor: Vector = cholesky_banded(band, lower=True, check_finite=False)
         return factor
+
+    def _anything(self, noise: Noise) -> Vector:
+        """Return the variance of torques that do not count, shape (joints,)."""
+        encoder = np.diagonal(self._products[0], axis1=1, axis2=2).mean(axis=0)
+        found: Vector = _ANYTHING**2 * (noise.torque**2 + noise.encoder**2 * encoder)
+        return found
 
     def whitened(self, values: Vector, noise: Noise, factor: Vector | None = None) -> Vector:
         """Return values, shape (samples, joints, ...), whitened, shape (rows, ...)."""
         factor = self.factor(noise) if factor is None else factor
-        found = self.filtered(values, noise)
+        found = self.filtered(
+            np.where(self._used.reshape(*self._used.shape, *(1,) * (values.ndim - 2)), values, 0.0),
+            noise,
+        )
         flat = found.reshape(found.shape[0] * found.shape[1], -1)
         solved, _ = lapack.dtbtrs(factor, flat, uplo="L")
         white: Vector = solved.reshape(-1, *values.shape[2:])
@@ -133,41 +164,104 @@ class Whitener:
         Returns:
             Shape (samples + 2, joints), in rad or m.
         """
-        factor, rows = self.factor(noise), self.rows(noise.order)
+        factor = self.factor(noise)
         white = self.whitened(residual, noise, factor)
         solved, _ = lapack.dtbtrs(factor, white[:, None], uplo="L", trans="T")
-        solved = solved.reshape(rows.shape) * rows
-        order, (count, joints) = noise.order, residual.shape
-        back = np.zeros((count, joints))
-        back[order:] = solved
-        for lag in range(1, order + 1):
-            back[order - lag : count - lag] -= noise.regression[:, lag - 1] * solved
+        solved, (count, joints) = solved.reshape(residual.shape), residual.shape
+        back = solved.copy()
+        for lag, weights in enumerate(noise.regression.T, 1):
+            back[:-lag] -= weights * solved[lag:]
         found = np.zeros((count + 2, joints))
         for place, blocks in enumerate(self._blocks):
             found[place : place + count] += np.einsum("kij,ki->kj", blocks, back)
         return noise.encoder**2 * found
 
-    def loss(self, residual: Vector, noise: Noise) -> float:
-        """Return minus the logarithm of the likelihood of a residual."""
-        factor = self.factor(noise)
-        white = self.whitened(residual, noise, factor)
-        return float(np.log(factor[0]).sum() + 0.5 * white @ white)
+    def draw(self, noise: Noise) -> tuple[Vector, Vector]:
+        """Return errors of the encoders, shape (samples + 2, joints), and the residual they leave.
 
-    def fit(self, residual: Vector, start: Noise) -> Noise:
-        """Return the most likely noise of a residual, of the same order as the start."""
+        The latter has errors of the torques too. It is the same draw every time.
+        """
+        random, (count, joints) = np.random.default_rng(0), self._used.shape
+        errors = noise.encoder * random.standard_normal((count + 2, joints))
+        residual = noise.torque * random.standard_normal((count, joints))
+        for row in range(noise.order, count):
+            for lag, weights in enumerate(noise.regression.T, 1):
+                residual[row] += weights * residual[row - lag]
+        for place, blocks in enumerate(self._blocks):
+            residual -= np.einsum("kij,kj->ki", blocks, errors[place : place + count])
+        return errors, residual
+
+    def loss(
+        self,
+        residual: Vector,
+        noise: Noise,
+        columns: Vector | None = None,
+        known: Vector | None = None,
+    ) -> float:
+        """Return minus the logarithm of the likelihood of a residual.
+
+        Args:
+            residual: Shape (samples, joints).
+            noise: The noise.
+            columns: What the residual was fitted with, shape (samples, joints, columns), of full
+                rank: the likelihood is then the restricted one, of what no fit of them changes.
+            known: What is known of these columns' values beforehand, as rows with residuals of
+                variance 1 at their ends, shape (rows, columns + 1).
+        """
+        factor = self.factor(noise)
+        values = residual[..., None]
+        if columns is not None:
+            values = np.concatenate([columns, values], axis=2)
+        white = self.whitened(values, noise, factor)
+        if known is not None:
+            white = np.concatenate([white, known])
+        left = np.abs(np.diag(np.linalg.qr(white, mode="r")))
+        volume = np.log(factor[0]).sum() + np.log(left[:-1]).sum()
+        volume -= 0.5 * np.sum(~self._used * np.log(self._anything(noise)))
+        return float(volume + 0.5 * left[-1] ** 2)
+
+    def fit(
+        self,
+        residual: Vector,
+        start: Noise,
+        columns: Vector | None = None,
+        known: Vector | None = None,
+    ) -> LikelyNoise:
+        """Return the most likely noise of a residual, of the same order as the start.
+
+        Newton's method along the axes of the information in the residual's spectrum.
+
+        Args:
+            residual: As of `loss`.
+            start: Where to start.
+            columns: As of `loss`.
+            known: As of `loss`.
+        """
 
         def loss(x: Vector) -> float:
             try:
-                found = self.loss(residual, _unpacked(x, start))
+                found = self.loss(residual, _unpacked(x, start), columns, known)
+                found += _prior(x, start)[0]
             except np.linalg.LinAlgError:
                 return _NEVER
             return found if np.isfinite(found) else _NEVER
 
-        begin = _packed(start)
-        bounds = _bounds(begin, start)
-        options = {"ftol": 1e-8, "maxiter": _ITERATIONS}
-        found = minimize(loss, begin, method="L-BFGS-B", bounds=bounds, options=options)
-        return _unpacked(found.x, start)
+        x = min((_packed(each) for each in (start, _usual(start))), key=loss)
+        axes = _Spectrum(residual, self._products).axes(_unpacked(x, start))
+        lowest = loss(x)
+        for _ in range(_ITERATIONS):
+            ends = np.array([[loss(x + sign * _APART * axis) for sign in (1, -1)] for axis in axes])
+            slopes = (ends[:, 0] - ends[:, 1]) / (2 * _APART)
+            curves = np.clip((ends.sum(axis=1) - 2 * lowest) / _APART**2, _FLATTEST, None)
+            step = np.clip(-slopes / curves, -_FARTHEST, _FARTHEST)
+            if np.abs(step * np.sqrt(curves)).max() < _NOWHERE:
+                break
+            while (found := loss(x + step @ axes)) > lowest and np.abs(step).max() > _NOWHERE:
+                step = 0.5 * step
+            if found > lowest:
+                break
+            x, lowest = x + step @ axes, found
+        return LikelyNoise(_unpacked(x, start), axes / np.sqrt(curves)[:, None])
 
     def guess(self, residual: Vector, orders: int) -> Noise:
         """Return the noise that a residual's spectrum shows; its order is that of the lowest BIC.
@@ -181,7 +275,7 @@ class Whitener:
         """
         spectrum = _Spectrum(residual, self._products)
         best: tuple[float, Noise] | None = None
-        for order in range(orders + 1):
+        for order in range(min(1, orders), orders + 1):
             found = min((spectrum.fit(each) for each in spectrum.starts(order)), key=lambda x: x[0])
             cost = found[0] + 0.5 * order * residual.shape[1] * np.log(len(residual))
             if best is not None and cost > best[0]:
@@ -228,21 +322,37 @@ class _Spectrum:
         return float(found.fun), _unpacked(found.x, start)
 
     def _loss(self, x: Vector, like: Noise) -> tuple[float, Vector]:
+        spectrum, slopes = self._shape(x, like)
+        ratio = self._power / spectrum
+        prior, slope = _prior(x, like)
+        found = np.tensordot(slopes, 1 - ratio, 2) + slope
+        return float(np.sum(np.log(spectrum) + ratio)) + prior, found
+
+    def axes(self, noise: Noise) -> Vector:
+        """Return independent standard deviations of packed noise, one a row, 1 at most."""
+        x = _packed(noise)
+        slopes = self._shape(x, noise)[1].reshape(len(x), -1)
+        values, turns = np.linalg.eigh(slopes @ slopes.T)
+        axes: Vector = turns.T / np.sqrt(np.maximum(values, 1.0))[:, None]
+        return axes
+
+    def _shape(self, x: Vector, like: Noise) -> tuple[Vector, Vector]:
+        """Return the spectrum, and the derivatives of its logarithm by packed noise."""
         noise, joints = _unpacked(x, like), self._joints
         encoder = noise.encoder**2 * self._shares
         torque = noise.torque**2 * self._gain(noise.regression)
-        spectrum = encoder + torque
-        slope = (1 - self._power / spectrum) / spectrum
-        found = np.empty(len(x))
-        found[0] = np.sum(slope * 2 * encoder)
-        found[1 : 1 + joints] = np.sum(slope * 2 * torque, axis=0)
+        slopes = np.zeros((len(x), *torque.shape))
+        slopes[0] = 2 * encoder
+        own = np.arange(joints)
+        slopes[1 + own, :, own] = 2 * torque.T
         partial = x[1 + joints :].reshape(joints, -1)
         for place in range(like.order):
             near = partial.copy()
             near[:, place] += _NEAR
             by = (self._gain(_regression(np.tanh(near))) * noise.torque**2 - torque) / _NEAR
-            found[1 + joints + place :: like.order] = np.sum(slope * by, axis=0)
-        return float(np.sum(np.log(spectrum) + self._power / spectrum)), found
+            slopes[1 + joints + place + like.order * own, :, own] = by.T
+        spectrum = encoder + torque
+        return spectrum, slopes / spectrum
 
     def _gain(self, regression: Vector) -> Vector:
         response = np.ones(self._power.shape, np.complex128)
@@ -250,6 +360,29 @@ class _Spectrum:
             response -= self._turns**lag * weights
         gain: Vector = 1 / (response.real**2 + response.imag**2)
         return gain
+
+
+def _prior(x: Vector, like: Noise) -> tuple[float, Vector]:
+    """Return minus the logarithm of the prior of packed noise, and its slope.
+
+    Noise of torques is rarely alternating, and encoders that hide all but the slowest of it tell no
+    autocorrelation; what a log tells at all outweighs this.
+    """
+    slope = np.zeros(len(x))
+    partial = slope[1 + len(like.torque) :].reshape(len(like.torque), -1)
+    partial[:] = x[1 + len(like.torque) :].reshape(partial.shape)
+    if like.order:
+        partial[:, 0] -= _USUAL
+    return 0.5 * float(slope @ slope), slope
+
+
+def _usual(noise: Noise) -> Noise:
+    """Return noise with usual autocorrelations, and the same slow torques."""
+    partial = np.zeros(noise.regression.shape)
+    partial[:, :1] = np.tanh(_USUAL)
+    regression = _regression(partial)
+    slow = (1 - regression.sum(axis=1)) / (1 - noise.regression.sum(axis=1))
+    return Noise(noise.encoder, noise.torque * slow, regression)
 
 
 def _packed(noise: Noise) -> Vector:

@@ -1,7 +1,8 @@
 """Tests of what is left: does the residual keep a structure that the model lacks?
 
-Each is a score test with columns along the path that the noise does not reach, so that it has its
-stated size: together, the tests find something in at most one of twenty logs without model error.
+Each is a test of what columns along the path that the noise does not reach would add to the model.
+With the uncertainty of the noise, it has its stated size: together, the tests find something in at
+most one of twenty logs without model error.
 """
 
 from __future__ import annotations
@@ -11,16 +12,16 @@ from dataclasses import dataclass
 
 import numpy as np
 from scipy.stats import chi2
+from scipy.stats import f as fisher
 
-from physx_core.typing import Vector
 from physx_identify.fit import Fit
 from physx_identify.model import STRIBECK
+from physx_identify.noise import LikelyNoise
+from physx_identify.uncertainty import Values, values_of
 
 SIZE = 0.05
 """Share of logs without model error in which the tests together find one."""
 _LAGS = 8
-_NEW = 1e-3
-"""Relative length of a column that the fitted ones do not explain, from which it is tested."""
 
 
 @dataclass(frozen=True)
@@ -52,10 +53,7 @@ def structure_tests(found: Fit, joints: Sequence[str]) -> list[ResidualTest]:
 
 
 def _tests(found: Fit, joints: Sequence[str]) -> Iterator[tuple[str, str, float]]:
-    noise, whitener, path = found.noise, found.whitener, found.path
-    factor = whitener.factor(noise)
-    count = noise.order, len(path.own)
-    rows = (count[1] - count[0]) * len(joints)
+    path = found.path
     speed, place = path.ends, path.own - path.own.mean(axis=0)
     sign = np.sign(speed)
     columns = {
@@ -68,51 +66,43 @@ def _tests(found: Fit, joints: Sequence[str]) -> Iterator[tuple[str, str, float]
         "a torque that depends on the position": place,
         "friction that grows with the load": sign * np.abs(found.torques),
     }
-    for joint, name in enumerate(joints):
-        for lacks, values in columns.items():
-            feature = np.zeros((*values.shape, 1))
-            feature[:, joint, 0] = values[:, joint]
-            white = np.zeros((len(found.white), 1))
-            white[:rows] = whitener.whitened(feature, noise, factor)
-            probability = _score(found, white)
-            if probability is not None:
-                yield name, lacks, probability
-    late = np.zeros((len(found.white), 1))
-    late[rows // 2 : rows] = 1.0
-    halves = _score(found, late * found.instruments[:, found.independent])
-    if halves is not None:
-        yield "", "something that changes with time: the halves of the log differ", halves
-    yield (
-        "",
-        "noise as it is: what is left is still correlated",
-        _whiteness(found, len(joints), rows),
+    lacks = [(name, each) for name in joints for each in columns]
+    features = np.zeros((*speed.shape, len(lacks)))
+    for number, (name, each) in enumerate(lacks):
+        joint = joints.index(name)
+        features[:, joint, number] = columns[each][:, joint]
+    late = found.regressors.copy()
+    late[: len(late) // 2] = 0.0
+    lacks.append(("", "something that changes with time: the halves of the log differ"))
+    groups = [np.array([number]) for number in range(features.shape[2])]
+    groups.append(np.arange(features.shape[2], features.shape[2] + late.shape[2]))
+    beside = values_of(
+        found.whitener,
+        found.likely or LikelyNoise(found.noise, np.zeros((0, 0))),
+        found.residual,
+        found.regressors,
+        found.known,
+        np.concatenate([features, late], axis=2),
+        groups,
     )
+    for (name, each), values in zip(lacks, beside, strict=True):
+        if len(values.values):
+            yield name, each, _probability(values)
+    yield "", "noise as it is: what is left is still correlated", _whiteness(found)
 
 
-def _score(found: Fit, features: Vector) -> float | None:
-    """Return the probability of what is left along features; None: the fit explains them."""
-    z, a = (each[:, found.independent] for each in (found.instruments, found.columns))
-    scale = np.linalg.norm(features, axis=0)
-    if not scale.all():
-        return None
-    features = features / scale
-    rest = features - z @ np.linalg.solve(a.T @ z, a.T @ features)
-    unexplained = features - z @ np.linalg.lstsq(z, features, rcond=None)[0]
-    values, turns = np.linalg.eigh(unexplained.T @ unexplained)
-    turns = turns[:, values > _NEW**2]
-    if not turns.shape[1]:
-        return None
-    rest = rest @ turns
-    score = rest.T @ found.white
-    value = score @ np.linalg.lstsq(rest.T @ rest, score, rcond=None)[0]
-    variance = found.white @ found.white / found.freedom
-    return float(chi2.sf(value / variance, turns.shape[1]))
+def _probability(found: Values) -> float:
+    """Return the probability of values as far from 0."""
+    size = len(found.values)
+    square = found.values @ np.linalg.solve(found.covariance, found.values)
+    freedom = size / np.sum(1 / found.freedom)
+    return float(fisher.sf(square / size, size, freedom))
 
 
-def _whiteness(found: Fit, joints: int, rows: int) -> float:
+def _whiteness(found: Fit) -> float:
     """Return the probability of the correlations of the whitened residual with itself."""
-    white = found.white[:rows].reshape(-1, joints)
-    count = len(white)
+    count, joints = found.used.shape
+    white = found.white[: count * joints].reshape(count, joints)
     power = np.mean(white**2, axis=0)
     value = 0.0
     for lag in range(1, _LAGS + 1):

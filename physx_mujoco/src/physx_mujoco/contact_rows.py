@@ -1,6 +1,8 @@
-"""Contacts of which MuJoCo knows too little: with bodies that move as prescribed, and deep ones.
+"""Contacts of which MuJoCo knows too little.
 
-A step is split where MuJoCo has found the contacts but not yet solved for their forces.
+These are contacts with bodies that move as prescribed, deep ones, and those in which one body has
+the smaller friction and the other one resists turning. A step is split where MuJoCo has found the
+contacts but not yet solved for their forces.
 """
 
 from __future__ import annotations
@@ -28,16 +30,23 @@ class ContactRows:
         self._world, self._data = world, data
         self._moving: dict[int, Vector] = {}
         self.expect_depth()
+        self.note_frictions()
 
     @property
     def active(self) -> bool:
         """Whether steps differ from MuJoCo's own."""
-        return self._deep or bool(self._moving)
+        return self._deep or self._mixed or bool(self._moving)
 
     def expect_depth(self) -> None:
         """Note that a state was set, in which contacts may be deep."""
         # With this integrator there are none, and its steps cannot be split.
         self._deep = self._world.model.opt.integrator != mujoco.mjtIntegrator.mjINT_RK4
+
+    def note_frictions(self) -> None:
+        """Note whether MuJoCo's choice of torsional and rolling friction is the wrong one."""
+        model = self._world.model
+        turns = bool(model.geom_friction[:, 1:].any())
+        self._mixed = turns and len(set(model.geom_priority.tolist())) > 1
 
     def place(self, static: int, pose: Vector, velocity: Vector, surface: Vector) -> None:
         """Place a static body for the next step, as in `RobotSimulation.place_static`."""
@@ -64,11 +73,26 @@ class ContactRows:
             mujoco.mj_step(model, data)
             return
         mujoco.mj_step1(model, data)
+        if self._mixed and data.ncon:
+            self._resist_turning()
         if self._deep:
             self._limit_depth()
         if self._moving:
             self._push()
         mujoco.mj_step2(model, data)
+
+    def _resist_turning(self) -> None:
+        """Give each contact the larger torsional and rolling friction of its two shapes."""
+        model, data = self._world.model, self._data
+        turning = model.geom_friction[data.contact.geom, 1:].max(axis=1)
+        data.contact.friction[:, 2:] = np.maximum(turning[:, [0, 1, 1]], mujoco.mjMINMU)
+        for remake in (
+            mujoco.mj_makeConstraint,
+            mujoco.mj_island,
+            mujoco.mj_projectConstraint,
+            mujoco.mj_referenceConstraint,
+        ):
+            remake(model, data)
 
     def _limit_depth(self) -> None:
         """Let contacts appear only so deep as they may return."""

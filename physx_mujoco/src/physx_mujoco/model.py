@@ -83,15 +83,20 @@ class WorldModel:
     def write_frictions(self, parts: Parts) -> None:
         """Write the coefficients of friction of all shapes.
 
-        Of two shapes, MuJoCo uses the friction of the one with the higher priority.
+        Of two shapes, MuJoCo uses all friction of the one with the higher priority, or the larger
+        of equal ones.
         """
-        shapes = [shape for movable in parts.movables for shape in movable.model.shapes]
-        frictions = [shape.friction for shape in shapes]
+        whats: list[Any] = [s for movable in parts.movables for s in movable.model.shapes]
         for owner, static in enumerate(parts.statics, len(self.bodies)):
-            frictions += [static.what.friction] * int((self.owners == owner).sum())
-        ranks = {mu: rank for rank, mu in enumerate(sorted(set(frictions), reverse=True))}
-        self.model.geom_friction[:, 0] = np.array(frictions)[self.made]
-        self.model.geom_priority[:] = np.array([ranks[mu] for mu in frictions], int)[self.made]
+            whats += [static.what] * int((self.owners == owner).sum())
+        found = [(x.friction, x.torsional_friction, x.rolling_friction) for x in whats]
+        ranks = {mu: rank for rank, mu in enumerate(sorted({mu for mu, *_ in found}, reverse=True))}
+        self.model.geom_friction[:] = np.array(found)[self.made]
+        turning = self.model.geom_friction[:, 1:]
+        dimensions = np.select([turning[:, 1] > 0, turning[:, 0] > 0], [6, 4], 3)
+        # All contacts have as many if `ContactRows` changes their coefficients.
+        self.model.geom_condim[:] = dimensions.max() if len(ranks) > 1 else dimensions
+        self.model.geom_priority[:] = np.array([ranks[mu] for mu, *_ in found], int)[self.made]
 
     def write_heights(self, parts: Parts) -> None:
         """Write the heights of the ground."""

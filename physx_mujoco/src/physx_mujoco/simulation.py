@@ -17,8 +17,9 @@ from physx_mujoco.algorithms import MujocoAlgorithms
 from physx_mujoco.contact_rows import ContactRows
 from physx_mujoco.drives import Drives
 from physx_mujoco.model import SPARE, ModelBuilder, WorldModel, quaternion_of
+from physx_mujoco.pictures import Pictures
 from physx_mujoco.robot import MujocoRobot, Running
-from physx_sim import CONTACT, FEATURES, Simulation, World
+from physx_sim import CONTACT, FEATURES, Camera, Simulation, World
 from physx_sim.engines import (
     RK4_LACKS,
     Algorithms,
@@ -62,13 +63,15 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
     """A world in MuJoCo."""
 
     engine = "mujoco"
-    lacks: ClassVar[frozenset[str]] = frozenset({"derivatives", "restitution"})
+    lacks: ClassVar[frozenset[str]] = frozenset({"derivatives", "restitution", "step_derivatives"})
     caveats: ClassVar[Mapping[str, str]] = {
         "attachments": f"while it runs, {SPARE} more than at the start; soft",
+        "cameras": "with EGL or OSMesa",
         "contacts": "soft",
         "body_contacts": "soft",
         "joint_wrenches": "not while anything is attached",
         "mesh_contacts": "as convex hulls",
+        "torsional_friction": "soft; sliding, turning and rolling share one bound",
     }
 
     def __init__(self, world: World) -> None:
@@ -86,6 +89,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         data = mujoco.MjData(model)
         self._running = Running(model, data, data.qpos.copy(), data.qvel.copy())
         self._bound: dict[int, int] = {}
+        self._pictures: Pictures | None = None
         layout = layout_of(parts)
         robots = [
             MujocoRobot(movable, part, self._world.bodies[part.bodies], self._running)
@@ -152,8 +156,10 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         self._world.write_masses(self.parts)
         if len(self._world.made):
             self._world.write_frictions(self.parts)
+            self._contact_rows.note_frictions()
         if self.parts.world.ground is not before.world.ground:
             self._world.write_heights(self.parts)
+            self._forget_pictures()
         self._world.derive()
 
     def hide(self, bodies: Sequence[int]) -> None:
@@ -203,6 +209,23 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         self._running.data.qacc_warmstart[:] = 0.0
         self._contact_rows.expect_depth()
 
+    def draw(
+        self, camera: Camera, position: Vector, turn: Vector, passed: Sequence[int]
+    ) -> dict[str, Vector]:
+        """Return the images of a camera.
+
+        Raises:
+            SimulationError: If neither EGL nor OSMesa works here.
+        """
+        if self._pictures is None:
+            self._pictures = Pictures(self._world)
+        return self._pictures.take(self._running.data, camera, position, turn, passed)
+
+    def _forget_pictures(self) -> None:
+        if self._pictures is not None:
+            self._pictures.close()
+        self._pictures = None
+
     def read_contacts(self) -> Records:
         """Return the contacts of the last physics step."""
         model, data = self._running.model, self._running.data
@@ -220,12 +243,14 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         found["point"], found["depth"] = contact.pos, -contact.dist
         found["normal"] = sign * frames[:, 0]
         found["force"] = sign * (forces[:, None, :3] @ frames)[:, 0]
+        found["torque"] = sign * (forces[:, None, 3:] @ frames)[:, 0]
         return found
 
     def close(self) -> None:
         """Free the world; further calls do nothing."""
         if not self._closed:
             super().close()
+            self._forget_pictures()
             del self._running, self._drives, self._contact_rows, self._world
 
 

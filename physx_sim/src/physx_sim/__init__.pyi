@@ -4,6 +4,7 @@ from .backend import Backend as Backend
 from .backend import Hook as Hook
 from .backend import RobotInfo as RobotInfo
 from .backend import Simulation as Simulation
+from .derivatives import StepDerivatives as StepDerivatives
 from .description.attachment import Attachment as Attachment
 from .description.attachment import Connect as Connect
 from .description.attachment import Weld as Weld
@@ -36,6 +37,10 @@ from .motors.motor import Motor as Motor
 from .motors.motor import with_rotors as with_rotors
 from .motors.motors import Motors as Motors
 from .motors.motors import MotorState as MotorState
+from .motors.network import ActuatorNetwork as ActuatorNetwork
+from .motors.network import read_actuators as read_actuators
+from .motors.network import write_actuators as write_actuators
+from .sensors.sensor import Camera as Camera
 from .sensors.sensor import ContactSensor as ContactSensor
 from .sensors.sensor import EffortSensor as EffortSensor
 from .sensors.sensor import Encoder as Encoder

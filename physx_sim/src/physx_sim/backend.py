@@ -14,6 +14,7 @@ import numpy as np
 
 from physx_core import Closeable
 from physx_core.typing import Records, Vector
+from physx_sim.derivatives import StepDerivatives
 from physx_sim.description.attachment import Attachment
 from physx_sim.description.body_settings import BodySettings
 from physx_sim.description.ground import HeightField
@@ -21,6 +22,7 @@ from physx_sim.description.world import World
 from physx_sim.description.wrench import Wrench
 from physx_sim.errors import FeatureNotSupportedError
 from physx_sim.layout import Layout, State
+from physx_sim.sensors.sensor import Camera
 
 
 @dataclass(frozen=True)
@@ -140,6 +142,25 @@ class Simulation(Closeable):
         Raises:
             SimulationError: If the state is no longer finite, or a hook calls `step`.
         """
+
+    def step_with_derivatives(self, n: int = 1, *, compare_sides: bool = False) -> StepDerivatives:
+        """Simulate n physics steps like `step`; return how the result depends on what was before.
+
+        Impacts take place at the end of steps, here as in differences of simulations, so where
+        something hits, the derivatives are those of the steps, not of the motion that they
+        approximate.
+
+        Args:
+            n: Number of steps, under the held commands.
+            compare_sides: Whether to determine `StepDerivatives.asymmetry`, by `n` steps from each
+                of two states nearby; the warm start is then discarded as in `snapshot`.
+
+        Raises:
+            SimulationError: If `n` is invalid, the state is no longer finite, or one of the steps
+                has no derivatives; the message names the reason. The simulation is then after this
+                step.
+        """
+        raise self._lacks("step_derivatives")
 
     def add_hook(self, hook: Hook, every: int = 1) -> None:
         """Call a function before the physics steps whose frame is a multiple of `every`.
@@ -331,6 +352,17 @@ class Simulation(Closeable):
                 one of these names.
         """
         raise self._lacks("raycast")
+
+    def take_images(self, camera: Camera) -> dict[str, Vector]:
+        """Return the images of a camera by their names, in the present state.
+
+        Args:
+            camera: The camera; its period and errors have no effect.
+
+        Raises:
+            SimulationError: If there is no body with one of its names, or nothing can draw here.
+        """
+        raise self._lacks("cameras")
 
     @abstractmethod
     def body_poses(

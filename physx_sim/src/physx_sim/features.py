@@ -8,6 +8,7 @@ FEATURES = {
     "armature": "JointSettings.armature",
     "attachments": "Weld and Connect, in the world from the start or while it runs",
     "body_contacts": "contacts between moving bodies",
+    "cameras": "images of cameras: depth, segmentation, colors",
     "changes": "masses, friction, hidden objects and height fields that change while it runs",
     "contacts": "contacts with static bodies",
     "derivatives": "derivatives of the forward dynamics",
@@ -30,6 +31,8 @@ FEATURES = {
     "rk4": 'World(integrator="rk4")',
     "self_collisions": "Robot(self_collisions=True)",
     "springs": "springs and damping in joints",
+    "step_derivatives": "derivatives of steps, through contacts, limits and motors",
+    "torsional_friction": "torsional and rolling friction of contacts",
     "wrenches": "external forces",
 }
 """Every feature that a simulation may have, with its meaning."""

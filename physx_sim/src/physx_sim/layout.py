@@ -28,11 +28,13 @@ CONTACT = np.dtype(
         ("force", np.float64, (3,)),
         ("normal", np.float64, (3,)),
         ("depth", np.float64),
+        ("torque", np.float64, (3,)),
     ]
 )
 """A contact: the bodies (indices into `Layout.names`, `body_a` before `body_b`, so a static one is
 `body_b`); the point, in m; the force on `body_a`, in N (that on `body_b` is opposite); the unit
-normal from `body_b` to `body_a`; the penetration depth, in m. All in the world frame."""
+normal from `body_b` to `body_a`; the penetration depth, in m; the torque on `body_a` about the
+point, in N m, of torsional and rolling friction. All in the world frame."""
 
 RAY_HIT = np.dtype(
     [

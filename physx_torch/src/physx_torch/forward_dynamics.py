@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
 from typing import Any
 
-import numpy as np
 import torch
 from torch import Tensor
 from torch.autograd.function import once_differentiable
 
-from physx_core.rotations import cross_rows, rotate_rows
 from physx_core.typing import Vector
-from physx_sim import Layout, Simulation
+from physx_sim import Simulation
 from physx_sim.errors import FeatureNotSupportedError, SimulationError
+from physx_torch.coordinates import as_rows, check_widths, to_position_gradients
 
 
 class ForwardDynamics:
@@ -64,34 +62,19 @@ class ForwardDynamics:
                 have length 1 (within 0.001), or one of the processes has ended.
         """
         given = (positions, velocities, torques)
-        self._check(given)
+        layout = self.simulation.layout
+        check_widths(
+            ("positions", "velocities", "torques"), given, (layout.nq, layout.nv, layout.nv)
+        )
         dtype = torch.promote_types(positions.dtype, velocities.dtype)
         dtype = torch.promote_types(dtype, torques.dtype)
         leading = torch.broadcast_shapes(*(tensor.shape[:-1] for tensor in given))
-        rows = [_rows(tensor, leading) for tensor in given]
+        rows = [as_rows(tensor, leading) for tensor in given]
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given):
             found: Tensor = _Function.apply(self, *rows)
         else:
             found = torch.from_numpy(_accelerations(self, rows))
         return found.reshape(*leading, velocities.shape[-1]).to(positions.device, dtype)
-
-    def _check(self, given: tuple[Tensor, ...]) -> None:
-        layout = self.simulation.layout
-        names = ("positions", "velocities", "torques")
-        for name, tensor, length in zip(
-            names, given, (layout.nq, layout.nv, layout.nv), strict=True
-        ):
-            if tensor.shape[-1:] != (length,):
-                shape = tuple(tensor.shape)
-                raise SimulationError(f"{name} have shape {shape} but need (..., {length}).")
-
-
-def _rows(tensor: Tensor, leading: Sequence[int]) -> Tensor:
-    """Return a tensor as rows, shape (n, last), in double precision on the CPU."""
-    tensor = tensor.to("cpu", torch.float64)
-    if len(leading) == 1 and tensor.shape[:-1] == leading:
-        return tensor
-    return tensor.expand(*leading, -1).reshape(math.prod(leading), tensor.shape[-1])
 
 
 def _accelerations(dynamics: ForwardDynamics, rows: Sequence[Tensor]) -> Vector:
@@ -116,38 +99,6 @@ class _Function(torch.autograd.Function):
         arrays = [tensor.detach().numpy() for tensor in (*ctx.saved_tensors, given)]
         gradients = list(simulation.forward_dynamics_gradients_batch(*arrays, processes=processes))
         if ctx.needs_input_grad[1]:
-            gradients[0] = _to_position_gradients(simulation.layout, arrays[0], gradients[0])
+            gradients[0] = to_position_gradients(simulation.layout, arrays[0], gradients[0])
         needed = zip(gradients, ctx.needs_input_grad[1:], strict=True)
         return None, *(torch.from_numpy(each) if needs else None for each, needs in needed)
-
-
-def _to_position_gradients(layout: Layout, positions: Vector, by_motion: Vector) -> Vector:
-    """Return gradients by position coordinates, (n, nq), from those by small motions."""
-    found = np.empty(positions.shape)
-    for part in layout.parts.values():
-        mine, along = found[:, part.positions], by_motion[:, part.velocities]
-        if part.floating:
-            _write_base(mine, positions[:, part.positions.start + 3 :][:, :4], along)
-            mine[:, 7:] = along[:, 6:]
-        else:
-            mine[:] = along
-    return found
-
-
-def _write_base(found: Vector, quaternion: Vector, by_motion: Vector) -> None:
-    """Write gradients by x, y, z and the quaternion x, y, z, w of a base into `found` (n, 7..).
-
-    In the base's frame, a change dp of the position is R^T dp, and a change du of the quaternion u
-    is the rotation 2 Im(u* du) / |u|^2.
-
-    Args:
-        found: The first seven columns are written.
-        quaternion: Quaternion of the base, x, y, z, w, shape (n, 4).
-        by_motion: Gradients by translations along and rotations about the base's axes, (n, 6..).
-    """
-    length = np.sqrt((quaternion**2).sum(axis=1, keepdims=True))
-    unit = quaternion / length
-    axis, w, turned = unit[:, :3], unit[:, 3:], by_motion[:, 3:6]
-    found[:, :3] = rotate_rows(unit, by_motion[:, :3])
-    found[:, 3:6] = 2 / length * (w * turned + cross_rows(axis, turned))
-    found[:, 6] = -2 / length[:, 0] * (axis * turned).sum(axis=1)

@@ -29,6 +29,7 @@ def assert_same(vector, other, steps):
             np.testing.assert_array_equal(found, expected)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("launcher", ["ray", "slurm"])
 def test_steps_are_those_of_processes_that_share_memory(launcher, request, tmp_path, monkeypatch):
     options = {"launcher": f"cluster/{launcher}"}

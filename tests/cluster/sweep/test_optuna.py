@@ -154,6 +154,7 @@ def test_what_a_pruner_keeps_of_trials_is_passed_on():
     assert [result.state for result in earlier] == ["complete", "pruned", "pruned", "pruned"]
 
 
+@pytest.mark.slow
 def test_trials_that_fall_behind_end_early(write):
     options = {"pruner": "optuna/median", "pruner_kwargs": {"n_startup_trials": 1}, "batch": 1}
     file = write(parameters={"training.network.lr": [0.05, 0.01, 0.2]}, **options)
@@ -173,6 +174,7 @@ def test_a_library_that_a_sampler_lacks_is_named_before_anything_runs(monkeypatc
         search("optuna/cmaes")
 
 
+@pytest.mark.slow
 def test_fewer_trials_in_a_batch_than_processes_are_said(write):
     options = {"sampler": "optuna/tpe", "trials": 2, "batch": 1, "run": {"parallel": 2}}
     said = []
@@ -180,6 +182,7 @@ def test_fewer_trials_in_a_batch_than_processes_are_said(write):
     assert said[1].startswith("note: only 1 of 2 (run.parallel) trials can run at the same time")
 
 
+@pytest.mark.slow
 def test_results_that_were_changed_are_noticed(write):
     ranges = {"training.network.lr": {"low": 0.01, "high": 0.5}}
     options = {"sampler": "optuna/tpe", "sampler_kwargs": {"n_startup_trials": 1}}

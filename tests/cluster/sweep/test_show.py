@@ -54,6 +54,7 @@ def test_a_visualizer_gets_the_numbers_of_all_trials_as_one_run(study):
     assert session == "session: study/trial_0001"
 
 
+@pytest.mark.slow
 def test_curves_are_one_recording_in_the_viewer(study, physx):
     rerun = pytest.importorskip("rerun")
     assert rerun is not None
@@ -62,6 +63,7 @@ def test_curves_are_one_recording_in_the_viewer(study, physx):
     assert Path("study/study.rrd").stat().st_size > 1000
 
 
+@pytest.mark.slow
 def test_the_figure_shows_the_results(study):
     pytest.importorskip("matplotlib")
     draw_figure(study, Path("study.svg"))

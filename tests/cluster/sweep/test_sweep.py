@@ -23,6 +23,7 @@ def table(folder):
         return list(csv.DictReader(file))
 
 
+@pytest.mark.slow
 def test_each_pipeline_is_tried_with_each_setting_and_seed(write, training, physx, data):
     other = copy.deepcopy(training)
     other["network"]["network_kwargs"]["net_fields"] = ["state"]
@@ -58,6 +59,7 @@ def test_each_pipeline_is_tried_with_each_setting_and_seed(write, training, phys
     assert before == {p: p.stat().st_mtime_ns for p in Path("studies").rglob("*/scalars.csv")}
 
 
+@pytest.mark.slow
 def test_more_trials_leave_the_first_ones_as_they_are(write, physx):
     ranges = {"training.network.lr": {"low": 0.05, "high": 0.4, "log": True}}
     write(sampler="random", trials=1, parameters=ranges)
@@ -74,6 +76,7 @@ def test_more_trials_leave_the_first_ones_as_they_are(write, physx):
     assert Path("studies/sweep/trials.csv").read_text() == after
 
 
+@pytest.mark.slow
 def test_trials_that_fail_are_results_and_the_others_go_on(write, physx):
     write(parameters={"training.network.lr": [0.123, 1e6, 0.3]})
     said = physx("sweep", "sweep.toml")
@@ -94,6 +97,7 @@ def test_a_study_in_which_nothing_succeeds_is_an_error(write, physx):
     assert table("studies/sweep")[0]["state"] == "failed"
 
 
+@pytest.mark.slow
 def test_what_concerns_all_trials_ends_the_sweep_at_once_and_is_no_result(write, training, physx):
     away = Path("away")
     training["dataset"]["existing_dir"] = "data"
@@ -115,6 +119,7 @@ def test_a_number_that_trainings_do_not_record_is_named(write, physx):
     assert 'Did you mean "loss/validation"?' in said
 
 
+@pytest.mark.slow
 def test_each_trial_may_generate_its_own_data(write, training, physx):
     del training["dataset"]["existing_dir"]
     spring = {"environment": "toy/spring", "as_tcp_ip_client": False}
@@ -157,6 +162,7 @@ def test_a_folder_that_is_no_study_is_named(physx):
     assert "There is no configuration file" in physx("sweep", "missing.toml", status=1)
 
 
+@pytest.mark.slow
 def test_corrupt_trial_files_are_reported(write):
     definition = Definition.read(write(parameters={"training.network.lr": [0.1]}))
     folder = Path("study")

@@ -183,6 +183,7 @@ def test_replaced_production_of_batches_gets_a_stream():
         assert dataset.recorded_episodes("training") is None
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT, signal.SIGTERM])
 def test_interrupted_batches_are_resumed_without_repeating_what_has_ended(how):
     kwargs = {"least": 1, "sleep": 0.03, "log": "log"}

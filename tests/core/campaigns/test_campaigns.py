@@ -96,6 +96,7 @@ def check_rows(name, total, troubles=None, **options):
 TROUBLES = {"2": ["raises", 0], "11": ["is not finite", 1], "30": ["raises early", 0]}
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["walks", "single rows", "parameters", "long"])
 def test_datasets_are_equal_however_many_clients_there_are(kind):
     kwargs = {"troubles": TROUBLES, "least": 1}
@@ -158,6 +159,7 @@ def begun_at_least(count):
     return lambda: sum(begun().values()) >= count
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("clients", [0, 2])
 @pytest.mark.parametrize("trial", range(sizes.trials(6, 1)))
 def test_killed_run_is_resumed_with_what_is_missing(clients, trial):
@@ -221,6 +223,7 @@ def test_interrupted_run_keeps_what_has_finished(clients):
     assert set(begun() - before) == set(range(60)) - set(recorded)
 
 
+@pytest.mark.slow
 def test_campaign_is_killed_again_and_again():
     generate("whole", 60, env_kwargs={"least": 1})
     process = start()
@@ -327,6 +330,7 @@ def test_as_many_failures_as_allowed_are_no_error():
     check_rows("run", 9, troubles, least=1)
 
 
+@pytest.mark.slow
 def test_number_that_ends_its_client_twice_has_failed():
     troubles = {"4": ["ends the process", 0]}
     kwargs = {"troubles": troubles, "least": 1, "sleep": 0.03, "log": "log"}

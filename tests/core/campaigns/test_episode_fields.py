@@ -197,6 +197,7 @@ def test_cut_episodes_keep_theirs_until_they_are_extended(clients):
                 assert len(numbers) == total
 
 
+@pytest.mark.slow
 def test_killed_campaign_is_resumed():
     made = ["case.py:Case", "--environment.seed", "1", "--environment.num-clients", "2"]
     words = [*made, "--episodes", "60", "--session-name", "run", "--no-prove-independence",

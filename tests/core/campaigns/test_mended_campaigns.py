@@ -60,6 +60,7 @@ def counts():
         return dataset.num_samples("training"), len(dataset.failed_episodes("training"))
 
 
+@pytest.mark.slow
 def test_episodes_that_failed_by_a_mistake_are_simulated_again(write):
     generate("--episodes", "6")
     with Dataset.open("sessions/run") as dataset:

@@ -98,6 +98,7 @@ def test_samples_of_another_mode_are_other_episodes():
     assert 3 in {number for number, _, _ in found[len(first) :]}
 
 
+@pytest.mark.slow
 def test_samples_of_an_episode_that_is_simulated_again_replace_the_former():
     generate("run", num_clients=2)
     before = rows("run", "wrong")

@@ -70,6 +70,7 @@ def test_an_episode_longer_than_its_clients_live_ends(undisturbed, simulation):
     assert simulation.steps < 2 * NUMBERS * ROWS
 
 
+@pytest.mark.slow
 @settings(max_examples=sizes.size(30, 6), phases=[Phase.explicit, Phase.generate])
 @given(drawn, st.integers(1, 3), st.sets(st.integers(0, ROWS - 1), max_size=8))
 def test_rows_do_not_depend_on_kills_and_the_order_of_events(undisturbed, choose, count, kills):

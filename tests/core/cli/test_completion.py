@@ -121,6 +121,7 @@ def test_arguments_follow_commands_and_options_that_are_complete(after):
     assert after("nonsense") == []
 
 
+@pytest.mark.slow
 def test_each_option_that_takes_a_component_is_known(after, capsys):
     """What their help calls a reference is a component, or of the network's library."""
     others = {"loss", "metrics", "optimizer", "scheduler"}

@@ -231,6 +231,28 @@ def test_partitions_of_free_axes_roll_over_when_any_file_is_full(tmp_path):
         assert len(parts) > 2 and all(part.sizes["node"] <= 20 for part in parts)
 
 
+def test_partitions_that_are_all_but_full_stay_as_they_were_written(tmp_path):
+    """The entries of the next row rarely fit exactly; nothing is copied for the rest."""
+    counts = [7] * 300
+    rows = [np.full((count, 2), number / 8) for number, count in enumerate(counts)]
+    with Dataset.create(tmp_path, max_file_size=size(1000 * 16)) as dataset:
+        dataset.define_fields("training", [FIELDS[0]])
+        dataset.append("training", {"x": rows[:100]})
+        path = tmp_path / f"{dataset.session}_training_x_0.h5"
+        inode = path.stat().st_ino
+        dataset.append("training", {"x": rows[100:]})
+    assert path.stat().st_ino == inode
+    with h5py.File(path) as file:
+        assert file["data"].shape == (1000, 2) and file["rows"][()] == 142 * 7
+    with h5py.File(tmp_path / f"{dataset.session}.h5") as file:
+        np.testing.assert_array_equal(file["training/x"][:], np.concatenate(rows))
+    Dataset.rebuild(tmp_path)
+    with Dataset.open(tmp_path) as found:
+        assert found.verify() == []
+        stored = np.concatenate(found["training"]["x"][:])
+        np.testing.assert_array_equal(stored, np.concatenate(rows))
+
+
 def test_a_row_larger_than_a_partition_is_stored(tmp_path):
     with Dataset.create(tmp_path, max_file_size=size(10)) as dataset:
         dataset.define_fields("training", [Field("x", ("node",))])
@@ -280,16 +302,6 @@ def test_free_axes_that_contradict_each_other_are_refused(tmp_path, fields, matc
 def test_rows_of_any_size_without_a_free_axis_say_how_to_define_one(tmp_path):
     with Dataset.create(tmp_path) as dataset, pytest.raises(FieldShapeError, match="free axis"):
         dataset.append("training", {"x": [np.zeros(2), np.zeros(3)]})
-
-
-def test_windows_of_several_rows_of_a_free_axis_are_refused(tmp_path):
-    with Dataset.create(tmp_path) as dataset:
-        dataset.define_fields("training", FIELDS)
-        rows = block([row(n) for n in range(9)])
-        dataset.append_episodes("training", rows, [EpisodeRecord(episode=0, rows=9)])
-    view = View(hold_back=False, window={"x": {"field": "x", "at": [0, 1]}})
-    with pytest.raises(ConfigError, match="give each its own window"):
-        view.open(2, data=tmp_path)
 
 
 def test_damaged_ends_of_a_free_axis_are_found(tmp_path):

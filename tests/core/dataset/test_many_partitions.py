@@ -10,6 +10,7 @@ import pytest
 from numpy.testing import assert_array_equal
 
 from physx_core import Dataset
+from physx_core.dataset.store import changes_file
 from physx_core.errors import DatasetError
 
 SIZE = (2**14 + 80) / 1e9  # a few rows in each partition
@@ -92,6 +93,33 @@ def test_a_torn_line_loses_no_rows(killed, rows, tmp_path):
         shutil.rmtree(copy)
 
 
+def test_partitions_that_are_sealed_together_count_in_statistics_together(
+    folder, tmp_path, monkeypatch
+):
+    """A cut may leave only the first bytes of what lists them and names their statistics."""
+    append, before = changes_file.append, []
+
+    def kept(directory, end, change):
+        found = append(directory, end, change)
+        shutil.copytree(folder, tmp_path / f"after_{end.nbytes}")
+        before.append(end.nbytes)
+        return found
+
+    with Dataset.create(folder, max_file_size=SIZE) as dataset:
+        dataset.append("training", block(0, 17))
+        monkeypatch.setattr(changes_file, "append", kept)
+    after = tmp_path / f"after_{before[0]}"
+    content, rows = (after / "changes.jsonl").read_bytes(), block(0, 17)
+    assert content[before[0] :].count(b'"sealed": true') > 2
+    for end in range(before[0], len(content) + 1, 50):
+        copy = shutil.copytree(after, tmp_path / "copy")
+        (copy / "changes.jsonl").write_bytes(content[:end])
+        with Dataset.open(copy, writable=True, max_file_size=SIZE) as dataset:
+            found = dataset.normalization_of("training")["x"]
+            np.testing.assert_allclose(found.mean, rows["x"].mean(axis=0), err_msg=str(end))
+        shutil.rmtree(copy)
+
+
 def test_a_damaged_line_loses_no_rows(killed, rows):
     content = (killed / "changes.jsonl").read_bytes()
     for place in range(0, len(content), 41):
@@ -137,6 +165,8 @@ def hostile(folder, change):
     {"mode": "training", "partition": {"session": "../x"}},
     {"mode": "training", "partition": []},
     {"mode": ["training"]},
+    {"mode": "training", "partition": {"session": "run", "index": 99, "first_row": 1000, "rows": 0,
+        "sealed": False, "offsets": {"x": 0, "n": 0}}, "also": [{"mode": "other"}]},
     {"mode": "training", "partition": {
         "session": "run", "index": 99, "first_row": 2**62, "rows": 2**62, "sealed": True,
         "offsets": {"x": 0, "n": 0}}},

@@ -47,6 +47,7 @@ def rows_of(session, mode="training"):
         return {name: dataset[mode][name][:] for name in dataset[mode]}
 
 
+@pytest.mark.slow
 def test_the_program_in_c(compiler):
     compiler("cc")
     Path("spring.c").write_text(block("c", "int main"))
@@ -61,6 +62,7 @@ def test_the_program_in_c(compiler):
     assert len({*rows_of("data_generation_1", "parameters")["stiffness"]}) == 10
 
 
+@pytest.mark.slow
 def test_the_program_in_fortran(compiler):
     compiler("gfortran")
     Path("bar.f90").write_text(block("fortran", "program bar"))

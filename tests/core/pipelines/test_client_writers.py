@@ -103,6 +103,7 @@ def test_dataset_of_client_writers_is_that_of_the_server(clients, options):
                 assert virtual[mode][name][:].tobytes() == view[:].tobytes()
 
 
+@pytest.mark.slow
 def test_rows_of_client_writers_can_be_compacted_merged_and_extended(tmp_path):
     folder = generate("clients")
     wanted = contents(folder)
@@ -117,6 +118,7 @@ def test_rows_of_client_writers_can_be_compacted_merged_and_extended(tmp_path):
     assert contents(folder) == contents(generate("server", "server", options={"episodes": 45}))
 
 
+@pytest.mark.slow
 def test_commands_take_them():
     command = [sys.executable, "-m", "physx_core"]
     made = ["generate", WALKS, "--environment.num-clients", "2", "--environment.seed", "3"]
@@ -131,6 +133,7 @@ def test_commands_take_them():
 # Failures ---------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_episode_of_a_lost_client_writer_is_simulated_again():
     wanted = contents(generate("server", "server"))
     assert contents(generate("clients", env_kwargs={"dies": (12, 1)})) == wanted
@@ -181,6 +184,7 @@ def server_dataset(run_killed):
     return contents(Path("server/sessions/run")), duration
 
 
+@pytest.mark.slow
 def test_killed_run_of_client_writers_is_resumed(run_killed):
     wanted, duration = server_dataset(run_killed)
     check_killed_runs(run_killed, Path("killed").resolve(), [0.8 * duration], wanted)
@@ -263,6 +267,7 @@ def test_client_writer_on_other_file_system_is_refused(content, text):
     assert not Path("sessions/clients").exists()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "message",
     [

@@ -155,6 +155,7 @@ def test_failures_of_episodes_that_no_batch_needs_do_not_count():
             assert dataset.failed_episodes("training") == []
 
 
+@pytest.mark.slow
 def test_resumed_training_may_have_more_failures():
     options = {"batch_nb": 20}
     lesson = {"fails": (20, 21), "delay": 0.01}

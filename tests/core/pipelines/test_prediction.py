@@ -210,6 +210,7 @@ def test_the_command_replays_too(capsys):
 # The end ----------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("steps", [-1, 1_000_000])
 def test_ctrl_c_ends_prediction_cleanly(tmp_path, steps, nothing_stays_behind):
     script = tmp_path / "script.py"

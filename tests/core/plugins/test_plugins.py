@@ -77,6 +77,7 @@ def test_available_reads_metadata_only():
     assert out.stdout.strip() == "[]"
 
 
+@pytest.mark.slow
 def test_broken_plugins_are_reported_and_the_rest_works(tmp_path):
     add_plugin(tmp_path, "good", GOOD)
     add_plugin(tmp_path, "raises", "raise RuntimeError('on purpose')")
@@ -147,6 +148,7 @@ HANG = "import time\ntime.sleep(600)\n"
 STUBBORN = HANG.replace("time.sleep(600)", "try: time.sleep(600)\nexcept BaseException: pass")
 
 
+@pytest.mark.slow
 def test_plugins_that_never_end_to_import_are_named_and_given_up(tmp_path, monkeypatch):
     monkeypatch.setenv("PHYSX_IMPORT_TIMEOUT", "1.5")
     add_plugin(tmp_path, "hang", HANG)
@@ -197,6 +199,7 @@ GARBAGE = {
 }
 
 
+@pytest.mark.slow
 def test_garbage_in_the_metadata_of_a_package_is_told_and_breaks_nothing_else(tmp_path):
     for name, content in GARBAGE.items():
         info = tmp_path / f"{name.replace('-', '_')}-1.0.dist-info"

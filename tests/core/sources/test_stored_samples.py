@@ -197,6 +197,7 @@ def test_batch_nb_cuts_an_epoch_and_the_pass_goes_on(source_dir):
     assert rows_of("sessions/always")["times"].tolist() == [2] * 40  # 7 + ... + 5, twice
 
 
+@pytest.mark.slow
 def test_the_same_over_tcp(source_dir, nothing_stays_behind):
     weights = []
     for over_tcp in (False, True):
@@ -266,6 +267,7 @@ def test_too_many_rejected_samples_end_the_training_and_are_kept(source_dir):
     assert not rows_of("sessions/training")["times"].any()
 
 
+@pytest.mark.slow
 def test_a_source_whose_writer_was_killed_gives_its_committed_rows(source_dir):
     stored = rows_of(source_dir)
     left = Dataset.create("left open")

@@ -108,6 +108,7 @@ def test_client_that_leaves_is_replaced_by_one_that_joins(config, join):
     check(results, 40)
 
 
+@pytest.mark.slow
 def test_run_with_too_few_clients_ends_after_timeout(config, join, unhurried):
     join()
     config = dataclasses.replace(config, min_clients=2, timeout=unhurried(1.0))
@@ -138,6 +139,7 @@ def test_run_without_its_last_client_ends_after_timeout(config, join, unhurried)
         Results().take_all(source, queue)
 
 
+@pytest.mark.slow
 def test_client_for_which_there_is_no_place_is_refused(config, join):
     queue, ours = EpisodeQueue(80), [join("--instance", "1")]
     config = dataclasses.replace(config, max_clients=1)
@@ -155,6 +157,7 @@ def test_client_for_which_there_is_no_place_is_refused(config, join):
         assert process.returncode == 1
 
 
+@pytest.mark.slow
 def test_guest_that_fails_to_start_does_not_end_the_run(config, join, said, tmp_path):
     script = tmp_path / "guests.py"
     script.write_text(
@@ -192,6 +195,7 @@ def test_client_that_runs_too_long_an_episode_is_ended(said, nothing_stays_behin
     assert sorted(results.rows) == [number for number in range(12) if number != 3]
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", ["sleeps long", "is busy long"])
 def test_long_step_of_an_episode_is_no_silence(kind, unhurried, nothing_stays_behind):
     timeout = unhurried(1.0)

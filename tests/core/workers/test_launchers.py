@@ -186,6 +186,7 @@ def test_run_reports_what_a_queued_client_waits_for(clients):
         pass
 
 
+@pytest.mark.slow
 def test_timeout_of_queued_client_starts_when_it_runs(clients, caplog):
     settings = {"launcher": IdleLauncher, "launcher_kwargs": {"queued": 6.0}, "timeout": 0.5}
     began = time.monotonic()

@@ -100,6 +100,7 @@ def test_manual_client_replaces_one_that_left(local, by_hand, join, caplog):
     assert "The run waits up to 20 s for another client to take its place" in text
 
 
+@pytest.mark.slow
 def test_missing_manual_client_ends_run_after_timeout(by_hand, join, unhurried):
     client, timeout = join(), unhurried(2.0)
     assert "connecting to the server" in client.stdout.readline()

@@ -40,6 +40,7 @@ def test_environment_variables_of_client_process(clients, services, monkeypatch)
         assert services.kept[1]["threads"] == "2"
 
 
+@pytest.mark.slow
 def test_the_token_is_not_on_the_command_line():
     process = ClientProcess(1, "127.0.0.1:1", "very secret token")
     process.start()

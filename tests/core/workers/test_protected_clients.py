@@ -141,6 +141,7 @@ class Between:
 # What can be read on the way ------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_tls_hides_token_and_rows_from_eavesdropper(local, clients, here, port, join):
     settings = {"num_clients": 1, "env_kwargs": {"pace": 0.0, "asks": True}}
     with local(WANDERER, **settings) as source:

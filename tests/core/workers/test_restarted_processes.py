@@ -24,6 +24,7 @@ def batch_services(services):
     return services
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("fault", "place"), [("kill", "step"), ("stop", "step"), ("disconnect", "prediction")]
 )
@@ -40,6 +41,7 @@ def test_a_process_that_breaks_is_started_again(
     assert len([*Path().glob("started-*")]) == 2 + 3
 
 
+@pytest.mark.slow
 def test_a_pipeline_stores_the_same_rows_whatever_happens(nothing_stays_behind):
     """With three clients and delays by chance, one of them killed in the last run."""
     sums = set()
@@ -64,6 +66,7 @@ def test_a_pipeline_stores_the_same_rows_whatever_happens(nothing_stays_behind):
     assert len(sums) == 1
 
 
+@pytest.mark.slow
 def test_a_stream_ends_though_each_of_its_processes_makes_few_rows(nothing_stays_behind):
     found = []
     for life in (0, 12):

@@ -67,6 +67,7 @@ def local(environment, **options):
     return LocalSource(EnvironmentConfig(environment, num_clients=2, **options), Services(), SEED)
 
 
+@pytest.mark.slow
 @settings(max_examples=size(30, 4))
 @given(drawn, rooms)
 def test_rows_are_the_same_in_any_order_of_events(program, choose, room):

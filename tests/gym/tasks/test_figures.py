@@ -88,6 +88,7 @@ def with_pd(base, **options):
     return ControlledEnv(base, PDController("pd", base, **options))
 
 
+@pytest.mark.slow
 def test_standing_for_9_s():
     env = with_pd(a1(Exact, step_dt=0.05), kp=200.0, kd=0.02)
     env.reset(seed=0)

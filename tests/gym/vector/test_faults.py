@@ -88,6 +88,7 @@ def test_a_process_that_dies_between_two_steps_is_noticed_by_the_next(nothing_st
                 vector.step(actions())
 
 
+@pytest.mark.slow
 def test_a_step_that_takes_too_long_is_named_with_its_place(nothing_stays_behind):
     with vectors(timeout=3) as vector:
         for _ in range(3):  # each is short enough

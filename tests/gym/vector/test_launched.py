@@ -126,6 +126,7 @@ def test_an_unknown_launcher_is_named(nothing_stays_behind):
         ParallelVectorEnv("CartPole-v1", 2, launcher="physx/subproces")
 
 
+@pytest.mark.slow
 def test_one_that_dies_is_started_again_and_goes_on(nothing_stays_behind):
     draw = random.Random(1)
     with vectors(retries=3) as vector, vectors(launcher=None) as shared:

@@ -15,7 +15,7 @@ from physx_gym import RobotEnv, Simulator, replay
 from physx_gym.cli import log as log_command
 from physx_gym.errors import LogError
 from physx_gym.telemetry.log_file import read_log
-from physx_sim import Ground, Robot, World
+from physx_sim import BodySettings, Box, Ground, Robot, World
 from physx_sim.errors import SimulationError
 
 
@@ -144,6 +144,50 @@ def test_a_command_replays_with_ghosts(paths, tmp_path, capsys):
     log_command.run([*words, "--columns", "motor.torque", "--trajectories", "torso"])
     assert f"recording: {path}" in capsys.readouterr().out
     assert path.stat().st_size > 1000
+
+
+class Hall(Chase):
+    """A door that moves and a crate that is hidden after half of the episode."""
+
+    def __init__(self):
+        door = Box(name="door", size=(0.1, 1.0, 1.0), static=True, position=(2.0, 0.0, 0.5))
+        crate = Box(name="crate", size=(0.2, 0.2, 0.2), position=(0.0, 3.0, 0.1))
+        robots = [Robot("ant", fixed_base=False)]
+        world = World(robots, period=5e-3, ground=Ground(), objects=[door, crate])
+        RobotEnv.__init__(self, Simulator(world, sensors=()), 0.05)
+        self.target = np.zeros(3)
+
+    def _initialize_buffers(self):
+        self.simulator.simulation.set_body("door", BodySettings(velocity=(0.0, 1.0, 0.0)))
+
+    def _refresh_buffers(self):
+        if self.num_steps == 10:
+            self.simulator.simulation.set_body("crate", BodySettings(hidden=True))
+
+
+def test_objects_that_moved_or_were_hidden_are_so_in_the_replay(tmp_path):
+    with Hall() as env:
+        env.eval()
+        env.reset(seed=0, options={"log_path": tmp_path / "hall.h5"})
+        for _ in range(20):
+            env.step(env.action_space.sample())
+        env.stop()
+    replay(tmp_path / "hall.h5", path=tmp_path / "hall.rrd", visualizer=Witness)
+    times, places = zip(
+        *((time, values["position"][1]) for time, values in Witness.updates["door"]), strict=True
+    )
+    np.testing.assert_allclose(places, times, atol=0.06)
+    assert places[-1] == pytest.approx(1.0, abs=0.06)
+    seen = [time for time, values in Witness.updates["crate"] if values.get("visible") is False]
+    assert seen and seen[0] == pytest.approx(0.5, abs=0.06)
+
+
+@pytest.mark.parametrize("moved", [[1], [[0.0, "nothing", [], True]], [[0.0, "ground", [1], True]]])
+def test_moved_objects_that_cannot_be_read_are_an_error_of_the_log(paths, moved):
+    log = read_log(paths[0])
+    damaged = dataclasses.replace(log, constants={**log.constants, "scene": {"moved": moved}})
+    with pytest.raises(LogError, match="moved objects"):
+        replay(damaged, path="unused.rrd", visualizer=Witness)
 
 
 def test_contacts_and_scenes_go_through_files_and_restored_states(tmp_path):

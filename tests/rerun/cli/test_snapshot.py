@@ -36,6 +36,7 @@ def orange(path):
     return np.nonzero(red - blue > 60)[1].mean()
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("vulkan")
 def test_a_picture_at_a_step_or_a_time_or_the_end(session, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)

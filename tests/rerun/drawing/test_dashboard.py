@@ -150,6 +150,7 @@ def test_a_note_is_in_the_recording(opened, read):
     assert rows == [(3, ["The training stopped early."])]
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("vulkan")
 def test_the_picture_can_be_read(opened, tmp_path):
     """Each cell shows its curves, bars and points; nothing is a solid block."""

@@ -52,6 +52,7 @@ def test_picture_of_two_times(recording, tmp_path):
     assert (first != last).any(axis=2).mean() > 0.005
 
 
+@pytest.mark.slow
 @pytest.mark.usefixtures("vulkan")
 def test_a_film_goes_from_the_beginning_to_the_end(recording, tmp_path):
     before, size = children(), (320, 200)

@@ -105,6 +105,7 @@ def test_a_door_opens_and_pushes(engine):
         assert simulation.positions()[1] > 0.1
 
 
+@pytest.mark.slow
 def test_a_table_turns_what_stands_on_it(engine):
     table = Cylinder(name="table", radius=0.5, length=0.1, static=True, position=(0, 0, -0.05))
     with engine.build(World(objects=[crate(position=(0.2, 0, 0.1)), table])) as simulation:

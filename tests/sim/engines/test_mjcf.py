@@ -6,11 +6,13 @@ import sys
 import warnings
 from pathlib import Path
 
+import gymnasium
+import mujoco
 import numpy as np
 import pytest
+from compiled import Compiled, states, without_friction
 
 from physx_core import plugins
-from physx_core.rotations import to_matrix
 from physx_sim import Ground, JointSettings, Robot, World, mjcf_robots
 from physx_sim.engines import read_robot
 from physx_sim.errors import ModelError
@@ -19,9 +21,6 @@ pytestmark = [
     pytest.mark.processes,
     pytest.mark.filterwarnings("ignore:.*leaves out"),
 ]
-
-mujoco = pytest.importorskip("mujoco")
-gymnasium = pytest.importorskip("gymnasium")
 
 ASSETS = Path(gymnasium.__file__).parent / "envs/mujoco/assets"
 ENGINES = ("dart", "pinocchio", "mujoco")
@@ -70,90 +69,15 @@ def odd(tmp_path):
     return path
 
 
-def states(layout, rng):
-    """Return random positions, velocities and torques."""
-    q = rng.uniform(-1, 1, layout.nq)
-    for part in layout.parts.values():
-        if part.floating:
-            turn = q[part.positions][3:7]
-            turn /= np.linalg.norm(turn)
-    return q, *rng.uniform(-1, 1, (2, layout.nv))
-
-
-class Theirs:
-    """A file in MuJoCo itself, without what no engine of physx has."""
-
-    def __init__(self, path, layout):
-        self.model = mujoco.MjModel.from_xml_path(str(path))
-        self.model.opt.density = self.model.opt.viscosity = 0.0
-        self.model.opt.gravity[:] = 0.0, 0.0, -9.81
-        self.model.dof_frictionloss[:] = 0.0
-        self.data, self.layout = mujoco.MjData(self.model), layout
-        at = [self.model.joint(name.rpartition("/")[2]) for name in layout.joints]
-        self.q, self.v = ([int(getattr(j, a)[0]) for j in at] for a in ("qposadr", "dofadr"))
-        bases = [j for j in range(self.model.njnt) if self.model.jnt_type[j] == 0]
-        self.bases = [(self.model.jnt_qposadr[j], self.model.jnt_dofadr[j]) for j in bases]
-        self.floating = [part for part in layout.parts.values() if part.floating]
-
-    def set(self, q, v, tau):
-        data, layout = self.data, self.layout
-        data.qpos[self.q] = q[list(layout.position_index.values())]
-        ours = list(layout.velocity_index.values())
-        data.qvel[self.v], data.qfrc_applied[self.v] = v[ours], tau[ours]
-        for (x, y), part in zip(self.bases, self.floating, strict=True):
-            pose, twist, wrench = q[part.positions], v[part.velocities], tau[part.velocities]
-            turn = to_matrix(pose[3:7])
-            data.qpos[x : x + 7] = pose[[0, 1, 2, 6, 3, 4, 5]]
-            data.qvel[y : y + 6] = *(turn @ twist[:3]), *twist[3:6]
-            data.qfrc_applied[y : y + 6] = *(turn @ wrench[:3]), *wrench[3:6]
-        mujoco.mj_forward(self.model, data)
-
-    def accelerations(self, q, v, tau):
-        """Return what physx's forward dynamics is."""
-        self.set(q, v, tau)
-        found = np.zeros(self.layout.nv)
-        found[list(self.layout.velocity_index.values())] = self.data.qacc_smooth[self.v]
-        for (_, y), part in zip(self.bases, self.floating, strict=True):
-            a, twist = self.data.qacc_smooth[y : y + 6], v[part.velocities]
-            linear = a[:3] @ to_matrix(q[part.positions][3:7]) - np.cross(twist[3:6], twist[:3])
-            found[part.velocities][:6] = *linear, *a[3:]
-        return found
-
-    def masses(self):
-        """Return the mass matrix of the joints, after `set`."""
-        found = np.zeros((self.model.nv, self.model.nv))
-        mujoco.mj_fullM(self.model, self.data, found)
-        return found[np.ix_(self.v, self.v)]
-
-    def poses(self, names):
-        """Return the poses of bodies, with quaternions x, y, z, w, after `set`."""
-        found = []
-        for name in names:
-            body = self.data.body(name)
-            w, *xyz = body.xquat * (1 if body.xquat[0] >= 0 else -1)
-            found.append([*body.xpos, *xyz, w])
-        return np.array(found)
-
-
 def check_close(found, expected, bound):
     assert np.abs(found - expected).max() <= bound * max(np.abs(expected).max(), 1.0)
-
-
-def without_friction(robots):
-    """Return robots without friction in their joints, which MuJoCo's smooth dynamics lack."""
-    found = []
-    for robot in robots:
-        names = [joint.name for joint in read_robot(robot).joints]
-        joints = {name: JointSettings(friction=0.0) for name in names}
-        found.append(Robot(**{**vars(robot), "joints": joints}))
-    return found
 
 
 def compare(path, engine):
     robots = without_friction(mjcf_robots(path, collisions="none"))
     with plugins.resolve("backend", engine).build(World(robots)) as simulation:
         layout, rng = simulation.layout, np.random.default_rng(0)
-        theirs = Theirs(path, layout)
+        theirs = Compiled(path, layout)
         named = [name for name in layout.bodies if name.rpartition("/")[2] in path.read_text()]
         named = [name for name in named if "." not in name and "world" not in name]
         for _ in range(3):
@@ -254,6 +178,45 @@ def test_a_mesh_collides_where_mujoco_has_it(tmp_path):
     assert shape.mesh == tmp_path / "shapes/wedge.obj"
 
 
+def test_what_is_fixed_to_the_world_is_there_beside_a_floating_tree(engine, tmp_path):
+    path = tmp_path / "step.xml"
+    path.write_text(
+        '<mujoco><worldbody><geom type="box" size="1 1 0.1"/><body name="ball" pos="0 0 1">'
+        '<freejoint/><geom size="0.1"/></body></worldbody></mujoco>',
+        encoding="utf-8",
+    )
+    step, ball = mjcf_robots(path)
+    assert (step.root, ball.root) == ("world", "ball")
+    with engine.build(World([step, ball])) as simulation:
+        simulation.step(2000)
+        assert simulation.body_poses(["ball/ball"])[0, 2] == pytest.approx(0.2, abs=1e-3)
+    with engine.build(World([Robot(path, fixed_base=False)])) as simulation:
+        assert simulation.layout.bodies == ("ball",)
+
+
+@pytest.mark.parametrize("engine", ["dart", "pinocchio", "mujoco"])
+def test_meshes_in_the_format_of_mujoco_are_read(tmp_path, engine):
+    corners = np.array([(-1, -1, -1), (1, -1, -1), (0, 1, -1), (0, 0, 2)], "<f4")
+    faces = np.array([(0, 2, 1), (0, 1, 3), (1, 2, 3), (2, 0, 3)], "<i4")
+    header = np.array([4, 0, 4, 4], "<i4")
+    content = b"".join(x.tobytes() for x in (header, corners, np.zeros((4, 2), "<f4"), faces))
+    (tmp_path / "wedge.msh").write_bytes(content)
+    path = tmp_path / "wedge.xml"
+    path.write_text(
+        '<mujoco><asset><mesh file="wedge.msh" scale=".1 .1 .1"/></asset><worldbody><body>'
+        '<freejoint/><geom type="mesh" mesh="wedge"/></body></worldbody></mujoco>',
+        encoding="utf-8",
+    )
+    collisions = "boxes" if engine == "pinocchio" else "shapes"
+    robot = Robot(path, fixed_base=False, collisions=collisions)
+    with plugins.resolve("backend", engine).build(World([robot], ground=Ground())) as simulation:
+        up, down = (simulation.reach("robot", np.array([0, 0, z])) for z in (1.0, -1.0))
+        assert up + down == pytest.approx(0.3, rel=1e-6)
+    (tmp_path / "wedge.msh").write_bytes(content[:-4])
+    with pytest.raises(ModelError, match="wedge.msh"):
+        read_robot(robot, touching=True)
+
+
 def test_what_is_left_out_is_named_once(tmp_path):
     path = tmp_path / "rich.xml"
     path.write_text(
@@ -271,8 +234,8 @@ def test_what_is_left_out_is_named_once(tmp_path):
     (text,) = [str(each.message) for each in caught]
     for part in (
         *('Robot "rich"', "actuators (1: command", "tendons (1", "equality constraints (1"),
-        *("the fluid", "gravity=(0.0, 0.0, -1.6)", "rolling friction", "ellipsoids"),
-        *("the friction of geoms", "fixed to the world (World(ground=", "fixed_base=False lets"),
+        *("the fluid", "gravity=(0.0, 0.0, -1.6)", "ellipsoids"),
+        *("fixed to the world (World(ground=", "fixed_base=False lets"),
     ):
         assert part in text
 
@@ -344,7 +307,6 @@ EQUALITIES = """
 
 @pytest.mark.filterwarnings("ignore:.*leaves out")
 def test_equality_constraints_hold_as_in_mujoco(engine, tmp_path):
-    mujoco = pytest.importorskip("mujoco")
     path = tmp_path / "equalities.xml"
     path.write_text(EQUALITIES)
     model = mujoco.MjModel.from_xml_path(str(path))

@@ -13,6 +13,7 @@ from physx_core import (
     NetworkConfig,
     Prediction,
     Training,
+    View,
 )
 from physx_core.errors import FieldsMismatchError
 from physx_core.pipelines.learning.learner import load_learner
@@ -88,6 +89,22 @@ def test_graph_network_learns_resumes_and_predicts_in_the_loop(tmp_path):
         assert len(rows["x"]) == 6
         for x, u in zip(rows["x"], rows["predicted_u"], strict=True):
             assert len(x) == len(u)
+
+
+def test_graph_network_learns_from_all_rows_of_a_window_at_once(tmp_path):
+    data = generate(tmp_path, "data")
+    windows = {f"{name}s": (name, [0, 1]) for name in ("x", "edge", "load", "u")}
+    net = network(nodes=3, net_fields=["xs", "edges", "loads"], opt_fields="us")
+    run = Training(
+        net, DatasetConfig(existing_dir=str(data), view=View(window=windows)), epoch_nb=2,
+        batch_size=4, seed=1, session_dir=str(tmp_path), session_name="net", quiet=True,
+    )  # fmt: skip
+    assert run.execute().parts["validation"].fields["us"].errors["rmse"] > 0
+    two = {
+        "xs": [np.array([[0.1], [0.7], [0.2], [0.5]])], "edges": [np.array([[0, 1], [2, 3]])],
+        "loads": np.ones((1, 2)),
+    }  # fmt: skip
+    assert load_learner(tmp_path / "net").predict(two)["us"][0].shape == (4,)
 
 
 def test_a_prediction_does_not_depend_on_the_other_graphs_of_a_batch(tmp_path):

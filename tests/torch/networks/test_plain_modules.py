@@ -125,6 +125,7 @@ def test_the_seed_decides_its_first_parameters(tmp_path, monkeypatch):
     assert torch.equal(found[0], found[1]) and not torch.equal(found[0], found[2])
 
 
+@pytest.mark.slow
 def test_the_checkpoint_of_a_scripts_class_is_restored_in_a_new_process(tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     rng = np.random.default_rng(0)

@@ -72,6 +72,7 @@ def observer(tmp_path):
     observer.close()
 
 
+@pytest.mark.slow
 def test_numbers_and_histograms(observer, folder):
     for step in (1, 2):
         observer.scalars({"loss/batch": step / 2}, step, "batch")

@@ -172,7 +172,9 @@ class Batches(Closeable):
     def _choose(self, names: Sequence[str] | None, dtype: DTypeLike | None, *, reuse: bool) -> None:
         """Choose what a batch contains."""
         stored = self._sources[0].rows.fields
-        added = packed_fields(free_axes(stored.values()))
+        several = [window for window in self.view.windows.values() if not window.is_single]
+        steps = {axis: len(w.at) for w in several for axis in self._axes_of(w).values()}
+        added = packed_fields([*free_axes(stored.values()), *steps], steps)
         wanted = list(names or self.view.windows or stored)
         self._names = [name for name in wanted if name in stored or name not in added]
         self._all_names = None if names is None else list(names)
@@ -185,7 +187,12 @@ class Batches(Closeable):
         self._kinds = {n: field.converted_dtype(self._dtype) for n, field in self.fields.items()}
         kinds = {n: (field.row_kind[0], self._kinds[n]) for n, field in self.fields.items()}
         self._axes = free_axes(self.fields.values())
-        self.fields |= packed_fields(self._axes)
+        self._steps = {
+            self.fields[name].free_axis: len(window.at)
+            for name, window in self._windows.items()
+            if self.fields[name].free_axis and not window.is_single
+        }
+        self.fields |= packed_fields(self._axes, self._steps)
         self._scratch = Scratch() if self._axes and reuse else None
         self._arrays = BatchArrays({} if self._axes else kinds, self.batch_size, reuse=reuse)
 
@@ -224,19 +231,36 @@ class Batches(Closeable):
                 {window.field: stored},
             )
         of_window = () if window.is_single else (len(window.at),)
-        if of_window and stored.free_axis:
-            raise ConfigError(
-                f'The window "{name}" has several rows of "{stored.name}", whose axis '
-                f'"{stored.free_axis}" may have another size in each: give each its own window.'
-            )
         like = stored.name if stored.name != name else stored.like
-        axes = ("time", *stored.axes) if stored.axes and of_window else stored.axes
+        shape, axes, indexes = stored.shape or (), stored.axes, stored.indexes
+        if of_window:
+            own = self._axes_of(window)
+            indexes = own.get(indexes, indexes)
+            if stored.free_axis:
+                shape = own[stored.free_axis], *shape[1:]
+                axes = (shape[0], *axes[1:]) if axes else ()
+            else:
+                shape, axes = (*of_window, *shape), (("time", *axes) if axes else ())
         axes = axes if len(set(axes)) == len(axes) else ()
-        shape = (*of_window, *(stored.shape or ()))
-        found = {name: replace(stored, name=name, shape=shape, axes=axes, like=like)}
+        of = replace(stored, name=name, shape=shape, axes=axes, like=like, indexes=indexes)
+        found = {name: of}
         if self.view.edges == "pad" and name in self.view.windows:
             found[name + PAD] = Field(name + PAD, of_window, "bool", role="additional")
         return found
+
+    def _axes_of(self, window: Window) -> dict[str, str]:
+        """Return the free axes of the rows of a window, by that of each row.
+
+        Windows with the same offsets share them; they have the name of the first of these.
+        """
+        stored = self._sources[0].rows.fields
+        same = {
+            name: stored[other.field].free_axis
+            for name, other in self.view.windows.items()
+            if other.at == window.at and not other.is_single and other.field in stored
+        }
+        first = next((name for name, axis in same.items() if axis), "")
+        return {axis: f"{first}_{axis}" for axis in same.values() if axis}
 
     # Batches --------------------------------------------------------------------------------
 
@@ -291,10 +315,10 @@ class Batches(Closeable):
         for name, values in rows.items():
             field = self.fields[name]
             if field.free_axis:
-                values, counts = join(field, values.tolist())
+                values, counts = join(field, values.ravel().tolist())
                 self._check_sizes(name, counts, sizes)
             found[name] = values.astype(self._kinds[name], copy=False)
-        return pack(self.fields, found, sizes, self._named)
+        return pack(self.fields, found, sizes, self._named, steps=self._steps)
 
     def _pack(self, source: Source, where: Located) -> Batch:
         """Return some items of a source as a batch in which free axes are packed."""
@@ -303,14 +327,16 @@ class Batches(Closeable):
         scratch = self._scratch
         for name, window in self._windows.items():
             if name not in fixed:
-                if where.rows is not None:
+                if where.rows is not None and len(window.at) == 1:
                     rows = where.rows + window.at[0]
                 else:
-                    rows = source.items.rows(where.items, window.at)[:, 0]
+                    rows = source.items.rows(where.items, window.at).ravel()
                 allocate = np.empty if scratch is None else partial(scratch.take, name)
                 found[name], counts = source.rows.entries(window.field, rows, self._dtype, allocate)
                 self._check_sizes(name, counts, sizes)
-        return pack(self.fields, {n: found[n] for n in self._kinds}, sizes, self._named, scratch)
+                found |= self._padding(source, where, name)
+        found = {name: found[name] for name in self._kinds}
+        return pack(self.fields, found, sizes, self._named, scratch, self._steps)
 
     def _check_sizes(self, name: str, counts: Index, sizes: dict[str, Index]) -> None:
         """Check that fields that share a free axis have the same sizes in a batch."""
@@ -486,10 +512,16 @@ class Batches(Closeable):
             if not self.fields[name].free_axis:
                 values = values.astype(self._kinds[name], copy=False)
             found[name] = values
-            if name + PAD in self.fields:
-                padded = source.items.are_padded(where.items, window.at)
-                found[name + PAD] = padded[:, 0] if window.is_single else padded
+            found |= self._padding(source, where, name)
         return found
+
+    def _padding(self, source: Source, where: Located, name: str) -> Batch:
+        """Return which values of a window are repeated, if it may have some."""
+        if name + PAD not in self.fields:
+            return {}
+        window = self._windows[name]
+        padded = source.items.are_padded(where.items, window.at)
+        return {name + PAD: padded[:, 0] if window.is_single else padded}
 
     # What it is ---------------------------------------------------------------------------------
 

@@ -35,7 +35,8 @@ class ViewOptions:
     """Windows by name: the stored field and the offsets in rows, in Python
     ``{"past": ("state", [-2, -1, 0])}``, in TOML ``window.past = {field = "state", at = [-2, 0]}``.
     A window never reaches into another trajectory. With a single number instead of a list, the
-    values get no axis for it. Fields without a window are taken at offset 0."""
+    values get no axis for it. Fields without a window are taken at offset 0. The entries of free
+    axes are end to end, also those of the rows of a window: see `physx_core.packing.pack`."""
     stride: int = at_least(1, 1)
     """Number of rows between the reference rows of consecutive windows of a trajectory."""
     edges: str = field(default="inside", metadata={"choices": ("inside", "pad")})

@@ -86,6 +86,9 @@ class DartSimulation(RobotSimulation[DartRobot]):
     """A world in DART."""
 
     engine = "dart"
+    lacks: ClassVar[frozenset[str]] = frozenset(
+        {"cameras", "step_derivatives", "torsional_friction"}
+    )
     caveats: ClassVar[Mapping[str, str]] = {
         "armature": "impulses of contacts, limits and servos do not know it: a warning",
         "exact_restore": "not with the detector `dart` and an iterative solver",
@@ -143,6 +146,9 @@ class DartSimulation(RobotSimulation[DartRobot]):
         if parts.world.integrator == "rk4":
             check_rk4(parts, self.engine, features)
         shapes = [shape for each in parts.movables for shape in each.model.shapes]
+        if parts.turning and parts.world.contacts != "none":
+            advice = "Robot(torsional_friction=0.0, rolling_friction=0.0) leaves out a file's."
+            raise FeatureNotSupportedError(self.engine, "torsional_friction", features, advice)
         shapes += [each.what for each in parts.statics if isinstance(each.what, CollisionShape)]
         if detector == "fcl" and any(shape.kind == "capsule" for shape in shapes):
             advice = "Use another detector."

@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import itertools
 from collections.abc import Callable, Sequence
-from typing import Any
+from dataclasses import dataclass
 
 import numpy as np
 
-from physx_core.typing import Vector
+from physx_core.typing import Index, Vector
 from physx_dart.pinocchio.contact_problem import unit
-from physx_dart.pinocchio.contacts import ContactPoints, Indices
+from physx_dart.pinocchio.contacts import ContactPoints, Indices, Spins, joined, together
 from physx_dart.pinocchio.limits import JointConstraints, solve
 from physx_dart.pinocchio.solver import ImpulseSolver
 
@@ -37,6 +37,39 @@ class Warmth:
         self.rows.fill(0.0)
 
 
+@dataclass(eq=False, slots=True)
+class Solved:
+    """What a step solved: impulses along rows, of contact points, then joints, then ties.
+
+    Attributes:
+        parts: Constraints of the robots; their velocities, one after the other, are the columns.
+        inverse: Inverse of their mass matrix, shape (nv, nv).
+        along: Jacobian of the rows, shape (n, nv).
+        spread: Velocities for unit impulses, shape (nv, n).
+        response: Velocities along the rows for unit impulses, shape (n, n).
+        free: Velocities along the rows without impulses minus the target ones, shape (n,).
+        friction: Coefficients of the points, shape (k,).
+        least: Smallest impulses of the other rows, shape (n - 3 k,).
+        most: Largest impulses of these rows, in the same form.
+        impulses: The solution, shape (n,).
+        rows: Which rows of the joints acted, as indices into those of all parts.
+        pace: Target velocities of the ties.
+    """
+
+    parts: Sequence[Constraints]
+    inverse: Vector
+    along: Vector
+    spread: Vector
+    response: Vector
+    free: Vector
+    friction: Vector
+    least: Vector
+    most: Vector
+    impulses: Vector
+    rows: Indices
+    pace: Vector
+
+
 class Constraints:
     """The constraints of one robot or object in a step.
 
@@ -47,6 +80,7 @@ class Constraints:
         acts: Which rows of the joints act, shape (rows,).
         impulses: Impulses of the touching points along their axes, shape (k, 3), once known.
         nv: Length of its velocities.
+        solved: What was solved, once it is, together with other robots that touch it.
     """
 
     def __init__(
@@ -80,6 +114,7 @@ class Constraints:
         self.acts = joints.acting(self._bounds, velocities, _REACH if touched else 0.0)
         self.nv = joints.base + len(velocities)
         self.impulses = np.zeros((0, 3))
+        self.solved: Solved | None = None
 
     def aims(self) -> Vector:
         """Return the target velocities of all rows, shape (rows,)."""
@@ -121,10 +156,16 @@ def limited(part: Constraints, v: Vector) -> Vector:
     part.clear_warm_start()
     if not len(rows):
         return v
-    column = joints.columns[rows]
-    spread = part.inverse().take(column, 1)
-    change = part.aims()[rows] - v[column]
-    return v + spread.dot(solve(spread[column], change, joints.least[rows], joints.most[rows]))
+    column, least, most = joints.columns[rows], joints.least[rows], joints.most[rows]
+    inverse = part.inverse()
+    spread = inverse.take(column, 1)
+    response, change = spread[column], part.aims()[rows] - v[column]
+    impulses, along = solve(response, change, least, most), unit(len(v)).take(column, 0)
+    none = change[:0]
+    part.solved = Solved(
+        [part], inverse, along, spread, response, -change, none, least, most, impulses, rows, none
+    )
+    return v + spread.dot(impulses)
 
 
 def constrained(
@@ -158,12 +199,13 @@ def constrained(
         if part.touching is not None:
             touching.append(part.touching.widened(span, len(v)))
         guess.append(part.last())
-    held, pace = (np.zeros((0, len(v))), np.zeros(0)) if ties is None else ties
-    points = joined([each.jacobian for each in touching]) if touching else held[:0]
-    bias = joined([each.bias(before, period) for each in touching]) if touching else pace[:0]
-    friction = joined([each.friction for each in touching]) if touching else pace[:0]
+    points = joined([each.jacobian for each in touching]) if touching else np.zeros((0, len(v)))
+    bias = joined([each.bias(before, period) for each in touching]) if touching else v[:0]
+    friction = joined([each.friction for each in touching]) if touching else v[:0]
     of_parts = zip(*(part.rows() for part in parts), strict=True)
     columns, least, most, aims, last = (joined(each) for each in of_parts)
+    spins = together(touching)
+    more, fixed, endless, turning = _last_rows(ties, spins, len(v))
     if len(parts) > 1:
         starts, counts = [span.start for span in spans], [len(part.acts) for part in parts]
         columns = columns + np.repeat(starts, counts)
@@ -176,30 +218,61 @@ def constrained(
         jacobian = [points, unit(len(v)).take(columns[rows], 0)]
         targets, low, high = [bias, -aims[rows]], least[rows], most[rows]
         begin = [*guess, last[rows]]
-        if len(pace):
-            jacobian.append(held)
-            targets.append(-pace)
-            begin.append(np.zeros(len(pace)))
-            low = np.concatenate([low, np.full(len(pace), -np.inf)])
-            high = np.concatenate([high, np.full(len(pace), np.inf)])
+        if len(fixed):
+            jacobian.append(more)
+            targets.append(fixed)
+            begin.append(np.zeros(len(fixed)))
+            low, high = np.concatenate([low, -endless]), np.concatenate([high, endless])
         along = np.concatenate(jacobian)
         spread = inverse.dot(along.T)
         response, free = along.dot(spread), along.dot(v) + np.concatenate(targets)
         if len(bias):
-            impulses = solver.solve(response, free, friction, low, high, np.concatenate(begin))
+            first = np.concatenate(begin)
+            impulses = solver.solve(response, free, friction, low, high, first, turning)
         else:
             impulses = solve(response, -free, low, high)
         after = v + spread.dot(impulses)
         missed = False
         for part, span in zip(parts, spans, strict=True):
             missed |= part.add_missed(after[span])
+    solved = Solved(
+        parts,
+        *(inverse, along, spread, response, free, friction, low, high, impulses, rows),
+        v[:0] if ties is None else ties[1],
+    )
     of_rows = np.zeros(len(columns))
     of_rows[rows] = impulses[len(bias) : len(bias) + len(rows)]
-    of_pairs, *of_points = np.split(impulses[: len(bias)], np.cumsum([len(each) for each in guess]))
-    of_joints = np.split(of_rows, np.cumsum([len(part.acts) for part in parts]))
-    for part, *own in zip(parts, of_points, of_joints, strict=False):
-        part.keep(*own)
-    return after, of_pairs.reshape(-1, 3)
+    _keep_turning(touching, impulses)
+    point = ahead = len(guess[0])
+    row = 0
+    for part, warmed in zip(parts, guess[1:], strict=True):
+        end, last_row = point + len(warmed), row + len(part.acts)
+        part.keep(impulses[point:end], of_rows[row:last_row])
+        part.solved = solved
+        point, row = end, last_row
+    return after, impulses[:ahead].reshape(-1, 3)
+
+
+def _last_rows(
+    ties: tuple[Vector, Vector] | None, spins: Spins | None, width: int
+) -> tuple[Vector, Vector, Vector, tuple[Index, Vector] | None]:
+    """Return Jacobian, velocities and bounds of the last rows, and what resists turning."""
+    held, pace = (np.zeros((0, width)), np.zeros(0)) if ties is None else ties
+    endless = np.full(len(pace), np.inf)
+    if spins is None:
+        return held, -pace, endless, None
+    jacobian = np.concatenate([held, spins.jacobian])
+    targets = -np.concatenate([pace, spins.drift])
+    return jacobian, targets, endless, (spins.points, spins.bounds)
+
+
+def _keep_turning(touching: Sequence[ContactPoints], impulses: Vector) -> None:
+    """Store angular impulses, the last of all, where the points can be read."""
+    for each in reversed(touching):
+        if each.spins is not None:
+            first = len(impulses) - len(each.spins.drift)
+            each.spins.impulses[:] = impulses[first:].reshape(-1, 3)
+            impulses = impulses[:first]
 
 
 def _diagonal(blocks: Sequence[Vector], spans: Sequence[slice]) -> Vector:
@@ -210,8 +283,3 @@ def _diagonal(blocks: Sequence[Vector], spans: Sequence[slice]) -> Vector:
     for block, span in zip(blocks, spans, strict=True):
         found[span, span] = block
     return found
-
-
-def joined(arrays: Sequence[Any]) -> Any:
-    """Concatenate arrays."""
-    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)

@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
+import copy
 import functools
 import math
+from collections.abc import Sequence
 
 import eigenpy
 import numpy as np
 
-from physx_core.typing import Vector
+from physx_core.typing import Index, Vector
 
 _REGULARIZATION = 1e-9
 """Relative regularization of the diagonal, as in DART's solver."""
@@ -22,17 +24,18 @@ class ContactProblem:
     """The problem of finding the impulses that prevent penetration and keep rows in their bounds.
 
     A point's impulse lies in its friction cone and opposes sliding (Coulomb's law); a row's impulse
-    lies within its bounds, and a row at neither bound has velocity 0. Such impulses are fixed
-    points of a step against the velocities followed by a projection onto the cones and bounds.
-    This equation is piecewise smooth: Newton's method solves it exactly once it has determined
-    which points stick, slide, or separate (P. Alart and A. Curnier, A mixed
-    formulation for frictional contact problems prone to Newton like solution methods, Computer
-    Methods in Applied Mechanics and Engineering 92, 1991).
+    lies within its bounds, and a row at neither bound has velocity 0. Points that resist turning
+    have two more such laws, for their angular impulses across and about the normal. Such impulses
+    are fixed points of a step against the velocities followed by a projection onto the cones and
+    bounds. This equation is piecewise smooth: Newton's method solves it exactly once it has
+    determined which points stick, slide, or separate (P. Alart and A. Curnier, A mixed formulation
+    for frictional contact problems prone to Newton like solution methods, Computer Methods in
+    Applied Mechanics and Engineering 92, 1991).
 
     Attributes:
-        matrix: Velocities for unit impulses, shape (3 k + m, 3 k + m).
-        free: Velocities without impulses minus the target ones, shape (3 k + m,): of k points along
-            two tangents and the normal, then of m rows.
+        matrix: Velocities for unit impulses, shape (n, n): n is 3 k + m, or 3 k + m + 3 s.
+        free: Velocities without impulses minus the target ones, shape (n,): of k points along two
+            tangents and the normal, of m rows, then of s points about these axes.
         friction: Coefficients of the points, shape (k,).
         least: Smallest impulses of the rows, shape (m,).
         most: Largest impulses of the rows, shape (m,).
@@ -40,12 +43,27 @@ class ContactProblem:
     """
 
     def __init__(
-        self, response: Vector, free: Vector, friction: Vector, least: Vector, most: Vector
+        self,
+        response: Vector,
+        free: Vector,
+        friction: Vector,
+        least: Vector,
+        most: Vector,
+        turning: tuple[Index, Vector] | None = None,
     ) -> None:
         """Set up the problem, with a diagonal that is slightly larger than that of `response`.
 
         A direction in which nothing can move, such as across a rail, gets no impulse, because any
         impulse would do.
+
+        Args:
+            response: The matrix before that.
+            free: As in the attribute.
+            friction: Likewise.
+            least: Likewise.
+            most: Likewise.
+            turning: Points that resist turning, as indices, and their largest angular impulses per
+                normal impulse across and about the normal, in m, shape (s, 2).
         """
         self.matrix = regularized(response)
         # Lists, because operations on short arrays take longer.
@@ -59,6 +77,12 @@ class ContactProblem:
         self.friction, self.least, self.most = friction, least, most
         for place in range(0, 3 * len(friction), 3):
             rates[place : place + 3] = [max(rates[place : place + 3])] * 3
+        self._turning: list[tuple[int, float, float]] = []
+        if turning is not None:
+            points, bounds = turning
+            self._turning = list(zip((3 * points + 2).tolist(), *bounds.T.tolist(), strict=True))
+            for place in range(len(free) - 3 * len(points), len(free), 3):
+                rates[place : place + 2] = [max(rates[place : place + 2])] * 2
         self._rates = np.array(rates)
         # A step against the velocities, scaled per row.
         self._unit, self._scaled = unit(len(free)), self.matrix / self._rates[:, None]
@@ -88,6 +112,23 @@ class ContactProblem:
                 break
             impulses = impulses + eigenpy.PartialPivLU(slope).solve(change)
         return best, least_error
+
+    def slope(self, impulses: Vector) -> Vector:
+        """Return the derivative of the solution by the free velocities, shape (n, n).
+
+        At a switch, as between sticking and sliding, it is that of one side.
+
+        Args:
+            impulses: The solution.
+        """
+        _, slope = self._project(impulses)
+        # The projection alone: at the same place, but as if impulses had no response.
+        alone, n = copy.copy(self), len(impulses)
+        alone._start = self._back.dot(impulses) + self._start - impulses
+        alone._back, alone._scaled = self._unit, np.zeros((n, n))
+        _, rest = alone._project(impulses)
+        found: Vector = eigenpy.PartialPivLU(slope).solve((rest - self._unit) / self._rates)
+        return found
 
     def _error(self, change: Vector) -> float:
         velocities = change * self._rates
@@ -123,7 +164,32 @@ class ContactProblem:
                 values[place] = least if value <= least else most
                 slope[place] = unit[place]
             place += 1
+        for normal, across, about in self._turning:
+            self._limit_turning(values, slope, place, normal, (across, about))
+            place += 3
         return np.array(values), slope
+
+    def _limit_turning(
+        self, values: list[float], slope: Vector, place: int, normal: int, bounds: Sequence[float]
+    ) -> None:
+        """Project the angular impulses of a point, from a row on, given its normal's row."""
+        across, about = (bound * values[normal] for bound in bounds)
+        unit, back = self._unit, self._back
+        x, y, z = values[place : place + 3]
+        if not across:
+            values[place : place + 2] = 0.0, 0.0
+            slope[place : place + 2] = unit[place : place + 2]
+        elif (size := math.hypot(x, y)) > across:
+            share, x, y = across / size, x / size, y / size
+            values[place], values[place + 1] = across * x, across * y
+            turn = np.array(((share * y * y, -share * x * y), (-share * x * y, share * x * x)))
+            rows = unit[place : place + 2] - turn.dot(back[place : place + 2])
+            slope[place : place + 2] = rows - bounds[0] * np.outer((x, y), back[normal])
+        if abs(z) >= about:
+            values[place + 2] = math.copysign(about, z)
+            slope[place + 2] = unit[place + 2]
+            if about:
+                slope[place + 2] -= math.copysign(bounds[1], z) * back[normal]
 
 
 def regularized(response: Vector) -> Vector:

@@ -17,9 +17,9 @@ from numpy.typing import NDArray
 from physx_core.typing import Records, Vector
 from physx_dart.pinocchio.models import twists_of
 from physx_dart.pinocchio.surfaces import Heights, Plane, surface_of
-from physx_sim import CONTACT, HeightField
+from physx_sim import CONTACT, Ground, HeightField, Stairs
 from physx_sim.engines import CollisionShape, MovableBody, Static
-from physx_sim.errors import FeatureNotSupportedError
+from physx_sim.errors import FeatureNotSupportedError, SimulationError
 
 MARGIN = 1e-4
 """Distance, in m, below which a point counts as touching."""
@@ -39,6 +39,45 @@ Indices = NDArray[np.intp]
 
 
 @dataclass(eq=False, slots=True)
+class Spins:
+    """Friction that acts against turning at contact points.
+
+    Attributes:
+        points: Which of the contact points have it, shape (s,).
+        bounds: Largest torques per normal force against rolling, and about the normal, in m, shape
+            (s, 2).
+        jacobian: Jacobian of the angular velocities along the axes of these points, shape
+            (3 s, nv).
+        drift: Angular velocities along the axes of what they touch, in rad/s, shape (3 s,).
+        impulses: Angular impulses on the first body along the axes, in N m s, shape (s, 3); filled
+            by the step, also where the points were widened.
+    """
+
+    points: Indices
+    bounds: Vector
+    jacobian: Vector
+    drift: Vector
+    impulses: Vector
+
+    @classmethod
+    def of(cls, bounds: Vector, axes: Vector, motions: Vector, moved: Vector) -> Spins | None:
+        """Return the friction against turning of points, or None.
+
+        Args:
+            bounds: For each point, as in `Spins`, shape (k, 2).
+            axes: Two tangents and the normal of each, shape (k, 3, 3).
+            motions: Twists for unit velocities, shape (6, nv).
+            moved: How much of each the points take part in, shape (k, nv).
+        """
+        rows = np.flatnonzero(bounds.any(axis=1))
+        if not len(rows):
+            return None
+        jacobian = axes[rows] @ motions[3:] * moved[rows, None]
+        flat = jacobian.reshape(3 * len(rows), -1)
+        return cls(rows, bounds[rows], flat, np.zeros(len(flat)), np.zeros((len(rows), 3)))
+
+
+@dataclass(eq=False, slots=True)
 class ContactPoints:
     """Points that touch, or may touch within the next step.
 
@@ -51,6 +90,7 @@ class ContactPoints:
         restitution: Coefficients of restitution, shape (k,).
         jacobian: Jacobian of the points along their axes, shape (3 k, nv).
         drift: Velocities along the axes of what they touch, in m/s, shape (3 k,); None: at rest.
+        spins: Friction against turning; None: nowhere.
     """
 
     numbers: Indices
@@ -61,14 +101,17 @@ class ContactPoints:
     restitution: Vector
     jacobian: Vector
     drift: Vector | None = None
+    spins: Spins | None = None
 
     def widened(self, span: slice, width: int) -> ContactPoints:
         """Return the points with a wider Jacobian, in which `span` holds their columns."""
         if self.jacobian.shape[1] == width:
             return self
-        wide = np.zeros((len(self.jacobian), width))
-        wide[:, span] = self.jacobian
-        return replace(self, jacobian=wide)
+        found = replace(self, jacobian=_widened(self.jacobian, span, width))
+        if self.spins is not None:
+            jacobian = _widened(self.spins.jacobian, span, width)
+            found.spins = replace(self.spins, jacobian=jacobian)
+        return found
 
     def records(self, body_a: Any, body_b: Any, impulses: Vector, period: float) -> Records:
         """Return the points as `CONTACT` records.
@@ -84,7 +127,16 @@ class ContactPoints:
         records["point"], records["normal"] = self.points, self.axes[:, 2]
         records["force"] = np.einsum("kij,ki->kj", self.axes, impulses / period)
         records["depth"] = np.maximum(-self.gaps, 0.0)
+        if self.spins is not None:
+            rows, impulses = self.spins.points, self.spins.impulses
+            records["torque"][rows] = np.einsum("kij,ki->kj", self.axes[rows], impulses / period)
         return records
+
+    def bias_slopes(self, period: float) -> Vector:
+        """Return the derivatives of the normal biases by the gaps, in 1/s, shape (k,)."""
+        gaps = self.gaps
+        returning = np.where(_RETURN * gaps > -_FASTEST_RETURN * period, _RETURN, 0.0)
+        return np.where(gaps > 0, 1.0, returning) / period
 
     def bias(self, before: Vector, period: float) -> Vector:
         """Return the velocity bias along the axes, shape (3 k,).
@@ -165,6 +217,10 @@ class ContactFinder:
         of_materials = np.array([(x.what.friction, x.what.restitution) for x in statics])
         of_shapes = np.array([(shape.friction, shape.restitution) for shape in shapes])
         first, second = of_materials.reshape(-1, 1, 2), of_shapes.reshape(1, -1, 2)
+        self._spins = spins_of(
+            np.array([turning_of(x.what) for x in statics]).reshape(-1, 1, 2),
+            np.array([turning_of(shape) for shape in shapes]).reshape(1, -1, 2),
+        )
         self._friction = np.minimum(first[:, :, 0], second[:, :, 0])
         self._restitution = first[:, :, 1] * second[:, :, 1]
         for number, (place, surface) in enumerate(self._surfaces):
@@ -195,6 +251,7 @@ class ContactFinder:
         spread = np.repeat(np.arange(len(anchors)), [1] * len(points) + [around] * len(rims))
         self._links = np.array([row[3] for row in anchors], np.intp)[spread]
         self._radii = np.array([row[2] for row in points] + [0.0] * (around * len(rims)))
+        self._joint_of = joints[spread]
         self._moved = np.repeat(moved[joints[spread]], 3, axis=0)
         self._frames = np.zeros((len(spread), 3, 6))
 
@@ -235,6 +292,10 @@ class ContactFinder:
             if not len(rows):
                 continue
             numbers, normals = place * len(points) + rows, frames.take(rows, 0)[:, :, :3]
+            spins = None
+            if self._spins is not None:
+                bounds, moved = self._spins[numbers], self._moved[3 * rows]
+                spins = Spins.of(bounds, normals, motions, moved)
             found.append(
                 ContactPoints(
                     numbers,
@@ -245,6 +306,7 @@ class ContactFinder:
                     self._restitution.take(numbers),
                     jacobian.reshape(len(points), 3, -1).take(rows, 0).reshape(3 * len(rows), -1),
                     self._drift(place, normals, rows, rolling),
+                    spins,
                 )
             )
         return _together(found) if found else None
@@ -267,6 +329,33 @@ class ContactFinder:
             found += np.einsum("kij,kj->ki", axes, rolling[points])
         found[:, 2] = 0.0
         return found.ravel()
+
+    def anchors(self, found: ContactPoints, before: Vector) -> tuple[Indices, Vector]:
+        """Return the joints that carry points, and centers that move with these, shape (k, 3).
+
+        Args:
+            found: Points from `find`.
+            before: Velocities before the step, shape (nv,).
+
+        Raises:
+            SimulationError: If the velocities of the points after a step are not smooth.
+        """
+        numbers, points = np.divmod(found.numbers, len(self._links))
+        radii, normals = self._radii[points], found.axes[:, 2]
+        centers = found.points + (radii + 0.5 * np.minimum(found.gaps, 0.0))[:, None] * normals
+        bounces = (found.restitution > 0) & (found.jacobian[2::3] @ before < -_BOUNCE)
+        at_edges = np.zeros(len(points), np.bool_)
+        for place, surface in self._surfaces:
+            mine = numbers == place
+            at_edges[mine] = surface.at_edges(centers[mine])
+        for where, what in (
+            (points >= self._first_rim, "a cylinder rolls along its rim; use spheres or capsules"),
+            (bounces, "a contact bounces; use a restitution of 0"),
+            (at_edges, "a point touches an edge of a height field"),
+        ):
+            if where.any():
+                raise SimulationError(f"A step has no derivatives where {what}.")
+        return self._joint_of[points], centers
 
     def bodies(self, numbers: Indices) -> tuple[Indices, Indices]:
         """Return the robot's links and the static bodies for `ContactPoints.numbers`."""
@@ -332,16 +421,55 @@ def poses_of(data: Any) -> Vector:
     return np.lib.stride_tricks.as_strided(first, (len(data.oMi), 4, 3), strides)
 
 
+def turning_of(material: CollisionShape | Ground | Stairs | HeightField) -> tuple[float, float]:
+    """Return the rolling and the torsional friction of a material, in m."""
+    return material.rolling_friction, material.torsional_friction
+
+
+def spins_of(first: Vector, second: Vector) -> Vector | None:
+    """Return the bounds of all pairs of materials as in `Spins`, shape (pairs, 2); None: all 0."""
+    found = np.maximum(first, second).reshape(-1, 2)
+    return found if found.any() else None
+
+
+def together(points: Sequence[ContactPoints]) -> Spins | None:
+    """Return the friction against turning of points that are combined in this order."""
+    if all(each.spins is None for each in points):
+        return None
+    first, numbers, found = 0, [], []
+    for each in points:
+        if each.spins is not None:
+            numbers.append(first + each.spins.points)
+            found.append(each.spins)
+        first += len(each.gaps)
+    names = ("bounds", "jacobian", "drift", "impulses")
+    rest = (np.concatenate([getattr(spins, name) for spins in found]) for name in names)
+    return Spins(np.concatenate(numbers), *rest)
+
+
+def joined(arrays: Sequence[Any]) -> Any:
+    """Concatenate arrays."""
+    return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
+
+
+def _widened(jacobian: Vector, span: slice, width: int) -> Vector:
+    wide = np.zeros((len(jacobian), width))
+    wide[:, span] = jacobian
+    return wide
+
+
 def _together(found: list[ContactPoints]) -> ContactPoints:
     """Return the points of several surfaces combined."""
     if len(found) == 1:
         return found[0]
-    *names, _ = ContactPoints.__slots__
-    points = ContactPoints(
-        *(np.concatenate([getattr(each, name) for each in found]) for name in names)
-    )
+    *names, _, _ = ContactPoints.__slots__
+    whole: dict[str, Any] = {
+        name: np.concatenate([getattr(each, name) for each in found]) for name in names
+    }
+    points = ContactPoints(**whole)
     if found[0].drift is not None:
         points.drift = np.concatenate([each.drift for each in found if each.drift is not None])
+    points.spins = together(found)
     return points
 
 

@@ -14,6 +14,7 @@ from physx_dart.pinocchio.solver import ImpulseSolver
 from physx_dart.pinocchio.ties import Ties
 from physx_sim import CONTACT
 from physx_sim.engines import Parts
+from physx_sim.errors import SimulationError
 
 
 class Coupling:
@@ -61,6 +62,10 @@ class Coupling:
             contacts = touching.contacts
             wide = [contacts.jacobian[:, self.finder.columns[place]] for place in coupled]
             contacts.jacobian = np.concatenate(wide, axis=1)
+            if contacts.spins is not None:
+                whole = contacts.spins.jacobian
+                wide = [whole[:, self.finder.columns[place]] for place in coupled]
+                contacts.spins.jacobian = np.concatenate(wide, axis=1)
             share = self._warmth[touching.pairs] / np.bincount(touching.pairs)[touching.pairs, None]
             warm = np.einsum("kij,kj->ki", contacts.axes, share)
         ties = self.ties.rows(coupled) if self.ties else None
@@ -88,6 +93,21 @@ class Coupling:
         for robot in group:
             robot.finish(after[first : first + robot.nv])
             first += robot.nv
+
+    def groups(self) -> list[list[PinocchioRobot]]:
+        """Return the robots whose constraints were solved together in the last step.
+
+        Raises:
+            SimulationError: If shapes touched.
+        """
+        if self._touching is not None:
+            raise SimulationError(
+                "A step has no derivatives where shapes of bodies touch each other or a static "
+                "object: points and normals of such contacts jump. Use the ground instead."
+            )
+        coupled = [self._robots[place] for place in sorted(self.ties.robots)]
+        alone = [[robot] for robot in self._robots if robot not in coupled]
+        return [*alone, *([coupled] if coupled else [])]
 
     def contacts(self) -> Records:
         """Return the contacts between shapes in the last step."""

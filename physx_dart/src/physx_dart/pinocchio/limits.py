@@ -13,6 +13,8 @@ from physx_core.typing import Vector
 from physx_dart.pinocchio.contact_problem import regularized, unit
 from physx_sim.engines import Joint
 
+Indices = NDArray[np.intp]
+
 _FASTEST_RETURN = 10.0
 """Maximum speed, in rad/s or m/s, at which a joint returns to within its limits, as in DART."""
 
@@ -127,6 +129,29 @@ class JointConstraints:
         if len(self._rubs):  # a joint that is at rest without friction stays so, as in DART
             acts[bounds.size : bounds.size + len(self._rubs)] = velocities[self._rubs] != 0
         return acts
+
+    def slopes(self, positions: Vector) -> Vector:
+        """Return the derivative of each row's target velocity by its joint's position, (rows,).
+
+        Args:
+            positions: Positions before the step, shape (n,).
+        """
+        needed = self._limits - self._pace * positions
+        found = np.zeros(len(self.columns))
+        found[: needed.size][(self.bounds(positions) == needed).ravel()] = -1 / self._period
+        return found
+
+    def motors(self) -> Vector:
+        """Return 1 for rows of motors, otherwise 0, shape (rows,)."""
+        found = np.zeros(len(self.columns))
+        found[len(found) - len(self._motors) :] = 1.0
+        return found
+
+    def resting(self, velocities: Vector) -> Indices:
+        """Return the rows of friction of joints that are at rest without it."""
+        first = 2 * len(self.targets)
+        still: Indices = first + (velocities[self._rubs] == 0).nonzero()[0]
+        return still
 
     def aims(self, bounds: Vector) -> Vector:
         """Return the target velocity of each row, shape (rows,)."""

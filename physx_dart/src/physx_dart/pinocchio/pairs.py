@@ -17,12 +17,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from physx_core.rotations import cross_rows, to_matrix
-from physx_core.typing import Vector
-from physx_dart.pinocchio.contacts import MARGIN, ContactPoints, poses_of, supports_of
+from physx_core.typing import Index, Vector
+from physx_dart.pinocchio.contacts import (
+    MARGIN,
+    ContactPoints,
+    Spins,
+    poses_of,
+    spins_of,
+    supports_of,
+    turning_of,
+)
 from physx_dart.pinocchio.robot import PinocchioRobot
 from physx_dart.pinocchio.surfaces import axes_of, moments_of
 from physx_sim import Stairs
-from physx_sim.engines import CollisionShape, Parts
+from physx_sim.engines import CollisionShape, Parts, steps_of
 from physx_sim.errors import FeatureNotSupportedError
 
 _TOLERANCE = 1e-4
@@ -91,6 +99,7 @@ class PairFinder:
         self._positions = np.array([solid.position for solid in solids]).reshape(-1, 3, 1)
         self._radii = np.array([_radius(solid.shape) for solid in solids])
         self._first, self._second = np.array(self._pairs, np.intp).reshape(-1, 2).T
+        self._note_spins()
         self._transforms = [coal.Transform3s() for _ in solids]
         shapes = [_geometry(solid.shape) for solid in solids]
         self._queries = [
@@ -127,10 +136,8 @@ class PairFinder:
         for place, static in enumerate(self._parts.statics):
             what, body = static.what, self.statics + place
             if isinstance(what, Stairs):
-                for center, size in what.boxes():
-                    material = what.friction, what.restitution
-                    box = CollisionShape("box", size, np.zeros(3), np.eye(3), "ground", *material)
-                    yield _Solid(None, 0, 0, body, box, np.eye(3), np.array(center))
+                for box in steps_of(what):
+                    yield _Solid(None, 0, 0, body, box, box.rotation, box.position)
             elif isinstance(what, CollisionShape):
                 turn = to_matrix(static.orientation)
                 yield _Solid(None, 0, 0, body, what, turn, np.array(static.position))
@@ -141,6 +148,12 @@ class PairFinder:
         found = [*self._moving(), *self._static()]
         for solid, changed in zip(self._solids, found, strict=True):
             solid.shape = changed.shape
+        self._note_spins()
+
+    def _note_spins(self) -> None:
+        """Note which pairs resist turning."""
+        turning = np.array([turning_of(solid.shape) for solid in self._solids]).reshape(-1, 2)
+        self._spins = spins_of(turning[self._first], turning[self._second])
 
     def hide(self, bodies: Sequence[int]) -> None:
         """Let only bodies that are not among these touch."""
@@ -178,6 +191,15 @@ class PairFinder:
                 arm = np.cross(velocity[3:], point - center)
                 found[place] = along + axes[place] @ (velocity[:3] + arm)
         return found.ravel()
+
+    def _let_turn(self, spins: Spins | None, pairs: Index, axes: Vector) -> None:
+        """Take over how static bodies turn, in friction against it."""
+        if spins is None:
+            return
+        for place, point in enumerate(spins.points.tolist()):
+            body = self._solids[self._pairs[pairs[point]][1]].body
+            if body in self._moved:
+                spins.drift[3 * place : 3 * place + 3] = axes[point] @ self._moved[body][1][3:]
 
     def _possible(self, solids: Sequence[_Solid]) -> Iterator[tuple[int, int]]:
         """Yield the pairs of shapes that may touch: those that can move relative to each other."""
@@ -268,6 +290,7 @@ class PairFinder:
         gaps = np.array([each[3] for each in found])
         frames = np.concatenate([axes, moments_of(points, axes)], axis=2)
         jacobian = np.zeros((3 * len(pairs), self.columns[-1].stop))
+        shares = []
         sides = (self._first[pairs], 1.0), (self._second[pairs], -1.0)
         for motions, supports, rows, columns in zip(
             self._motions, self._supports, self._rows, self.columns, strict=True
@@ -277,6 +300,7 @@ class PairFinder:
                 joints = self._joints[solids] - rows.start
                 own = (joints >= 0) & (joints < len(supports))
                 moved[own] += sign * supports[joints[own]]
+            shares.append(moved)
             if moved.any():
                 jacobian[:, columns] = frames.reshape(-1, 6) @ motions * np.repeat(moved, 3, axis=0)
         drift = None
@@ -289,6 +313,11 @@ class PairFinder:
         if not len(close):
             return None
         pairs = pairs[close]
+        spins = None
+        if self._spins is not None:
+            motions, moved = np.concatenate(self._motions, 1), np.concatenate(shares, 1)[close]
+            spins = Spins.of(self._spins[pairs], axes[close], motions, moved)
+            self._let_turn(spins, pairs, axes[close])
         places = (self._pairs[pair] for pair in pairs)
         touching = [(self._solids[i], self._solids[j]) for i, j in places]
         contacts = ContactPoints(
@@ -300,6 +329,7 @@ class PairFinder:
             np.array([a.shape.restitution * b.shape.restitution for a, b in touching]),
             jacobian.reshape(len(gaps), 3, -1)[close].reshape(3 * len(close), -1),
             None if drift is None else drift.reshape(-1, 3)[close].ravel(),
+            spins,
         )
         owners = {
             solid.owner

@@ -19,7 +19,7 @@ from numpy import add, multiply
 from physx_core.rotations import rotate_back, to_matrix
 from physx_core.typing import Records, Vector
 from physx_dart.pinocchio.constraints import Constraints, Warmth, constrained, limited
-from physx_dart.pinocchio.contacts import ContactFinder
+from physx_dart.pinocchio.contacts import ContactFinder, Indices, supports_of
 from physx_dart.pinocchio.limits import JointConstraints
 from physx_dart.pinocchio.models import (
     frames_of,
@@ -135,6 +135,7 @@ class PinocchioRobot(RobotEngine):
                 self._safe_steps = 0
                 return done
             done += count
+        self._constraints = None
         self._safe_steps -= done
         return done
 
@@ -175,6 +176,22 @@ class PinocchioRobot(RobotEngine):
         torques = self._net_torques(q, v) if self._smooth else self._torques
         a = pinocchio.aba(self.model_in_motion, self.data, q, v, torques, *self._more)
         return v + self._period * a
+
+    def free_derivatives(self) -> tuple[Vector, Vector, Vector]:
+        """Return derivatives of `free_velocities` of the last step, each of shape (nv, nv).
+
+        They are w.r.t. positions, along small motions, velocities, and torques.
+        """
+        q, v, resists, period = self._earlier, self._before, self.resistance, self._period
+        found = pinocchio.computeABADerivatives(
+            self.model_in_motion, self.data, q, v, self._net_torques(q, v)
+        )
+        by_q, by_v, inverse = (np.array(matrix, order="C") for matrix in found)
+        by_tau = np.triu(inverse) + np.triu(inverse, 1).T
+        if self._smooth:
+            by_q -= by_tau * resists.stiffness
+            by_v -= by_tau * (resists.damping + period * resists.stiffness)
+        return period * by_q, np.eye(self.nv) + period * by_v, period * by_tau
 
     def finish(self, velocities: Vector) -> None:
         """End the step with these velocities."""
@@ -333,6 +350,35 @@ class PinocchioRobot(RobotEngine):
             self._velocities[:3] = rotation @ velocities[:3]
         self._earlier, self._before = self._positions, self._velocities
         self._constraints, self._safe_steps = None, 0
+
+    @functools.cached_property
+    def supports(self) -> Vector:
+        """A matrix with 1 where a velocity (column) moves a joint (row), otherwise 0."""
+        return supports_of(self.model_in_motion)
+
+    @functools.cached_property
+    def carriers(self) -> Vector:
+        """A matrix with 1 where a velocity (column) moves another's axis (row), otherwise 0."""
+        return self.supports[self._joint_of_velocity]
+
+    @functools.cached_property
+    def parents(self) -> Indices:
+        """The joint that carries the joint of each velocity, shape (nv,)."""
+        return np.array(self.model_in_motion.parents, np.intp)[self._joint_of_velocity]
+
+    @functools.cached_property
+    def _joint_of_velocity(self) -> Indices:
+        return np.repeat(np.arange(self.model_in_motion.njoints), self.model_in_motion.nvs)
+
+    def forces(self) -> Vector:
+        """Return 1 for velocities of joints that commands drive by torques, otherwise 0, (nv,)."""
+        found = np.ones(self.nv)
+        found[self.base :] = 1.0 if self._forces is None else self._forces
+        return found
+
+    def last_step(self) -> tuple[Vector, Vector, Constraints | None]:
+        """Return native positions and velocities before the last step, and its constraints."""
+        return self._earlier, self._before, self._constraints
 
     def native(self) -> tuple[Vector, Vector]:
         """Return a copy of the state in the convention of the stepping model."""

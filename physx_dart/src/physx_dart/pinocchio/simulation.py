@@ -13,9 +13,10 @@ import numpy as np
 from physx_core.typing import Records, Vector
 from physx_dart.batch.processes import ParallelAlgorithms
 from physx_dart.pinocchio.coupling import Coupling
+from physx_dart.pinocchio.derivatives import GroupDerivatives
 from physx_dart.pinocchio.robot import PinocchioRobot
 from physx_dart.pinocchio.solver import ImpulseSolver
-from physx_sim import FEATURES, Simulation, World
+from physx_sim import FEATURES, Simulation, StepDerivatives, World
 from physx_sim.engines import (
     RK4_LACKS,
     Algorithms,
@@ -53,8 +54,11 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
     """A world in Pinocchio."""
 
     engine = "pinocchio"
-    lacks: ClassVar[frozenset[str]] = frozenset({"mesh_contacts"})
-    caveats: ClassVar[Mapping[str, str]] = {"joint_wrenches": "not while anything is attached"}
+    lacks: ClassVar[frozenset[str]] = frozenset({"cameras", "mesh_contacts"})
+    caveats: ClassVar[Mapping[str, str]] = {
+        "joint_wrenches": "not while anything is attached",
+        "step_derivatives": "not where shapes touch: [gradients](contacts.md#gradients)",
+    }
 
     def __init__(self, world: World) -> None:
         """Build the world; raises the same errors as the backend's `build`."""
@@ -88,6 +92,29 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
             return
         for robot in self._robots:
             robot.run(n)
+
+    def derivatives_of_step(self) -> StepDerivatives:
+        """Return the derivatives of the last physics step.
+
+        Raises:
+            SimulationError: If it has none.
+        """
+        groups = self._coupling.groups() if self._coupling else [[each] for each in self._robots]
+        nv, joints = self.layout.nv, len(self.layout.joints)
+        state, commands = np.zeros((2 * nv, 2 * nv)), np.zeros((2 * nv, joints))
+        parts = dict(zip(self._robots, self.layout.parts.values(), strict=True))
+        for group in groups:
+            constraints = group[0].last_step()[2]
+            solved = None if constraints is None else constraints.solved
+            found = GroupDerivatives(group, solved, self.period).in_layout()
+            if len(group) == len(self._robots):
+                return found
+            own = np.concatenate([np.arange(nv)[parts[robot].velocities] for robot in group])
+            driven = np.concatenate([np.arange(joints)[parts[robot].joints] for robot in group])
+            rows = np.concatenate([own, nv + own])
+            state[np.ix_(rows, rows)] = found.state
+            commands[np.ix_(rows, driven)] = found.commands
+        return StepDerivatives(state, commands)
 
     def change_gravity(self, gravity: tuple[float, ...]) -> None:
         """Change the gravity of all robots and objects."""

@@ -11,7 +11,7 @@ import numpy as np
 import pinocchio
 
 from physx_core.errors import UnknownOptionError
-from physx_core.typing import Vector
+from physx_core.typing import Index, Vector
 from physx_dart.pinocchio.contact_problem import ContactProblem
 from physx_sim.errors import SimulationError
 
@@ -70,22 +70,25 @@ class ImpulseSolver:
         least: Vector,
         most: Vector,
         guess: Vector,
+        turning: tuple[Index, Vector] | None = None,
     ) -> Vector:
-        """Return the impulses, shape (3 k + m,).
+        """Return the impulses, shape (n,).
 
         Args:
-            response: Velocities for unit impulses, shape (3 k + m, 3 k + m).
-            free: Velocities without impulses minus the target ones, shape (3 k + m,): of k points
-                along two tangents and the normal, then of m rows.
+            response: Velocities for unit impulses, shape (n, n): n is 3 k + m, or 3 k + m + 3 s.
+            free: Velocities without impulses minus the target ones, shape (n,): of k points along
+                two tangents and the normal, of m rows, then of s points about these axes.
             friction: Coefficients of the points, shape (k,).
             least: Smallest impulses of the rows, shape (m,); rows with one bound come first.
             most: Largest impulses of the rows, shape (m,).
-            guess: Impulses to start with, shape (3 k + m,).
+            guess: Impulses to start with, shape (n,).
+            turning: These s points, as indices, and their largest angular impulses per normal
+                impulse across and about the normal, in m, shape (s, 2).
         """
         # A non-finite entry of the response makes the diagonal non-finite, too.
         if not math.isfinite(sum(free.tolist()) + sum(response.diagonal().tolist())):
             raise SimulationError("The state is no longer finite. Use a smaller period.")
-        problem = ContactProblem(response, free, friction, least, most)
+        problem = ContactProblem(response, free, friction, least, most, turning)
         best, least_error, good = guess, math.inf, problem.accuracy
         for begin in self._beginnings(problem, guess):
             if math.isfinite(begin.dot(begin)):
@@ -108,7 +111,7 @@ class ImpulseSolver:
     def iterate(
         self, problem: ContactProblem, name: str, limits: tuple[int, float], guess: Vector
     ) -> Vector:
-        """Return the result of one of Pinocchio's solvers.
+        """Return the result of one of Pinocchio's solvers, which know no friction against turning.
 
         Args:
             problem: The problem.
@@ -117,12 +120,14 @@ class ImpulseSolver:
             guess: Impulses to start with.
         """
         models, data, signs, flips = self._models(problem)
-        delassus = pinocchio.DelassusOperatorDense(problem.matrix * flips)
+        known = len(signs)
+        delassus = pinocchio.DelassusOperatorDense(problem.matrix[:known, :known] * flips)
         solver, result = _KINDS[name][0](), _KINDS[name][2]()
-        result.setConstraintImpulseGuess(signs * guess)
+        result.setConstraintImpulseGuess(signs * guess[:known])
         settings = _settings(name, *limits)
-        solver.solve(delassus, signs * problem.free, models, data, settings, result)
-        found: Vector = signs * result.retrieveConstraintImpulses()
+        solver.solve(delassus, signs * problem.free[:known], models, data, settings, result)
+        found = np.zeros(len(guess))
+        found[:known] = signs * result.retrieveConstraintImpulses()
         return found
 
     def _models(self, problem: ContactProblem) -> tuple[Any, Any, Vector, Vector]:
@@ -142,7 +147,7 @@ class ImpulseSolver:
         for model in models:
             data.append(model.createData())
         # Limits in Pinocchio only push upward.
-        signs = np.ones(len(problem.free))
+        signs = np.ones(3 * len(problem.friction) + len(least))
         signs[3 * len(problem.friction) :][np.isinf(least) & np.isfinite(most)] = -1.0
         if len(self._known) >= _MOST_KNOWN:
             self._known.clear()

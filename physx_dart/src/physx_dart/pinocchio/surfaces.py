@@ -7,11 +7,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from numpy.typing import NDArray
 
 from physx_core.typing import Vector
 from physx_sim import Ground, HeightField, Stairs
 from physx_sim.engines import Static
 
+_EDGE = 1e-5
+"""Distance from an edge, relative to a cell, up to which a point counts as at the edge."""
 _CROSS = np.zeros((3, 9))
 _CROSS[[0, 0, 1, 1, 2, 2], [7, 5, 2, 6, 3, 1]] = -1.0, 1.0, -1.0, 1.0, -1.0, 1.0
 """Maps a vector to its cross-product matrix, flattened by columns; multiplied by a row, it gives
@@ -29,6 +32,10 @@ class Surface(ABC):
             Distances in m, shape (n,); two tangents and the outward normal as rows,
             shape (n, 3, 3), or (1, 3, 3) if they are the same everywhere.
         """
+
+    def at_edges(self, points: Vector) -> NDArray[np.bool_]:
+        """Return whether points (n, 3) are where the surface bends."""
+        return np.zeros(len(points), np.bool_)
 
     def moments(self, points: Vector, axes: Vector) -> Vector:
         """Return the cross products of points (n, 3) with the axes there, shape (n, 3, 3)."""
@@ -89,6 +96,14 @@ class Heights(Surface):
         found = (points[:, 2] - height) / lengths
         found[outside] = np.inf
         return found, axes_of(upward / lengths[:, None])
+
+    def at_edges(self, points: Vector) -> NDArray[np.bool_]:
+        """Return whether points are at an edge of a triangle."""
+        grid = (points[:, :2] - self.field.corner()) / np.array(self.field.spacing)
+        diagonal = grid[:, :1] - grid[:, 1:]
+        lines = np.concatenate([grid, diagonal], axis=1)
+        found: NDArray[np.bool_] = (np.abs(lines - np.round(lines)) < _EDGE).any(axis=1)
+        return found
 
 
 def surface_of(static: Static) -> Surface | None:

@@ -19,7 +19,7 @@ _FASTEST_RETURN = 1.0
 """Maximum speed at which it is closed, in m/s or rad/s."""
 _STUCK = 1e-9
 """Motion of a point per motion of a joint below which it cannot move."""
-_FASTEST_FOLLOWER = 10.0
+FASTEST_FOLLOWER = 10.0
 """Maximum speed at which a joint returns to where its leader has it, as to its limits."""
 
 
@@ -72,7 +72,7 @@ class Ties:
                 gap = q[follower] - mimic.multiplier * q[leader] - mimic.offset
                 speed = -gap / self._period
                 blocks.append(row)
-                aims.append(np.clip([speed], -_FASTEST_FOLLOWER, _FASTEST_FOLLOWER))
+                aims.append(np.clip([speed], -FASTEST_FOLLOWER, FASTEST_FOLLOWER))
         for bond in self._bonds.values():
             poses, jacobians = [], []
             for body, frame in zip(bond.bodies, bond.frames, strict=True):

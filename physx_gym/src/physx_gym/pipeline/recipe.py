@@ -14,6 +14,7 @@ from physx_core.errors import ConfigError, ConfigFileError
 from physx_core.parsing import parse_json
 from physx_gym.blocks.block import ControllerBlock, ObserverBlock
 from physx_gym.env.layers.block_layers import ControlledEnv, ObservedEnv
+from physx_gym.env.layers.randomized import RandomizedEnv
 from physx_gym.pipeline.tables import build, check_table, find, find_environment
 
 
@@ -26,16 +27,21 @@ class Recipe:
     Attributes:
         env_config: Table of the environment.
         layers_config: Tables of the layers, the lowest first.
+        randomize: File of ``physx identify -o`` that each episode draws from; None: none.
     """
 
     env_config: Mapping[str, Any]
     layers_config: tuple[Mapping[str, Any], ...] = ()
+    randomize: str | None = None
 
-    def __call__(self, *, backend: Any = None, **options: Any) -> Any:
+    def __call__(
+        self, *, backend: Any = None, randomize: str | Path | None = None, **options: Any
+    ) -> Any:
         """Return a new pipeline: the topmost layer, or the environment if there are no layers.
 
         Args:
             backend: Engine to use instead of the one in the tables; None: the latter.
+            randomize: File to draw from instead of the one in the tables; None: the latter.
             options: Options of the environment that replace those in its table.
         """
         table, layers = copy.deepcopy((self.env_config, self.layers_config))
@@ -53,11 +59,14 @@ class Recipe:
         env = build("env_config", "environment", {"cls": maker, "kwargs": kwargs}, **options)
         for number, layer in enumerate(layers):
             env = _add_layer(f"layers_config[{number}]", layer, env)
-        return env
+        posterior = self.randomize if randomize is None else randomize
+        return env if posterior is None else RandomizedEnv(env, randomizations=posterior)
 
 
 def build_pipeline(
-    env_config: Mapping[str, Any], layers_config: Sequence[Mapping[str, Any]] = ()
+    env_config: Mapping[str, Any],
+    layers_config: Sequence[Mapping[str, Any]] = (),
+    randomize: str | None = None,
 ) -> Recipe:
     """Return a callable that creates the pipeline described by tables.
 
@@ -72,6 +81,8 @@ def build_pipeline(
             "kwargs": {...}}, "wrapper": {"cls": ..., "kwargs": {...}}}``. A block without a wrapper
             gets an `ObservedEnv` or a `ControlledEnv`; one without a name is named after its class.
             A wrapper does not need a block.
+        randomize: File of ``physx identify -o``: a `RandomizedEnv` on top of the layers draws from
+            its posterior.
 
     Raises:
         UnknownOptionError: If a table has an unknown key.
@@ -84,13 +95,16 @@ def build_pipeline(
         raise ConfigError(f"layers_config is {layers_config!r} but must be a list of tables.")
     for number, layer in enumerate(layers_config):
         _check_layer(f"layers_config[{number}]", layer)
-    return Recipe(*copy.deepcopy((env_config, tuple(layers_config))))
+    if randomize is not None and not isinstance(randomize, str):
+        raise ConfigError(f"randomize is {randomize!r} but must be the name of a file.")
+    return Recipe(*copy.deepcopy((env_config, tuple(layers_config))), randomize)
 
 
 def load_pipeline(path: str | Path) -> Recipe:
     """Return a callable that creates the pipeline described by a TOML or JSON file.
 
-    The file has the tables ``env_config`` and ``layers_config`` of `build_pipeline`.
+    The file has the tables ``env_config`` and ``layers_config`` of `build_pipeline`, and optionally
+    ``randomize``, a file relative to its own folder.
 
     Raises:
         ConfigFileError: If the file is missing, or is neither TOML nor JSON.
@@ -104,7 +118,9 @@ def load_pipeline(path: str | Path) -> Recipe:
             f"{path} is not a pipeline file: its name must end in .toml or .json."
         )
     content = read_toml(path) if path.suffix == ".toml" else _read_json(path)
-    check_table(str(path), content, ("env_config", "layers_config"), "env_config")
+    check_table(str(path), content, ("env_config", "layers_config", "randomize"), "env_config")
+    if isinstance(content.get("randomize"), str):
+        content["randomize"] = str(path.parent / content["randomize"])
     return build_pipeline(**content)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any
@@ -10,6 +11,7 @@ import numpy as np
 
 from physx_core.typing import Vector
 from physx_sim import (
+    Camera,
     Encoder,
     Imu,
     Layout,
@@ -159,15 +161,26 @@ class Equipment:
             out[:] = self._seen
 
     def by_kind(self, values: Vector) -> dict[str, Vector]:
-        """Return views of an array of sensor values: for each kind, shape (values, sensors)."""
-        found, begin = {}, 0
-        sensors = self.sensor_list
-        for kind in dict.fromkeys(type(sensor) for sensor in sensors):
-            members = [sensor for sensor in sensors if type(sensor) is kind]
-            width = sum(kind.quantities.values())
-            end = begin + width * len(members)
-            found[kind_of(members[0])] = values[begin:end].reshape(len(members), width).T
-            begin = end
+        """Return views of an array of sensor values: for each kind, shape (values, sensors).
+
+        Sensors of a kind that differ in size are apart, by their names; so is each image of a
+        camera, named after the camera and the image, in its shape.
+        """
+        found: dict[str, Vector] = {}
+        rest = values
+        for kind, group in itertools.groupby(self.sensor_list, type):
+            members = list(group)
+            widths = [sum(sensor.quantities.values()) for sensor in members]
+            own, rest = np.split(rest, [sum(widths)])
+            if len(set(widths)) == 1 and kind is not Camera:
+                found[kind_of(members[0])] = own.reshape(len(members), -1).T
+                continue
+            for sensor, part in zip(members, np.split(own, np.cumsum(widths)[:-1]), strict=True):
+                found |= (
+                    _images(sensor, part)
+                    if isinstance(sensor, Camera)
+                    else {sensor.name: part[:, None]}
+                )
         return found
 
     def snapshot(self) -> EquipmentState:
@@ -186,6 +199,14 @@ class Equipment:
             self.sensors.reset(random)
             self.sensors.restore(sensors)
             self._hook(reading_period)
+
+
+def _images(camera: Camera, values: Vector) -> dict[str, Vector]:
+    ends = np.cumsum(list(camera.quantities.values()))[:-1]
+    return {
+        f"{camera.name}.{image}": pixels.reshape(camera.shape_of(image))
+        for image, pixels in zip(camera.images, np.split(values, ends), strict=True)
+    }
 
 
 class _DirectMotors:

@@ -11,7 +11,10 @@ from physx_sim import BodySettings, JointSettings, Layout, Motor, Robot, Sensor,
 from physx_sim.engines import read_robot
 
 _NAMES = frozenset(
-    {"name", "joint", "urdf", "package_dirs", "joints", "feet", "path", "heights", "mimic"}
+    {
+        *("name", "joint", "urdf", "package_dirs", "joints", "feet", "path", "heights", "mimic"),
+        "network",
+    }
 )
 """Fields that identify a thing rather than configure it; these are not options."""
 _PARTS = ("robots", "objects")

@@ -67,7 +67,7 @@ class EpisodeRecorder:
         self._in_detail = True
         self._register_action(action)
         self._register_reward()
-        self._scene.begin(draw)
+        self._scene.begin(draw, self._simulator.simulation)
         file = self._folder.new_path(name) if path is None else Path(path)
         self.telemetry.begin(file, described)
         return str(file)
@@ -100,7 +100,7 @@ class EpisodeRecorder:
         self.telemetry.register("step", self._reward, namespace="reward")
 
     def end_step(self, reward: float, redraw: Draw) -> None:
-        """Record the results of a step: its reward, drawings, and contacts."""
+        """Record the results of a step: its reward, drawings, contacts, and moved objects."""
         self._reward[()] = reward
         if self._in_detail and self.telemetry.is_recording:
             self._scene.record(self._simulator.stepper_state.t, redraw, self._simulator.simulation)

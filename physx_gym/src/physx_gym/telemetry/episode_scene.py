@@ -1,4 +1,4 @@
-"""EpisodeScene: records an environment's own drawings and the contacts, step by step."""
+"""EpisodeScene: records drawings, contacts, and moved objects of an episode, step by step."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Draw = Callable[[Factory], None]
 
 
 class EpisodeScene:
-    """Records an episode's initial drawings, their changes, and contact forces."""
+    """Records an episode's initial drawings, their changes, contact forces, and moved objects."""
 
     def __init__(self) -> None:
         self._factory = Factory()
@@ -28,15 +28,17 @@ class EpisodeScene:
         self._known: dict[tuple[str, str], Any] = {}
         self._numbers = 0
         self._contacts: list[Vector] = []
+        self._moved: list[tuple[float, str, list[float], bool]] = []
 
-    def begin(self, draw: Draw) -> None:
-        """Start over with the initial drawings."""
+    def begin(self, draw: Draw, simulation: Simulation) -> None:
+        """Start over with the initial drawings, and where static and hidden objects are."""
         EpisodeScene.__init__(self)
         draw(self._factory)
         for event in self._factory.take_events():
             if event.kind not in _WITHOUT:
                 values = dict(event.values)
                 self._added.append({"kind": event.kind, "name": event.name, "values": values})
+        self._record_moved(0.0, simulation)
         self._remember()
 
     def record(self, time: float, redraw: Draw, simulation: Simulation) -> None:
@@ -61,11 +63,29 @@ class EpisodeScene:
             self._numbers += size
             self._known |= {(event.name, option): value for option, value in changes.items()}
             self._changes.append((time, event.name, changes))
+        self._record_moved(time, simulation)
         if "contacts" in simulation.features:
             found = simulation.contacts()
             if len(found):
                 times = np.full((len(found), 1), time)
                 self._contacts.append(np.hstack([times, found["point"], found["force"]]))
+
+    def _record_moved(self, time: float, simulation: Simulation) -> None:
+        """Record objects that `Simulation.set_body` moved or hid, where that changed.
+
+        The states of an episode contain neither.
+        """
+        if "changes" not in simulation.features:
+            return
+        layout = simulation.layout
+        for name in (*(each for each in layout.parts if each in layout.bodies), *layout.statics):
+            settings = simulation.body_settings(name)
+            pose = [*(settings.position or ()), *(settings.orientation or ())]
+            now = pose, bool(settings.hidden)
+            before = next((row[2:] for row in reversed(self._moved) if row[1] == name), ([], False))
+            if now != before and self._numbers + len(pose) <= _MOST_NUMBERS:
+                self._numbers += len(pose)
+                self._moved.append((time, name, *now))
 
     def _is_known(self, name: str, option: str, value: Any) -> bool:
         key = name, option
@@ -74,6 +94,7 @@ class EpisodeScene:
     def rewind(self, time: float) -> None:
         """Discard everything recorded after a time, in s."""
         self._changes = [change for change in self._changes if change[0] <= time]
+        self._moved = [moved for moved in self._moved if moved[0] <= time]
         self._contacts = [block for block in self._contacts if block[0, 0] <= time]
         self._remember()
 
@@ -95,7 +116,9 @@ class EpisodeScene:
         """
         changes = [list(change) for change in self._changes]
         contacts = np.concatenate([np.zeros((0, 7)), *self._contacts])
-        return {"scene": {"added": list(self._added), "changes": changes}, "contacts": contacts}
+        moved = [list(each) for each in self._moved]
+        scene = {"added": list(self._added), "changes": changes, "moved": moved}
+        return {"scene": scene, "contacts": contacts}
 
 
 def _size(value: Any) -> int:

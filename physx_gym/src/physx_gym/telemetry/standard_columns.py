@@ -43,7 +43,9 @@ def register_simulator(telemetry: Telemetry, simulator: Simulator) -> None:
     telemetry.register(VELOCITIES, simulator.velocities, velocities, unit=units[1], **always)
     joints = dict(zip(layout.joints, layout.units, strict=False))
     for kind, values in simulator.measurements.get("measurements", {}).items():
-        sensors = [sensor for sensor in simulator.sensors if kind_of(sensor) == kind]
+        sensors = [each for each in simulator.sensors if kind in (kind_of(each), each.name)]
+        if not sensors:  # an image, too large for columns
+            continue
         sensed = [
             _unit_of(quantity, kind, joints.get(getattr(sensor, "joint", ""), ""))
             for sensor in sensors

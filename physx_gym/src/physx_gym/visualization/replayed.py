@@ -13,6 +13,7 @@ from physx_core.typing import Vector
 from physx_gym.errors import LogError
 from physx_gym.telemetry.episode_log import Log
 from physx_gym.visualization.plotting import Groups, label_of
+from physx_sim import Layout
 
 _LONG = 0.5  # length of a strong force's arrow, as a fraction of the size of what moves
 _THIN = 0.006  # radius of an arrow, likewise
@@ -53,6 +54,49 @@ class Scene:
 
     def _call(self, action: str, name: str, values: Mapping[str, Any]) -> None:
         getattr(self._factory, f"{action}_{self._kinds[name]}")(name, **values)
+
+
+class Moved:
+    """Where static objects were, and which objects were hidden, in the episode."""
+
+    def __init__(self, log: Log, layout: Layout) -> None:
+        """Read it from a log.
+
+        Args:
+            log: The log.
+            layout: Names of everything in its world.
+        """
+        scene = log.constants.get("scene")
+        rows = scene.get("moved", ()) if isinstance(scene, Mapping) else ()
+        places = {name: place for place, name in enumerate(layout.names)}
+        self.hidden: set[str] = set()
+        self._begin, self._poses = float(log.time[0]), dict[int, Vector]()
+        try:
+            self._changes = [
+                (float(time), places[name], str(name), np.array(pose, np.float64), bool(hidden))
+                for time, name, pose, hidden in rows
+            ]
+            if any(len(pose) not in (0, 7) for *_, pose, _ in self._changes):
+                raise ValueError("a pose has not 7 numbers")
+        except (KeyError, TypeError, ValueError) as error:
+            raise LogError(
+                f'The moved objects of the log "{log.label}" cannot be read: {error}'
+            ) from error
+
+    def move(self, poses: Vector, time: float) -> None:
+        """Replace the poses of static objects, and update `hidden`.
+
+        Args:
+            poses: Of everything in `Layout.names`, shape (names, 7).
+            time: Since the start, in s; not before that of the last call.
+        """
+        while self._changes and self._changes[0][0] - self._begin <= time + 1e-9:
+            _, place, name, pose, hidden = self._changes.pop(0)
+            (self.hidden.add if hidden else self.hidden.discard)(name)
+            if len(pose):
+                self._poses[place] = pose
+        for place, pose in self._poses.items():
+            poses[place] = pose
 
 
 class Contacts:

@@ -21,7 +21,7 @@ from physx_gym.visualization.drawing import WorldDrawing
 from physx_gym.visualization.film import write_film
 from physx_gym.visualization.plotting import Groups, groups_of
 from physx_gym.visualization.rendering import PICTURE_SIZE, Picture, open_viewer
-from physx_gym.visualization.replayed import Contacts, Line, Plots, Scene, row_at
+from physx_gym.visualization.replayed import Contacts, Line, Moved, Plots, Scene, row_at
 from physx_sim import Backend, World
 
 _FRAMES, _FRAMES_PER_ROW = 10_000, 100
@@ -151,6 +151,7 @@ class _Body:
             )
         self._drawing = WorldDrawing(world=world, backend=engine, layout=layout, **drawn)
         self._is_drawn = False
+        self.moved: Moved | None = None
 
     def poses(self, time: float, names: Sequence[str] | None = None) -> Vector:
         """Return the poses of bodies at a time after the start, in s."""
@@ -158,8 +159,14 @@ class _Body:
 
     def draw(self, time: float) -> None:
         """Draw it at a time."""
-        poses = self.poses(time, self.simulation.layout.names)
-        (self._drawing.move if self._is_drawn else self._drawing.add)(poses)
+        poses, hidden = self.poses(time, self.simulation.layout.names), set[str]()
+        if self.moved is not None:
+            self.moved.move(poses, time)
+            hidden = self.moved.hidden
+        if not self._is_drawn:
+            self._drawing.add(poses)
+        if self._is_drawn or hidden:
+            self._drawing.move(poses, hidden)
         self._is_drawn = True
 
     def close(self) -> None:
@@ -180,6 +187,7 @@ class _Motion:
         view = log.constants.get("view") or None
         states = log.trajectory()
         self._body = _Body(log.label, states, self._world, self._engine, view=view, **drawn)
+        self._body.moved = Moved(log, self._body.simulation.layout)
         self._ghosts: list[_Body] = []
         self._beside: list[Scene | Contacts | Line] = [Scene(self._factory, log)]
         if contacts and len(log.contacts):

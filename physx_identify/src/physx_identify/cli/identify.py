@@ -13,10 +13,12 @@ from physx_core.cli import show
 from physx_identify import (
     Model,
     identify,
+    learn_actuators,
     propose,
     read_log,
     store_identification,
     write_identification,
+    write_learned,
     write_motion,
 )
 from physx_sim import Robot
@@ -37,6 +39,9 @@ class Identify:
     0.7 +- 0.1 beforehand."""
     output: Annotated[str | None, tyro.conf.arg(aliases=["-o"])] = None
     """TOML file with values, intervals and draws, which training can draw from."""
+    actuator: str | None = None
+    """File for networks of what actuators do beyond their commands and the robot's model, learned
+    from the same log; Motor(network=FILE) adds it. Needs physx-identify[actuator]."""
     session: str | None = None
     """Folder that keeps the result, for physx report."""
     propose: str | None = None
@@ -87,6 +92,10 @@ def run(words: Sequence[str]) -> None:
     if options.output is not None:
         write_identification(options.output, found)
         notes.append(f"identification: {options.output}")
+    if options.actuator is not None:
+        actuators = learn_actuators(found, log, robot, gravity=options.gravity, held=options.held)
+        write_learned(options.actuator, actuators)
+        notes += [*str(actuators).splitlines(), f"actuator networks: {options.actuator}"]
     if options.session is not None:
         store_identification(options.session, found, time.monotonic() - begin)
         notes.append(

@@ -104,6 +104,38 @@ def _derivatives(subject: Subject) -> None:
             )
 
 
+def _step_derivatives(subject: Subject) -> None:
+    need(subject, "step_derivatives")
+    with build(subject, arm()) as simulation:
+        q, v = state_of(simulation, 4)
+        state = [q, v, _torques(simulation, 4)]
+
+        def stepped(*given: Vector) -> Vector:
+            simulation.set_state(given[0], given[1])
+            simulation.set_torques(given[2])
+            simulation.step(2)
+            return np.concatenate([simulation.positions(), simulation.velocities()])
+
+        columns = []
+        for number, width in enumerate(map(len, state)):
+            for unit in np.eye(width):
+                two = []
+                for sign in (-1, 1):
+                    moved = list(state)
+                    moved[number] = moved[number] + sign * _SMALL * unit
+                    two.append(stepped(*moved))
+                columns.append((two[1] - two[0]) / (2 * _SMALL))
+        simulation.set_state(q, v)
+        simulation.set_torques(state[2])
+        found = simulation.step_with_derivatives(2)
+        expect_close(
+            np.hstack([found.state, found.commands]),
+            np.array(columns).T,
+            1e-5,
+            "the derivatives of steps differ from finite differences",
+        )
+
+
 def _batches(subject: Subject) -> None:
     need(subject, "forward_dynamics")
     for simulation in _both(subject):
@@ -124,5 +156,6 @@ CHECKS: dict[str, Check] = {
     "has a mass matrix that agrees with the dynamics": _mass,
     "has Jacobians that agree with velocities": _jacobian,
     "has derivatives that agree with finite differences": _derivatives,
+    "has derivatives of steps that agree with finite differences": _step_derivatives,
     "computes batches like single states": _batches,
 }

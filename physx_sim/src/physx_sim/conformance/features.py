@@ -18,6 +18,7 @@ from physx_sim import (
     Mimic,
     Robot,
     Simulation,
+    Sphere,
     Weld,
     World,
     Wrench,
@@ -34,6 +35,7 @@ def _zeros(simulation: Simulation) -> tuple[Vector, Vector]:
 
 
 _CALLS: Mapping[str, _Call] = {
+    "step_derivatives": lambda one: one.step_with_derivatives(),  # none while there are hooks
     "accelerations": lambda one: one.accelerations(),
     "attachments": lambda one: one.detach(one.attach(Connect("hand"))),
     "changes": lambda one: one.set_body("hand", BodySettings(mass=2.0)),
@@ -68,6 +70,11 @@ def _touching() -> World:
     return World(objects=boxes, ground=Ground(), period=PERIOD)
 
 
+def _turning() -> World:
+    top = Sphere(name="top", radius=0.1, position=(0.0, 0.0, 0.1), torsional_friction=0.01)
+    return World(objects=[top], ground=Ground(), period=PERIOD)
+
+
 _WORLDS: Mapping[str, Callable[[], World]] = {
     "actuators": lambda: _with_joint(JointSettings(mode="servo")),
     "armature": lambda: _with_joint(JointSettings(armature=0.1)),
@@ -77,6 +84,7 @@ _WORLDS: Mapping[str, Callable[[], World]] = {
     "springs": lambda: _with_joint(JointSettings(stiffness=1.0, damping=0.1)),
     "rk4": lambda: pendulum(integrator="rk4"),
     "self_collisions": _colliding,
+    "torsional_friction": _turning,
     "body_contacts": _touching,
     "contacts": box,
 }
@@ -136,6 +144,21 @@ def _spring(subject: Subject) -> None:
     expect(abs(angle - 0.5) < 0.02, f"a spring with rest=0.5 rad settles at {angle:.3f} rad")
 
 
+def _stops_spins(subject: Subject) -> None:
+    need(subject, "torsional_friction")
+    with build(subject, _turning()) as simulation:
+        simulation.step(300)
+        v = simulation.velocities()
+        v[5] = 5.0
+        simulation.set_state(simulation.positions(), v)
+        simulation.step(100)
+        speed, wanted = float(simulation.velocities()[5]), 5.0 - 0.1 * 0.01 * 9.81 / 0.004
+        expect(
+            abs(speed - wanted) < 0.15,
+            f"torsional friction slows a ball down to {speed:.3f} instead of {wanted:.3f} rad/s",
+        )
+
+
 def _drives(subject: Subject) -> None:
     need(subject, "moving_statics")
     belt = Box(name="belt", size=(4.0, 1.0, 0.1), static=True, position=(0.0, 0.0, -0.05))
@@ -156,6 +179,7 @@ def _drives(subject: Subject) -> None:
 
 CHECKS: dict[str, Check] = {
     "drives what lies on a belt": _drives,
+    "stops what spins": _stops_spins,
     "claims features that exist": _known,
     "can do what its features say": _honest,
     "builds what its features say": _builds,

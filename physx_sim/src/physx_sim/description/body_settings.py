@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 from physx_core import checks
 
+FRICTIONS = ("friction", "torsional_friction", "rolling_friction")
+"""Names of the settings that are coefficients of friction."""
 _VECTORS = {
     "position": 3,
     "orientation": 4,
@@ -25,6 +27,9 @@ class BodySettings:
     Attributes:
         mass: Mass of a link or moving object, in kg; its moments of inertia change in proportion.
         friction: Coefficient of friction of all its shapes.
+        torsional_friction: Friction torque of all its shapes about the normal of a contact per
+            normal force, in m.
+        rolling_friction: Their friction torque against rolling per normal force, in m.
         hidden: Whether an object, moving or static, is absent: it touches nothing, rays pass it,
             and it stays at rest where it is. It returns there, or where `Simulation.set_state` put
             it in the meantime.
@@ -47,13 +52,16 @@ class BodySettings:
     velocity: tuple[float, ...] | None = None
     angular_velocity: tuple[float, ...] | None = None
     surface_velocity: tuple[float, ...] | None = None
+    torsional_friction: float | None = None
+    rolling_friction: float | None = None
 
     def __post_init__(self) -> None:
         checks.store_declared("BodySettings.", self)
         if self.mass is not None:
             checks.positive("BodySettings.mass", self.mass)
-        if self.friction is not None:
-            checks.not_negative("BodySettings.friction", self.friction)
+        for option in FRICTIONS:
+            if (value := getattr(self, option)) is not None:
+                checks.not_negative(f"BodySettings.{option}", value)
         for option, length in _VECTORS.items():
             given = getattr(self, option)
             if given is not None:

@@ -1,7 +1,8 @@
 """Ground of a world, which never moves: a plane, stairs, or a height field.
 
-A contact uses the smaller coefficient of friction and the product of the coefficients of
-restitution. By default, the restitution of the body that touches the ground decides.
+A contact uses the smaller coefficient of friction, the larger coefficients of torsional and
+rolling friction, and the product of the coefficients of restitution. By default, the restitution of
+the body that touches the ground decides.
 """
 
 from __future__ import annotations
@@ -14,6 +15,9 @@ from numpy.typing import NDArray
 from physx_core import checks
 from physx_core.errors import ConfigError
 
+MATERIAL = ("friction", "restitution", "torsional_friction", "rolling_friction")
+"""Options of everything that can touch, none of which is negative."""
+
 
 @dataclass(frozen=True)
 class Ground:
@@ -24,6 +28,8 @@ class Ground:
         restitution: Coefficient of restitution; 1: that of the other body decides.
         height: Height of the plane above the world's origin along the normal, in m.
         normal: Direction away from the ground, of any length.
+        torsional_friction: Friction torque about the normal per normal force, in m.
+        rolling_friction: Friction torque against rolling per normal force, in m.
 
     Raises:
         ConfigError: If an option is out of range, or the normal is 0.
@@ -33,10 +39,12 @@ class Ground:
     restitution: float = 1.0
     height: float = 0.0
     normal: tuple[float, ...] = (0.0, 0.0, 1.0)
+    torsional_friction: float = 0.0
+    rolling_friction: float = 0.0
 
     def __post_init__(self) -> None:
         checks.store_declared("Ground.", self)
-        checks.options(checks.not_negative, "Ground.", self, "friction", "restitution")
+        checks.options(checks.not_negative, "Ground.", self, *MATERIAL)
         checks.finite("Ground.height", self.height)
         normal = checks.vector("Ground.normal", self.normal, 3)
         length = float(np.linalg.norm(normal))
@@ -58,6 +66,8 @@ class Stairs:
         landing: Length of the last step beyond `run`, in m.
         friction: Coefficient of friction.
         restitution: Coefficient of restitution; 1: that of the other body decides.
+        torsional_friction: Friction torque about the normal per normal force, in m.
+        rolling_friction: Friction torque against rolling per normal force, in m.
 
     Raises:
         ConfigError: If an option is out of range.
@@ -71,10 +81,12 @@ class Stairs:
     landing: float = 2.0
     friction: float = 1.0
     restitution: float = 1.0
+    torsional_friction: float = 0.0
+    rolling_friction: float = 0.0
 
     def __post_init__(self) -> None:
         checks.store_declared("Stairs.", self)
-        checks.options(checks.not_negative, "Stairs.", self, "friction", "restitution")
+        checks.options(checks.not_negative, "Stairs.", self, *MATERIAL)
         if self.steps < 1:
             raise ConfigError(f"Stairs.steps is {self.steps!r} but must be a positive integer.")
         checks.options(checks.positive, "Stairs.", self, "rise", "run", "width")
@@ -105,6 +117,8 @@ class HeightField:
         origin: x and y of the point ``heights[0, 0]``, in m; None: the grid is centered at 0, 0.
         friction: Coefficient of friction.
         restitution: Coefficient of restitution; 1: that of the other body decides.
+        torsional_friction: Friction torque about the normal per normal force, in m.
+        rolling_friction: Friction torque against rolling per normal force, in m.
 
     Raises:
         ConfigError: If the heights are not a grid of at least 2 x 2 finite numbers, or an option is
@@ -116,10 +130,12 @@ class HeightField:
     origin: tuple[float, ...] | None = None
     friction: float = 1.0
     restitution: float = 1.0
+    torsional_friction: float = 0.0
+    rolling_friction: float = 0.0
 
     def __post_init__(self) -> None:
         checks.store_declared("HeightField.", self)
-        checks.options(checks.not_negative, "HeightField.", self, "friction", "restitution")
+        checks.options(checks.not_negative, "HeightField.", self, *MATERIAL)
         heights = self.heights
         if heights.ndim != 2 or min(heights.shape) < 2 or not np.isfinite(heights).all():
             raise ConfigError(

@@ -8,6 +8,7 @@ from typing import ClassVar
 
 from physx_core import checks
 from physx_core.errors import ConfigError
+from physx_sim.description.ground import MATERIAL
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -22,6 +23,10 @@ class WorldObject:
         orientation: Initial orientation: quaternion x, y, z, w.
         friction: Coefficient of friction; a contact uses the smaller of the two.
         restitution: Coefficient of restitution; a contact uses the product of the two.
+        torsional_friction: Friction torque about the normal of a contact per normal force, in m; a
+            contact uses the larger of the two.
+        rolling_friction: Friction torque against rolling per normal force, in m; a contact uses the
+            larger of the two.
     """
 
     lengths: ClassVar[tuple[str, ...]] = ()
@@ -34,6 +39,8 @@ class WorldObject:
     orientation: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
     friction: float = 1.0
     restitution: float = 0.0
+    torsional_friction: float = 0.0
+    rolling_friction: float = 0.0
 
     def __post_init__(self) -> None:
         kind = type(self).__name__
@@ -44,7 +51,7 @@ class WorldObject:
         object.__setattr__(self, "position", checks.vector(f"{where}position", self.position, 3))
         orientation = checks.unit_quaternion(f"{where}orientation", self.orientation)
         object.__setattr__(self, "orientation", orientation)
-        checks.options(checks.not_negative, where, self, "friction", "restitution")
+        checks.options(checks.not_negative, where, self, *MATERIAL)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +117,7 @@ class Mesh(WorldObject):
     """A triangle mesh from a file, with the moments of inertia of its bounding box.
 
     Attributes:
-        path: Path of an stl, obj, or dae file. Its origin is the object's center.
+        path: Path of an stl, obj, dae, or msh file. Its origin is the object's center.
         scale: Scale factor for all lengths.
 
     Raises:

@@ -9,6 +9,7 @@ from typing import Literal, get_args
 
 from physx_core import checks
 from physx_core.errors import ConfigError, UnknownOptionError
+from physx_sim.description.ground import MATERIAL
 
 Mode = Literal["force", "servo", "velocity", "position"]
 _RESISTANCE = ("damping", "friction", "stiffness", "rest", "armature")
@@ -116,8 +117,14 @@ class Robot:
         self_collisions: Whether links that are not connected by a joint collide with each other.
         feet: Links that collide as a sphere around their origin instead of with their own shapes,
             and the sphere's radius, in m.
-        friction: Coefficient of friction of all links; a contact uses the smaller of the two.
+        friction: Coefficient of friction of all links; a contact uses the smaller of the two. None:
+            as in an MJCF file, otherwise 1.
         restitution: Coefficient of restitution of all links; a contact uses the product of the two.
+        torsional_friction: Friction torque of all links about the normal of a contact per normal
+            force, in m; a contact uses the larger of the two. None: as in an MJCF file (condim 4
+            and 6), otherwise 0.
+        rolling_friction: Friction torque against rolling per normal force, in m, in the same form
+            (condim 6).
         joints: Settings of joints, by their name in the file.
         mass_factors: Scale factors for the mass and moments of inertia of links, by their name in
             the file; 1 for all others.
@@ -136,11 +143,13 @@ class Robot:
     collisions: Collisions = "shapes"
     self_collisions: bool = False
     feet: Mapping[str, float] = field(default_factory=dict)
-    friction: float = 1.0
+    friction: float | None = None
     restitution: float = 0.0
     joints: Mapping[str, JointSettings] = field(default_factory=dict)
     mass_factors: Mapping[str, float] = field(default_factory=dict)
     root: str = ""
+    torsional_friction: float | None = None
+    rolling_friction: float | None = None
 
     def __post_init__(self) -> None:
         checks.name("robot", self.name)
@@ -157,8 +166,9 @@ class Robot:
         object.__setattr__(self, "orientation", orientation)
         for link, radius in self.feet.items():
             checks.positive(f'{where}feet["{link}"]', radius)
-        checks.not_negative(f"{where}friction", self.friction)
-        checks.not_negative(f"{where}restitution", self.restitution)
+        for option in MATERIAL:
+            if (value := getattr(self, option)) is not None:
+                checks.not_negative(f"{where}{option}", value)
         for joint, settings in self.joints.items():
             if not isinstance(settings, JointSettings):
                 raise ConfigError(f'{where}joints["{joint}"] must be JointSettings(...).')

@@ -32,6 +32,7 @@ from .models.robot_files import find_robot as find_robot
 from .models.robot_files import named_robots as named_robots
 from .models.robot_model import RobotModel as RobotModel
 from .models.shapes import CollisionShape as CollisionShape
+from .models.shapes import steps_of as steps_of
 from .models.urdf_text import to_urdf as to_urdf
 from .resistance import Resistance as Resistance
 from .rk4 import RK4_LACKS as RK4_LACKS

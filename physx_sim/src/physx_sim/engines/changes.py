@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import numpy as np
 
 from physx_core.rotations import from_rotation_vector, multiply
 from physx_core.typing import Vector
 from physx_sim import BodySettings, HeightField, Layout
+from physx_sim.description.body_settings import FRICTIONS
 from physx_sim.engines.models.parts import MovableBody, Parts, static_poses
 from physx_sim.engines.models.shapes import CollisionShape
 from physx_sim.errors import SimulationError
@@ -186,9 +188,8 @@ class Changes:
         statics = []
         for static in described.statics:
             what = static.what if static.name != "ground" or self.ground is None else self.ground
-            friction = self.of(static.name).friction
-            if friction is not None:
-                what = replace(what, friction=friction)
+            if frictions := _frictions(self.of(static.name)):
+                what = replace(what, **frictions)
             statics.append(static if what is static.what else replace(static, what=what))
         world = replace(world, gravity=now.world.gravity)
         return replace(described, world=world, movables=tuple(movables), statics=tuple(statics))
@@ -203,9 +204,9 @@ class Changes:
             for body in model.bodies
         )
         shapes = tuple(
-            shape
-            if (friction := changed.get(shape.body, changed[model.links[0]]).friction) is None
-            else replace(shape, friction=friction)
+            replace(shape, **frictions)
+            if (frictions := _frictions(changed.get(shape.body, changed[model.links[0]])))
+            else shape
             for shape in model.shapes
         )
         if bodies == model.bodies and shapes == model.shapes:
@@ -214,3 +215,9 @@ class Changes:
 
     def _what(self, name: str) -> object:
         return self._described.statics[self._statics.index(name)].what
+
+
+def _frictions(settings: BodySettings) -> dict[str, Any]:
+    """Return the coefficients of friction that settings give, by their names."""
+    given = {option: getattr(settings, option) for option in FRICTIONS}
+    return {option: value for option, value in given.items() if value is not None}

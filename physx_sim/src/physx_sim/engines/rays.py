@@ -12,7 +12,7 @@ from physx_core.typing import Index, Records, Vector
 from physx_sim import RAY_HIT, Ground, HeightField, Stairs
 from physx_sim.engines.models.meshes import read_triangles
 from physx_sim.engines.models.parts import Parts
-from physx_sim.engines.models.shapes import CollisionShape
+from physx_sim.engines.models.shapes import CollisionShape, steps_of
 
 _KINDS = ("sphere", "capsule", "cylinder", "box", "mesh")
 _CYLINDER, _BOX, _MESH = 2, 3, 4
@@ -49,9 +49,8 @@ class Caster:
                 normal = np.array(what.normal if isinstance(what, Ground) else (0.0, 0.0, 1.0))
                 height = what.height if isinstance(what, Ground) else 0.0
                 self._planes.append((body, normal, float(height)))
-                for center, size in what.boxes() if isinstance(what, Stairs) else ():
-                    place = np.array(center), np.eye(3)
-                    found.append((body, CollisionShape("box", size, *place, "", 0.0, 0.0)))
+                steps = steps_of(what) if isinstance(what, Stairs) else ()
+                found += ((body, step) for step in steps)
         found.sort(key=lambda each: _KINDS.index(each[1].kind))
         self._shapes = [shape for _, shape in found]
         self.bodies = np.array([body for body, _ in found], np.intp)

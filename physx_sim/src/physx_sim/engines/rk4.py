@@ -22,6 +22,8 @@ RK4_LACKS = (
     "moving_statics",
     "restitution",
     "self_collisions",
+    "step_derivatives",
+    "torsional_friction",
 )
 """Features that a simulation lacks with this integrator."""
 

@@ -48,10 +48,12 @@ class Motor:
         backlash: Play of an elastic gear at the joint, from one flank to the other, in rad.
         period: Time between updates of the motor's command and measured velocity, in s; a
             multiple of the physics period; None: at every physics step.
+        network: File of ``physx identify --actuator``, whose network for the joint adds what the
+            real actuator does beyond all this, for a rigid gear; None: nothing.
 
     Raises:
-        ConfigError: If the joint is not a name, a number is out of range, or there is damping or
-            backlash without `stiffness`.
+        ConfigError: If the joint is not a name, a number is out of range, there is damping or
+            backlash without `stiffness`, or a network with it.
     """
 
     joint: str
@@ -67,6 +69,7 @@ class Motor:
     damping: float = 0.0
     backlash: float = 0.0
     period: float | None = None
+    network: str | None = None
 
     def __post_init__(self) -> None:
         where = f'Motor of "{self.joint}": '
@@ -83,6 +86,8 @@ class Motor:
         if self.period is not None:
             checks.positive(f"{where}period", self.period)
         if self.stiffness is not None:
+            if self.network is not None:
+                raise ConfigError(f"{where}a network needs a rigid gear, without stiffness.")
             checks.positive(f"{where}stiffness", self.stiffness)
             checks.positive(f"{where}inertia, with stiffness,", self.inertia)
         elif self.damping or self.backlash:

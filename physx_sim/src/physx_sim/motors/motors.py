@@ -16,6 +16,7 @@ from physx_sim.description.world import World
 from physx_sim.devices import as_slice, check_unique, places_of, steps_of
 from physx_sim.errors import FeatureNotSupportedError, SimulationError
 from physx_sim.motors.motor import Motor, armature_in
+from physx_sim.motors.network import AddedTorques
 from physx_sim.motors.shaft import Friction, Rotors, TorqueLimits, column
 from physx_sim.vectors import overwrite
 
@@ -32,6 +33,8 @@ class MotorState:
         rotor_positions: Positions of rotors behind elastic gears, in rad or m at the joint.
         rotor_velocities: Velocities of these rotors, in rad/s or m/s at the joint.
         fresh: Whether they have not run since they were created or reset.
+        histories: What networks have seen: torques and velocities, shape (networks, 2, samples).
+        added: Torques that networks add, shape (networks,), in N m or N.
     """
 
     commands: Vector
@@ -41,6 +44,8 @@ class MotorState:
     rotor_positions: Vector
     rotor_velocities: Vector
     fresh: bool
+    histories: Vector
+    added: Vector
 
 
 class Motors:
@@ -74,8 +79,8 @@ class Motors:
         Raises:
             ComponentNotFoundError: If the simulation has no joint with a given name.
             ConfigError: If two motors share a joint, a joint's mode is not ``"force"``, a period is
-                not a multiple of the physics period, a gear is too stiff for that period, or the
-                world lacks a rotor's inertia.
+                not a multiple of the physics period, a gear is too stiff for that period, the world
+                lacks a rotor's inertia, or a network cannot be read.
             FeatureNotSupportedError: If a rotor behind a rigid gear needs the feature ``armature``.
         """
         self.motors = tuple(motors)
@@ -99,7 +104,9 @@ class Motors:
         self._rotors = None
         if elastic:
             self._rotors = Rotors(elastic, period, self._joint_limit[self._elastic])
-        self._reads = self._friction.acts or self._rotors is not None
+        self._networks = AddedTorques(motors, period)
+        self._learned = len(self._networks.places) > 0
+        self._reads = self._friction.acts or self._rotors is not None or self._learned
         self._geared = bool((self._reduction != 1).any()) or self._rotors is not None
         self._limited = bool(np.isfinite(self._joint_limit).any())
         self._hook_every = 1 if self._reads else int(np.gcd.reduce(self._every))
@@ -201,6 +208,12 @@ class Motors:
             torques[self._elastic] = self._rotors.step(
                 torques[self._elastic], positions, joint_velocities[self._elastic]
             )
+        if self._learned:
+            at = self._networks.places
+            torques = torques.copy()
+            torques[at] += self._networks.update(
+                torques[at], joint_velocities[at], simulation.frame
+            )
         self._send(simulation, torques)
 
     def _send(self, simulation: Simulation, torques: Vector) -> None:
@@ -228,6 +241,7 @@ class Motors:
         self._commands[:] = self._drives[:] = 0.0
         self._send(simulation, self._drives)
         self._fresh = True
+        self._networks.reset()
         if self._rotors is not None:
             self._rotors.positions = simulation.positions()[self._q[self._elastic]]
             self._rotors.velocities = simulation.velocities()[self._v[self._elastic]]
@@ -244,6 +258,8 @@ class Motors:
             none if rotors is None else rotors.positions.copy(),
             none if rotors is None else rotors.velocities.copy(),
             self._fresh,
+            self._networks.history.copy(),
+            self._networks.added.copy(),
         )
 
     def restore(self, state: MotorState) -> None:
@@ -261,6 +277,7 @@ class Motors:
         self._torques[:], self._sent[:] = state.torques, state.others
         self._sent[self._span] = self._torques
         self._fresh = state.fresh
+        self._networks.history[:], self._networks.added[:] = state.histories, state.added
         if self._rotors is not None:
             self._rotors.positions = state.rotor_positions.copy()
             self._rotors.velocities = state.rotor_velocities.copy()

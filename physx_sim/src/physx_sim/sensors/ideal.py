@@ -21,6 +21,7 @@ from physx_sim.description.world import World
 from physx_sim.devices import as_slice, places_of
 from physx_sim.errors import FeatureNotSupportedError
 from physx_sim.sensors.sensor import (
+    Camera,
     ContactSensor,
     EffortSensor,
     Encoder,
@@ -143,7 +144,7 @@ class IdealContactSensors:
     def measure(self, simulation: Simulation, out: Vector) -> None:
         """Write touching, normal force, and force."""
         sums = [[0.0] * 5 for _ in out]
-        for first, second, _, (x, y, z), (a, b, c), _ in simulation.contacts().tolist():
+        for first, second, _, (x, y, z), (a, b, c), *_ in simulation.contacts().tolist():
             for place, sign in ((first, 1.0), (second, -1.0)):
                 for row in self._rows.get(place, ()):
                     mine = sums[row]
@@ -226,6 +227,23 @@ class IdealHeightScans:
             row[:] = (1 - 2 * np.where(hits["hit"], hits["fraction"], 1.0)) * sensor.reach
 
 
+class IdealCameras:
+    """Images of cameras."""
+
+    def __init__(self, sensors: Sequence[Camera], simulation: Simulation) -> None:
+        _require("cameras", simulation, "A Camera")
+        self._sensors = sensors
+        for sensor in sensors:
+            seen = [sensor.body] if sensor.body else []
+            places_of("body", [*seen, *sensor.ignored], simulation.layout.names)
+
+    def measure(self, simulation: Simulation, out: Vector) -> None:
+        """Write the images."""
+        for row, sensor in zip(out, self._sensors, strict=True):
+            images = simulation.take_images(sensor)
+            row[:] = np.concatenate([images[image].ravel() for image in sensor.images])
+
+
 class IdealEffortSensors:
     """Torques that drive joints."""
 
@@ -259,6 +277,7 @@ def ideal_sensors(
         EffortSensor: IdealEffortSensors,
         Lidar: IdealLidars,
         HeightScan: IdealHeightScans,
+        Camera: IdealCameras,
     }
     if kind not in kinds:
         raise ConfigError(f"{kind.__name__} is not a known kind of sensor.")

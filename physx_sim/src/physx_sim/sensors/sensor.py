@@ -10,6 +10,10 @@ from typing import ClassVar
 from physx_core import checks
 from physx_core.errors import ConfigError, UnknownOptionError
 
+_IMAGES = {"depth": 2, "segmentation": 2, "rgb": 3}
+"""Images of cameras, and how many axes they have."""
+_MOST_PIXELS = 4096
+"""Largest number of rows and of columns of an image."""
 Amounts = float | Mapping[str, float | Sequence[float]]
 """A number for all components, or for each quantity one number or a number for each component."""
 
@@ -95,6 +99,15 @@ class Sensor:
             many = value if isinstance(value, (tuple, list)) else (value,) * width
             found += checks.vector(f'{where}["{name}"]', many, width)
         return found
+
+    def shape_of(self, quantity: str) -> tuple[int, ...]:
+        """Return the shape of a quantity in the sensor's record: () for a number.
+
+        Args:
+            quantity: Its name.
+        """
+        width = self.quantities[quantity]
+        return () if width == 1 else (width,)
 
     def error_widths(self) -> dict[str, int]:
         """Return the number of errors of each quantity that has errors."""
@@ -219,12 +232,12 @@ class EffortSensor(Sensor):
 
 @dataclass(frozen=True, kw_only=True)
 class RaySensor(Sensor):
-    """Options common to `Lidar` and `HeightScan`, which see shapes and the ground.
+    """Options common to `Lidar`, `HeightScan` and `Camera`, which see shapes and the ground.
 
     Attributes:
-        body: Name of the link or object that carries it; rays pass its own shapes.
-        reach: Length of the rays, in m; what is beyond is not seen.
-        ignored: Names of other bodies that rays pass.
+        body: Name of the link or object that carries it, whose own shapes it does not see.
+        reach: How far it sees, in m.
+        ignored: Names of other bodies that it does not see.
 
     Raises:
         ConfigError: If an option is out of range, or `ignored` are not names.
@@ -311,6 +324,78 @@ class HeightScan(RaySensor):
     def __post_init__(self) -> None:
         self._store_rows("points", 2)
         super().__post_init__()
+
+
+@dataclass(frozen=True, kw_only=True)
+class Camera(RaySensor):
+    """Takes images along its x axis; z points up in them, and y to the left.
+
+    ``depth``: distance along x of what is seen, in m; `reach` where nothing is. ``segmentation``:
+    the body that is seen, an index into `Layout.names`, or -1, without errors. ``rgb``: colors from
+    0 to 255; each body has one. Rows are from the top down, columns from left to right. Needs an
+    engine with the feature ``cameras``.
+
+    Attributes:
+        body: As for all ray sensors; empty: the camera stands in the world.
+        images: Which of these images it takes.
+        height: Number of rows.
+        width: Number of columns; pixels are squares.
+        field_of_view: Angle between the upper and the lower edge of the images, in rad.
+        near: Distance below which nothing is seen, in m.
+        position: Position of the sensor in the body's frame, in m.
+        rotation: Rotation of the sensor in the body's frame: quaternion x, y, z, w.
+
+    Raises:
+        UnknownOptionError: If there is no such image.
+        ConfigError: If no image is named, or another option is out of range.
+    """
+
+    exact: ClassVar[frozenset[str]] = frozenset({"segmentation"})
+
+    body: str = ""
+    images: Sequence[str] = ("depth",)
+    height: int = 64
+    width: int = 64
+    field_of_view: float = 1.0
+    near: float = 0.01
+    position: tuple[float, ...] = (0.0, 0.0, 0.0)
+    rotation: tuple[float, ...] = (0.0, 0.0, 0.0, 1.0)
+
+    @property
+    def quantities(self) -> Mapping[str, int]:  # type: ignore[override]
+        """Number of components of each quantity."""
+        return {image: math.prod(self.shape_of(image)) for image in self.images}
+
+    def shape_of(self, quantity: str) -> tuple[int, ...]:
+        """Return the shape of an image: (height, width), with 3 colors for ``rgb``.
+
+        Args:
+            quantity: Its name.
+        """
+        return (self.height, self.width, 3)[: _IMAGES.get(quantity, 2)]
+
+    def __post_init__(self) -> None:
+        where = f'Camera "{self.name}": '
+        images = (self.images,) if isinstance(self.images, str) else tuple(self.images)
+        if unknown := [str(image) for image in images if image not in _IMAGES]:
+            raise UnknownOptionError(f"{where}images", unknown, tuple(_IMAGES))
+        object.__setattr__(self, "images", tuple(dict.fromkeys(images)))
+        if not images:
+            raise ConfigError(f"{where}images are none, but must be of: {', '.join(_IMAGES)}.")
+        checks.store_declared(where, self)
+        for option in ("height", "width"):
+            if not 0 < (value := getattr(self, option)) <= _MOST_PIXELS:
+                raise ConfigError(f"{where}{option} is {value!r}, not from 1 to {_MOST_PIXELS}.")
+        super().__post_init__()
+        if not 0 < self.field_of_view < math.pi:
+            raise ConfigError(
+                f"{where}field_of_view is {self.field_of_view!r} but must be between 0 and π."
+            )
+        if not 0 < self.near < self.reach:
+            raise ConfigError(f"{where}near is {self.near!r} but must be between 0 and reach.")
+        object.__setattr__(self, "position", checks.vector(f"{where}position", self.position, 3))
+        rotation = checks.unit_quaternion(f"{where}rotation", self.rotation)
+        object.__setattr__(self, "rotation", rotation)
 
 
 def fan(

@@ -310,7 +310,7 @@ def _record(sensor: Sensor) -> np.dtype[np.void]:
     """Return the record type of one sensor's quantities."""
     return np.dtype(
         [
-            (name, np.float64) if width == 1 else (name, np.float64, (width,))
-            for name, width in sensor.quantities.items()
+            (name, np.float64, shape) if (shape := sensor.shape_of(name)) else (name, np.float64)
+            for name in sensor.quantities
         ]
     )

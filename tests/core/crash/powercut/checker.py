@@ -63,6 +63,7 @@ class Result:
     Attributes:
         examined: How many states were compared with a promise.
         distinct: How many different ones there were in each history, all together.
+        free: How many of those are of data with free axes.
         histories: How many histories.
         problems: What was wrong.
         deep: How many states were also recovered or repaired, by kind.
@@ -70,6 +71,7 @@ class Result:
 
     examined: int = 0
     distinct: int = 0
+    free: int = 0
     histories: int = 0
     problems: list[Problem] = field(default_factory=list)
     deep: Counter[str] = field(default_factory=Counter)
@@ -78,6 +80,7 @@ class Result:
         """Add what another campaign found."""
         self.examined += other.examined
         self.distinct += other.distinct
+        self.free += other.free
         self.histories += other.histories
         self.problems += other.problems
         self.deep += other.deep
@@ -271,6 +274,7 @@ class _Part:
         problem = promise.broken(seen, power=power)
         if new:
             self._result.distinct += 1
+            self._result.free += self._history.has_free_axes
             if not problem and not seen.error and self._result.distinct % DEEP == 0:
                 kinds = self._history.kinds
                 kind = kinds[self._result.distinct // DEEP % len(kinds)]

@@ -127,9 +127,11 @@ class CheckpointHistory:
     Attributes:
         calls: What was called, for messages.
         problems: What calls did wrong.
+        has_free_axes: Whether a field has one: there are none.
     """
 
     kinds = ("save",)
+    has_free_axes = False
 
     def __init__(
         self, chance: random.Random, stage: Stage, folder: Path, aside: Path, longest: int = 7

@@ -264,6 +264,7 @@ class History:
     Attributes:
         calls: What was called, for messages.
         problems: What calls did wrong.
+        has_free_axes: Whether a field has one.
     """
 
     kinds = ("verify", "write", "verify", "write", "repair", "write", "verify", "rebuild")
@@ -295,6 +296,7 @@ class History:
             name: fields if any(0 not in of.shape for of in fields) else (KINDS[1], *fields)
             for name, fields in self._modes.items()
         }
+        self.has_free_axes = any(of.free_axis for fields in self._modes.values() for of in fields)
         self._capacity = chance.choice((2, 5, 9, 30, 70))
         self._draw_options()
         self._eager = chance.choice((0.0, 0.0, 0.02, 0.1))

@@ -157,7 +157,7 @@ def _difference(found: Inspection, partition: Partition, field: Field) -> str | 
     if not partition.sealed:
         short = found.rows < rows
         return f"has {found.rows} committed rows, not {rows}." if short else None
-    if found.rows != rows or found.capacity != rows:
+    if not found.is_sealed_form(rows):
         return (
             f"has {found.rows} committed rows and space for {found.capacity}, but "
             f"{rows} were expected."

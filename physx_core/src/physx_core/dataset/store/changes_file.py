@@ -1,10 +1,12 @@
 """The file ``changes.jsonl``: partitions that were begun or sealed since the manifest was written.
 
 A new partition is one line here instead of a new manifest, whose size grows with the number of
-partitions. Each line is on the disk before it is relied upon. It ends in a CRC-32 of everything
-before it, the manifest included: lines that do not continue the manifest, because they are torn or
-older than it, are no part of the dataset. The manifest takes them over when they have grown to half
-of its size, at any other change, and when the dataset is opened for writing or closed.
+partitions; several that are listed at once share a line, so that a cut leaves all of them or none,
+as the statistics that a line names are those of all. Each line is on the disk before it is relied
+upon. It ends in a CRC-32 of everything before it, the manifest included: lines that do not continue
+the manifest, because they are torn or older than it, are no part of the dataset. The manifest takes
+them over when they have grown to half of its size, at any other change, and when the dataset is
+opened for writing or closed.
 """
 
 from __future__ import annotations
@@ -12,7 +14,7 @@ from __future__ import annotations
 import json
 import os
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -55,13 +57,11 @@ class End(NamedTuple):
         return 2 * self.nbytes > self.manifest_nbytes
 
 
-def append(directory: Path, end: End, changes: Iterable[Mapping[str, Any]]) -> End:
-    """Append changes and wait until they are on the disk; return where the next one goes."""
-    content, crc = b"", end.crc32
-    for change in changes:
-        body = json.dumps(change).encode()[:-1]
-        crc = crc32(body, crc)
-        content += body + b', "crc32": "%08x"}\n' % crc
+def append(directory: Path, end: End, change: Mapping[str, Any]) -> End:
+    """Append a change and wait until it is on the disk; return where the next one goes."""
+    body = json.dumps(change).encode()[:-1]
+    crc = crc32(body, end.crc32)
+    content = body + b', "crc32": "%08x"}\n' % crc
     descriptor = files.open_regular(directory / FILE, os.O_RDWR | os.O_CREAT)
     try:
         files.write_at(descriptor, content, end.nbytes)

@@ -78,9 +78,10 @@ def append(directory: Path, manifest: Manifest, end: End, partitions: list[Parti
     """
     before, after = end.statistics, _store_statistics(directory, manifest)
     plain = [{"mode": each.mode, "partition": each.to_dict()} for each in partitions]
+    change: dict[str, Any] = {**plain[0], "also": plain[1:]} if plain[1:] else plain[0]
     if after != before and after is not None:
-        plain[-1]["statistics"] = statistics_file.reference(after)
-    end = changes_file.append(directory, end, plain)
+        change["statistics"] = statistics_file.reference(after)
+    end = changes_file.append(directory, end, change)  # they count in the statistics, or none does
     manifest.end, manifest.statistics_checksum = end._replace(statistics=after), after
     for each in partitions:
         manifest.modes[each.mode].put(each)

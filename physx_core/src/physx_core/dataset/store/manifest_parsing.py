@@ -36,13 +36,14 @@ def parse_manifest(plain: Mapping[str, Any]) -> Manifest:
 
 def apply_change(manifest: Manifest, plain: Any) -> None:
     """Take over a change of the manifest, described by plain data."""
-    name = checked(str, plain["mode"], "a mode")
-    mode = manifest.modes[name]
-    partition = _partition(name, plain["partition"], mode.files, set(mode.axes))
-    if any(partition.key == each.key for each in mode.dropped):
-        raise ValueError("a partition is listed twice")
-    mode.put(partition)
-    whole(mode.rows, "the number of rows")
+    for one in (plain, *checked(list, plain.get("also", []), "the other partitions")):
+        name = checked(str, one["mode"], "a mode")
+        mode = manifest.modes[name]
+        partition = _partition(name, one["partition"], mode.files, set(mode.axes))
+        if any(partition.key == each.key for each in mode.dropped):
+            raise ValueError("a partition is listed twice")
+        mode.put(partition)
+        whole(mode.rows, "the number of rows")
     if "statistics" in plain:
         manifest.statistics_checksum = _statistics_checksum(plain["statistics"])
         for each in manifest.modes.values():

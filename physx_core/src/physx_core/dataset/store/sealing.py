@@ -47,7 +47,7 @@ def seal(
         found, rows = partition.inspect(directory, field), partition.rows_of(field)
         offsets[name] = found.data_offset
         path = partition.path(directory, name)
-        if rewrite or found.capacity != rows or found.rows != rows:
+        if rewrite or not found.is_sealed_form(rows):
             identity = partition.identity(field)
             offsets[name], _ = copy(path, found.data_offset, path, identity, rows)
         else:

@@ -117,7 +117,7 @@ class Share:
         found = measure(directory, {field.name: field for field in self.fields}, found)
         for of in self.fields:
             file, rows = found.inspect(directory, of), found.rows_of(of)
-            if file.identity != found.identity(of) or {file.rows, file.capacity} != {rows}:
+            if file.identity != found.identity(of) or not file.is_sealed_form(rows):
                 return False
             offsets[of.name] = file.data_offset
         del self._open[found.first_row]

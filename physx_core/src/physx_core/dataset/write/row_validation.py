@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,8 @@ from physx_core.fields import ENDS, NO_ARRAY, NUMBERS, RESERVED, Field, first_no
 from physx_core.packing import check_sizes, join
 from physx_core.rows import check_names
 from physx_core.typing import Array, Batch
+
+_DTYPE, _SHAPE = attrgetter("dtype"), attrgetter("shape")
 
 
 def infer_fields(values: Mapping[str, Any], axes: int = 1) -> list[Field]:
@@ -107,13 +110,12 @@ def check_rows(
 
 def _converted(field: Field, rows: Any) -> list[Array]:
     """Return rows of a field with a free axis, each as an array of its type."""
-    kind, shape = field.numpy_dtype, field.entry_shape
-    return [
-        value
-        if type(value) is np.ndarray and value.dtype is kind and value.shape[1:] == shape
-        and value.ndim else field.convert(value)
-        for value in rows
-    ]  # fmt: skip
+    given = list(rows)
+    if set(map(type, given)) == {np.ndarray} and set(map(_DTYPE, given)) == {field.numpy_dtype}:
+        shapes = set(map(_SHAPE, given))
+        if all(len(shape) and shape[1:] == field.entry_shape for shape in shapes):
+            return given
+    return [field.convert(value) for value in given]
 
 
 def _fit(fields: Mapping[str, Field], block: Batch) -> bool:
@@ -150,8 +152,9 @@ def _joined(free: Mapping[str, Field], rows: Mapping[str, list[Array]], *, check
         if not checked and (bad := first_not_finite(entries[name])) is not None:
             row = int(np.cumsum(counts).searchsorted(bad, "right"))
             raise field.not_finite(where=f" in row {row} of the block")
-        end = np.cumsum(counts).astype("<u8")
-        if not np.array_equal(ends.setdefault(field.free_axis + ENDS, end), end):
-            row = int(np.argmax(end != ends[field.free_axis + ENDS]))
+        end = np.cumsum(counts, dtype="<u8")
+        first = ends.setdefault(field.free_axis + ENDS, end)
+        if first is not end and not np.array_equal(first, end):
+            row = int(np.argmax(end != first))
             check_sizes(free, {each: values[row] for each, values in rows.items()})
     return entries | ends

@@ -83,7 +83,7 @@ class OpenPartition:
             ends = rows[axis + ENDS]
             begin, _ = _entries(rows, axis, start, start)
             most = begin + capacity - self.partition.sizes[axis]
-            found = int(ends[start : start + found].searchsorted(most, "right"))
+            found = int(ends[start : start + found].searchsorted(np.uint64(most), "right"))
         return found
 
     def append(self, rows: Batch, start: int, count: int) -> None:

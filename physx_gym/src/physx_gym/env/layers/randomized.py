@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar
 
 import numpy as np
 
 from physx_core.errors import ConfigError
+from physx_core.plugins import import_component
 from physx_gym.env.layers.layer import Layer
 from physx_gym.env.pipeline_env import PipelineEnv
 from physx_gym.tasks.randomizations import Randomization
 from physx_gym.tasks.randomizations.randomization import Nominal
+
+_POSTERIOR = "physx_identify:Identified"
+"""Draws from a file; of a package that builds on this one, so it is named, not imported."""
 
 
 class RandomizedEnv(Layer):
@@ -41,23 +46,26 @@ class RandomizedEnv(Layer):
         self,
         env: PipelineEnv,
         *,
-        randomizations: Sequence[Randomization] | Randomization,
+        randomizations: Sequence[Randomization | str | Path] | Randomization | str | Path,
         every: int = 1,
     ) -> None:
         """Add randomizations to an environment.
 
         Args:
             env: The environment.
-            randomizations: One or more, with different names.
+            randomizations: One or more, with different names. A file of ``physx identify -o``
+                stands for draws from its posterior.
             every: Number of episodes that share the drawn values.
 
         Raises:
             ConfigError: If one is not a `Randomization`, two have the same name, the environment is
                 randomized already, or lacks what is randomized.
-            ComponentNotFoundError: If a randomization names something that is not there.
+            ComponentNotFoundError: If a randomization names something that is not there, or a file
+                is given and the package physx-identify is not installed.
         """
-        given = [randomizations] if isinstance(randomizations, Randomization) else randomizations
-        self.randomizations = tuple(given)
+        if isinstance(randomizations, (Randomization, str, Path)):
+            randomizations = [randomizations]
+        self.randomizations = tuple(map(_randomization, randomizations))
         self.every = every
         self.drawn: dict[str, Any] = {}
         self._prepared: dict[str, Any] | None = None
@@ -130,6 +138,13 @@ class RandomizedEnv(Layer):
 
     def _constants(self) -> dict[str, Any]:
         return {"randomization": self.drawn}
+
+
+def _randomization(given: Any) -> Any:
+    """Return a randomization; that of a posterior, if a file is given."""
+    if not isinstance(given, (str, Path)):
+        return given
+    return import_component("randomization", _POSTERIOR)(given)
 
 
 def _merge(options: dict[str, Any], more: Mapping[str, Any]) -> None:

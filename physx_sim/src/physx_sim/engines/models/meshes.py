@@ -15,7 +15,7 @@ from physx_core.processes import TemporaryFolder
 from physx_core.typing import Vector
 from physx_sim.errors import ModelError
 
-_FORMATS = (".stl", ".obj", ".dae")
+_FORMATS = (".stl", ".obj", ".dae", ".msh")
 _LARGEST = 2**27
 """Maximum size of a mesh file, in bytes; loading takes several times as much memory."""
 _GEOMETRY = ([b"v"], [b"vn"], [b"vt"], [b"f"], [b"o"], [b"g"])
@@ -25,7 +25,7 @@ def read_vertices(path: Path, scale: Sequence[float]) -> Vector:
     """Return the vertices of a mesh file, shape (n, 3), in m.
 
     Args:
-        path: Path of an stl, obj, or dae file.
+        path: Path of an stl, obj, dae, or msh file.
         scale: Scale factor along each axis.
 
     Raises:
@@ -39,7 +39,7 @@ def read_triangles(path: Path, scale: Sequence[float]) -> Vector:
     """Return the corners of the triangles of a mesh file, shape (n, 3, 3), in m.
 
     Args:
-        path: Path of an stl, obj, or dae file.
+        path: Path of an stl, obj, dae, or msh file.
         scale: Scale factor along each axis.
 
     Raises:
@@ -83,18 +83,50 @@ def _vertices(path: Path, mesh: Any) -> Vector:
 def geometry_file(path: Path) -> Iterator[Path]:
     """Yield a file with the vertices and faces of a mesh that refers to no other file.
 
-    An obj file can refer to material files anywhere, which the engines' libraries would read.
+    An obj file can refer to material files anywhere, which the engines' libraries would read. They
+    cannot read MuJoCo's format, msh, so it is converted to obj.
+
+    Raises:
+        ModelError: If an msh file is damaged.
     """
-    if path.suffix.lower() != ".obj":
+    suffix = path.suffix.lower()
+    if suffix not in (".obj", ".msh"):
         yield path
         return
-    content = path.read_bytes().replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
-    lines = content.splitlines(keepends=True)
-    kept = b"".join(line for line in lines if line.split(None, 1)[:1] in _GEOMETRY)
+    kept = _bare(path.read_bytes()) if suffix == ".obj" else _converted(path)
     with TemporaryFolder("mesh-") as folder:
-        bare = folder.path / path.name
+        bare = folder.path / path.with_suffix(".obj").name
         files.replace(bare, kept, wait=False)
         yield bare
+
+
+def _bare(content: bytes) -> bytes:
+    """Return the vertices and faces of an obj file."""
+    joined = content.replace(b"\\\r\n", b" ").replace(b"\\\n", b" ")
+    lines = joined.splitlines(keepends=True)
+    return b"".join(line for line in lines if line.split(None, 1)[:1] in _GEOMETRY)
+
+
+def _converted(path: Path) -> bytes:
+    """Return the vertices and faces of an msh file as an obj file.
+
+    It contains, little-endian, the numbers of vertices, normals, texture coordinates and faces
+    (4 int32), then these as float32 (3, 3 and 2 each) and int32 (3 each).
+    """
+    content = path.read_bytes()
+    header = np.frombuffer(content[:16] if len(content) >= 16 else b"", "<i4")
+    if len(header) == 4 and (header >= 0).all():
+        vertices, normals, textures, faces = header.tolist()
+        begin = 16 + 12 * vertices
+        end = begin + 12 * normals + 8 * textures
+        if len(content) == end + 12 * faces:
+            points = np.frombuffer(content[16:begin], "<f4").reshape(-1, 3)
+            corners = np.frombuffer(content[end:], "<i4").reshape(-1, 3)
+            if not faces or (corners.min() >= 0 and corners.max() < vertices):
+                lines = [f"v {x!r} {y!r} {z!r}" for x, y, z in points.tolist()]
+                lines += [f"f {a} {b} {c}" for a, b, c in (corners + 1).tolist()]
+                return "\n".join([*lines, ""]).encode("ascii")
+    raise ModelError(f"The mesh {path} is not an msh file of MuJoCo, or it is damaged.")
 
 
 def bounding_box(vertices: Vector) -> tuple[Vector, Vector]:

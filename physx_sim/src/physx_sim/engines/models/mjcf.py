@@ -24,7 +24,7 @@ from physx_core.typing import Vector
 from physx_sim import Attachment, Connect, JointSettings, Mimic, Robot, Weld
 from physx_sim.engines.models.rigid_bodies import Joint, RigidBody
 from physx_sim.engines.models.robot_model import RobotModel, check_names, with_leaders
-from physx_sim.engines.models.shapes import CollisionShape, shape_of_foot, simplified
+from physx_sim.engines.models.shapes import CollisionShape, material_of, shape_of_foot, simplified
 from physx_sim.errors import ModelError
 
 WORLD = "world"
@@ -93,7 +93,7 @@ def read_mjcf(robot: Robot, path: Path, *, touching: bool) -> RobotModel:
     check_names(robot, names, joints)
     shapes = _Shapes(file, robot, list(links.places))
     mimics, attachments, untold = _equalities(file, links)
-    left_out = [*_left_out(robot, file, links), *untold, *shapes.left_out]
+    left_out = [*_left_out(file, links), *untold, *shapes.left_out]
     if robot.fixed_base and root in file.floating:
         left_out.append("the free joint of its root body (fixed_base=False lets it float)")
     warnings = (f"physx leaves out {'; '.join(left_out)}",) if left_out else ()
@@ -155,8 +155,9 @@ class _File:
     def root(self, robot: Robot) -> int:
         """Return the body that is a robot's root link; 0: the world."""
         names = {self.body_name(body): body for body in self.floating}
-        names |= {WORLD: 0} if self.attached or not names else {}
-        if not robot.root and len(names) > 1:
+        trees = len(names) + bool(self.attached)
+        names |= {WORLD: 0} if self.attached or self.solid(0) or not names else {}
+        if not robot.root and trees > 1:
             raise ModelError(
                 f"it has several trees: choose one with Robot(root=...), or take all with "
                 f"mjcf_robots(...). Roots: {listed(names)}"
@@ -321,11 +322,18 @@ class _Shapes:
         elif kind in (kinds.mjGEOM_HFIELD, kinds.mjGEOM_SDF):
             self._count("height fields and distance fields: use World(ground=HeightField(...))")
         else:
-            material = self._robot.friction, self._robot.restitution
             place = pose[:3, 3].copy(), pose[:3, :3].copy()
-            shape = CollisionShape(name, found, *place, link, *material, mesh)
+            material = self._material(geom)
+            shape = CollisionShape(name, found, *place, link, mesh=mesh, **material)
             return simplified(shape, self._robot.collisions)
         return None
+
+    def _material(self, geom: int) -> dict[str, Any]:
+        """Return what a geom is made of; its ``condim`` says which kinds of friction it has."""
+        kinds = ("friction", "torsional_friction", "rolling_friction")
+        count = {4: 2, 6: 3}.get(int(self._file.model.geom_condim[geom]), 1)
+        values = self._file.model.geom_friction[geom].tolist()
+        return material_of(self._robot, **dict(zip(kinds[:count], values, strict=False)))
 
     def _count(self, what: str) -> None:
         self._odd[what] = self._odd.get(what, 0) + 1
@@ -396,7 +404,7 @@ def _attachment(file: _File, links: _Links, place: int, pair: list[int]) -> Atta
     return Weld(one, other, tuple(held[:3, 3].tolist()), tuple(turn.tolist()))
 
 
-def _left_out(robot: Robot, file: _File, links: _Links) -> Iterator[str]:
+def _left_out(file: _File, links: _Links) -> Iterator[str]:
     """Yield what of a file no engine is told, and what that changes."""
     model, option = file.model, file.model.opt
     for count, what, effect in (
@@ -419,12 +427,7 @@ def _left_out(robot: Robot, file: _File, links: _Links) -> Iterator[str]:
         (model.jnt_stiffnesspoly[joints].any(), "the nonlinear part of springs"),
         (model.dof_dampingpoly[places].any(), "the nonlinear part of dampers"),
         (model.jnt_springyield[joints].any(), "springs that yield"),
-        ((model.geom_condim[solid] > 3).any(), "torsional and rolling friction (condim 4 and 6)"),
         ((model.geom_condim[solid] < 3).any(), "that some contacts have no friction (condim 1)"),
-        (
-            (model.geom_friction[solid][:, 0] != robot.friction).any(),
-            "the friction of geoms (Robot(friction=...) decides)",
-        ),
         (model.geom_margin[solid].any(), "margins of contacts"),
     ):
         if found:

@@ -89,6 +89,13 @@ class Parts:
     statics: tuple[Static, ...]
     attachments: tuple[Attachment, ...] = ()
 
+    @property
+    def turning(self) -> bool:
+        """Whether anything has torsional or rolling friction."""
+        touching = [shape for movable in self.movables for shape in movable.model.shapes]
+        whats = [*touching, *(static.what for static in self.statics)]
+        return any(what.torsional_friction or what.rolling_friction for what in whats)
+
 
 def read_parts(world: World) -> Parts:
     """Read a world's files, and warn once about robots whose inertia is wrong.

@@ -5,11 +5,13 @@ from __future__ import annotations
 import math
 from dataclasses import dataclass, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from physx_core.typing import Vector
-from physx_sim import Box, Capsule, Cylinder, Mesh, Robot, Sphere, UrdfTree, WorldObject
+from physx_sim import Box, Capsule, Cylinder, Mesh, Robot, Sphere, Stairs, UrdfTree, WorldObject
+from physx_sim.description.ground import MATERIAL
 from physx_sim.engines.models.meshes import bounding_box, bounding_capsule, read_vertices
 from physx_sim.engines.models.robot_files import mesh_path
 from physx_sim.errors import ModelError
@@ -29,6 +31,8 @@ class CollisionShape:
         friction: Coefficient of friction.
         restitution: Coefficient of restitution.
         mesh: File of a mesh.
+        torsional_friction: Friction torque about the normal of a contact per normal force, in m.
+        rolling_friction: Friction torque against rolling per normal force, in m.
     """
 
     kind: str
@@ -39,6 +43,21 @@ class CollisionShape:
     friction: float
     restitution: float
     mesh: Path | None = None
+    torsional_friction: float = 0.0
+    rolling_friction: float = 0.0
+
+
+def material_of(robot: Robot, **file: float) -> dict[str, Any]:
+    """Return what a robot's shapes are made of: options of `CollisionShape`.
+
+    Args:
+        robot: The robot's description.
+        file: Coefficients of friction in its file, by option.
+    """
+    found = {"friction": 1.0, "torsional_friction": 0.0, "rolling_friction": 0.0, **file}
+    given = {option: getattr(robot, option) for option in found}
+    found |= {option: value for option, value in given.items() if value is not None}
+    return {"restitution": robot.restitution, **found}
 
 
 def shapes_of_robot(robot: Robot, path: Path, tree: UrdfTree) -> tuple[CollisionShape, ...]:
@@ -50,7 +69,7 @@ def shapes_of_robot(robot: Robot, path: Path, tree: UrdfTree) -> tuple[Collision
         tree: Its links.
     """
     shapes: list[CollisionShape] = []
-    material = robot.friction, robot.restitution
+    material = material_of(robot)
     for name in tree.elements:
         if name in robot.feet:
             shapes.append(shape_of_foot(robot, name))
@@ -60,15 +79,15 @@ def shapes_of_robot(robot: Robot, path: Path, tree: UrdfTree) -> tuple[Collision
                     raise ModelError(f'link "{name}" has a {each.kind} of size {each.size}')
                 pose = each.pose[:3, 3].copy(), each.pose[:3, :3].copy()
                 mesh = mesh_path(path, each.mesh, robot.package_dirs) if each.mesh else None
-                shape = CollisionShape(each.kind, each.size, *pose, name, *material, mesh)
+                shape = CollisionShape(each.kind, each.size, *pose, name, mesh=mesh, **material)
                 shapes.append(simplified(shape, robot.collisions))
     return tuple(shapes)
 
 
 def shape_of_foot(robot: Robot, link: str) -> CollisionShape:
     """Return the sphere that a robot has in the place of a link's own shapes."""
-    size, material = (float(robot.feet[link]),), (robot.friction, robot.restitution)
-    return CollisionShape("sphere", size, np.zeros(3), np.eye(3), link, *material)
+    size, material = (float(robot.feet[link]),), material_of(robot)
+    return CollisionShape("sphere", size, np.zeros(3), np.eye(3), link, **material)
 
 
 def shape_of_object(thing: WorldObject) -> CollisionShape:
@@ -88,8 +107,19 @@ def shape_of_object(thing: WorldObject) -> CollisionShape:
         raise ModelError(
             f'Object "{thing.name}" is a {type(thing).__name__}, which is not a shape.'
         )
-    material = thing.friction, thing.restitution
-    return CollisionShape(kind, size, np.zeros(3), np.eye(3), thing.name, *material, mesh)
+    return CollisionShape(kind, size, np.zeros(3), np.eye(3), thing.name, mesh=mesh, **_own(thing))
+
+
+def steps_of(stairs: Stairs) -> list[CollisionShape]:
+    """Return the boxes of which stairs consist, where they are in the world."""
+    return [
+        CollisionShape("box", size, np.array(center), np.eye(3), "ground", **_own(stairs))
+        for center, size in stairs.boxes()
+    ]
+
+
+def _own(thing: WorldObject | Stairs) -> dict[str, Any]:
+    return {option: getattr(thing, option) for option in MATERIAL}
 
 
 def moments(shape: CollisionShape, mass: float) -> Vector:

@@ -60,7 +60,10 @@ def read_urdf(robot: Robot, path: Path, *, touching: bool) -> RobotModel:
     for joint in tree.joints:
         if joint.get("type", "") not in (*_MOVING, "fixed"):
             name, kind = joint.get("name"), joint.get("type", "")
-            raise ModelError(f'joint "{name}" has the type "{kind}", which is not supported')
+            advice = ": use three hinges" if kind == "spherical" else ""
+            raise ModelError(
+                f'joint "{name}" has the type "{kind}", which is not supported{advice}'
+            )
     if robot.root not in ("", tree.links[0]):
         raise ModelError(f'its root is "{tree.links[0]}", not "{robot.root}"')
     moving = [joint for joint in tree.joints if joint.get("type") in _MOVING]

@@ -47,6 +47,8 @@ VERSION = 4
 MAGIC = b"\x89physx\r\n"
 """Start of the dataset ``header``, which physx reads without HDF5."""
 SIGNATURE = b"\x89HDF\r\n\x1a\n"
+SPARE = 64
+"""A sealed file has space for one entry of a free axis more for each so many, at most."""
 _PAGE = 4096
 _NUMBERS = struct.Struct("<6QI")  # digest and size of the header, offsets, capacity, length of text
 _ALIGNMENT = 16  # no number in a row crosses a sector boundary
@@ -155,6 +157,15 @@ class Inspection:
     def is_consistent(self) -> bool:
         """Whether the row count is that of the newest record, as each commit leaves them."""
         return self.rows == self.commits[0].rows
+
+    def is_sealed_form(self, rows: int) -> bool:
+        """Whether a sealed file with so many rows may be like this: it has space for no others.
+
+        Entries of a free axis rarely fill a file: a little space may be left, for to copy all of
+        them would cost more than to write them did.
+        """
+        spare = rows // SPARE if self.identity.field.free_axis else 0
+        return self.rows == rows <= self.capacity <= rows + spare
 
     @property
     def certain(self) -> bool:
