@@ -4,7 +4,7 @@ The "real" arm is one in another engine, MuJoCo, whose masses, damping and dry f
 tells: its encoders and torques are noisy, and the torques in its log are late. `physx identify`
 finds what the log tells, and training draws each episode's arm from that posterior. The rivals
 train on the arm of the file, alone or with masses within 20 % of it, as one would guess; the real
-ones are 30 % off, and the file knows of no dry friction. A plan of torques is trained with an
+ones are 15 % off, and the file knows of no dry friction. A plan of torques is trained with an
 evolution strategy; feedback is soft, so what the arm does follows from the plan.
 
     python examples/24_identified_arm.py --picture identified.png

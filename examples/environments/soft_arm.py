@@ -14,7 +14,7 @@ KNOWN = Robot("double_pendulum", "arm")
 HIDDEN = Robot(
     "double_pendulum",
     "arm",
-    mass_factors={"upper": 1.3, "lower": 0.7},
+    mass_factors={"upper": 1.15, "lower": 0.85},
     joints={
         "shoulder": JointSettings(damping=0.5, friction=0.8),
         "elbow": JointSettings(damping=0.2, friction=0.3),

@@ -66,13 +66,13 @@ def test_a_parquet_file_of_somebody_else_is_imported(tmp_path):
     table = {
         "state": arrow.array([[1.0, 2.0], [3.0, 4.0]], arrow.list_(arrow.float32(), 2)),
         "count": arrow.array([1, 2]),
-        "name": arrow.array(["a", "b"]),
+        "day": arrow.array([1, 2], arrow.date32()),
         "path": arrow.array([[1], [2, 3]]),
         "gap": arrow.array([1, None]),
     }
     parquet.write_table(arrow.table(table), tmp_path / "table.parquet")
     for name, reason in {
-        "name": "holds string", "path": "lists of different lengths", "gap": "without a value"
+        "path": "lists of different lengths", "gap": "without a value", "day": "holds date32"
     }.items():  # fmt: skip
         with pytest.raises(ExchangeError, match=f'"{name}" of .*{reason}'):
             import_file(tmp_path / "table.parquet", tmp_path / "set", fields=[name])

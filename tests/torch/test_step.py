@@ -51,6 +51,26 @@ CASES = {
     "sliding": ball(height=0.0999, v=[1.0, 0.5, 0.0, 0.0, 2.0, 0.1]),
     "sliding on four corners": block(v=[1.0, 0.5, 0.0, 0.0, 0.0, 0.1]),
     "sticking on four corners": block(v=[1e-3, 2e-3, 0.0, 1e-3, 0.0, 1e-3]),
+    "resisting turns": (
+        World(
+            objects=[
+                Sphere(name="a", radius=0.1, rolling_friction=1e-3, torsional_friction=2e-3)
+            ],
+            ground=GROUND,
+        ),
+        [0.1, 0.2, 0.0999, 0.5, 0.5, 0.5, 0.5],
+        [0.02, 0.01, -0.1, 2.0, 0.5, 1.0],
+        [],
+    ),
+    "held against turns": (
+        World(
+            objects=[Sphere(name="a", radius=0.1, rolling_friction=0.02, torsional_friction=0.1)],
+            ground=GROUND,
+        ),
+        [0.1, 0.2, 0.0999, 0.5, 0.5, 0.5, 0.5],
+        [1e-3, -0.1, 1e-3, 1e-3, 2e-3, 1e-3],
+        [],
+    ),
     "grazing": ball(height=0.10001, v=[1.0, 0.5, -0.02, 0.0, 2.0, 0.1]),
     "hitting": block(q=(0.0, 0.0, 0.12), v=[1.0, 0.5, -2.0, 1.0, 2.0, -3.0], turn=TURN),
     "capsule": (

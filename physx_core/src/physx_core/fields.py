@@ -31,6 +31,9 @@ RESERVED = ("env_id", "episode", "step")
 NUMBERS = "biufc"
 """Kinds of NumPy types that fields may have: boolean, integer, floating-point, complex."""
 
+TEXT = "S"
+"""Kind of NumPy types of text: UTF-8 in a fixed number of bytes, filled up with zeros."""
+
 _FITTING = {"b": "b", "i": "biu", "u": "biu", "f": "biuf", "c": NUMBERS}
 """Kind of a field's type to the kinds of values that fit it."""
 
@@ -66,7 +69,8 @@ class Field:
         shape: Shape of one sample's value. None: taken from the first sample. The first axis may
             have a name instead of a size, as in ``("node", 3)``: it is *free*, of any size in each
             sample, the same for all fields with this axis. Its values are *entries*.
-        dtype: NumPy type: any plain boolean, integer, floating-point, or complex type.
+        dtype: NumPy type: any plain boolean, integer, floating-point, or complex type, or ``"S16"``
+            for text of at most 16 bytes in UTF-8, which is read as bytes.
         unit: Unit of the values, for example ``"N m"``; empty for dimensionless numbers.
         role: ``training`` for data that networks read, ``episode`` for what a whole independent
             episode has once, ``additional`` for everything else.
@@ -111,10 +115,11 @@ class Field:
         except TypeError as error:
             text = f'Field "{self.name}": {self.dtype!r} is not a NumPy type.'
             raise ConfigError(text) from error
-        if dtype.kind not in NUMBERS:
+        if dtype.kind not in (*NUMBERS, TEXT) or not dtype.itemsize:
             raise ConfigError(
                 f'Field "{self.name}" has type {dtype}, which has no fixed plain layout. '
-                "Use a boolean, integer, floating or complex type."
+                "Use a boolean, integer, floating or complex type, or for text its largest number "
+                'of bytes: "S16".'
             )
         object.__setattr__(self, "dtype", dtype.newbyteorder("<").str)
         if self.shape is not None:
@@ -149,6 +154,11 @@ class Field:
     def row_kind(self) -> tuple[tuple[int, ...], np.dtype[Any]]:
         """Shape and type of a row in an array of rows, an object with a free axis."""
         return ((), np.dtype(object)) if self.free_axis else (self.entry_shape, self.numpy_dtype)
+
+    @property
+    def is_text(self) -> bool:
+        """Whether its values are text, as UTF-8."""
+        return self.numpy_dtype.kind == TEXT
 
     @property
     def has_statistics(self) -> bool:
@@ -201,7 +211,9 @@ class Field:
           (float64 represents all of them up to 2**53). A number that is too large for the type
           becomes infinite, and infinite numbers are rejected when rows are checked: see
           `is_finite`.
-        - Byte order and memory layout do not matter. Strings, objects, and dates fit no field.
+        - Text fits a text field that has room for it in UTF-8; bytes do if they are that. It holds
+          no zero characters.
+        - Byte order and memory layout do not matter. Objects and dates fit no field.
         - An empty list or tuple fits a field of any type.
 
         Args:
@@ -224,7 +236,7 @@ class Field:
             return np.fromiter(rows, object, len(rows))
         error: type[FieldShapeError | FieldTypeError] = FieldShapeError
         try:
-            array: Array = np.asarray(values)
+            array: Array = _as_text(values) if self.is_text else np.asarray(values)
         except ValueError as cause:
             text = f"is ragged or malformed: {cause}. {_FREE}"
         except NO_ARRAY as cause:
@@ -236,12 +248,10 @@ class Field:
                 text = f"has shape {array.shape[axes:]} but is defined as {self.shape}"
             elif self.axes and array.ndim - axes != len(self.axes):
                 text = f"has shape {array.shape[axes:]} but the axes {self.axes}"
-            elif array.dtype == self.numpy_dtype:
-                return array
             else:
-                error, text = FieldTypeError, _misfit(array, self.numpy_dtype)
-                if not text or (not array.size and not isinstance(values, np.ndarray)):
-                    return _cast(array, self.numpy_dtype)
+                error, (text, array) = FieldTypeError, _fitted(array, self.numpy_dtype, values)
+                if not text:
+                    return array
         raise error(
             f'field "{self.name}" {text}.', field=self.name, instance_id=instance_id, step=step
         )
@@ -476,6 +486,18 @@ def first_not_finite(rows: Array) -> int | None:
     return int(np.argmin(finite))
 
 
+def _fitted(array: Array, dtype: np.dtype[Any], values: Any) -> tuple[str, Array]:
+    """Return why a type cannot hold the given values, empty if it can, and the array of it."""
+    if dtype.kind == TEXT:
+        return _encoded(array, dtype)
+    if array.dtype == dtype:
+        return "", array
+    text = _misfit(array, dtype)
+    if not text or (not array.size and not isinstance(values, np.ndarray)):
+        return "", _cast(array, dtype)
+    return text, array
+
+
 def _misfit(array: Array, dtype: np.dtype[Any]) -> str:
     """Return why a type cannot hold the values of an array; empty if it can."""
     kind = array.dtype.kind
@@ -490,6 +512,43 @@ def _misfit(array: Array, dtype: np.dtype[Any]) -> str:
             if not limits.min <= number <= limits.max:
                 return f"holds {number} but is defined as {dtype}, which cannot hold it"
     return ""
+
+
+def _as_text(values: Any) -> Array:
+    """Return values as an array, strings as objects: NumPy would drop zero characters."""
+    array = np.asarray(values)
+    return array if array.dtype.kind in TEXT + NUMBERS else np.asarray(values, object)
+
+
+def is_utf8(array: Array) -> bool:
+    """Return whether all bytes of an array of text are UTF-8."""
+    try:
+        np.char.decode(array, "utf-8")
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+def _encoded(array: Array, dtype: np.dtype[Any]) -> tuple[str, Array]:
+    """Return why values are no text of a type, empty if they are, and the text in UTF-8."""
+    if array.dtype == dtype:
+        return "" if is_utf8(array) else "holds bytes that are not UTF-8", array
+    found = []
+    for value in array.ravel().tolist():
+        if not isinstance(value, (str, bytes)):
+            return f"holds {value!r:.40} but is defined as text", array
+        try:
+            text = value.encode() if isinstance(value, str) else value
+            text.decode()
+        except UnicodeError as error:
+            return f"holds {value!r:.40}, which is not UTF-8: {error}", array
+        if len(text) > dtype.itemsize:
+            room = f"takes {len(text)} bytes in UTF-8; it has room for {dtype.itemsize}"
+            return f"holds {value!r:.40}, which {room}", array
+        if b"\0" in text:
+            return f"holds {value!r:.40}, with a zero character", array
+        found.append(text)
+    return "", np.array(found, dtype).reshape(array.shape)
 
 
 def _cast(array: Array, dtype: np.dtype[Any]) -> Array:

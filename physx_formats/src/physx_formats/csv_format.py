@@ -2,7 +2,8 @@
 
 A column is named after its field, the place of the number in arrays, and the unit:
 ``position[0][2] [m]``. Text holds no types: columns of integers become int64, of ``true`` and
-``false`` bool, and all others float64. The decimal numbers are exact.
+``false`` bool, others of numbers float64, and the rest text, as wide as the longest. The decimal
+numbers are exact.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.fields import Field
+from physx_core.fields import TEXT, Field
 from physx_core.typing import Array
 from physx_formats.errors import ExchangeError
 from physx_formats.format import Columns, Format
@@ -60,6 +61,8 @@ def _names(field: Field) -> Iterator[str]:
 
 
 def _columns(values: Array) -> Iterator[Array]:
+    if values.dtype.kind == TEXT:
+        values = np.char.decode(values, "utf-8")
     if values.dtype.kind == "f":
         values = values.astype(np.float64)  # the decimal number is then the exact one
     yield from np.ascontiguousarray(values.reshape(len(values), -1).T)
@@ -83,16 +86,22 @@ class _Column:
         self.shape = (table.num_rows, *size)
         arrays = [table.column(parts[place][0]) for place in sorted(parts)]
         kinds = [np.dtype(each.type.to_pandas_dtype()) for each in arrays]
-        self.dtype, self.problem = np.result_type(*kinds), ""
+        self.problem, self._is_text = "", all(str(each.type) == "string" for each in arrays)
+        if self._is_text:
+            arrays = [each.fill_null("") for each in arrays]
+            texts = (text for each in arrays for text in each.to_pylist())
+            longest = max((len(text.encode()) for text in texts), default=0)
+            kinds = [np.dtype(f"S{max(1, longest)}")]
+        self.dtype = np.result_type(*kinds)
         units = [parts[place][1] for place in sorted(parts)]
         self.unit = units[0] if len(set(units)) == 1 else ", ".join(units)
         missing = next((each for each in arrays if each.null_count), None)
         if len(parts) != np.prod(size, dtype=int):
             self.problem = f'The columns of "{name}" in {path} leave out places of {size}.'
-        elif any(kind.kind not in "biuf" for kind in kinds):
+        elif not self._is_text and any(kind.kind not in "biuf" for kind in kinds):
             self.problem = (
-                f'"{name}" of {path} holds text. Choose what to import with fields (--fields on '
-                "the command line)."
+                f'Only some columns of "{name}" of {path} hold numbers. Choose what to '
+                "import with fields (--fields on the command line)."
             )
         elif missing is not None:
             row = next(k for k, each in enumerate(missing) if not each.is_valid)
@@ -101,7 +110,11 @@ class _Column:
 
     def read(self, start: int, count: int) -> Array:
         """Return the next rows."""
-        parts = [each.slice(start, count).to_numpy() for each in self._arrays]
+        parts = [each.slice(start, count) for each in self._arrays]
+        if self._is_text:
+            parts = [np.array([t.encode() for t in each.to_pylist()], self.dtype) for each in parts]
+        else:
+            parts = [each.to_numpy() for each in parts]
         return np.stack(parts, axis=-1).astype(self.dtype).reshape(-1, *self.shape[1:])
 
 
@@ -111,7 +124,11 @@ def open_columns(path: Path, limit: int) -> Iterator[tuple[Columns, Notes]]:
     import_library("pyarrow", "Importing CSV", "csv")
     csv = import_library("pyarrow.csv", "Importing CSV", "csv")
     check_size(path, path.stat().st_size, limit)
-    convert = csv.ConvertOptions(null_values=["", "NA", "null"], strings_can_be_null=True)
+    convert = csv.ConvertOptions(
+        null_values=["", "NA", "null"],
+        strings_can_be_null=True,
+        quoted_strings_can_be_null=False,
+    )
     try:
         table = csv.read_csv(path, convert_options=convert)
     except (ValueError, OSError) as error:
@@ -130,7 +147,9 @@ def open_columns(path: Path, limit: int) -> Iterator[tuple[Columns, Notes]]:
 
 FORMAT = Format(
     write=write,
+    loses=("types", "notes", "records"),
     recognizes=lambda path, begin: path.suffix.lower() == ".csv",
     open=open_columns,
+    text=True,
 )
 """CSV files have nothing that identifies them but their name."""

@@ -23,7 +23,7 @@ from physx_core.dataset import (
     rows_per_block,
 )
 from physx_core.errors import ConfigError, DatasetError, listed, nearest
-from physx_core.fields import RESERVED, Field, free_axes
+from physx_core.fields import NUMBERS, RESERVED, Field, free_axes
 from physx_core.plugins import import_component
 from physx_core.typing import Array, Batch, Index
 from physx_core.views import Batches, Part, View
@@ -253,7 +253,13 @@ class _Mode:
                 shape = self._axis(name, values, numbers), *values[0].shape[1:]
                 known = Field(name, shape, values[0].dtype)
             return known, np.empty(self.count, object)
-        if name in RESERVED or values.dtype.kind not in "biufc" or not values.ndim:
+        if values.dtype.kind == "U" and known is None:
+            raise ExchangeError(
+                f'"{name}" is text: derive it with its largest number of bytes, as '
+                'np.char.encode(..., "utf-8").astype("S16").'
+            )
+        is_text = values.dtype.kind in "US"
+        if name in RESERVED or not (values.dtype.kind in NUMBERS or is_text) or not values.ndim:
             raise ExchangeError(f'"{name}" of {values.dtype} cannot be derived as a field.')
         field = known or Field(name, values.shape[1:], values.dtype)
         place, shape = self._folder / f"{self._name}.{name}", (self.count, *values.shape[1:])

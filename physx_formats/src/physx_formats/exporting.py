@@ -67,6 +67,12 @@ def export(
             f"{to} holds rows of one size, but these fields have a free axis: {listed(free)}. Read "
             "them from the dataset's HDF5 files, or leave them out with `physx edit`."
         )
+    texts = [f.name for table in tables for f in table.fields.values() if f.is_text]
+    if texts and not form.text:
+        raise ExchangeError(
+            f"{to} holds numbers, but these fields are text: {listed(texts)}. Leave them out with "
+            "`physx edit --drop`."
+        )
     check_new(out)
     try:
         with tempfile.TemporaryDirectory(dir=out.absolute().parent, prefix=".export-") as folder:

@@ -15,6 +15,14 @@ KIND = "format"
 """The kind of component."""
 Columns: TypeAlias = dict[str, Column]
 
+LOSSES = {
+    "types": "types: numbers are int64, float64 or bool again, with the same values",
+    "notes": "roles and axes of fields, and which are the same quantity",
+    "records": "records of episodes, with their parameters",
+    "way back": "a way back: nothing is imported from it",
+}
+"""What a format may not keep, in words."""
+
 
 def _never(path: Path, begin: bytes) -> bool:
     """Recognize nothing."""
@@ -32,6 +40,8 @@ class Format:
         several: Whether one file can hold several modes.
         options: Names of the episode options that it takes: see `ExportOptions`.
         free_axes: Whether it holds rows of any size.
+        text: Whether it holds text.
+        loses: What it does not keep, of `LOSSES`; all else comes back as it was.
         recognizes: Returns whether a path is a file or folder of this format, from its first 8
             bytes; those of a folder are empty. File names do not matter.
         open: Opens a file that holds at most this number of bytes, and yields its arrays by name,
@@ -43,6 +53,8 @@ class Format:
     several: bool = False
     options: Collection[str] = ()
     free_axes: bool = False
+    text: bool = False
+    loses: Collection[str] = ()
     recognizes: Callable[[Path, bytes], bool] = _never
     open: Callable[[Path, int], AbstractContextManager[tuple[Columns, Notes]]] | None = None
 

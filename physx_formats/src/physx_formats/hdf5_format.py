@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.dataset import rows_per_block
+from physx_core.dataset import hdf5_type, rows_per_block
 from physx_core.typing import Array
 from physx_formats.errors import ExchangeError
 from physx_formats.format import Format
@@ -88,12 +88,13 @@ def _write_field(group: Any, table: Table, name: str, compression: str | None, s
     if compression and 0 not in shape:
         rows = min(table.rows, rows_per_block(field.nbytes, _CHUNK))
         options = {"compression": compression, "shuffle": True, "chunks": (rows, *shape[1:])}
-    stored = group.create_dataset(name, shape, np.dtype(field.dtype), **options)
+    kind = hdf5_type(field)
+    stored = group.create_dataset(name, shape, kind, **options)
     stored.attrs["unit"], stored.attrs["role"] = field.unit, field.role
     for axis, label in enumerate(("sample", *field.axes) if field.axes else ()):
         stored.dims[axis].label = label
     for start, block in table.column(name):
-        stored[start : start + len(block)] = block
+        stored[start : start + len(block)] = block.view(kind)
         sink.check()
 
 
@@ -185,6 +186,7 @@ FORMAT = Format(
     write=write,
     compressions=COMPRESSIONS,
     several=True,
+    text=True,
     recognizes=lambda path, begin: begin == b"\x89HDF\r\n\x1a\n",
     open=open_columns,
 )

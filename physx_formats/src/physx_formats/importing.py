@@ -18,7 +18,7 @@ from physx_core.typing import Batch
 from physx_formats.episodes import EpisodeCopier, copy_stream, split_records
 from physx_formats.errors import ExchangeError
 from physx_formats.format import Columns, all_formats
-from physx_formats.table import Advance, Column, Notes, check_size
+from physx_formats.table import KINDS, Advance, Column, Notes, check_size
 
 _SESSION = "import"
 _ALWAYS = 2**28
@@ -165,11 +165,12 @@ def _choose(path: Path, columns: Columns, names: Sequence[str]) -> Columns:
     for name, column in chosen.items():
         if column.problem:
             raise ExchangeError(column.problem)
-        if column.dtype.kind not in "biufc" or not column.shape:
+        if column.dtype.kind not in KINDS or not column.dtype.itemsize or not column.shape:
             what = "no rows" if not column.shape else str(column.dtype)
             raise ExchangeError(
-                f'"{name}" of {path} holds {what}; a field has rows of plain numbers. Choose what '
-                "to import with fields (--fields on the command line)."
+                f'"{name}" of {path} holds {what}; a field has rows of plain numbers, or of text '
+                "with a fixed number of bytes. Choose what to import with fields (--fields on the "
+                "command line)."
             )
     return chosen
 

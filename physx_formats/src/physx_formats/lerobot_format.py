@@ -278,5 +278,7 @@ def _summary(found: RunningStatistics) -> Mapping[str, Any]:
 
 
 FORMAT = Format(
-    write=write, options=("observations", "actions", "rewards", "fps", "task", "features")
+    write=write,
+    loses=("way back", "records"),
+    options=("observations", "actions", "rewards", "fps", "task", "features"),
 )

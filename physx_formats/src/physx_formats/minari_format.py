@@ -154,4 +154,6 @@ def _box(field: Field) -> dict[str, Any]:
     return {"type": "Box", "dtype": dtype.name, "shape": shape, **bounds}
 
 
-FORMAT = Format(write=write, options=("observations", "actions", "rewards"))
+FORMAT = Format(
+    write=write, loses=("way back", "records"), options=("observations", "actions", "rewards")
+)

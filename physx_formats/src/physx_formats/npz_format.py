@@ -23,6 +23,7 @@ from physx_core.typing import Array
 from physx_formats.errors import ExchangeError
 from physx_formats.format import Format
 from physx_formats.table import (
+    KINDS,
     Column,
     ExportOptions,
     Notes,
@@ -85,7 +86,7 @@ class NpzColumn:
         except (ValueError, KeyError, *_DAMAGE) as error:
             raise ExchangeError(f"{self._place} has no readable header.") from error
         self._whole: Array | None = None
-        if self.dtype.kind not in "biufc" or not self.shape:
+        if self.dtype.kind not in KINDS or not self.shape:
             return  # it cannot be imported; the error is raised if it is requested
         self._row = math.prod(self.shape[1:]) * self.dtype.itemsize
         if min(self.shape) < 0 or size - file.tell() != self.shape[0] * self._row:
@@ -169,6 +170,7 @@ FORMAT = Format(
     write=write,
     compressions=COMPRESSIONS,
     several=True,
+    text=True,
     recognizes=lambda path, begin: begin.startswith(b"PK"),
     open=open_columns,
 )

@@ -8,13 +8,14 @@ from __future__ import annotations
 
 import contextlib
 import math
+import re
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from physx_core.fields import Field
+from physx_core.fields import TEXT, Field
 from physx_core.typing import Array
 from physx_formats.errors import ExchangeError
 from physx_formats.format import Columns, Format
@@ -30,6 +31,7 @@ from physx_formats.table import (
 
 COMPRESSIONS = ("none", "snappy", "gzip", "zstd", "lz4", "brotli")
 _ROW_GROUP = 2 * BLOCK
+_TEXT = re.compile(rb"\|S(\d{1,6})")
 
 
 def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
@@ -53,7 +55,7 @@ def write(tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
 
 def _metadata(field: Field) -> dict[str, str]:
     shape = ",".join(str(length) for length in field.shape or ())
-    dtype = np.dtype(field.dtype).name
+    dtype = field.numpy_dtype.str if field.is_text else field.numpy_dtype.name
     return {"unit": field.unit, "role": field.role, "shape": shape, "dtype": dtype}
 
 
@@ -65,7 +67,8 @@ def _shape(field: Field) -> tuple[int, ...]:
 def _type(arrow: Any, field: Field) -> Any:
     dtype = np.dtype(field.dtype)
     try:
-        kind = arrow.from_numpy_dtype(np.empty(0, dtype).real.dtype)
+        real = np.empty(0, dtype).real.dtype
+        kind = arrow.string() if field.is_text else arrow.from_numpy_dtype(real)
     except (arrow.ArrowNotImplementedError, arrow.ArrowInvalid) as error:
         raise ExchangeError(
             f'Parquet has no equivalent of {dtype}, the type of the field "{field.name}".'
@@ -83,7 +86,8 @@ def _array(arrow: Any, kind: Any, values: Array) -> Any:
     """Return rows as an Arrow array; lists of lists share one flat array of numbers."""
     if np.iscomplexobj(values):
         values = np.stack([values.real, values.imag], axis=-1)
-    array = arrow.array(values.reshape(-1))
+    flat = values.reshape(-1)
+    array = arrow.array(np.char.decode(flat, "utf-8") if values.dtype.kind == "S" else flat)
     for axis in reversed(range(1, values.ndim)):
         array = arrow.FixedSizeListArray.from_arrays(array, values.shape[axis])
     return array.cast(kind)
@@ -99,7 +103,7 @@ class _Column:
         while hasattr(kind, "list_size"):
             shape.append(kind.list_size)
             kind = kind.value_type
-        self._file, self._name = file, field.name
+        self._path, self._file, self._name = path, file, field.name
         self._batches: Iterator[Any] | None = None
         self.shape, self.problem = (file.metadata.num_rows, *shape), ""
         known = field.metadata or {}
@@ -108,7 +112,10 @@ class _Column:
             self.dtype = np.dtype(kind.to_pandas_dtype())
         except NotImplementedError:
             self.problem = f'"{field.name}" of {path} holds {kind}.'
-        if "list" in str(kind):
+        if str(kind) in ("string", "large_string"):
+            noted = _TEXT.fullmatch(known.get(b"dtype", b""))
+            self.dtype = np.dtype(f"S{max(1, int(noted[1]) if noted else 0, self._longest())}")
+        elif "list" in str(kind):
             self.problem = f'"{field.name}" of {path} holds lists of different lengths.'
         elif self.dtype.kind not in "biuf":
             self.problem = self.problem or f'"{field.name}" of {path} holds {kind}.'
@@ -117,7 +124,7 @@ class _Column:
             self.shape = self.shape[:-1]
             self.dtype = np.result_type(self.dtype, np.complex64)
         self.unit = known.get(b"unit", b"").decode(errors="replace")
-        self._path, self._left = path, np.empty((0, *self.shape[1:]), self.dtype)
+        self._left = np.empty((0, *self.shape[1:]), self.dtype)
 
     def read(self, start: int, count: int) -> Array:
         """Return the next rows."""
@@ -130,16 +137,28 @@ class _Column:
         found, self._left = rows[:count], rows[count:]
         return found
 
+    def _longest(self) -> int:
+        """Return the largest number of bytes of a text."""
+        batches = self._file.iter_batches(columns=[self._name])
+        texts = (self._flat(batch.column(0)).to_pylist() for batch in batches)
+        return max((len(text.encode()) for some in texts for text in some), default=0)
+
+    def _flat(self, array: Any) -> Any:
+        """Return the single values of a batch of the column."""
+        while True:
+            if array.null_count:
+                raise ExchangeError(f'"{self._name}" of {self._path} has rows without a value.')
+            if not hasattr(array.type, "list_size"):
+                return array
+            array = array.flatten()
+
     def _values(self, array: Any) -> Array:
         """Return a batch of the column as rows."""
-        flat = array
-        while True:
-            if flat.null_count:
-                raise ExchangeError(f'"{self._name}" of {self._path} has rows without a value.')
-            if not hasattr(flat.type, "list_size"):
-                break
-            flat = flat.flatten()
-        values: Array = flat.to_numpy(zero_copy_only=False)
+        flat = self._flat(array)
+        if self.dtype.kind == TEXT:
+            values = np.array([text.encode() for text in flat.to_pylist()], self.dtype)
+        else:
+            values = flat.to_numpy(zero_copy_only=False)
         if self._is_complex:
             values = np.ascontiguousarray(values).view(self.dtype)
         return values.reshape(-1, *self.shape[1:])
@@ -167,7 +186,9 @@ def open_columns(path: Path, limit: int) -> Iterator[tuple[Columns, Notes]]:
 
 FORMAT = Format(
     write=write,
+    loses=("records",),
     compressions=COMPRESSIONS,
     recognizes=lambda path, begin: begin.startswith(b"PAR1"),
     open=open_columns,
+    text=True,
 )

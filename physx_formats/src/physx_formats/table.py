@@ -14,7 +14,7 @@ import numpy as np
 from physx_core import checks
 from physx_core.dataset import Episode, ModeView, find_episodes, rows_per_block
 from physx_core.errors import ConfigError, MissingLibraryError
-from physx_core.fields import RESERVED, Field, Role
+from physx_core.fields import NUMBERS, RESERVED, TEXT, Field, Role
 from physx_core.parsing import parse_json
 from physx_core.typing import Array, Batch
 from physx_formats.errors import ExchangeError
@@ -23,6 +23,9 @@ FORMAT = "physx export"
 VERSION = 1
 BLOCK = 2**23
 """Approximate number of bytes of a block in memory."""
+
+KINDS = NUMBERS + TEXT
+"""Kinds of NumPy types that can be imported."""
 
 Advance = Callable[[int], None]
 """Called with the number of bytes transferred."""
@@ -206,7 +209,8 @@ class Notes:
     def field(self, mode: str, name: str, column: Column) -> Field:
         """Return the field of a column, with what is noted of it."""
         known = self.modes.get(mode, {}).get(name)
-        role: Role = "additional" if name in RESERVED else "training"
+        is_no_input = name in RESERVED or column.dtype.kind == TEXT
+        role: Role = "additional" if is_no_input else "training"
         shape = column.shape[1:]
         if known is None:
             return Field(name, shape, column.dtype, column.unit, role)

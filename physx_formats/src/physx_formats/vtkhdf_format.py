@@ -300,6 +300,7 @@ def _check(corners: Array, count: int, field: Field) -> None:
 
 FORMAT = Format(
     write=write,
+    loses=("way back", "records"),
     several=True,
     options=("points", "cells", "cell_type", "fps"),
     free_axes=True,

@@ -117,4 +117,4 @@ def _length(table: Table, axis: str) -> int | None:
     return found.pop() if len(found) == 1 and axis != "sample" else None
 
 
-FORMAT = Format(write=write, compressions=COMPRESSIONS, several=True)
+FORMAT = Format(write=write, loses=("way back",), compressions=COMPRESSIONS, several=True)

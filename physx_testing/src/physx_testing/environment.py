@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from physx_core.components import Environment
+from physx_core.components import Environment, Visualizer
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import NotFiniteError, StateError
 from physx_core.rows import ROW_FIELDS, RowBuffer, infer_shapes
@@ -157,7 +157,7 @@ def _over_tcp(subject: Subject) -> None:
 def _draws(subject: Subject) -> None:
     plain = _rows(subject)
     services = Services()
-    drawn = _rows(subject, services=services, visualizer="kit")
+    drawn = _rows(subject, services=services, visualizer=Visualizer)
     expect_equal(drawn, plain, "with a visualizer it generates different rows than without")
     if not services.drawn:
         raise NotApplicableError("it draws nothing")

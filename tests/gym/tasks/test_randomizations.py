@@ -13,6 +13,7 @@ from physx_gym import (
     PDController,
     RandomizedEnv,
     RobotEnv,
+    Simulator,
     build_pipeline,
     load_pipeline,
     read_log,
@@ -27,7 +28,7 @@ from physx_gym.tasks.randomizations import (
     RandomNoise,
     RandomPushes,
 )
-from physx_sim import Encoder, Robot, Sphere, World
+from physx_sim import Encoder, Ground, Robot, Sphere, World
 
 TABLE = """
 env_config.cls = "RobotEnv"
@@ -313,6 +314,19 @@ def test_own_randomizations():
     env = RandomizedEnv(ant(), randomizations=[Tilted("slope")])
     env.reset(seed=0)
     assert env.simulator.world.gravity[0] == 9.81 * np.sin(env.drawn["slope"]["angle"])
+
+
+def test_the_friction_of_the_file_returns(backend):
+    for described, builds in ((None, 1), (0.25, 2)):
+        robot = Robot("ant", fixed_base=False, friction=described)
+        simulator = Simulator(World([robot], ground=Ground()), backend=backend)
+        simulator.prepare()
+        for friction, found in ((0.5, 0.5), (None, 1.0)):
+            simulator.set_options({"world": {"robots": {"robot": {"friction": friction}}}})
+            simulator.prepare()
+            shapes = simulator.simulation.parts.movables[0].model.shapes
+            assert {shape.friction for shape in shapes} == {found}
+        assert simulator.builds == builds
 
 
 def test_masses_and_friction_change_without_a_build(backend):

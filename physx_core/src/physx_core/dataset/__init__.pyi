@@ -19,4 +19,5 @@ from .store.episode_record import EpisodeStatus as EpisodeStatus
 from .store.episode_table import EPISODES as EPISODES
 from .store.episode_table import TABLE_FIELDS as TABLE_FIELDS
 from .store.failure_file import FailedEpisode as FailedEpisode
+from .store.partition.format import hdf5_type as hdf5_type
 from .store.partition.segment import rows_per_block as rows_per_block

@@ -39,7 +39,7 @@ class Warmth:
 
 @dataclass(eq=False, slots=True)
 class Solved:
-    """What a step solved: impulses along rows, of contact points, then joints, then ties.
+    """What a step solved: impulses along rows of contact points, joints, ties, and turning points.
 
     Attributes:
         parts: Constraints of the robots; their velocities, one after the other, are the columns.
@@ -54,6 +54,7 @@ class Solved:
         impulses: The solution, shape (n,).
         rows: Which rows of the joints acted, as indices into those of all parts.
         pace: Target velocities of the ties.
+        turning: Points that resist turning, as in `ContactProblem`.
     """
 
     parts: Sequence[Constraints]
@@ -68,6 +69,7 @@ class Solved:
     impulses: Vector
     rows: Indices
     pace: Vector
+    turning: tuple[Index, Vector] | None = None
 
 
 class Constraints:
@@ -239,6 +241,7 @@ def constrained(
         parts,
         *(inverse, along, spread, response, free, friction, low, high, impulses, rows),
         v[:0] if ties is None else ties[1],
+        turning,
     )
     of_rows = np.zeros(len(columns))
     of_rows[rows] = impulses[len(bias) : len(bias) + len(rows)]

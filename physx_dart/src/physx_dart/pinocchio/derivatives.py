@@ -74,22 +74,30 @@ class GroupDerivatives:
         if not len(rows):
             return solved
         columns = self._columns(solved)[rows]
-        along = np.concatenate([solved.along, unit(self._nv).take(columns, 0)])
+        last = len(solved.impulses) - _turning_rows(solved)
+        nothing = np.zeros(len(rows))
+        along, free, impulses = (
+            np.concatenate([before[:last], more, before[last:]])
+            for before, more in (
+                (solved.along, unit(self._nv).take(columns, 0)),
+                (solved.free, nothing),
+                (solved.impulses, nothing),
+            )
+        )
         spread = solved.inverse.dot(along.T)
         least, most = (
             joined([getattr(part.joints, name) for part in solved.parts])[rows]
             for name in ("least", "most")
         )
-        nothing = np.zeros(len(rows))
         return replace(
             solved,
             along=along,
             spread=spread,
             response=along.dot(spread),
-            free=np.concatenate([solved.free, nothing]),
+            free=free,
             least=np.concatenate([solved.least, least]),
             most=np.concatenate([solved.most, most]),
-            impulses=np.concatenate([solved.impulses, nothing]),
+            impulses=impulses,
         )
 
     def _columns(self, solved: Solved) -> Vector:
@@ -100,7 +108,8 @@ class GroupDerivatives:
     def _constrain(self, solved: Solved) -> None:
         """Add what the impulses change."""
         problem = ContactProblem(
-            solved.response, solved.free, solved.friction, solved.least, solved.most
+            *(solved.response, solved.free, solved.friction, solved.least, solved.most),
+            solved.turning,
         )
         if not problem.error(solved.impulses) < _UNSOLVED * problem.accuracy:
             raise SimulationError(
@@ -108,16 +117,18 @@ class GroupDerivatives:
             )
         nv, slopes = self._nv, np.zeros((len(solved.impulses), self._nv))
         caused, pushed, first = solved.spread.dot(solved.impulses), np.zeros((nv, nv)), 0
+        spin = len(solved.impulses) - _turning_rows(solved)
         for part, (robot, span) in zip(solved.parts, self._robots, strict=True):
             pushed[span, span] = -_momentum_slopes(robot, caused[span])
             if (points := part.touching) is not None:
                 end = first + 3 * len(points.gaps)
-                found = _point_slopes(
-                    robot, points, solved.impulses[first:end], self._after[span], self._period
-                )
-                slopes[first:end, span], forces = found
+                spun = spin + (0 if points.spins is None else 3 * len(points.spins.points))
+                impulses = solved.impulses[first:end], solved.impulses[spin:spun]
+                after = self._after[span]
+                found = _point_slopes(robot, points, impulses, after, self._period)
+                slopes[first:end, span], slopes[spin:spun, span], forces = found
                 pushed[span, span] += forces
-                first = end
+                first, spin = end, spun
         change = self._change.reshape(nv, -1)
         change[:, :nv] += solved.inverse.dot(pushed)
         missing = solved.along.dot(change)
@@ -162,6 +173,11 @@ class GroupDerivatives:
         return StepDerivatives(after @ state @ before, after @ driven)
 
 
+def _turning_rows(solved: Solved) -> int:
+    """Return the number of rows of points that resist turning."""
+    return 0 if solved.turning is None else 3 * len(solved.turning[0])
+
+
 def _to_world(found: Vector, at: int, nv: int, q: Vector, v: Vector) -> None:
     """Write how changes along a base's axes change its native positions and velocities."""
     turn = to_matrix(q[3:7])
@@ -196,22 +212,22 @@ def _momentum_slopes(robot: PinocchioRobot, velocities: Vector) -> Vector:
 def _point_slopes(
     robot: PinocchioRobot,
     points: ContactPoints,
-    impulses: Vector,
+    impulses: tuple[Vector, Vector],
     velocities: Vector,
     period: float,
-) -> tuple[Vector, Vector]:
+) -> tuple[Vector, Vector, Vector]:
     """Return derivatives by positions of what contact points do at given impulses and velocities.
 
     Args:
         robot: The robot.
         points: The points.
-        impulses: Along their axes, shape (3 k,).
+        impulses: Along their axes, shape (3 k,), and angular, of those that resist turning, (3 s,).
         velocities: Velocities of the robot, shape (nv,).
         period: Length of the step, in s.
 
     Returns:
-        Derivatives of the points' velocities along their axes minus the target ones, (3 k, nv), and
-        of the impulses that the points exert on the joints, (nv, nv).
+        Derivatives of the points' velocities along their axes minus the target ones, (3 k, nv), of
+        the angular velocities, (3 s, nv), and of the impulses exerted on the joints, (nv, nv).
     """
     q, before, _ = robot.last_step()
     joints, centers = robot.contact_finder.anchors(points, before)
@@ -227,7 +243,7 @@ def _point_slopes(
     linear = cross_rows(turn, relative[..., :3]) + cross_rows(line, relative[..., 3:])
     angular = cross_rows(turn, relative[..., 3:])
     normals = points.axes[:, 2]
-    forces = np.einsum("kij,ki->kj", points.axes, impulses.reshape(-1, 3))
+    forces = np.einsum("kij,ki->kj", points.axes, impulses[0].reshape(-1, 3))
     moves = line + cross_rows(turn, centers[:, None])
     gaps = np.einsum("kj,kvj->kv", normals, moves)
     moves -= (0.5 * (points.gaps < 0))[:, None, None] * gaps[:, :, None] * normals[:, None]
@@ -238,9 +254,13 @@ def _point_slopes(
     rows = points.axes @ speeds.transpose(0, 2, 1)
     rows[:, 2] += points.bias_slopes(period)[:, None] * gaps * carried[:, :, 0]
     wrenches = np.concatenate([forces, cross_rows(points.points, forces)], axis=1)
+    spinning = np.zeros(0, np.intp) if points.spins is None else points.spins.points
+    axes = points.axes[spinning]
+    spins = axes @ (angular * carried)[spinning].transpose(0, 2, 1)
+    wrenches[spinning, 3:] += np.einsum("kij,ki->kj", axes, impulses[1].reshape(-1, 3))
     borne = carried[:, :, 0].T @ wrenches
     turned = cross_rows(turn, borne[:, 3:]) + cross_rows(line, borne[:, :3])
     exerted = carriers * (cross_rows(turn, borne[:, :3]) @ line.T + turned @ turn.T)
     moments = cross_rows(moves, forces[:, None])
     exerted += np.einsum("kv,vd,kud->vu", carried[:, :, 0], turn, moments)
-    return rows.reshape(-1, robot.nv), exerted
+    return rows.reshape(-1, robot.nv), spins.reshape(-1, robot.nv), exerted

@@ -12,6 +12,7 @@ from physx_core.cli import count, show
 from physx_core.dataset import EPISODES, Dataset
 from physx_core.observers import ProgressBar
 from physx_formats import ExportOptions, export
+from physx_formats.format import LOSSES, find_format
 
 
 @dataclass
@@ -98,8 +99,11 @@ def run(words: Sequence[str]) -> None:
         stored = {mode: dataset.num_samples(mode) for mode in written}
         if dataset.has_episodes and EPISODES in stored:
             stored[EPISODES] = written[EPISODES]
+        lost = [n for n in find_format(options.to).loses if n != "records" or dataset.has_episodes]
     for mode, rows in written.items():
         show(f"{count(rows, f'{mode} sample')}: {options.out}")
         if rows < stored[mode]:
             left = stored[mode] - rows
             show(f"left out: {left:,} samples in trajectories of a single sample")
+    for name in lost:
+        show(f"{options.to} does not keep {LOSSES[name]}")

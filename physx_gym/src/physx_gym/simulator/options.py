@@ -83,7 +83,12 @@ def needing_a_build(options: Mapping[str, Any]) -> dict[str, Any]:
 def _without(part: str, given: Any) -> Any:
     if not isinstance(given, Mapping):
         return given
-    return {name: value for name, value in given.items() if name not in _CHANGEABLE[part]}
+    # None means what a file says, which a running engine no longer knows once it was built without.
+    return {
+        name: value
+        for name, value in given.items()
+        if name not in _CHANGEABLE[part] or value is None
+    }
 
 
 def link_masses(world: World, layout: Layout) -> dict[str, float]:

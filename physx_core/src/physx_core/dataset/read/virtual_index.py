@@ -20,6 +20,7 @@ from physx_core import files
 from physx_core.dataset.read.order.order import Order
 from physx_core.dataset.read.reader import Reader
 from physx_core.dataset.store.manifest import Mode, Partition, Partitions
+from physx_core.dataset.store.partition.format import hdf5_type
 from physx_core.dataset.store.partition.spans import FlatIndex
 from physx_core.fields import PTR, Field
 from physx_core.typing import Index
@@ -111,7 +112,7 @@ def _add(group: Any, field: Field, pieces: list[Piece]) -> None:
     import h5py
 
     rows = sum(part.stop - part.start for _, part, _ in pieces)
-    shape, dtype = (rows, *field.entry_shape), np.dtype(field.dtype)
+    shape, dtype = (rows, *field.entry_shape), hdf5_type(field)
     if not rows or not field.nbytes:
         entry = group.create_dataset(field.name, shape, dtype)
     else:

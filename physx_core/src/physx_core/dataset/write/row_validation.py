@@ -33,8 +33,14 @@ def infer_fields(values: Mapping[str, Any], axes: int = 1) -> list[Field]:
         except NO_ARRAY:
             array = Field(name).convert(value)  # reports what is wrong
         if array.dtype.kind not in NUMBERS:
+            text = (
+                " Text needs a field with its largest number of bytes, defined before: "
+                f'Field("{name}", (), "S16").'
+            )
             raise FieldTypeError(
-                f'field "{name}" holds {array.dtype}; only plain numbers can be stored.', field=name
+                f'field "{name}" holds {array.dtype}; only plain numbers can be stored.'
+                f"{text if array.dtype.kind in 'SU' else ''}",
+                field=name,
             )
         field = Field(name, dtype=array.dtype, role=role)  # type: ignore[arg-type]
         fields.append(replace(field, shape=field.convert(array, axes=axes).shape[axes:]))

@@ -23,6 +23,7 @@ from physx_core.errors import (
     ConfigError,
     DivergedError,
     FieldShapeError,
+    FieldsMismatchError,
     FieldTypeError,
     MissingFieldError,
     PhysxError,
@@ -135,6 +136,10 @@ class Learner:
         self.fields = fields
         self.network.bind(fields)
         self._free = {n: fields[n] for n in self.batch_fields if n in fields}
+        why = "text: choose others, or give it another role when it is defined"
+        texts = {name: why for name, of in self._free.items() if of.is_text}
+        if texts:
+            raise FieldsMismatchError(f"{type(self.network).__name__} computes with numbers", texts)
         if not any(field.free_axis for field in self._free.values()):
             self._free = {}
         if self._free and self.group.size > 1:

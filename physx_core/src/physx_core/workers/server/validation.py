@@ -14,14 +14,14 @@ from typing import Any, TypedDict, cast
 from physx_core.components.parameter import Parameter
 from physx_core.components.scene.event import ACTIONS, Event
 from physx_core.errors import ConfigError, ConnectionRefusedByPeerError
-from physx_core.fields import RESERVED, ROLES, Field, first_not_finite
+from physx_core.fields import RESERVED, ROLES, Field, first_not_finite, is_utf8
 from physx_core.net.frames import MAX_PAYLOAD
 from physx_core.net.values import decode
 from physx_core.packing import check_sizes
 from physx_core.rows import ROW_FIELDS
 from physx_core.typing import Array, Batch
 
-_DTYPE = re.compile(r"[<>|=]?[biufc]\d{1,2}")
+_DTYPE = re.compile(r"[<>|=]?[biufc]\d{1,2}|\|S[1-9]\d{0,4}")
 _MOST_PARAMETERS = 4096
 _MOST_EPISODES = 2**48
 
@@ -224,6 +224,10 @@ def check_values(block: Batch, fields: Sequence[Field], instance_id: int) -> Non
     for field in fields:
         values = block[field.name]
         kind = values.dtype.kind
+        if field.is_text and not is_utf8(values):
+            raise ConnectionRefusedByPeerError(
+                f'It sent rows whose field "{field.name}" is no text in UTF-8.'
+            )
         if field.numpy_dtype.kind == "b" and _raw(values).translate(None, b"\0\1"):
             raise ConnectionRefusedByPeerError(
                 f'It sent rows whose field "{field.name}" is neither true nor false.'

@@ -18,6 +18,7 @@ import os
 import struct
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from xxhash import xxh3_64_intdigest
@@ -178,6 +179,14 @@ def partition_file(session: str, mode: str, field: str, index: int) -> str:
     return f"{session}_{mode}_{field}_{index}.h5"
 
 
+def hdf5_type(field: Field) -> np.dtype[Any]:
+    """Return a field's type as h5py stores it: text as strings of fixed length in UTF-8."""
+    import h5py
+
+    kind = field.numpy_dtype
+    return h5py.string_dtype("utf-8", kind.itemsize) if field.is_text else kind
+
+
 def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
     """Make the header of a partition file with h5py.
 
@@ -194,7 +203,7 @@ def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
     layout.set_layout(h5d.CONTIGUOUS)
     layout.set_alloc_time(h5d.ALLOC_TIME_EARLY)
     layout.set_fill_time(h5d.FILL_TIME_NEVER)
-    kind = h5t.py_create(np.dtype(field.dtype), logical=True)
+    kind = h5t.py_create(hdf5_type(field), logical=True)
     image = io.BytesIO()
     with h5py.File(
         image,
@@ -221,7 +230,7 @@ def make_header(identity: Identity, capacity: int, rows: int = 0) -> Header:
         if capacity * field.nbytes:
             origin, one = (0,) * len(data.shape), (1,) * len(data.shape)
             space.select_hyperslab(origin, one)
-            data.write(h5s.create_simple(one), space, np.zeros(one, field.dtype))
+            data.write(h5s.create_simple(one), space, np.zeros(one, field.dtype), kind)
         rows_offset, data_offset = counter.get_offset(), data.get_offset() or 0
         own_offset, records_offset = own.get_offset(), records.get_offset()
         table_offset = digests.get_offset() or 0
