@@ -36,8 +36,8 @@ import logged_arm as arm
 from physx_core.typing import Vector
 from physx_dart import PinocchioBackend
 from physx_identify import Identification, Log, Model, identify, propose
+from physx_identify.estimation.model import Path as Motion
 from physx_identify.excitation import expected_errors
-from physx_identify.model import Path as Motion
 from physx_identify.unknowns import as_unknowns
 from physx_sim import JointSettings, Robot
 

@@ -21,7 +21,7 @@ from physx_core.errors import (
     SampleError,
 )
 from physx_core.sources import LocalSource
-from physx_formats.importing import import_file
+from physx_formats import import_file
 
 pytestmark = pytest.mark.processes
 

@@ -29,9 +29,15 @@ from physx_identify import (
     write_motion,
 )
 from physx_identify.errors import IdentificationError
+from physx_identify.estimation.inertia import (
+    body_of,
+    cholesky_of,
+    from_cholesky,
+    is_physical,
+    ten_of,
+)
+from physx_identify.estimation.noise import Noise, Whitener
 from physx_identify.excitation import expected_errors
-from physx_identify.inertia import body_of, cholesky_of, from_cholesky, is_physical, ten_of
-from physx_identify.noise import Noise, Whitener
 from physx_report import write_report
 from physx_sim import Motor, Robot, World
 

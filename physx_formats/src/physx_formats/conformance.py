@@ -11,10 +11,10 @@ import numpy as np
 
 from physx_core import Dataset
 from physx_core.errors import PhysxError
-from physx_formats.exporting import export
 from physx_formats.format import Format
-from physx_formats.importing import import_file
 from physx_formats.table import ExportOptions
+from physx_formats.transfer.exporting import export
+from physx_formats.transfer.importing import import_file
 from physx_testing.report import NotApplicableError
 from physx_testing.subject import Check, Subject, expect
 

@@ -11,11 +11,11 @@ import numpy as np
 
 from physx_core.errors import MissingLibraryError
 from physx_identify.errors import IdentificationError
-from physx_identify.identification import Identification
-from physx_identify.log import Log
-from physx_identify.model import GRAVITY, Model
-from physx_identify.model import Path as Motion
-from physx_identify.smooth import Smoother
+from physx_identify.estimation.model import GRAVITY, Model
+from physx_identify.estimation.model import Path as Motion
+from physx_identify.estimation.smooth import Smoother
+from physx_identify.logs.log import Log
+from physx_identify.result.identification import Identification
 from physx_sim import Robot, write_actuators
 
 if TYPE_CHECKING:

@@ -13,11 +13,11 @@ from physx_core import files
 from physx_core.errors import ConfigError
 from physx_core.typing import Vector
 from physx_identify.errors import IdentificationError
-from physx_identify.identification import Identification
-from physx_identify.model import GRAVITY, Model, Path
-from physx_identify.noise import Noise, Whitener
+from physx_identify.estimation.model import GRAVITY, Model, Path
+from physx_identify.estimation.noise import Noise, Whitener
+from physx_identify.result.identification import Identification
+from physx_identify.result.wording import WIDTH, number
 from physx_identify.unknowns import Parameter, Unknown
-from physx_identify.wording import WIDTH, number
 from physx_sim import Robot
 
 _WAVES = 6

@@ -10,14 +10,14 @@ from scipy.stats import t as student
 
 from physx_core.errors import ConfigError
 from physx_core.typing import Array, Vector
-from physx_identify.checks import check_log
-from physx_identify.estimates import Combination, Estimate, LogNoise
-from physx_identify.fit import Data, Fit, fit
-from physx_identify.identification import Identification
-from physx_identify.inertia import cholesky_of, from_cholesky, is_physical
-from physx_identify.log import Log
-from physx_identify.model import GRAVITY, Model
-from physx_identify.structure import structure_tests
+from physx_identify.estimation.fit import Data, Fit, fit
+from physx_identify.estimation.inertia import cholesky_of, from_cholesky, is_physical
+from physx_identify.estimation.model import GRAVITY, Model
+from physx_identify.estimation.structure import structure_tests
+from physx_identify.logs.checks import check_log
+from physx_identify.logs.log import Log
+from physx_identify.result.estimates import Combination, Estimate, LogNoise
+from physx_identify.result.identification import Identification
 from physx_identify.unknowns import Parameter, Unknown, as_unknowns
 from physx_sim import Robot
 

@@ -11,8 +11,8 @@ from numpy.random import Generator
 from physx_core.errors import ComponentNotFoundError
 from physx_gym.tasks.randomizations import Randomization
 from physx_identify.errors import IdentificationError
-from physx_identify.identification import SETTINGS, Identification
-from physx_identify.stored import read_identification
+from physx_identify.result.identification import SETTINGS, Identification
+from physx_identify.result.stored import read_identification
 
 
 class Identified(Randomization):

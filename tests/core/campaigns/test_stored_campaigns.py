@@ -10,8 +10,7 @@ import pytest
 from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.pipelines.stored_rows import StoredRows
 from physx_core.workers.instance import PARAMETER, SET
-from physx_formats.exporting import export
-from physx_formats.importing import import_file
+from physx_formats import export, import_file
 
 ENVS = Path(__file__).parents[1] / "programs" / "episode_envs.py"
 

@@ -1,4 +1,5 @@
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -260,7 +261,8 @@ def test_commands_of_other_packages(tmp_path):
         add_plugin(tmp_path, name, text, distribution, "physx.commands")
     (tmp_path / "plugin_of_wrong_dist.py").unlink()
     overview = physx(tmp_path, "--help").stdout
-    lines = {line.split()[0]: line for line in overview.splitlines() if line.startswith("  ")}
+    rows = re.findall(r"^  \S.*(?:\n {3,}\S.*)*", overview, re.MULTILINE)  # long ones go on below
+    lines = {row.split()[0]: " ".join(row.split()) for row in rows}
     core = ["generate", "train", "predict", "replay", "branch", "info", "stats", "verify"]
     core += ["export", "import", "export-network", "client", "include", "plugins", "new"]
     core += ["check", "doctor", "completion"]

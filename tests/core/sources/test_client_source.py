@@ -87,7 +87,7 @@ def test_clients_make_no_more_than_they_may(clients, services):
 
     for ahead, total, most in ((0, None, 6), (2, None, 10), (100, 8, 8), (0, 2, 6)):
         services.shown.clear()
-        settings = {"num_clients": 2, "visualizer": "any"}
+        settings = {"num_clients": 2, "visualizer": "rerun"}
         with clients("Drawing", run_ahead=ahead, total=total, **settings) as source:
             source.batch(6)
             deadline = time.monotonic() + 60

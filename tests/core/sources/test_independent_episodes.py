@@ -158,7 +158,7 @@ def test_an_end_within_sub_steps_is_that_of_the_row(services):
 
 
 def test_steps_of_rows_and_drawings_go_on_in_the_next_episode(services):
-    options = {"visualizer": "any", "num_clients": 1}
+    options = {"visualizer": "rerun", "num_clients": 1}
     with open_local(services, "Chapters", **options) as source:
         rows = source.batch(20)
     assert rows["step"].tolist() == list(range(20))

@@ -55,9 +55,9 @@ def observed(make, services, *, apply, stored, **settings):
     ("settings", "apply", "stored"),
     [
         ({"simulations_per_step": 3}, False, False),
-        ({"visualizer": "any", "num_clients": 3}, False, False),
+        ({"visualizer": "rerun", "num_clients": 3}, False, False),
         ({"num_clients": 2, "simulations_per_step": 2}, True, False),
-        ({"num_clients": 3, "visualizer": "any", "record_wrong_samples": True}, True, True),
+        ({"num_clients": 3, "visualizer": "rerun", "record_wrong_samples": True}, True, True),
     ],
 )
 def test_all_that_an_environment_does_is_the_same_in_clients(
@@ -80,7 +80,7 @@ def test_all_that_an_environment_does_is_the_same_in_clients(
 def test_what_an_environment_leaves_drawn_is_shown(local, simulated, services, sub_steps):
     for make in (local, lambda *a, **k: simulated(*a, run_ahead=0, **k)):
         services.shown = []
-        settings = {"visualizer": "any", "simulations_per_step": sub_steps}
+        settings = {"visualizer": "rerun", "simulations_per_step": sub_steps}
         with make(f"{ENVS}:LeavesDrawn", **settings) as source:
             for _ in range(5):
                 source.batch(1)

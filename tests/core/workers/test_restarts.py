@@ -191,7 +191,7 @@ def test_restart_repeats_no_drawing_and_no_saved_parameters(simulated, services,
         services.shown.clear()
         services.kept.clear()
         kwargs = {"fault": fault, "place": "step", "at": 6}
-        settings = {"num_clients": 2, "visualizer": "any", "retries": 1}
+        settings = {"num_clients": 2, "visualizer": "rerun", "retries": 1}
         with simulated(WANDERER, env_kwargs=kwargs, total=20, **settings) as source:
             source.batch(20)
         drawn = sorted((i, step, str(events)) for i, step, events in services.shown)

@@ -113,7 +113,7 @@ def test_drawing_events_arrive_exactly(local, simulated, services):
     shown = []
     for make in (local, simulated):
         services.shown.clear()
-        with make("Drawing", num_clients=2, visualizer="any") as source:
+        with make("Drawing", num_clients=2, visualizer="rerun") as source:
             source.batch(6)
         shown.append(
             [one for number in (1, 2) for one in services.shown if one[0] == number and one[1] < 3]
@@ -127,7 +127,7 @@ def test_drawing_events_arrive_exactly(local, simulated, services):
             same_arrays(a.values, b.values)
 
 
-DRAWING = {"visualizer": "any", "env_kwargs": {"pace": 1e-4}}
+DRAWING = {"visualizer": "rerun", "env_kwargs": {"pace": 1e-4}}
 
 
 @pytest.mark.slow

@@ -76,7 +76,7 @@ PLACES = [f"{what} {row}" for row in range(20) for what in ("step", "prediction"
         {},
         {"env_kwargs": {"parameters": True}},
         {"record_wrong_samples": True},
-        {"visualizer": "any"},
+        {"visualizer": "rerun"},
     ],
 )
 def test_rows_do_not_depend_on_kills_at_every_row(states, every, options):
@@ -128,7 +128,7 @@ def test_drawings_and_saved_parameters_are_not_repeated(states, services):
     seen = []
     for kills in ([], PLACES[:40:3]):
         services.shown.clear()
-        run(states(3, env_kwargs={"kills": kills}, visualizer="any", retries=100))
+        run(states(3, env_kwargs={"kills": kills}, visualizer="rerun", retries=100))
         drawn = sorted((i, step, str(events)) for i, step, events in services.shown)
         seen.append((drawn, dict(services.kept)))
     assert seen[0] == seen[1]

@@ -176,6 +176,7 @@ def _overview() -> str:
             initial_indent=f"  {name:{width}}  ",
             subsequent_indent=indent,
         )
+        or f"  {name}"  # without a summary
         for name in names
     )
     return (

@@ -142,7 +142,7 @@ class RandomizedEnv(Layer):
 
 def _randomization(given: Any) -> Any:
     """Return a randomization; that of a posterior, if a file is given."""
-    if not isinstance(given, (str, Path)):
+    if not isinstance(given, (str, Path)) or Path(given).suffix != ".toml":
         return given
     return import_component("randomization", _POSTERIOR)(given)
 

@@ -17,10 +17,10 @@ from scipy.linalg import qr, solve_triangular
 
 from physx_core.typing import Array, Vector
 from physx_identify.errors import IdentificationError
-from physx_identify.model import Model, Path
-from physx_identify.noise import ORDERS, LikelyNoise, Noise, Whitener
-from physx_identify.smooth import Smoother
-from physx_identify.uncertainty import values_of
+from physx_identify.estimation.model import Model, Path
+from physx_identify.estimation.noise import ORDERS, LikelyNoise, Noise, Whitener
+from physx_identify.estimation.smooth import Smoother
+from physx_identify.estimation.uncertainty import values_of
 from physx_identify.unknowns import Parameter
 
 _STEPS = 20

@@ -23,10 +23,10 @@ from physx_core.config import MODES
 from physx_core.errors import listed
 from physx_core.fields import NUMBERS, RESERVED, Field
 from physx_core.typing import Array
-from physx_formats.array_pickle import ArrayPickleError, load_array
 from physx_formats.errors import ExchangeError
+from physx_formats.files.array_pickle import ArrayPickleError, load_array
+from physx_formats.files.npz import NpzColumn
 from physx_formats.format import Format
-from physx_formats.npz_format import NpzColumn
 from physx_formats.table import Column, Notes
 
 _DATABASE = re.compile(rf"(.+)_({'|'.join(MODES)})_(\d+)\.db")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 
-from physx_identify import wording
-from physx_identify.identification import Identification
-from physx_identify.stored import FILE, read_identification
+from physx_identify.result import wording
+from physx_identify.result.identification import Identification
+from physx_identify.result.stored import FILE, read_identification
 from physx_report import Run, Section, Table, Text
 
 

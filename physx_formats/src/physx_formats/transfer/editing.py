@@ -27,9 +27,9 @@ from physx_core.fields import NUMBERS, RESERVED, Field, free_axes
 from physx_core.plugins import import_component
 from physx_core.typing import Array, Batch, Index
 from physx_core.views import Batches, Part, View
-from physx_formats.episodes import EpisodeCopier, copy_stream
 from physx_formats.errors import ExchangeError
 from physx_formats.table import BLOCK, Advance, check_new
+from physx_formats.transfer.episodes import EpisodeCopier, copy_stream
 
 Function: TypeAlias = "str | Callable[[Mapping[str, Array]], Any]"
 _ALL = View(hold_back=False)

@@ -20,8 +20,8 @@ from physx_core.dataset import Episode
 from physx_core.fields import Field
 from physx_core.typing import Batch
 from physx_formats.errors import ExchangeError
+from physx_formats.files.roles import Roles
 from physx_formats.format import Format
-from physx_formats.roles import Roles
 from physx_formats.table import ExportOptions, Table, encode_notes, import_library
 
 _OVERHEAD = 6000

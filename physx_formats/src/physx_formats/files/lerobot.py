@@ -22,8 +22,8 @@ from physx_core.fields import Field
 from physx_core.statistics import RunningStatistics
 from physx_core.typing import Array, Batch
 from physx_formats.errors import ExchangeError
+from physx_formats.files.roles import OBSERVATION, Roles
 from physx_formats.format import Format
-from physx_formats.roles import OBSERVATION, Roles
 from physx_formats.table import ExportOptions, Table, encode_notes, import_library
 
 VERSION = "v3.0"

@@ -9,9 +9,9 @@ import numpy as np
 from physx_core.errors import listed
 from physx_core.typing import Vector
 from physx_identify.errors import IdentificationError
-from physx_identify.log import Log
-from physx_identify.model import Model, Path
-from physx_identify.smooth import Smoother
+from physx_identify.estimation.model import Model, Path
+from physx_identify.estimation.smooth import Smoother
+from physx_identify.logs.log import Log
 
 _LEAST = 50
 _LEAST_PER_PARAMETER = 10

@@ -15,8 +15,8 @@ import numpy as np
 from physx_core.dataset import hdf5_type, rows_per_block
 from physx_core.typing import Array
 from physx_formats.errors import ExchangeError
+from physx_formats.files.layouts import read_layout
 from physx_formats.format import Format
-from physx_formats.layouts import read_layout
 from physx_formats.table import Column, ExportOptions, Notes, Table, encode_notes
 
 COMPRESSIONS = {"none": None, "gzip": "gzip", "lzf": "lzf"}

@@ -14,10 +14,10 @@ import numpy as np
 from scipy.stats import chi2
 from scipy.stats import f as fisher
 
-from physx_identify.fit import Fit
-from physx_identify.model import STRIBECK
-from physx_identify.noise import LikelyNoise
-from physx_identify.uncertainty import Values, values_of
+from physx_identify.estimation.fit import Fit
+from physx_identify.estimation.model import STRIBECK
+from physx_identify.estimation.noise import LikelyNoise
+from physx_identify.estimation.uncertainty import Values, values_of
 
 SIZE = 0.05
 """Share of logs without model error in which the tests together find one."""

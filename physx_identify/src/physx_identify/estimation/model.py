@@ -12,7 +12,7 @@ from physx_core.errors import ComponentNotFoundError
 from physx_core.typing import Vector
 from physx_dart.pinocchio.models import frames_of, load_model
 from physx_identify.errors import IdentificationError
-from physx_identify.inertia import TEN, UNITS, carried, ten_of
+from physx_identify.estimation.inertia import TEN, UNITS, carried, ten_of
 from physx_identify.unknowns import LINKS, Parameter, Unknown
 from physx_sim import Robot, World
 from physx_sim.engines import MovableBody, read_parts

@@ -10,7 +10,7 @@ from physx_core import Result, files
 from physx_core.parsing import parse_toml
 from physx_core.results import from_plain, store_result
 from physx_identify.errors import IdentificationError
-from physx_identify.identification import Identification
+from physx_identify.result.identification import Identification
 
 FILE = "identification.toml"
 KIND = "identification"

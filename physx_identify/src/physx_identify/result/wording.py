@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-from physx_identify.estimates import Combination, Estimate, LogNoise
+from physx_identify.result.estimates import Combination, Estimate, LogNoise
 
 WIDTH = 80
 TOGETHER = "Inseparable in this log; told of them together"

@@ -15,10 +15,10 @@ from physx_core.dataset import EPISODES, TABLE_FIELDS, Dataset, holds_dataset
 from physx_core.errors import listed
 from physx_core.fields import Field
 from physx_core.typing import Batch
-from physx_formats.episodes import EpisodeCopier, copy_stream, split_records
 from physx_formats.errors import ExchangeError
 from physx_formats.format import Columns, all_formats
 from physx_formats.table import KINDS, Advance, Column, Notes, check_size
+from physx_formats.transfer.episodes import EpisodeCopier, copy_stream, split_records
 
 _SESSION = "import"
 _ALWAYS = 2**28

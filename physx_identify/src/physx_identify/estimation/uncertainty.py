@@ -12,7 +12,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from physx_core.typing import Array, Vector
-from physx_identify.noise import LikelyNoise, Noise, Whitener
+from physx_identify.estimation.noise import LikelyNoise, Noise, Whitener
 
 _NEW = 1e-3
 """Relative length of a column that the others do not explain, from which it counts."""

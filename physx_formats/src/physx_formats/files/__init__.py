@@ -1,0 +1,1 @@
+"""The file formats, each with what it reads and writes."""

@@ -1,0 +1,1 @@
+"""Logs: reading them, and what is wrong with them."""
