@@ -5,6 +5,7 @@ For documentation and tests; registered with the same hooks as any plugin.
 
 from __future__ import annotations
 
+import math
 import zipfile
 import zlib
 from pathlib import Path
@@ -144,9 +145,9 @@ class Linear(Network):
     def bind(self, fields: dict[str, Field]) -> None:  # type: ignore[override]
         """Set the sizes from the fields; existing weights are kept."""
         super().bind(fields)
-        row = {name: np.zeros((1, *(fields[name].shape or ()))) for name in self.net_fields}
+        none = {name: np.zeros((0, *(fields[name].shape or ()))) for name in self.net_fields}
         self._shape = fields[self.opt_fields[0]].shape or ()
-        size = (self.rows(row).shape[1], int(np.prod(self._shape)))
+        size = (self.rows(none).shape[1], int(np.prod(self._shape)))
         if self.weights.size == 0:
             self.weights = np.zeros(size, self._dtype)
         elif self.weights.shape != size:
@@ -155,7 +156,8 @@ class Linear(Network):
 
     def rows(self, data: Tensors) -> Array:
         """Return the inputs and a column of ones, shape (samples, inputs + 1)."""
-        parts = [data[name].reshape(len(data[name]), -1) for name in self.net_fields]
+        given = [data[name] for name in self.net_fields]
+        parts = [each.reshape(len(each), math.prod(each.shape[1:])) for each in given]
         return np.concatenate([*parts, np.ones((len(parts[0]), 1))], axis=1)
 
     def predict(self, data: Tensors) -> Tensors:
