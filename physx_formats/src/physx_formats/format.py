@@ -16,12 +16,12 @@ KIND = "format"
 Columns: TypeAlias = dict[str, Column]
 
 LOSSES = {
-    "types": "types: numbers are int64, float64 or bool again, with the same values",
-    "notes": "roles and axes of fields, and which are the same quantity",
-    "records": "records of episodes, with their parameters",
-    "way back": "a way back: nothing is imported from it",
+    "types": "keeps no types: numbers are int64, float64 or bool again, with the same values",
+    "notes": "keeps no roles and axes of fields, nor which are the same quantity",
+    "records": "keeps no records of episodes, with their parameters",
+    "way back": "is not imported",
 }
-"""What a format may not keep, in words."""
+"""What a format may not keep, as the predicate of its name."""
 
 
 def _never(path: Path, begin: bytes) -> bool:

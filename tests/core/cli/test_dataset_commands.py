@@ -144,7 +144,7 @@ def test_minari_by_commands(session, run, tmp_path):
     minari = pytest.importorskip("minari")
     words = ["--mode", "training", "--observations", "state", "--actions", "torque"]
     status, out, _ = run("export", session, "arm-v0", "--to", "minari", *words)
-    assert (status, out) == (0, "400 training samples: arm-v0\n")
+    assert (status, out) == (0, "400 training samples: arm-v0\nminari is not imported\n")
     found = minari.MinariDataset(tmp_path / "arm-v0" / "data")
     assert (found.total_episodes, found.total_steps) == (8, 392)
     assert found[0].observations.shape == (50, 27) and found[0].actions.shape == (49, 2)

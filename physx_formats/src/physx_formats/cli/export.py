@@ -106,4 +106,4 @@ def run(words: Sequence[str]) -> None:
             left = stored[mode] - rows
             show(f"left out: {left:,} samples in trajectories of a single sample")
     for name in lost:
-        show(f"{options.to} does not keep {LOSSES[name]}")
+        show(f"{options.to} {LOSSES[name]}")
