@@ -103,6 +103,12 @@ OBJECTS: Mapping[str, Sample] = dict(
             {"urdf": str(ROBOT), "bodies": ["base", "arm"]},
             {"poses": [[0, 0, 0, 0, 0, 0, 1], [0, 0, 1, 0, 0, 0, 1]]},
         ),
+        _sample(
+            "controls",
+            {"labels": ["mass"], "low": [0.5], "high": [2.0], "values": [1.0], "pulls": ["robot"]},
+            {},
+            "robot",
+        ),
         _sample("view", {"title": "scene", "eye": [3.0, 3.0, 3.0], "target": [0.0, 0.0, 0.0]}, {}),
     )
 )

@@ -82,7 +82,7 @@ def _draws(kind: str, make: Make, folder: Path) -> None:
         visualizer.events(1, 0, factory.take_events())
         OBJECTS[kind].move(factory)
         visualizer.events(1, 1, factory.take_events())
-        if kind != "view":
+        if kind not in {"view", "controls"}:  # which stay
             factory.remove(kind)
             visualizer.events(1, 2, factory.take_events())
 

@@ -130,6 +130,18 @@ def test_debug_shows_the_traceback(capsys):
     assert "Traceback" in capsys.readouterr().err
 
 
+def test_help_ends_well_though_a_library_has_replaced_sys_exit(monkeypatch, capsys):
+    leave = sys.exit
+
+    class Hooks:
+        def exit(self, code=0):
+            leave(code)
+
+    monkeypatch.setattr(sys, "exit", Hooks().exit)
+    assert main(["generate", "--help"]) == 0
+    assert "usage: physx generate" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("verb", "arguments"),
     [

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import sys
 import traceback
 from pathlib import Path
 from types import FrameType, TracebackType
@@ -20,10 +21,9 @@ def is_ending(error: BaseException) -> bool:
 
 def describe_ending(error: BaseException) -> str:
     """Return what ended where, without a full stop."""
-    frames = list(traceback.walk_tb(error.__traceback__))
-    if not frames:
+    if (place := _place(error)) is None:
         return repr(error)
-    frame, line = frames[-1]
+    frame, line = place
     name, file = frame.f_code.co_qualname, Path(frame.f_code.co_filename).name
     return f"{name}() ({file}, line {line}) raised {error!r}"
 
@@ -35,8 +35,18 @@ def passes_through(trace: TracebackType | None, *packages: str) -> bool:
 
 def ends_in(error: BaseException, *packages: str) -> bool:
     """Return whether a function of one of these packages raised the error."""
-    frames = list(traceback.walk_tb(error.__traceback__))
-    return bool(frames) and _package(frames[-1][0]) in packages
+    place = _place(error)
+    return place is not None and _package(place[0]) in packages
+
+
+def _place(error: BaseException) -> tuple[FrameType, int] | None:
+    """Return the frame and line that raised an error; None if it was never raised.
+
+    Libraries such as wandb replace `sys.exit`: then it is what called it.
+    """
+    leave = getattr(getattr(sys.exit, "__func__", sys.exit), "__code__", None)
+    places = list(traceback.walk_tb(error.__traceback__))
+    return next((each for each in reversed(places) if each[0].f_code is not leave), None)
 
 
 def _package(frame: FrameType) -> str:

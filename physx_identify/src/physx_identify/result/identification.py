@@ -9,9 +9,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from physx_identify.result import wording
 from physx_identify.errors import IdentificationError
 from physx_identify.estimation.structure import ResidualTest
+from physx_identify.result import wording
 from physx_identify.result.estimates import Combination, Estimate, LogNoise
 from physx_sim import JointSettings, Robot
 
