@@ -28,6 +28,8 @@ myst_heading_anchors = 4
 default_role = "code"
 nitpicky = False  # annotations name types of libraries whose pages are not included
 
+toc_object_entries = False  # the sidebar of each page would take four fifths of the time
+
 html_theme = "furo"
 html_title = "physx"
 html_static_path = ["site.css"]

@@ -115,12 +115,12 @@ def title_of(name: str) -> str:
 
 
 def overview() -> str:
-    """Return a grid of the pictures, each of which leads to its example."""
+    """Return a grid of pictures with titles, each of which leads to its example."""
     cells = []
     for name in filter(lambda each: picture(each).is_file(), names()):
         title = title_of(name)
         anchor = re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
-        cells.append(f"[![{title}](examples/{picture(name).name})](#{anchor})")
+        cells.append(f"[![{title}](examples/{picture(name).name}) {title}](#{anchor})")
     return "\n" + "\n".join(cells) + "\n"
 
 
