@@ -167,16 +167,17 @@ def _overview() -> str:
     commands = find_entries(COMMANDS)
     names = [name for name in _ORDER if name in commands]
     names += [name for name in commands if name not in _ORDER]
-    width = max(map(len, names), default=0)
+    shown = {name: printable(name) for name in names}
+    width = max(map(len, shown.values()), default=0)
     indent = " " * (width + 4)
     lines = "\n".join(
         textwrap.fill(
             printable(_summary(commands[name])),
             80,
-            initial_indent=f"  {name:{width}}  ",
+            initial_indent=f"  {shown[name]:{width}}  ",
             subsequent_indent=indent,
         )
-        or f"  {name}"  # without a summary
+        or f"  {shown[name]}"  # without a summary
         for name in names
     )
     return (
