@@ -12,8 +12,9 @@ from physx_core import Dataset, Field
 from physx_core.dataset import EPISODES, EpisodeRecord, EpisodeStatus
 from physx_core.errors import ConfigError, DatasetError, FieldTypeError, UsageError
 from physx_core.views import View
-from physx_formats import ExchangeError, edit, episodes
+from physx_formats import ExchangeError, edit
 from physx_formats.cli import edit as command
+from physx_formats.transfer import episodes
 
 pytestmark = pytest.mark.processes
 MESH = Field("mesh", (2,), "f4", "m", role="episode")

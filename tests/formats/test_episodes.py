@@ -6,7 +6,8 @@ import pytest
 
 from physx_core import Dataset, Field
 from physx_core.dataset import EPISODES, EpisodeRecord, EpisodeStatus
-from physx_formats import ExchangeError, episodes, export, import_file
+from physx_formats import ExchangeError, export, import_file
+from physx_formats.transfer import episodes
 
 pytestmark = pytest.mark.processes
 MESH = Field("mesh", (2,), "f4", "m", role="episode")
