@@ -1,1 +1,1 @@
-"""What is done with the rows of a dataset: exported, imported, edited."""
+"""Export, import and editing of the rows of a dataset."""

@@ -1,4 +1,4 @@
-"""What changes while a world runs: gravity, bodies, the ground, and what holds bodies together."""
+"""Changes of a running world: gravity, bodies, the ground, and what holds bodies together."""
 
 from __future__ import annotations
 

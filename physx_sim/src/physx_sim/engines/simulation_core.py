@@ -1,4 +1,4 @@
-"""What a simulation with engines consists of, and what an engine implements for all of it."""
+"""Base of simulations with engines: their parts, and what an engine implements for all of them."""
 
 from __future__ import annotations
 
