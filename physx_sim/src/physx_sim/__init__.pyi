@@ -9,6 +9,7 @@ from .description.attachment import Attachment as Attachment
 from .description.attachment import Connect as Connect
 from .description.attachment import Weld as Weld
 from .description.body_settings import BodySettings as BodySettings
+from .description.coupling import JointCoupling as JointCoupling
 from .description.ground import Ground as Ground
 from .description.ground import HeightField as HeightField
 from .description.ground import Stairs as Stairs

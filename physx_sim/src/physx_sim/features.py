@@ -11,6 +11,7 @@ FEATURES = {
     "cameras": "images of cameras: depth, segmentation, colors",
     "changes": "masses, friction, hidden objects and height fields that change while it runs",
     "contacts": "contacts with static bodies",
+    "couplings": "joints whose positions have a constant sum: differentials, locked joints",
     "derivatives": "derivatives of the forward dynamics",
     "exact_restore": "bit-identical continuation after restore",
     "forward_dynamics": "forward dynamics of any state",

@@ -23,7 +23,7 @@ from physx_dart.pinocchio.constraints import Solved
 from physx_dart.pinocchio.contact_problem import ContactProblem, unit
 from physx_dart.pinocchio.contacts import ContactPoints, joined
 from physx_dart.pinocchio.robot import PinocchioRobot
-from physx_dart.pinocchio.ties import FASTEST_FOLLOWER
+from physx_dart.pinocchio.ties import FASTEST_JOINT
 from physx_sim import StepDerivatives
 from physx_sim.errors import SimulationError
 
@@ -144,7 +144,7 @@ class GroupDerivatives:
         missing[places, at] -= joined(limits)[solved.rows]
         missing[places, 3 * nv + at] -= motors
         for tie, speed in enumerate(solved.pace.tolist(), of_joints.stop):
-            if abs(speed) < FASTEST_FOLLOWER:
+            if abs(speed) < FASTEST_JOINT:
                 missing[tie, :nv] += solved.along[tie] / self._period
         change += solved.spread.dot(problem.slope(solved.impulses).dot(missing))
 

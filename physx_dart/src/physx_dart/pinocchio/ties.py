@@ -1,4 +1,4 @@
-"""Rows that hold bodies and joints together: attachments, and joints that follow others."""
+"""Rows that hold bodies and joints together: attachments, and couplings of joints."""
 
 from __future__ import annotations
 
@@ -19,8 +19,8 @@ _FASTEST_RETURN = 1.0
 """Maximum speed at which it is closed, in m/s or rad/s."""
 _STUCK = 1e-9
 """Motion of a point per motion of a joint below which it cannot move."""
-FASTEST_FOLLOWER = 10.0
-"""Maximum speed at which a joint returns to where its leader has it, as to its limits."""
+FASTEST_JOINT = 10.0
+"""Maximum speed at which joints return to where their couplings hold, as to their limits."""
 
 
 class Ties:
@@ -31,8 +31,12 @@ class Ties:
         self._links = [(place, link) for place, each in enumerate(robots) for link in each.frames]
         self._supports = [supports_of(each.model_in_motion) for each in robots]
         self._bonds: dict[int, Bond] = {}
-        self._following = {place for place, each in enumerate(robots) if each.model.followers}
-        self.robots = frozenset(self._following)
+        self._couplings = {
+            place: each.model.coupling_rows
+            for place, each in enumerate(robots)
+            if each.model.followers or each.model.couplings
+        }
+        self.robots = frozenset(self._couplings)
 
     def __bool__(self) -> bool:
         """Return whether anything is held."""
@@ -51,7 +55,7 @@ class Ties:
     def _note(self) -> None:
         """Note which robots are held."""
         bodies = [body for bond in self._bonds.values() for body in bond.bodies if body >= 0]
-        self.robots = frozenset(self._following | {self._links[body][0] for body in bodies})
+        self.robots = frozenset([*self._couplings, *(self._links[body][0] for body in bodies)])
 
     def rows(self, coupled: Sequence[int]) -> tuple[Vector, Vector]:
         """Return the Jacobian of all rows, shape (m, nv), and the velocities along them (m,).
@@ -63,16 +67,14 @@ class Ties:
         ends = np.cumsum([0, *(robot.nv for robot in robots)])
         motions = [robot.place_joints() for robot in robots]
         blocks, aims = [np.zeros((0, ends[-1]))], [np.zeros(0)]
-        for begin, robot in zip(ends, robots, strict=False):
-            for follower, leader, mimic in robot.model.followers:
-                row = np.zeros((1, ends[-1]))
-                row[0, begin + robot.base + follower] = 1.0
-                row[0, begin + robot.base + leader] = -mimic.multiplier
-                q = robot.joint_positions()
-                gap = q[follower] - mimic.multiplier * q[leader] - mimic.offset
-                speed = -gap / self._period
-                blocks.append(row)
-                aims.append(np.clip([speed], -FASTEST_FOLLOWER, FASTEST_FOLLOWER))
+        for place, robot, begin, end in zip(coupled, robots, ends[:-1], ends[1:], strict=True):
+            if place in self._couplings:
+                joint_rows, sums = self._couplings[place]
+                rows = np.zeros((len(sums), ends[-1]))
+                rows[:, begin + robot.base : end] = joint_rows
+                speeds = (sums - joint_rows @ robot.joint_positions()) / self._period
+                blocks.append(rows)
+                aims.append(np.clip(speeds, -FASTEST_JOINT, FASTEST_JOINT))
         for bond in self._bonds.values():
             poses, jacobians = [], []
             for body, frame in zip(bond.bodies, bond.frames, strict=True):

@@ -6,7 +6,8 @@ import dataclasses
 
 from physx_sim import Robot
 from physx_sim.engines.models.inertias import inertia_warnings
-from physx_sim.engines.models.mjcf import is_mjcf, read_mjcf
+from physx_sim.engines.models.mjcf import read_mjcf
+from physx_sim.engines.models.mjcf_file import is_mjcf
 from physx_sim.engines.models.robot_files import find_robot
 from physx_sim.engines.models.robot_model import RobotModel
 from physx_sim.engines.models.urdf import read_urdf
