@@ -17,6 +17,6 @@ def physx_formats() -> Components:
         "vtkhdf": "physx_formats.files.vtkhdf:FORMAT",
         "zarr": "physx_formats.files.zarr:FORMAT",
         "minari": "physx_formats.files.minari:FORMAT",
-        "lerobot": "physx_formats.files.lerobot:FORMAT",
+        "lerobot": "physx_formats.files.lerobot.format:FORMAT",
         "deepphysx": "physx_formats.files.deepphysx:FORMAT",
     }
