@@ -67,6 +67,7 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
     physx_sim.Weld: {"body_a": "hand", "position": (1.0, 0.5, 0.25)}
     | {"orientation": BODY["orientation"]},
     physx_sim.Connect: {"body_a": "hand", "point_a": (1.0, 0.5, 0.25), "point_b": (0.5, 2.0, 1.0)},
+    physx_sim.Wheel: {"link": "wheel", "radius": 0.25, "axis": (1.0, 0.5, 0.25)},
     physx_sim.Robot: {
         "urdf": "arm.urdf",
         "feet": {"foot": 0.25},

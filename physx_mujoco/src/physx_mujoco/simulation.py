@@ -63,7 +63,9 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
     """A world in MuJoCo."""
 
     engine = "mujoco"
-    lacks: ClassVar[frozenset[str]] = frozenset({"derivatives", "restitution", "step_derivatives"})
+    lacks: ClassVar[frozenset[str]] = frozenset(
+        {"derivatives", "restitution", "rolling", "step_derivatives"}
+    )
     caveats: ClassVar[Mapping[str, str]] = {
         "attachments": f"while it runs, {SPARE} more than at the start; soft",
         "cameras": "with EGL or OSMesa",
@@ -106,6 +108,8 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
             raise FeatureNotSupportedError(self.engine, f"detector {world.detector}", features)
         if world.integrator == "rk4":
             check_rk4(parts, self.engine, features)
+        if parts.rolling:
+            raise FeatureNotSupportedError(self.engine, "rolling", features)
         shapes = [shape for movable in parts.movables for shape in movable.model.shapes]
         if any(shape.restitution for shape in shapes):
             raise FeatureNotSupportedError(self.engine, "restitution", features)

@@ -22,6 +22,7 @@ from .description.objects import WorldObject as WorldObject
 from .description.robot import JointSettings as JointSettings
 from .description.robot import Mimic as Mimic
 from .description.robot import Robot as Robot
+from .description.wheel import Wheel as Wheel
 from .description.world import World as World
 from .description.wrench import Wrench as Wrench
 from .devices import steps_of as steps_of

@@ -29,6 +29,7 @@ FEATURES = {
     "raycast": "ray casts",
     "restitution": "bouncing contacts",
     "mimic": "joints that follow others",
+    "rolling": "wheels that roll without slip: Robot(wheels=[Wheel(...)])",
     "rk4": 'World(integrator="rk4")',
     "self_collisions": "Robot(self_collisions=True)",
     "springs": "springs and damping in joints",

@@ -89,7 +89,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
 
     engine = "dart"
     lacks: ClassVar[frozenset[str]] = frozenset(
-        {"cameras", "step_derivatives", "torsional_friction"}
+        {"cameras", "rolling", "step_derivatives", "torsional_friction"}
     )
     caveats: ClassVar[Mapping[str, str]] = {
         "armature": "impulses of contacts, limits and servos do not know it: a warning",
@@ -148,6 +148,8 @@ class DartSimulation(RobotSimulation[DartRobot]):
         features = frozenset(FEATURES) - self.lacks
         if parts.world.integrator == "rk4":
             check_rk4(parts, self.engine, features)
+        if parts.rolling:
+            raise FeatureNotSupportedError(self.engine, "rolling", features)
         shapes = [shape for each in parts.movables for shape in each.model.shapes]
         if parts.turning and parts.world.contacts != "none":
             advice = "Robot(torsional_friction=0.0, rolling_friction=0.0) leaves out a file's."

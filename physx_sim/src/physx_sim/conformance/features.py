@@ -21,6 +21,7 @@ from physx_sim import (
     Simulation,
     Sphere,
     Weld,
+    Wheel,
     World,
     Wrench,
 )
@@ -84,6 +85,7 @@ _WORLDS: Mapping[str, Callable[[], World]] = {
     "mimic": lambda: _with_joint(JointSettings(mimic=Mimic("waist", 0.5))),
     "joint_friction": lambda: _with_joint(JointSettings(friction=0.1)),
     "springs": lambda: _with_joint(JointSettings(stiffness=1.0, damping=0.1)),
+    "rolling": lambda: arm(robot={"wheels": [Wheel("hand", 0.05)]}, ground=Ground(height=-10.0)),
     "rk4": lambda: pendulum(integrator="rk4"),
     "self_collisions": _colliding,
     "torsional_friction": _turning,

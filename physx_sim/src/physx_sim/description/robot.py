@@ -11,6 +11,7 @@ from physx_core import checks
 from physx_core.errors import ConfigError, UnknownOptionError
 from physx_sim.description.coupling import JointCoupling
 from physx_sim.description.ground import MATERIAL
+from physx_sim.description.wheel import Wheel
 
 Mode = Literal["force", "servo", "velocity", "position"]
 _RESISTANCE = ("damping", "friction", "stiffness", "rest", "armature")
@@ -129,6 +130,7 @@ class Robot:
         joints: Settings of joints, by their name in the file.
         couplings: Which joints move together, besides those that follow others; None: those of an
             MJCF file, otherwise none. It starts at positions that couplings allow.
+        wheels: Links that roll on the ground without slip.
         mass_factors: Scale factors for the mass and moments of inertia of links, by their name in
             the file; 1 for all others.
 
@@ -154,6 +156,7 @@ class Robot:
     torsional_friction: float | None = None
     rolling_friction: float | None = None
     couplings: Sequence[JointCoupling] | None = None
+    wheels: Sequence[Wheel] = ()
 
     def __post_init__(self) -> None:
         checks.name("robot", self.name)
@@ -174,7 +177,11 @@ class Robot:
             if (value := getattr(self, option)) is not None:
                 checks.not_negative(f"{where}{option}", value)
         kinds: tuple[tuple[type, Iterable[object]], ...]
-        kinds = (JointSettings, self.joints.values()), (JointCoupling, self.couplings or ())
+        kinds = (
+            (JointSettings, self.joints.values()),
+            (JointCoupling, self.couplings or ()),
+            (Wheel, self.wheels),
+        )
         for kind, things in kinds:
             wrong = [thing for thing in things if not isinstance(thing, kind)]
             if wrong:

@@ -22,6 +22,7 @@ RK4_LACKS = (
     "mimic",
     "moving_statics",
     "restitution",
+    "rolling",
     "self_collisions",
     "step_derivatives",
     "torsional_friction",
@@ -33,8 +34,8 @@ def check_rk4(parts: Parts, engine: str, features: Collection[str]) -> None:
     """Raise an error if a world needs constraints.
 
     Raises:
-        FeatureNotSupportedError: If there may be contacts, attachments, couplings, or a joint has
-            limits, friction, a leader, or a mode other than ``"force"``.
+        FeatureNotSupportedError: If there may be contacts, attachments, couplings, wheels, or a
+            joint has limits, friction, a leader, or a mode other than ``"force"``.
     """
     advice = 'Use World(integrator="euler").'
     solid = sum(bool(movable.model.shapes) for movable in parts.movables) + len(parts.statics)
@@ -43,6 +44,7 @@ def check_rk4(parts: Parts, engine: str, features: Collection[str]) -> None:
     for what, needed in (
         ("attachments", bool(parts.attachments)),
         ("couplings", any(movable.model.couplings for movable in parts.movables)),
+        ("rolling", parts.rolling),
     ):
         if needed:
             raise FeatureNotSupportedError(engine, f"{what} in rk4", features, advice)

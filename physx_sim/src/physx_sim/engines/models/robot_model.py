@@ -11,7 +11,7 @@ import numpy as np
 
 from physx_core.errors import listed, nearest
 from physx_core.typing import Vector
-from physx_sim import Attachment, JointCoupling, Mimic, Robot
+from physx_sim import Attachment, JointCoupling, Mimic, Robot, Wheel
 from physx_sim.engines.models.rigid_bodies import Inertial, Joint, RigidBody
 from physx_sim.engines.models.shapes import CollisionShape
 from physx_sim.errors import ModelError
@@ -27,6 +27,7 @@ class RobotModel:
         shapes: Collision shapes; empty if there is nothing to touch.
         attachments: What holds its links together besides its joints, by their names in the file.
         couplings: Which joints move together, besides those that follow others.
+        wheels: Links that roll without slip; their shapes have no friction.
         warnings: What is wrong with the file, although it can be simulated, and what of it no
             engine is told.
     """
@@ -37,6 +38,7 @@ class RobotModel:
     warnings: tuple[str, ...] = ()
     attachments: tuple[Attachment, ...] = ()
     couplings: tuple[JointCoupling, ...] = ()
+    wheels: tuple[Wheel, ...] = ()
 
     @functools.cached_property
     def links(self) -> tuple[str, ...]:
@@ -121,6 +123,25 @@ def coupled(
     return model
 
 
+def with_wheels(robot: Robot, model: RobotModel) -> RobotModel:
+    """Return a model with the wheels of a robot's description.
+
+    Args:
+        robot: The robot's description.
+        model: Its model.
+
+    Raises:
+        ModelError: If a link is named twice.
+    """
+    links = [wheel.link for wheel in robot.wheels]
+    if len(set(links)) < len(links):
+        raise ModelError(f"its wheels need different links, but are {listed(links)}")
+    shapes = tuple(
+        replace(shape, friction=0.0) if shape.body in links else shape for shape in model.shapes
+    )
+    return replace(model, shapes=shapes, wheels=tuple(robot.wheels))
+
+
 def _check_independent(model: RobotModel) -> None:
     """Check that all couplings can hold at the same time, whatever their motors do."""
     rows = model.coupling_rows[0]
@@ -191,6 +212,7 @@ def check_names(robot: Robot, links: Sequence[str], joints: Sequence[str]) -> No
         ("joints", robot.joints, "movable joint", joints),
         ("mass_factors", robot.mass_factors, "link", links),
         ("feet", robot.feet, "link", links),
+        ("wheels", [wheel.link for wheel in robot.wheels], "link", links),
     ):
         for name in given:
             if name not in known:
