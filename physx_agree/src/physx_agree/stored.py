@@ -5,15 +5,10 @@ from __future__ import annotations
 from pathlib import Path
 
 from physx_agree.agreement import Agreement
-from physx_core import Result, files
 from physx_core.errors import SessionError
-from physx_core.parsing import parse_json
-from physx_core.results import from_plain, store_result
+from physx_core.results import read_finding, store_finding
 
 FILE = "agreement.json"
-KIND = "agreement"
-"""What its result is called in the session."""
-_LARGEST = 2**24
 
 
 def store_agreement(session: str | Path, agreement: Agreement, seconds: float = 0.0) -> None:
@@ -27,8 +22,7 @@ def store_agreement(session: str | Path, agreement: Agreement, seconds: float = 
     Raises:
         SessionError: If it cannot be written.
     """
-    result = Result(KIND, Path(session).name, seconds, str(agreement).splitlines())
-    store_result(session, result, {FILE: f"{agreement.to_json()}\n".encode()})
+    store_finding(session, FILE, agreement, seconds)
 
 
 def read_agreement(session: str | Path) -> Agreement | None:
@@ -41,7 +35,6 @@ def read_agreement(session: str | Path) -> Agreement | None:
     if not path.is_file():
         return None
     try:
-        found: Agreement = from_plain(Agreement, parse_json(files.read_content(path, _LARGEST)))
-    except (OSError, ValueError, TypeError, AttributeError, LookupError) as error:
+        return read_finding(Agreement, path)
+    except ValueError as error:
         raise SessionError(f"{path} is damaged: {error}. Remove it.") from error
-    return found

@@ -10,38 +10,30 @@ import types
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from physx_core import files
 from physx_core.errors import SessionError
-from physx_core.parsing import parse_json
+from physx_core.parsing import parse_json, parse_toml
 from physx_core.results.result import Result
 
 FILE = "results.json"
-_LARGEST = 2**24
+_LARGEST, _LARGEST_FINDING = 2**24, 2**26
 _WRONG = ValueError, TypeError, AttributeError, LookupError
+T = TypeVar("T")
 
 
-def store_result(
-    session: str | Path, result: Result, beside: Mapping[str, bytes] | None = None
-) -> None:
+def store_result(session: str | Path, result: Result) -> None:
     """Write a result to a session, in place of that of the last run of the same pipeline.
 
     Args:
-        session: Its folder, which is made if it does not exist.
+        session: Its folder.
         result: The result.
-        beside: Contents of files that belong to it, by name.
 
     Raises:
         SessionError: If the session cannot be written to.
     """
     session = Path(session)
-    for name, content in (beside or {}).items():
-        try:
-            session.mkdir(parents=True, exist_ok=True)
-            files.replace(session / name, content)
-        except OSError as error:
-            raise SessionError(f"{session / name} cannot be written: {error}.") from error
     known = {}
     with contextlib.suppress(OSError, ValueError, AttributeError):  # none yet, or damaged
         for name, each in parse_json(files.read_content(session / FILE, _LARGEST)).items():
@@ -71,6 +63,70 @@ def read_results(session: str | Path) -> dict[str, Result]:
         return {name: from_plain(Result, each) for name, each in plain.items()}
     except (OSError, *_WRONG) as error:
         raise SessionError(f"{path} is damaged: {error}. Remove it.") from error
+
+
+def store_finding(session: str | Path, name: str, found: Any, seconds: float = 0.0) -> None:
+    """Keep what a command found in a session: in a file of its own, and as a result in words.
+
+    Args:
+        session: The session's folder, which is made if it does not exist.
+        name: Name of the file, as of `write_finding`; without its ending, that of the result.
+        found: A dataclass of plain values, in place of what was there; its text becomes the result.
+        seconds: How long it took, in s.
+
+    Raises:
+        SessionError: If the session cannot be written to.
+    """
+    path = Path(session) / name
+    try:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        write_finding(path, found)
+    except OSError as error:
+        raise SessionError(f"{path} cannot be written: {error}.") from error
+    store_result(session, Result(path.stem, path.parent.name, seconds, str(found).splitlines()))
+
+
+def write_finding(path: str | Path, found: Any) -> None:
+    """Write a dataclass of plain values to a file, as JSON if it is called ``*.json``, else TOML.
+
+    Raises:
+        OSError: If it cannot be written.
+    """
+    text = json.dumps(dataclasses.asdict(found), indent=1)
+    if not _is_json(path):
+        import tomli_w
+
+        text = tomli_w.dumps(_without_none(json.loads(text)))
+    files.replace(Path(path), f"{text.rstrip()}\n".encode())
+
+
+def read_finding(kind: type[T], path: str | Path) -> T:
+    """Return what `write_finding` wrote.
+
+    Args:
+        kind: The dataclass.
+        path: The file.
+
+    Raises:
+        ValueError: If it cannot be read, or is no such value.
+    """
+    parse = parse_json if _is_json(path) else parse_toml
+    try:
+        found: T = from_plain(kind, parse(files.read_content(Path(path), _LARGEST_FINDING)))
+    except (OSError, *_WRONG) as error:
+        raise ValueError(f"{error}") from error
+    return found
+
+
+def _is_json(path: str | Path) -> bool:
+    return Path(path).suffix == ".json"
+
+
+def _without_none(plain: Any) -> Any:
+    """Return plain data without what TOML has no word for."""
+    if isinstance(plain, Mapping):
+        return {key: _without_none(each) for key, each in plain.items() if each is not None}
+    return [_without_none(each) for each in plain] if isinstance(plain, list) else plain
 
 
 def from_plain(hint: Any, value: Any) -> Any:

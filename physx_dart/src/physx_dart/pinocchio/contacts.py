@@ -107,9 +107,9 @@ class ContactPoints:
         """Return the points with a wider Jacobian, in which `span` holds their columns."""
         if self.jacobian.shape[1] == width:
             return self
-        found = replace(self, jacobian=_widened(self.jacobian, span, width))
+        found = replace(self, jacobian=widened(self.jacobian, span, width))
         if self.spins is not None:
-            jacobian = _widened(self.spins.jacobian, span, width)
+            jacobian = widened(self.spins.jacobian, span, width)
             found.spins = replace(self.spins, jacobian=jacobian)
         return found
 
@@ -452,7 +452,10 @@ def joined(arrays: Sequence[Any]) -> Any:
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
-def _widened(jacobian: Vector, span: slice, width: int) -> Vector:
+def widened(jacobian: Vector, span: slice, width: int) -> Vector:
+    """Return a Jacobian with zeros for velocities outside a span."""
+    if jacobian.shape[1] == width:
+        return jacobian
     wide = np.zeros((len(jacobian), width))
     wide[:, span] = jacobian
     return wide

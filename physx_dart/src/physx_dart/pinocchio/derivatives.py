@@ -69,7 +69,7 @@ class GroupDerivatives:
         first, more = 0, []
         for part, (_, span) in zip(solved.parts, self._robots, strict=True):
             more.append(first + part.joints.resting(self._after[span][part.joints.base :]))
-            first += len(part.acts)
+            first += len(part.joints.columns)
         rows = np.setdiff1d(joined(more), solved.rows)
         if not len(rows):
             return solved

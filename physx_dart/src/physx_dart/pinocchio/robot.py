@@ -92,7 +92,8 @@ class PinocchioRobot(RobotEngine):
         self._constraints: Constraints | None = None
         self._warmth = Warmth(len(self.contact_finder), len(self._joints.columns))
         # Pinocchio only computes the upper triangle of the inverse mass matrix.
-        self._upper = np.triu(np.ones((self.nv, self.nv)), 1) + 0.5 * np.eye(self.nv)
+        rows, columns = np.indices((self.nv, self.nv))
+        self._mirrored = self.nv * np.minimum(rows, columns) + np.maximum(rows, columns)
 
     # Stepping -------------------------------------------------------------------------------
 
@@ -232,8 +233,9 @@ class PinocchioRobot(RobotEngine):
 
     def _inverse(self, model: Any) -> Vector:
         """Return the inverse of the mass matrix of a model, shape (nv, nv)."""
-        upper = self._upper * pinocchio.computeMinverse(model, self._data, self._positions)
-        return upper + upper.T
+        upper = pinocchio.computeMinverse(model, self._data, self._positions)
+        inverse: Vector = upper.take(self._mirrored)
+        return inverse
 
     def change_gravity(self, gravity: tuple[float, ...]) -> None:
         """Change the acceleration of free fall, in m/s²."""

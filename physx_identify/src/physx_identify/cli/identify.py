@@ -29,8 +29,8 @@ class Identify:
     """Find parameters of a robot in a log, with intervals that hold."""
 
     log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")]
-    """File or folder with positions and torques of the joints: CSV, Parquet, npz, HDF5, a physx
-    dataset, an episode's log, or a LeRobot dataset."""
+    """File or folder with positions and torques of the joints: CSV, Parquet, npz, HDF5, MCAP (of
+    ROS 2), a physx dataset, an episode's log, or a LeRobot dataset."""
     robot: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="ROBOT")]
     """URDF or MJCF file, or the name of a robot; see physx robots."""
     free: tuple[str, ...] = ("mass", "damping", "friction")
@@ -52,6 +52,9 @@ class Identify:
     """Columns of positions, torques, velocities and time, where they have unusual names."""
     episode: int | None = None
     """Episode of a dataset with several."""
+    topic: str | None = None
+    """Topic of an MCAP file, such as /joint_states; by default the only one of all joints. Needs
+    physx-identify[mcap]."""
     gravity: tuple[float, float, float] = (0.0, 0.0, -9.81)
     """In m/s^2."""
     held: tuple[str, ...] = ()
@@ -75,6 +78,7 @@ def run(words: Sequence[str]) -> None:
         period=options.period,
         columns=options.columns,
         episode=options.episode,
+        topic=options.topic,
     )
     found = identify(
         log,
@@ -85,7 +89,10 @@ def run(words: Sequence[str]) -> None:
         held=options.held,
         instant=options.instant,
     )
-    show(found.to_json() if options.json else found)
+    if options.json:
+        print(found.to_json())
+    else:
+        show(found)
     notes = []
     if log.left_out:
         notes.append(f"columns not used: {', '.join(log.left_out)}")

@@ -8,13 +8,10 @@ from pathlib import Path
 
 import numpy as np
 
-from physx_core.dataset import Dataset, holds_dataset
 from physx_core.errors import listed, nearest
-from physx_core.typing import Array, Vector
-from physx_formats import all_formats
-from physx_gym import read_log as read_episode
-from physx_gym.errors import LogError
+from physx_core.typing import Vector
 from physx_identify.errors import IdentificationError
+from physx_identify.logs.tables import read_table
 
 NAMES: Mapping[str, Sequence[str]] = {
     "time": ("time", "t", "timestamp", "stamp"),
@@ -41,7 +38,6 @@ _FACTORS = {
     "rpm": np.pi / 30,
 }  # fmt: skip
 """Units by their names, in rad, m, s, N m, N."""
-_MOST = 2**30
 _EVEN = 0.01
 """Largest deviation of a time step, in steps, of a log that is not resampled."""
 
@@ -107,6 +103,7 @@ def read_log(
     period: float | None = None,
     columns: Mapping[str, str] | None = None,
     episode: int | None = None,
+    topic: str | None = None,
 ) -> Log:
     """Read a log.
 
@@ -116,26 +113,29 @@ def read_log(
 
     Args:
         path: A file or folder of a format that physx imports (CSV, Parquet, npz, HDF5,
-            safetensors), a physx dataset, an episode's log, or the folder of a LeRobot dataset.
+            safetensors, MCAP), a physx dataset, an episode's log, or the folder of a LeRobot
+            dataset.
         joints: Names of the joints, in the order of arrays.
         period: Time between samples, in s; None: from the column of times.
         columns: Name of the column of ``"time"``, ``"positions"``, ``"velocities"`` or
             ``"torques"``, where it is not the usual one.
         episode: Which episode of a dataset with the column ``episode`` or ``episode_index``; None:
             the only one.
+        topic: Topic of an MCAP file, or group of an HDF5 file, that has the columns; None: the only
+            one of all joints.
 
     Raises:
         IdentificationError: If columns are missing, not of these joints or in an unknown unit; if
-            there is no time, it does not increase or has gaps; or if there are several episodes.
+            there is no time, it does not increase or has gaps; or if there are several episodes or
+            topics.
         ExchangeError: If the file cannot be read.
     """
     path = Path(path)
-    table, units = _table_of(path)
-    table = _episode(path, table, episode)
     given = dict(columns or {})
     wrong = [name for name in given if name not in NAMES]
     if wrong:
         raise IdentificationError(f'There is no column "{wrong[0]}" to choose: {listed(NAMES)}.')
+    table, units = read_table(path, joints, episode, topic, given.values())
     used: set[str] = set()
     found = {name: _find(path, table, units, name, given.get(name), joints, used) for name in NAMES}
     for name in _NEEDED:
@@ -159,78 +159,6 @@ def read_log(
         period, series = _even(path, time[:, 0], series)
     velocities = series[2] if len(series) > 2 else None
     return Log(tuple(joints), period, series[0], series[1], velocities, str(path), left_out)
-
-
-def _table_of(path: Path) -> tuple[dict[str, Vector], dict[str, str]]:
-    """Return the columns of a file, each of shape (rows, numbers), and their units."""
-    if not path.exists():
-        raise IdentificationError(f"There is no log {path}.")
-    if (path / "meta" / "info.json").is_file():
-        return _lerobot(path)
-    if holds_dataset(path) or holds_dataset(path / "dataset"):
-        with Dataset.open(path) as dataset:
-            mode = "training" if "training" in dataset.modes else dataset.modes[0]
-            fields = dataset.fields(mode)
-            values = {name: _flat(dataset[mode][name][:]) for name in fields}
-            return values, {name: field.unit for name, field in fields.items()}
-    if path.suffix in (".h5", ".hdf5"):
-        try:
-            episode = read_episode(path)
-        except LogError:  # a table of another program
-            return _file(path)
-        return {n: _flat(each) for n, each in episode.variables.items()}, dict(episode.units)
-    return _file(path)
-
-
-def _lerobot(path: Path) -> tuple[dict[str, Vector], dict[str, str]]:
-    tables = [_file(part)[0] for part in sorted((path / "data").rglob("*.parquet"))]
-    if not tables:
-        raise IdentificationError(f"{path} has no files data/**/*.parquet.")
-    return {name: np.concatenate([each[name] for each in tables]) for name in tables[0]}, {}
-
-
-def _file(path: Path) -> tuple[dict[str, Vector], dict[str, str]]:
-    begin = b""
-    if not path.is_dir():
-        with path.open("rb") as file:
-            begin = file.read(8)
-    for each in all_formats().values():
-        if each.open is None or not each.recognizes(path, begin):
-            continue
-        with each.open(path, _MOST) as (columns, notes):
-            numbers = {
-                name: column
-                for name, column in columns.items()
-                if not column.problem and column.dtype.kind in "biuf" and column.shape
-            }
-            units = {name: column.unit for name, column in numbers.items()}
-            for mode in notes.modes.values():
-                units |= {name: field.unit for name, field in mode.items() if field.unit}
-            return {n: _flat(c.read(0, c.shape[0])) for n, c in numbers.items()}, units
-    raise IdentificationError(f"{path} is of no known format: {listed(all_formats())}.")
-
-
-def _flat(values: Array) -> Vector:
-    found = np.asarray(values)
-    return found.reshape(len(found), -1).astype(np.float64)
-
-
-def _episode(path: Path, table: dict[str, Vector], wanted: int | None) -> dict[str, Vector]:
-    name = next((name for name in ("episode", "episode_index") if name in table), None)
-    if name is None:
-        if wanted is not None:
-            raise IdentificationError(f"{path} has no column of episodes.")
-        return table
-    numbers = table[name][:, 0]
-    known = np.unique(numbers)
-    if wanted is None and len(known) > 1:
-        raise IdentificationError(
-            f"{path} has {len(known)} episodes. Choose one: episode (--episode)."
-        )
-    rows = numbers == (known[0] if wanted is None else wanted)
-    if not rows.any():
-        raise IdentificationError(f"{path} has no episode {wanted}; its first is {known[0]:g}.")
-    return {key: values[rows] for key, values in table.items() if key != name}
 
 
 def _find(
