@@ -4,7 +4,11 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from sizes import size
 
+from physx_core import plugins
 from physx_core.errors import ConfigError
 from physx_sim import JointCoupling, JointSettings, Mimic, Robot, World
 from physx_sim.engines import read_robot
@@ -14,6 +18,8 @@ pytestmark = pytest.mark.processes
 
 INERTIAS = {"left": 0.02, "right": 0.05, "carrier": 0.3}
 """Moments of inertia about the axes, in kg m²."""
+ERROR = 2e-3
+"""Difference of accelerations relative to the largest."""
 SIDES = {"left": 0.5, "right": 0.5, "carrier": -1.0}
 DIFFERENTIAL = JointCoupling(SIDES)
 WHEEL = (
@@ -67,6 +73,37 @@ def test_a_differential_shares_torques_and_speeds(engine, gears):
     wanted = np.linalg.solve(mass, [torques["left"] + share, torques["right"] + share])
     np.testing.assert_allclose([found["left"], found["right"]], wanted, rtol=1e-7)
     assert found["carrier"] == pytest.approx(wanted.mean(), rel=1e-7)
+
+
+@settings(max_examples=size(12, 3))
+@given(st.sampled_from(["dart", "pinocchio", "mujoco"]), st.integers(0, 2**32 - 1))
+def test_a_floating_robot_accelerates_as_gauss_says(name, seed):
+    """Of all accelerations that couplings allow, it has the one nearest to the free ones."""
+    random = np.random.default_rng(seed)
+    joints = read_robot(Robot("ant")).joints
+    q = np.array([0.5 * (joint.lower + joint.upper) for joint in joints])
+    q += random.uniform(-0.2, 0.2, len(q))
+    rows = np.linalg.qr(random.normal(size=(len(q), random.integers(1, 5))))[0].T
+    couplings = [
+        JointCoupling({joint.name: x for joint, x in zip(joints, row, strict=True)}, row @ q)
+        for row in rows
+    ]
+    robot = Robot("ant", fixed_base=False, couplings=couplings)
+    with plugins.resolve("backend", name).build(
+        World([robot], period=1e-4, contacts="none")
+    ) as simulation:
+        q = np.concatenate([simulation.positions()[:7], q])
+        v, torques = random.uniform(-1.0, 1.0, 14), random.uniform(-1.0, 1.0, 8)
+        v[6:] -= np.linalg.pinv(rows) @ rows @ v[6:]
+        simulation.set_state(q, v)
+        simulation.set_torques(torques)
+        free = simulation.forward_dynamics(q, v, np.pad(torques, (6, 0)))
+        wide = np.pad(rows, ((0, 0), (6, 0)))
+        spread = np.linalg.solve(simulation.mass_matrix(q), wide.T)
+        wanted = free - spread @ np.linalg.solve(wide @ spread, wide @ free)
+        simulation.step()
+        found = (simulation.velocities() - v)[6:] / simulation.period
+    np.testing.assert_allclose(found, wanted[6:], atol=ERROR * abs(free).max())
 
 
 def test_a_coupling_of_one_joint_locks_it(engine, bar):

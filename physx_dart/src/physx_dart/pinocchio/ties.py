@@ -83,27 +83,24 @@ class Ties:
         for at, place in enumerate(coupled):
             for own, speeds in self._of_robot(place, motions[at]):
                 rows = np.zeros((len(own), ends[-1]))
-                rows[:, ends[at] : ends[at + 1]] = own
+                rows[:, ends[at + 1] - own.shape[1] : ends[at + 1]] = own
                 blocks.append(rows)
                 aims.append(speeds)
         for bond in self._bonds.values():
             rows, speeds = self._of_bond(bond, coupled, ends, motions)
             blocks.append(rows)
             aims.append(speeds)
-        found = np.concatenate(blocks)
-        moves = (np.abs(found) > _STUCK).any(axis=1)  # not what joints hold anyway
-        return found[moves], np.concatenate(aims)[moves]
+        return np.concatenate(blocks), np.concatenate(aims)
 
     def _of_robot(self, place: int, motions: Vector) -> Iterator[tuple[Vector, Vector]]:
-        """Yield rows of a robot's couplings and wheels, (m, nv of it), and velocities, (m,)."""
+        """Yield rows of couplings, whose columns are joints, and of wheels, with velocities."""
         robot = self._robots[place]
         if place in self._couplings:
             joint_rows, sums = self._couplings[place]
-            speeds = (sums - joint_rows @ robot.joint_positions()) / self._period
-            nothing = np.zeros((len(sums), robot.base))
-            yield np.hstack([nothing, joint_rows]), np.clip(speeds, -FASTEST_JOINT, FASTEST_JOINT)
+            speeds = (sums - joint_rows.dot(robot.joint_positions())) / self._period
+            yield joint_rows, np.clip(speeds, -FASTEST_JOINT, FASTEST_JOINT)
         if place in self._wheels:
-            yield self._wheels[place].rows(motions, self._supports[place])
+            yield _moving(*self._wheels[place].rows(motions, self._supports[place]))
 
     def _of_bond(
         self, bond: Bond, coupled: Sequence[int], ends: Index, motions: Sequence[Vector]
@@ -130,7 +127,7 @@ class Ties:
             ]
         )
         speeds = -_RETURN / self._period * gap
-        return relative[:parts], np.clip(speeds, -_FASTEST_RETURN, _FASTEST_RETURN)
+        return _moving(relative[:parts], np.clip(speeds, -_FASTEST_RETURN, _FASTEST_RETURN))
 
     def _moved(
         self, place: int, frame: int, inner: Vector, motions: Vector
@@ -143,3 +140,9 @@ class Ties:
         jacobian = motions * self._supports[place][link.parentJoint]
         jacobian[:3] += cross_rows(jacobian[3:].T, pose[:3, 3][None]).T
         return pose, jacobian
+
+
+def _moving(rows: Vector, speeds: Vector) -> tuple[Vector, Vector]:
+    """Return the rows along which something can move: joints hold the others anyway."""
+    moves = (np.abs(rows) > _STUCK).any(axis=1)
+    return rows[moves], speeds[moves]
