@@ -1,5 +1,6 @@
 """Datasets of LeRobot, with their videos, written by physx and by others."""
 
+import io
 import json
 
 import numpy as np
@@ -10,7 +11,8 @@ from physx_core.errors import MissingLibraryError, UsageError
 from physx_formats import ExchangeError, ExportOptions, export, import_file
 from physx_formats.cli.export import run
 
-for library in ("pyarrow", "pandas", "av"):
+pyarrow = pytest.importorskip("pyarrow")
+for library in ("pandas", "av"):
     pytest.importorskip(library)
 ROWS = 12
 FEATURES = {
@@ -104,6 +106,30 @@ def test_datasets_of_others_are_imported(rows, written, tmp_path):
     np.testing.assert_array_equal(found["step"], rows["step"])
     np.testing.assert_allclose(found["timestamp"], rows["step"] / 30, rtol=1e-6)
     assert (info["tasks"], info["fps"]) == (["lift"], 30)
+
+
+def test_images_in_the_rows_are_imported(rows, written, tmp_path):
+    parquet, image = pytest.importorskip("pyarrow.parquet"), pytest.importorskip("PIL.Image")
+    (place,) = written.glob("data/*/*.parquet")
+
+    def store(contents):
+        column = pyarrow.array([{"bytes": each, "path": None} for each in contents])
+        table = parquet.read_table(place)
+        if "info.png" in table.column_names:
+            table = table.drop(["info.png"])
+        parquet.write_table(table.append_column("info.png", column), place)
+
+    files = [io.BytesIO() for _ in range(ROWS)]
+    for file, picture in zip(files, rows["camera"], strict=True):
+        image.fromarray(picture).save(file, "PNG")
+    store([file.getvalue() for file in files])
+    png = {"dtype": "image", "shape": [3, 17, 20], "names": ["channels", "height", "width"]}
+    change(written, lambda info: info.pop("physx") and info["features"].update({"info.png": png}))
+    found, _ = imported(written, tmp_path)
+    np.testing.assert_array_equal(found["info_png"], rows["camera"])
+    store([b"nothing"] * ROWS)
+    with pytest.raises(ExchangeError, match=r'"info.png" has what is no picture'):
+        import_file(written, tmp_path / "other")
 
 
 def test_the_command_says_that_colors_are_lost_if_there_are_pictures(rows, tmp_path, capsys):

@@ -157,17 +157,22 @@ def test_lerobot_loads_its_format(dataset, tmp_path):
         assert set(found["tasks"]) == {"swing"}
 
 
+def camera_rows():
+    """Rows of three trajectories, with pictures that change smoothly."""
+    step, y, x = np.ogrid[:ROWS, :24, :32]
+    phases = [step / 9 + x / 30 + 0 * y, step / 7 - y / 20 + 0 * x, (x + y - step) / 30]
+    pictures = (128 + 100 * np.sin(np.stack(phases, axis=3))).astype("u1")
+    episode, number = np.divmod(np.arange(ROWS), 20)
+    state = np.arange(ROWS * 2.0).reshape(ROWS, 2)
+    return {"q": state, "camera": pictures, "episode": episode, "step": number}
+
+
 @pytest.mark.faults
 def test_lerobot_decodes_its_videos(tmp_path):
     """Its decoder, torchcodec, finds by their times the pictures that the import finds, too."""
-    step, y, x = np.ogrid[:ROWS, :24, :31]
-    phases = np.stack(
-        [step / 9 + x / 30 + 0 * y, step / 7 - y / 20 + 0 * x, (x + y - step) / 30], axis=3
-    )
-    pictures = (128 + 100 * np.sin(phases)).astype("u1")
-    own = {"q": np.arange(ROWS * 2.0).reshape(ROWS, 2), "camera": pictures, "step": step[:, 0, 0]}
+    rows = camera_rows()
     with Dataset.create(tmp_path / "data") as dataset:
-        dataset.append("training", own | {"step": own["step"] % 20})
+        dataset.append("training", rows)
         named = {"observation.state": ["q"], "observation.images.top": ["camera"]}
         options = ExportOptions(features=named, fps=50)
         export(dataset, "lerobot", tmp_path / "arm", options=options)
@@ -175,5 +180,23 @@ def test_lerobot_decodes_its_videos(tmp_path):
     import_file(tmp_path / "arm", tmp_path / "back")
     with np.load(tmp_path / "out.npz") as found, Dataset.open(tmp_path / "back") as back:
         seen = 255 * found["observation.images.top"].transpose(0, 2, 3, 1)
-        assert np.abs(seen - pictures).mean() < 2
+        assert np.abs(seen - rows["camera"]).mean() < 2
         assert_array_equal(seen.round(), back["training"]["camera"][:])
+
+
+@pytest.mark.faults
+def test_what_lerobot_has_recorded_is_imported(tmp_path):
+    rows = camera_rows()
+    np.savez(tmp_path / "rows.npz", **rows)
+    run_lerobot(tmp_path, "write_lerobot.py", tmp_path / "rows.npz", tmp_path / "recorded")
+    import_file(tmp_path / "recorded", tmp_path / "data")
+    with Dataset.open(tmp_path / "data") as dataset:
+        found = dataset["training"]
+        assert_array_equal(found["observation_state"][:], rows["q"])
+        assert_array_equal(found["observation_images_png"][:], rows["camera"])
+        for row, picture in enumerate(found["observation_images_video"][:].astype("f8")):
+            apart = np.abs(rows["camera"] - picture).mean(axis=(1, 2, 3))
+            assert apart.argmin() == row and apart[row] < 8
+        assert_array_equal(found["episode"][:], rows["episode"])
+        assert_array_equal(found["task_index"][:], rows["episode"])
+        assert dataset.info["tasks"] == ["task 0", "task 1", "task 2"]

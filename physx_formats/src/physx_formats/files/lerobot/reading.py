@@ -23,7 +23,7 @@ from physx_core.typing import Array
 from physx_formats.errors import ExchangeError
 from physx_formats.files.lerobot.features import VERSION
 from physx_formats.files.lerobot.layout import video_file
-from physx_formats.files.lerobot.video import Clip, Pictures
+from physx_formats.files.lerobot.video import Clip, Pictures, read_image
 from physx_formats.format import Columns
 from physx_formats.table import Column, Notes, check_size, import_library
 
@@ -88,11 +88,12 @@ class _Source:
             raise ExchangeError(f"{file} is not a valid Parquet file: {error}.") from error
 
     def columns(self) -> dict[str, Column]:
-        """Return the fields by name: all but texts and single images."""
+        """Return the fields by name: all but texts."""
         found: dict[str, Column] = {}
         for name, described in self._features.items():
             try:
-                found = self._columns_of(name, described) | found
+                for part, column in self._columns_of(name, described).items():
+                    found.setdefault(part, column)
             except (KeyError, TypeError, ValueError) as error:
                 raise ExchangeError(
                     f'The feature "{name}" of {self._path} is damaged: {error!r:.200}'
@@ -107,14 +108,18 @@ class _Source:
         parts = self._parts(name, described, shape)
         if kind == "video":
             return {part: self._pictures(name, described, shape) for part in parts}
-        if kind in ("string", "image", "language"):
+        if kind == "image":
+            size = _size_of(described, shape)
+            return {part: _Images(self._files, name, (*size, 3)) for part in parts}
+        if kind in ("string", "language"):
             warnings.warn(f'The feature "{name}" is left out: it is of type {kind}.', stacklevel=2)
             return {}
         columns: dict[str, Column] = {}
         begin, width = 0, math.prod(shape)
         for part, own in parts.items():
             end = begin + math.prod(own)
-            columns[part] = _Numbers(self._files, name, np.dtype(kind), own, (begin, end, width))
+            place = begin, end, width
+            columns[part] = _Numbers(self._files, name, np.dtype(kind), own, place)
             begin = end
         if parts and begin != width:
             raise ValueError(f"its fields have {begin} components of {width}")
@@ -130,12 +135,10 @@ class _Source:
         return {} if name == "index" else {name: () if shape == (1,) else shape}
 
     def _pictures(self, name: str, described: Mapping[str, Any], shape: _Shape) -> Column:
-        """Return the pictures of a feature; its shape may have the colors first."""
+        """Return the pictures of a feature in videos."""
         if Path(name).name != name:
             raise ValueError("its name is not that of a folder")
-        if len(shape) != 3:
-            raise ValueError(f"it has the shape {shape}")
-        size = shape[1:] if "channel" in str((described.get("names") or [""])[0]) else shape[:2]
+        size = _size_of(described, shape)
         keys = [f"videos/{name}/{key}" for key in ("chunk_index", "file_index", "from_timestamp")]
         wanted = ["episode_index", "length", *keys]
         rows: list[tuple[Any, ...]] = []
@@ -174,10 +177,50 @@ class _Source:
         return [str(text) for text in file.read(columns=texts[:1])[texts[0]].to_pylist()]
 
 
-class _Numbers:
+def _size_of(described: Mapping[str, Any], shape: _Shape) -> _Shape:
+    """Return height and width of pictures; their shape may have the colors first."""
+    if len(shape) != 3:
+        raise ValueError(f"it has the shape {shape}")
+    return shape[1:] if "channel" in str((described.get("names") or [""])[0]) else shape[:2]
+
+
+class _Sequential:
     """A field of the frames, read in sequence; see `Column`."""
 
     unit = problem = ""
+
+    def __init__(
+        self, files: Sequence[Any], name: str, dtype: np.dtype[Any], shape: _Shape
+    ) -> None:
+        """Keep where it is.
+
+        Args:
+            files: The Parquet files in order.
+            name: Name of the feature.
+            dtype: Type of the values.
+            shape: Shape of the field.
+        """
+        self.dtype, self.shape = dtype, (sum(file.metadata.num_rows for file in files), *shape)
+        self._name = name
+        self._batches = (b for file in files for b in file.iter_batches(columns=[name]))
+        self._left = np.empty((0, *shape), dtype)
+
+    def read(self, start: int, count: int) -> Array:
+        """Return the next rows."""
+        parts = [self._left]
+        while sum(map(len, parts)) < count:
+            parts.append(self._values(next(self._batches).column(0)))
+        rows = np.concatenate(parts)
+        found, self._left = rows[:count], rows[count:]
+        return found
+
+    def _values(self, array: Any) -> Array:
+        """Return the rows of an Arrow array."""
+        raise NotImplementedError
+
+
+class _Numbers(_Sequential):
+    """Components of a feature."""
 
     def __init__(
         self,
@@ -187,33 +230,11 @@ class _Numbers:
         shape: _Shape,
         place: tuple[int, int, int],
     ) -> None:
-        """Keep where it is.
-
-        Args:
-            files: The Parquet files in order.
-            name: Name of the feature.
-            dtype: Type of its values.
-            shape: Shape of the field.
-            place: First component in the feature, the one after the last, and their number.
-        """
+        """Keep where they are: first component, the one after the last, and their number."""
         if dtype.kind not in NUMBERS:
             raise ValueError(f"it is of type {dtype}")
-        self.dtype, self.shape = dtype, (sum(file.metadata.num_rows for file in files), *shape)
-        self._files, self._name, self._place = files, name, place
-        self._batches: Iterator[Any] | None = None
-        self._left = np.empty((0, *shape), dtype)
-
-    def read(self, start: int, count: int) -> Array:
-        """Return the next rows."""
-        if self._batches is None:
-            columns = [self._name]
-            self._batches = (b for file in self._files for b in file.iter_batches(columns=columns))
-        parts = [self._left]
-        while sum(map(len, parts)) < count:
-            parts.append(self._values(next(self._batches).column(0)))
-        rows = np.concatenate(parts)
-        found, self._left = rows[:count], rows[count:]
-        return found
+        super().__init__(files, name, dtype, shape)
+        self._place = place
 
     def _values(self, array: Any) -> Array:
         begin, end, width = self._place
@@ -228,3 +249,17 @@ class _Numbers:
             )
         found: Array = values.reshape(rows, width)[:, begin:end]
         return found.reshape(rows, *self.shape[1:])
+
+
+class _Images(_Sequential):
+    """Pictures that are files in the rows, such as PNG."""
+
+    def __init__(self, files: Sequence[Any], name: str, shape: _Shape) -> None:
+        super().__init__(files, name, np.dtype(np.uint8), shape)
+
+    def _values(self, array: Any) -> Array:
+        contents = array.field("bytes").to_pylist()
+        found = np.empty((len(contents), *self.shape[1:]), self.dtype)
+        for place, content in enumerate(contents):
+            found[place] = read_image(f'"{self._name}"', content or b"", self.shape[1:])
+        return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import itertools
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -155,14 +156,36 @@ class Pictures:
                     if not left:
                         return
                     left -= 1
-                    if (frame.height, frame.width) != self.shape[1:3]:
-                        raise ExchangeError(
-                            f"{clip.path} has pictures of {frame.height} x {frame.width} pixels, "
-                            f"not of {self.shape[1]} x {self.shape[2]}."
-                        )
-                    picture: Array = frame.to_ndarray(format="rgb24")
-                    yield picture
+                    yield _picture_of(str(clip.path), frame, self.shape[1:])
         except (self._av.FFmpegError, IndexError) as error:
             raise ExchangeError(f"{clip.path} cannot be read as a video: {error}.") from error
         if left:
             raise ExchangeError(f"{clip.path} lacks {left} pictures after {clip.start:g} s.")
+
+
+def read_image(what: str, content: bytes, shape: Sequence[int]) -> Array:
+    """Return the colors of a picture in a file such as PNG.
+
+    Args:
+        what: What has it, for messages.
+        content: The file.
+        shape: Height, width, and 3.
+    """
+    av = import_library("av", "Importing pictures of LeRobot", "lerobot")
+    try:
+        with av.open(io.BytesIO(content)) as file:
+            frame = next(file.decode(video=0))
+    except (av.FFmpegError, IndexError, StopIteration) as error:
+        raise ExchangeError(f"{what} has what is no picture: {error}.") from error
+    return _picture_of(what, frame, shape)
+
+
+def _picture_of(what: str, frame: Any, shape: Sequence[int]) -> Array:
+    """Return the colors of a decoded picture after checking its size."""
+    if (frame.height, frame.width) != tuple(shape[:2]):
+        raise ExchangeError(
+            f"{what} has pictures of {frame.height} x {frame.width} pixels, not of "
+            f"{shape[0]} x {shape[1]}."
+        )
+    picture: Array = frame.to_ndarray(format="rgb24")
+    return picture
