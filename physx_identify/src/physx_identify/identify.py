@@ -8,9 +8,10 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
+from physx_core import checks
 from physx_core.errors import ConfigError
 from physx_core.typing import Array, Vector
-from physx_identify.estimation.fit import Data, Fit, fit
+from physx_identify.estimation.fit import SLOWEST, Data, Fit, fit
 from physx_identify.estimation.inertia import cholesky_of, from_cholesky, is_physical
 from physx_identify.estimation.model import GRAVITY, Model
 from physx_identify.estimation.structure import structure_tests
@@ -42,6 +43,7 @@ def identify(
     gravity: Sequence[float] = GRAVITY,
     held: Sequence[str] = (),
     instant: bool = False,
+    slowest: float = SLOWEST,
     seed: int = 0,
 ) -> Identification:
     """Find parameters of a robot in a log, with intervals.
@@ -55,21 +57,24 @@ def identify(
         held: Names of joints that did not move and are not in the log: they are at 0.
         instant: Whether torques are those at the instants of the samples. By default, each is held
             from its sample to the next one, as engines and digital controllers do.
+        slowest: In rad/s or m/s. Samples at which a joint with dry friction is slower are left out,
+            since their friction is unknown.
         seed: Seed of the draws from the posterior.
 
     Raises:
         IdentificationError: If the log is bad, see `check_log`; if the robot's base floats; or if
             nothing unknown acts on its torques.
-        ConfigError: If an unknown or the level is wrong.
+        ConfigError: If an unknown, the level or the slowest velocity is wrong.
         ComponentNotFoundError: If the robot has no link or joint of a name.
         ModelError: If the robot cannot be loaded.
     """
     if not 0 < level < 1:
         raise ConfigError(f"level is {level!r} but must be between 0 and 1.")
+    checks.positive("slowest", slowest)
     model = Model(robot, gravity, held)
     parameters = model.parameters(as_unknowns(unknowns))
     check_log(log, model, len(parameters))
-    data = Data(log.positions, log.torques, log.period, instant)
+    data = Data(log.positions, log.torques, log.period, instant, slowest)
     found = fit(model, parameters, data)
     again = fit(model, parameters, data, np.array([p.nominal for p in parameters]), found.noise)
     return _summary(log, robot, parameters, found, again, level, seed)

@@ -61,6 +61,8 @@ class Identify:
     """Joints that did not move and are not in the log, such as a gripper's: they are at 0."""
     instant: bool = False
     """Torques are those at the instants of the samples, instead of held from each to the next."""
+    slowest: float = 0.02
+    """Velocity in rad/s or m/s below which samples of joints with dry friction are left out."""
     level: float = 0.95
     """Nominal probability of the intervals."""
     json: bool = False
@@ -88,6 +90,7 @@ def run(words: Sequence[str]) -> None:
         gravity=options.gravity,
         held=options.held,
         instant=options.instant,
+        slowest=options.slowest,
     )
     if options.json:
         print(found.to_json())
