@@ -3,7 +3,7 @@
 The fit's torques are those of Pinocchio's dynamics in steps of the log's period; an engine solves
 friction, damping and limits of a step in its own way. It gets the identified robot and each state
 of the fit's path, and the torques are found that bring it to the next one. They take the place of
-the fit's own, and the values are fitted anew, with the same path, instruments and noise: nothing
+the fit's own, and the values are fitted anew, along the same path and with the same noise: nothing
 but the engine's steps makes the difference.
 """
 
@@ -21,16 +21,20 @@ from physx_core.typing import Array, Vector
 from physx_identify.errors import IdentificationError
 from physx_identify.estimation.fit import Fit
 from physx_identify.estimation.model import Model, Path
+from physx_identify.estimation.noise import Whitener
 from physx_identify.result.estimates import EngineFit
-from physx_identify.result.identification import UNSETTABLE, Identification
+from physx_identify.result.identification import SETTINGS, UNSETTABLE, Identification
 from physx_identify.unknowns import Parameter
 from physx_sim import Backend, JointSettings, Robot, Simulation, World
 
-_STEPS, _CLOSE = 8, 0.02
+_STEPS, _CLOSE = 10, 0.02
 """Most steps of a refit; and how small its last one is, in standard errors."""
-_CORRECTIONS = 20
-_MISSING = 1e-3
-"""Torque missing to a state, relative to those of its joint, from which it is not reached."""
+_CORRECTIONS, _EXACT = 20, 0.01
+"""Most corrections of torques; and how exact they are, in deviations of their noise."""
+_LIGHTEST = 0.01
+"""Least mass that an engine's link gets, relative to that of the robot's file."""
+_FAINTEST = 1e-6
+"""Least noise of torques that counts, relative to the torques."""
 
 
 def find_engines(
@@ -100,30 +104,35 @@ class _Refit:
         fit: Fit,
         found: Identification,
     ) -> None:
-        self._world, self._model, self._fit, self._found = world, model, fit, found
-        self._values = np.array([each.value for each in found.estimates])
-        self._nominal = np.array([each.nominal for each in parameters])
-        self._directions = np.stack([model.direction(each) for each in parameters], axis=1)
-        self._lowest = np.array([
-            -np.inf if each.lowest is None else each.lowest for each in parameters
-        ])  # fmt: skip
+        self._world, self._joints, self._fit, self._found = world, model.joints, fit, found
+        kinds, nominal = zip(*((each.kind, each.nominal) for each in parameters), strict=True)
+        self._of_robot = np.array([kind in ("mass", *SETTINGS) for kind in kinds])
+        self._lowest = np.where(np.array(kinds) == "mass", _LIGHTEST * np.array(nominal), 0.0)
+        numbers = model.numbers + sum(
+            model.direction(each) * (max(value, lowest) - each.nominal)
+            for each, value, lowest in zip(parameters, fit.values, self._lowest, strict=True)
+        )
+        self._stencil = model.stencil(fit.path, numbers)
+        self._inertia = fit.path.period * self._stencil[2]  # torque for a change of the velocity
+        self._own = fit.torques.copy()
+        for each, value in zip(parameters, fit.values, strict=True):
+            if each.kind == "bias":
+                self._own[:, model.joints.index(each.of)] -= value
 
     def solve(self, name: str, engine: Backend) -> EngineFit:
         """Return the values that the log tells with an engine."""
         fit, free = self._fit, self._fit.independent
-        errors, factor = np.sqrt(np.diag(fit.covariance)), fit.whitener.factor(fit.noise)
-        instruments, columns = fit.instruments[:, free], fit.columns[:, free]
-        back = np.linalg.inv(instruments.T @ columns)
+        errors = np.sqrt(np.diag(fit.covariance))
         moved, last = np.zeros(len(free)), np.full(len(free), np.inf)
         for _ in range(_STEPS):
-            values = self._values.copy()
+            values = fit.values.copy()
             values[free] += moved
-            more, reached = self._difference(engine, np.maximum(values, self._lowest))
-            white = fit.whitener.whitened(np.where(reached, more, 0.0), fit.noise, factor)
-            last, moved = moved, -back @ (instruments[: len(white)].T @ white)
+            values[self._of_robot] = np.maximum(values, self._lowest)[self._of_robot]
+            more, reached = self._difference(engine, values)
+            compared = fit.used & reached
+            last, moved = moved, self._moved(more, compared)
             if (np.abs(moved - last) < _CLOSE * errors).all():
                 break
-        compared = fit.used & reached
         power = np.sum(np.where(compared, more, 0.0) ** 2, axis=0)
         told = [
             (row, self._found.estimates[place].name) for row, place in enumerate(free)
@@ -131,39 +140,48 @@ class _Refit:
         ]  # fmt: skip
         return EngineFit(
             name,
-            {each: float(self._values[free[row]] + moved[row]) for row, each in told},
+            {each: float(fit.values[free[row]] + moved[row]) for row, each in told},
             {each: float(moved[row] / errors[row]) for row, each in told},
             np.sqrt(power / np.maximum(compared.sum(axis=0), 1)).tolist(),
             int((fit.used & ~reached).any(axis=1).sum()),
         )
 
+    def _moved(self, more: Vector, used: Array) -> Vector:
+        """Return by what the values change with more torques, shape (samples, joints)."""
+        whitener = Whitener(self._stencil, used)
+        together = np.concatenate([self._fit.regressors, more[..., None]], axis=2)
+        white = whitener.whitened(np.where(used[..., None], together, 0.0), self._fit.noise)
+        known = self._fit.known.copy()
+        known[:, -1] = 0.0
+        white = np.concatenate([white, known])
+        change = np.linalg.lstsq(white[:, :-1], white[:, -1], rcond=None)[0]
+        moved: Vector = -change.astype(np.float64)
+        return moved
+
     def _difference(self, engine: Backend, values: Vector) -> tuple[Vector, Array]:
-        """Return what torques an engine needs beyond the model's, and whether they suffice.
+        """Return what torques an engine needs beyond the fit's, and whether they suffice.
 
         Returns:
             Both of shape (samples, joints); torques in N m or N.
         """
-        model, path = self._model, self._fit.path
-        numbers = model.numbers + self._directions @ (values - self._nominal)
-        stencil = model.stencil(path, numbers)
-        dry = model.dry(path, stencil, numbers)
-        own = model.columns(path, numbers[:, None], path.ends, dry)[..., 0]
-        inertia = path.period * stencil[2]  # torque for a change of the velocity at the end
+        path, free = self._fit.path, self._fit.independent
+        change = np.where(self._of_robot, values - self._fit.values, 0.0)[free]
+        own = self._own + self._fit.regressors @ change
         robot = self._found.applied_to(self._world.robots[0], values.tolist())
         torques, missing = own.copy(), np.zeros_like(own)
-        least = _MISSING * np.sqrt(np.mean(own**2, axis=0))
+        least = _EXACT * np.maximum(self._fit.noise.torque, _FAINTEST * np.std(own, axis=0))
         rows = np.arange(len(own))
         with warnings.catch_warnings(), engine.build(
             dataclasses.replace(self._world, robots=[robot])
         ) as simulation:  # fmt: skip
             for _ in range(_CORRECTIONS):
-                lag = path.ends[rows] - _ends(simulation, model.joints, path, torques, rows)
-                missing[rows] = np.einsum("kij,kj->ki", inertia[rows], lag)
+                lag = path.ends[rows] - _ends(simulation, self._joints, path, torques, rows)
+                missing[rows] = np.einsum("kij,kj->ki", self._inertia[rows], lag)
                 rows = rows[(np.abs(missing[rows]) > least).any(axis=1)]
                 torques[rows] += missing[rows]
                 if not len(rows):
                     break
-        return torques - own, np.abs(missing) <= least
+        return torques - own, np.abs(missing) <= least / _EXACT
 
 
 def _ends(
