@@ -38,8 +38,9 @@ from physx_identify.estimation.inertia import (
 )
 from physx_identify.estimation.noise import Noise, Whitener
 from physx_identify.excitation import expected_errors
+from physx_mujoco import MujocoBackend
 from physx_report import write_report
-from physx_sim import Motor, Robot, World
+from physx_sim import JointSettings, Motor, Robot, World
 
 UNKNOWN = ("mass", "damping", "friction")
 
@@ -108,6 +109,47 @@ def test_biases_gains_and_delays_are_found(clean):
     found = identify(late, known, ["delay", "gain:shoulder"])
     assert found["delay"].value == pytest.approx(3 * log.period, abs=0.1 * log.period)
     assert found["gain shoulder"].value == pytest.approx(2.0, rel=0.03)
+
+
+def rubbing(engine):
+    """Return motion and torques of an arm with strong dry friction."""
+    settings = {
+        joint: JointSettings(damping=damping, friction=friction)
+        for joint, damping, friction in (("shoulder", 0.5, 0.8), ("elbow", 0.2, 0.3))
+    }
+    robot = Robot("double_pendulum", joints=settings, mass_factors={"lower": 1.2})
+    return arm.simulated(robot, 800, engine), settings
+
+
+@pytest.mark.slow
+def test_late_torques_and_strong_dry_friction_are_told():
+    clean, settings = rubbing(arm.ENGINES[0])
+    for seed in range(3):
+        log = arm.noisy(clean, seed=seed)
+        late = Log(log.joints, log.period, log.positions[1:], log.torques[:-1])
+        found = identify(late, arm.KNOWN, [*UNKNOWN, "delay"], level=0.999)
+        assert found.holds, found
+        assert found["delay"].low < log.period < found["delay"].high
+        for joint, each in settings.items():
+            estimate = found[f"friction {joint}"]
+            assert estimate.low < each.friction < estimate.high
+
+
+@pytest.mark.slow
+def test_dry_friction_that_fades_is_named_and_can_be_left_out():
+    clean, settings = rubbing(MujocoBackend)
+    named = 0
+    for seed in range(3):
+        log = arm.noisy(clean, torque=0.005, seed=seed)
+        named += any("fades" in each for each in identify(log, arm.KNOWN, UNKNOWN).lacks)
+        found = identify(log, arm.KNOWN, UNKNOWN, level=0.999, slowest=0.15)
+        assert found.holds, found
+        for joint, each in settings.items():
+            estimate = found[f"friction {joint}"]
+            assert estimate.low < each.friction < estimate.high
+    assert named == 3
+    with pytest.raises(ConfigError, match="slowest"):
+        identify(log, arm.KNOWN, UNKNOWN, slowest=0.0)
 
 
 def test_a_hidden_friction_is_named_and_the_level_refused(clean):

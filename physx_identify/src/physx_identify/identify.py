@@ -9,10 +9,11 @@ import numpy as np
 from scipy.optimize import least_squares
 from scipy.stats import t as student
 
+from physx_core import checks
 from physx_core.errors import ConfigError
 from physx_core.typing import Array, Vector
 from physx_identify.engines import find_engines, refits, world_of
-from physx_identify.estimation.fit import Data, Fit, fit
+from physx_identify.estimation.fit import SLOWEST, Data, Fit, fit
 from physx_identify.estimation.inertia import cholesky_of, from_cholesky, is_physical
 from physx_identify.estimation.model import GRAVITY, Model
 from physx_identify.estimation.structure import structure_tests
@@ -45,6 +46,7 @@ def identify(
     held: Sequence[str] = (),
     instant: bool = False,
     engines: Sequence[str] = (),
+    slowest: float = SLOWEST,
     seed: int = 0,
 ) -> Identification:
     """Find parameters of a robot in a log, with intervals.
@@ -60,14 +62,16 @@ def identify(
             from its sample to the next one, as engines and digital controllers do.
         engines: Names of engines on which the values are fitted anew, such as ``"mujoco"``, to show
             which of them depend on the engine.
+        slowest: In rad/s or m/s. Samples at which a joint with dry friction is slower are left out,
+            since their friction is unknown.
         seed: Seed of the draws from the posterior.
 
     Raises:
         IdentificationError: If the log is bad, see `check_log`; if the robot's base floats; or if
             nothing unknown acts on its torques; or if there are engines, but something is unknown
             that no engine's robot can be given.
-        ConfigError: If an unknown, the level or an engine is wrong; or if torques are those at
-            instants, which no engine takes.
+        ConfigError: If an unknown, the level, the slowest velocity or an engine is wrong; or if
+            torques are those at instants, which no engine takes.
         ComponentNotFoundError: If the robot has no link or joint of a name.
         PluginNotFoundError: If there is no engine of a name.
         PluginError: If the plugin of an engine is broken.
@@ -76,6 +80,7 @@ def identify(
     """
     if not 0 < level < 1:
         raise ConfigError(f"level is {level!r} but must be between 0 and 1.")
+    checks.positive("slowest", slowest)
     model = Model(robot, gravity, held)
     parameters = model.parameters(as_unknowns(unknowns))
     check_log(log, model, len(parameters))
@@ -83,7 +88,7 @@ def identify(
         raise ConfigError("Engines hold torques from step to step: leave instant out, or engines.")
     world = world_of(robot, log.period, gravity, held)
     others = find_engines(engines, world, parameters)
-    data = Data(log.positions, log.torques, log.period, instant)
+    data = Data(log.positions, log.torques, log.period, instant, slowest)
     found = fit(model, parameters, data)
     again = fit(model, parameters, data, np.array([p.nominal for p in parameters]), found.noise)
     summary = _summary(log, robot, parameters, found, again, level, seed)

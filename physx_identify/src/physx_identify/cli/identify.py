@@ -64,6 +64,8 @@ class Identify:
     engines: tuple[str, ...] = ()
     """Engines on which the values are fitted anew, such as dart and mujoco, to show which of them
     depend on the engine."""
+    slowest: float = 0.02
+    """Velocity in rad/s or m/s below which samples of joints with dry friction are left out."""
     level: float = 0.95
     """Nominal probability of the intervals."""
     json: bool = False
@@ -92,6 +94,7 @@ def run(words: Sequence[str]) -> None:
         held=options.held,
         instant=options.instant,
         engines=options.engines,
+        slowest=options.slowest,
     )
     show(found.to_json() if options.json else found)
     notes = []

@@ -23,10 +23,13 @@ from physx_identify.estimation.smooth import Smoother
 from physx_identify.estimation.uncertainty import values_of
 from physx_identify.unknowns import Parameter
 
-_STEPS = 20
-_WHITE_STEPS, _NOISE_STEPS, _PATH_STEPS = 2, 5, 7
+_STEPS = 30
+_WHITE_STEPS, _NOISE_STEPS, _PATH_STEPS, _LONGEST = 2, 5, 7, 16
 """Steps that take the noise of torques as white; that look at it, the last by its exact likelihood;
-that correct the path. What wrong values leave looks like correlated noise, so that comes second."""
+that correct the path at least, and at most. What wrong values leave looks like correlated noise, so
+that comes second."""
+_SETTLED = 1.0
+"""Change of a value between two steps, in standard errors, below which the path needs no more."""
 _CLOSE = 0.1
 """Change of a value between two steps, in standard errors, that ends them."""
 _LOWEST = 0.2
@@ -37,7 +40,7 @@ _SEPARABLE = 1e-6
 """Relative length of what is left of a column without the others, below which it is one of them."""
 _NEAR = 0.01
 """Share of the encoders' errors in differences that derivatives are made of."""
-_STILL, _UNSURE = 0.02, 2.0
+SLOWEST, _UNSURE = 0.02, 2.0
 """Velocity below which dry friction is unknown: in rad/s or m/s, and in standard errors."""
 
 
@@ -50,16 +53,14 @@ class Data:
         torques: Shape (samples, joints), in N m or N.
         period: In s.
         instant: As in `Path`.
+        slowest: Velocity below which dry friction is unknown, in rad/s or m/s.
     """
 
     positions: Vector
     torques: Vector
     period: float
     instant: bool = False
-
-    def part(self, rows: slice) -> Data:
-        """Return a part of the samples."""
-        return Data(self.positions[rows], self.torques[rows], self.period, self.instant)
+    slowest: float = SLOWEST
 
 
 @dataclass(frozen=True)
@@ -145,6 +146,7 @@ class _Equation:
         target: Shape (samples, joints).
         stencil: As in `Model.stencil`, along the same path as the instruments.
         torques: Of the model along that path, of the same shape as the target.
+        doubt: By what dry friction differs if it is applied another way, shape (samples, joints).
     """
 
     instruments: Vector
@@ -152,6 +154,7 @@ class _Equation:
     target: Vector
     stencil: Vector
     torques: Vector
+    doubt: Vector
 
 
 class _Problem:
@@ -186,28 +189,45 @@ class _Problem:
                 found = found - offset
         return found
 
-    def _torques(self, values: Vector) -> Vector:
-        """Return measured torques at the times of the positions, shape (samples - 2, joints)."""
-        torques = self._data.torques
-        for place, each in self._special:
-            if each.kind == "delay" and values[place]:
-                time = np.arange(len(torques)) * self._data.period
-                late = time + values[place]
-                torques = np.stack([np.interp(late, time, own) for own in torques.T], axis=1)
-        return torques[1:-1]
+    def _late(self, values: Vector) -> float:
+        """Return by how many samples the torques are late."""
+        delays = (values[place] for place, each in self._special if each.kind == "delay")
+        return float(sum(delays)) / self._data.period
 
-    def _equation(self, path: Path, raw: Path, values: Vector) -> _Equation:
+    def _torques(self, values: Vector, whole: int) -> Vector:
+        """Return measured torques at the times of the positions, shape (samples - 2, joints).
+
+        They are moved by whole samples, or their noise would be smoothed, too; without it, what is
+        left of the delay moves them.
+        """
+        torques = self._data.torques
+        time = np.arange(len(torques))
+        rows = np.clip(time[1:-1] + whole, 0, time[-1])
+        rest = self._late(values) - whole
+        if not rest:
+            return torques[rows]
+        smooth = Smoother(torques)(torques)
+        moved = [np.interp(rows + rest, time, own) for own in smooth.T]
+        late: Vector = torques[rows] + np.stack(moved, axis=1) - smooth[rows]
+        return late
+
+    def _equation(self, path: Path, raw: Path, values: Vector, whole: int) -> _Equation:
         """Return what is linear in the parameters, near values of them.
 
         Args:
             path: That of the instruments.
             raw: As measured.
             values: Values of the parameters.
+            whole: Whole samples of the delay.
         """
         numbers = self._known + self._directions @ np.maximum(values, self._lowest)
         stencil = self._model.stencil(path, numbers)
-        dry = self._model.dry(path, stencil, numbers) if self._dry.any() else None
-        torques = self._torques(values)
+        dry, doubt = None, np.zeros(path.own.shape)
+        if self._dry.any() and not path.instant:  # halfway between the two ways of engines
+            dry = 0.5 * (self._model.dry(path, stencil, numbers) + np.eye(path.own.shape[1]))
+            rubbing = self._model.friction(path, numbers)
+            doubt = np.einsum("kij,kj->ki", dry, rubbing) - rubbing
+        torques = self._torques(values, whole)
         instruments, known = self._columns(path, path, stencil, dry, torques)
         own = known + instruments[..., self._plain] @ values[self._plain]
         instruments = self._endogenous(instruments, own)
@@ -219,7 +239,7 @@ class _Problem:
             elif each.kind in ("delay", "encoder"):
                 columns[..., place] = instruments[..., place]
                 target = target + columns[..., place] * values[place]
-        return _Equation(instruments, columns, target, stencil, own)
+        return _Equation(instruments, columns, target, stencil, own, doubt)
 
     def _columns(
         self, path: Path, raw: Path, stencil: Vector, dry: Vector | None, torques: Vector
@@ -253,23 +273,26 @@ class _Problem:
         values = self._nominal if start is None else start
         smoother, fixed = Smoother(self._positions(values)), noise is not None
         corrections: Vector | float = 0.0
-        slow = np.full(len(self._model.joints), _STILL)
+        whole, settled = 0, False
+        slow = np.full(len(self._model.joints), self._data.slowest)
         found: Fit | None = None
         likely: LikelyNoise | None = None
         for step in range(1, _STEPS + 1):
             measured = self._positions(values)
             raw = Path(measured, self._data.period, self._data.instant)
-            if step <= _PATH_STEPS:  # then it stays, or the sign of slow motions may never settle
+            moving = step <= _PATH_STEPS or (not settled and step <= _LONGEST)
+            if moving:  # then it stays, or the sign of slow motions may never settle
                 path = dataclasses.replace(raw, positions=smoother(measured + corrections))
-                used = ~(self._dry & (np.abs(path.ends) < slow))
-                used[:_EDGE] = used[-_EDGE:] = False
-            equation = self._equation(path, raw, values)
+                used = ~(self._dry & _unsure(path.ends, slow))
+                whole = round(self._late(values))
+                used[: max(_EDGE, -whole)] = used[-max(_EDGE, whole) :] = False
+            equation = self._equation(path, raw, values, whole)
             if start is None and step == 1:
                 values = self._first(path, smoother, used)
             whitener = Whitener(equation.stencil, used)
             residual = equation.target - equation.columns @ values
             if not fixed:
-                if step in (_NOISE_STEPS, _PATH_STEPS):
+                if step == _NOISE_STEPS or (moving and step >= _PATH_STEPS):
                     assert noise is not None
                     assert found is not None
                     free = equation.instruments[..., found.independent]
@@ -280,21 +303,29 @@ class _Problem:
             assert noise is not None
             found = self._step(whitener, equation, values, noise, step, path, used)
             moved = np.abs(found.values - values)[found.independent]
-            values = found.values
-            if step > _PATH_STEPS and (moved < _CLOSE * np.sqrt(np.diag(found.covariance))).all():
+            moved /= np.sqrt(np.diag(found.covariance))
+            values, settled = found.values, bool((moved < _SETTLED).all())
+            if not moving and (moved < _CLOSE).all():
                 found = dataclasses.replace(found, converged=True)
                 break
             corrections = whitener.corrections(found.residual, noise)
-            if self._dry.any() and step < _PATH_STEPS:
+            if self._dry.any() and moving:
                 errors, left = whitener.draw(noise)
                 unsure = np.diff(smoother(errors + whitener.corrections(left, noise)), axis=0)
-                slow = np.maximum(_STILL, _UNSURE * unsure.std(axis=0) / self._data.period)
+                slow = np.maximum(
+                    self._data.slowest, _UNSURE * unsure.std(axis=0) / self._data.period
+                )
         assert found is not None
         if likely is None:
             return found
-        sure = values_of(whitener, likely, found.residual, found.regressors, found.known)[0]
+        known = np.column_stack([found.known[:, :-1], np.zeros(len(found.known))])
+        sure, other = (
+            values_of(whitener, likely, each, found.regressors, prior)[0]
+            for each, prior in ((found.residual, found.known), (equation.doubt, known))
+        )
+        covariance = sure.covariance + np.outer(other.values, other.values)
         return dataclasses.replace(
-            found, covariance=sure.covariance, freedom=sure.freedom, likely=likely
+            found, covariance=covariance, freedom=sure.freedom, likely=likely
         )
 
     def _known_of(self, fitted: Array, values: Vector) -> Vector:
@@ -317,7 +348,7 @@ class _Problem:
         """Return the values of least squares along a smoothed path, for torques smoothed alike."""
         smooth = dataclasses.replace(self._data, torques=smoother(self._data.torques))
         equation = _Problem(self._model, self._parameters, smooth)._equation(
-            path, path, self._nominal
+            path, path, self._nominal, 0
         )
         target, flat = equation.target, equation.columns[used]
         weights = 1 / np.sqrt(np.mean(np.where(used, target, 0.0) ** 2, axis=0) + 1e-12)
@@ -384,3 +415,16 @@ class _Problem:
             target - columns @ values, equation.instruments[..., free[sort]], used, path, whitener,
             np.full(rank, float(used.sum() - rank)), self._known_of(free[sort], values),
         )  # fmt: skip
+
+
+def _unsure(velocities: Vector, slow: Vector) -> Array:
+    """Return where the sign of velocities, shape (samples, joints), is unsure.
+
+    That is where they are slow, and next to a reversal, where dry friction may have stopped a joint
+    for a moment, and smoothing takes most from the path.
+    """
+    found: Array = np.abs(velocities) < slow
+    turned = np.diff(np.sign(velocities), axis=0) != 0
+    found[1:] |= turned
+    found[:-1] |= turned
+    return found

@@ -251,11 +251,18 @@ class Model:
                 found += torques if dry is None or motion is not sign else dry @ torques
         return found
 
-    def dry(self, path: Path, stencil: Vector, numbers: Vector) -> Vector | None:
-        """Return what a unit of each joint's dry friction takes of the torques.
+    def friction(self, path: Path, numbers: Vector) -> Vector:
+        """Return the dry friction of each joint, shape (samples, joints), in N m or N."""
+        count = len(self.joints)
+        found: Vector = np.sign(path.ends) * numbers[11 * count : 12 * count]
+        return found
 
-        Engines damp a step's velocity first, and then let dry friction change it: at the velocity
-        where the step ends, the damping was more by this.
+    def dry(self, path: Path, stencil: Vector, numbers: Vector) -> Vector:
+        """Return what a unit of each joint's dry friction takes of the torques of a step.
+
+        DART and our Pinocchio damp a step's velocity first, and then let dry friction change it: at
+        the velocity where the step ends, the damping was more by this. MuJoCo applies both at once,
+        and a unit takes a unit.
 
         Args:
             path: The motion.
@@ -263,11 +270,8 @@ class Model:
             numbers: Numbers of the robot.
 
         Returns:
-            Shape (samples, joints, joints); None, that of its own joint, for torques at the
-            instants of samples.
+            Shape (samples, joints, joints).
         """
-        if path.instant:
-            return None
         count = len(self.joints)
         damping = path.period * np.diag(numbers[10 * count : 11 * count])
         damped = path.period**2 * stencil[2]

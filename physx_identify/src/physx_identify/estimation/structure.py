@@ -11,13 +11,15 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.linalg import qr
 from scipy.stats import chi2
 from scipy.stats import f as fisher
 
+from physx_core.typing import Vector
 from physx_identify.estimation.fit import Fit
 from physx_identify.estimation.model import STRIBECK
 from physx_identify.estimation.noise import LikelyNoise
-from physx_identify.estimation.uncertainty import Values, values_of
+from physx_identify.estimation.uncertainty import NEW, Values, values_of
 
 SIZE = 0.05
 """Share of logs without model error in which the tests together find one."""
@@ -56,8 +58,11 @@ def _tests(found: Fit, joints: Sequence[str]) -> Iterator[tuple[str, str, float]
     path = found.path
     speed, place = path.ends, path.own - path.own.mean(axis=0)
     sign = np.sign(speed)
+    stribeck = sign * np.exp(-np.abs(speed) / STRIBECK)
+    stops = speed * path.accelerations < 0
     columns = {
-        "friction that falls with speed (Stribeck)": sign * np.exp(-np.abs(speed) / STRIBECK),
+        "friction that falls with speed (Stribeck)": stribeck,
+        "dry friction that fades as a joint stops, as MuJoCo's (see slowest)": stops * stribeck,
         "a resistance that grows with the square of speed": speed * np.abs(speed),
         "a resistance in proportion to speed (damping)": speed,
         "dry friction": sign,
@@ -78,7 +83,7 @@ def _tests(found: Fit, joints: Sequence[str]) -> Iterator[tuple[str, str, float]
     groups.append(np.arange(features.shape[2], features.shape[2] + late.shape[2]))
     beside = values_of(
         found.whitener,
-        found.likely or LikelyNoise(found.noise, np.zeros((0, 0))),
+        _noise_beside(found, features),
         found.residual,
         found.regressors,
         found.known,
@@ -89,6 +94,22 @@ def _tests(found: Fit, joints: Sequence[str]) -> Iterator[tuple[str, str, float]
         if len(values.values):
             yield name, each, _probability(values)
     yield "", "noise as it is: what is left is still correlated", _whiteness(found)
+
+
+def _noise_beside(found: Fit, features: Vector) -> LikelyNoise:
+    """Return the noise as it is if the model has all features: what it lacks is no noise."""
+    columns = np.concatenate([found.regressors, features], axis=2)
+    white = found.whitener.whitened(columns, found.noise)
+    white = np.concatenate([white, np.pad(found.known[:, :-1], ((0, 0), (0, features.shape[2])))])
+    count = found.regressors.shape[2]
+    basis = np.linalg.qr(white[:, :count])[0]
+    rest = white[:, count:] / np.maximum(np.linalg.norm(white[:, count:], axis=0), 1e-300)
+    rest -= basis @ (basis.T @ rest)
+    _, triangle, order = qr(rest, mode="economic", pivoting=True)
+    new = np.sort(order[np.abs(np.diag(triangle)) > NEW])
+    known = np.insert(found.known, [count] * len(new), 0.0, axis=1)
+    columns = np.concatenate([found.regressors, features[..., new]], axis=2)
+    return found.whitener.fit(found.residual, found.noise, columns, known)
 
 
 def _probability(found: Values) -> float:

@@ -14,7 +14,7 @@ import numpy as np
 from physx_core.typing import Array, Vector
 from physx_identify.estimation.noise import LikelyNoise, Noise, Whitener
 
-_NEW = 1e-3
+NEW = 0.03
 """Relative length of a column that the others do not explain, from which it counts."""
 
 
@@ -108,7 +108,7 @@ class _Solver:
             for group in self._groups:
                 unit = rest[:, 1 + group] / sizes[group]
                 values, turns = np.linalg.eigh(unit.T @ unit)
-                self._turns.append(turns[:, values > _NEW**2] / sizes[group][:, None])
+                self._turns.append(turns[:, values > NEW**2] / sizes[group][:, None])
         found = []
         for group, turns in zip(self._groups, self._turns, strict=True):
             own = rest[:, 1 + group] @ turns
