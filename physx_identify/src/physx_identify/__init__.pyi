@@ -14,6 +14,7 @@ from .logs.log import Log as Log
 from .logs.log import read_log as read_log
 from .randomization import Identified as Identified
 from .result.estimates import Combination as Combination
+from .result.estimates import EngineFit as EngineFit
 from .result.estimates import Estimate as Estimate
 from .result.estimates import LogNoise as LogNoise
 from .result.identification import Identification as Identification

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
@@ -11,6 +12,7 @@ from scipy.stats import t as student
 from physx_core import checks
 from physx_core.errors import ConfigError
 from physx_core.typing import Array, Vector
+from physx_identify.engines import find_engines, refits, world_of
 from physx_identify.estimation.fit import SLOWEST, Data, Fit, fit
 from physx_identify.estimation.inertia import cholesky_of, from_cholesky, is_physical
 from physx_identify.estimation.model import GRAVITY, Model
@@ -43,6 +45,7 @@ def identify(
     gravity: Sequence[float] = GRAVITY,
     held: Sequence[str] = (),
     instant: bool = False,
+    engines: Sequence[str] = (),
     slowest: float = SLOWEST,
     seed: int = 0,
 ) -> Identification:
@@ -57,16 +60,23 @@ def identify(
         held: Names of joints that did not move and are not in the log: they are at 0.
         instant: Whether torques are those at the instants of the samples. By default, each is held
             from its sample to the next one, as engines and digital controllers do.
+        engines: Names of engines on which the values are fitted anew, such as ``"mujoco"``, to show
+            which of them depend on the engine.
         slowest: In rad/s or m/s. Samples at which a joint with dry friction is slower are left out,
             since their friction is unknown.
         seed: Seed of the draws from the posterior.
 
     Raises:
         IdentificationError: If the log is bad, see `check_log`; if the robot's base floats; or if
-            nothing unknown acts on its torques.
-        ConfigError: If an unknown, the level or the slowest velocity is wrong.
+            nothing unknown acts on its torques; or if there are engines, but something is unknown
+            that no engine's robot can be given.
+        ConfigError: If an unknown, the level, the slowest velocity or an engine is wrong; or if
+            torques are those at instants, which no engine takes.
         ComponentNotFoundError: If the robot has no link or joint of a name.
+        PluginNotFoundError: If there is no engine of a name.
+        PluginError: If the plugin of an engine is broken.
         ModelError: If the robot cannot be loaded.
+        FeatureNotSupportedError: If an engine lacks something that the robot needs.
     """
     if not 0 < level < 1:
         raise ConfigError(f"level is {level!r} but must be between 0 and 1.")
@@ -74,10 +84,16 @@ def identify(
     model = Model(robot, gravity, held)
     parameters = model.parameters(as_unknowns(unknowns))
     check_log(log, model, len(parameters))
+    if engines and instant:
+        raise ConfigError("Engines hold torques from step to step: leave instant out, or engines.")
+    world = world_of(robot, log.period, gravity, held)
+    others = find_engines(engines, world, parameters)
     data = Data(log.positions, log.torques, log.period, instant, slowest)
     found = fit(model, parameters, data)
     again = fit(model, parameters, data, np.array([p.nominal for p in parameters]), found.noise)
-    return _summary(log, robot, parameters, found, again, level, seed)
+    summary = _summary(log, robot, parameters, found, again, level, seed)
+    refitted = refits(others, world, model, parameters, found, summary)
+    return dataclasses.replace(summary, engines=refitted)
 
 
 def _summary(

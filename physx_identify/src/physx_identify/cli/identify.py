@@ -61,6 +61,9 @@ class Identify:
     """Joints that did not move and are not in the log, such as a gripper's: they are at 0."""
     instant: bool = False
     """Torques are those at the instants of the samples, instead of held from each to the next."""
+    engines: tuple[str, ...] = ()
+    """Engines on which the values are fitted anew, such as dart and mujoco, to show which of them
+    depend on the engine."""
     slowest: float = 0.02
     """Velocity in rad/s or m/s below which samples of joints with dry friction are left out."""
     level: float = 0.95
@@ -90,6 +93,7 @@ def run(words: Sequence[str]) -> None:
         gravity=options.gravity,
         held=options.held,
         instant=options.instant,
+        engines=options.engines,
         slowest=options.slowest,
     )
     if options.json:

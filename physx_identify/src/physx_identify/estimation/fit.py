@@ -80,7 +80,8 @@ class Fit:
         white: Whitened residual, shape (rows,).
         instruments: Whitened columns along the other path, shape (rows, parameters).
         columns: Whitened columns of what was measured, shape (rows, parameters).
-        torques: Torques of the model along the other path, shape (samples - 2, joints).
+        torques: Torques of the model along the other path, shape (samples - 2, joints), with biases
+            of logged torques, as these have them.
         residual: Of the torques, shape (samples - 2, joints), in N m or N.
         regressors: Columns of the fitted values along the other path, shape (samples - 2, joints,
             independent).
@@ -144,6 +145,7 @@ class _Equation:
         columns: Columns of what was measured, of the same shape.
         target: Shape (samples, joints).
         stencil: As in `Model.stencil`, along the same path as the instruments.
+        torques: Of the model along that path, of the same shape as the target.
         doubt: By what dry friction differs if it is applied another way, shape (samples, joints).
     """
 
@@ -151,6 +153,7 @@ class _Equation:
     columns: Vector
     target: Vector
     stencil: Vector
+    torques: Vector
     doubt: Vector
 
 
@@ -167,6 +170,7 @@ class _Problem:
             (place, each) for place, each in enumerate(parameters)
             if each.kind in ("gain", "bias", "encoder", "delay")
         ]  # fmt: skip
+        self._plain = [each.kind not in ("gain", "delay", "encoder") for each in parameters]
         joints = model.joints
         dry = np.zeros(len(joints), bool)
         rubbing = model.numbers[11 * len(joints) : 13 * len(joints)].reshape(2, -1)
@@ -225,7 +229,8 @@ class _Problem:
             doubt = np.einsum("kij,kj->ki", dry, rubbing) - rubbing
         torques = self._torques(values, whole)
         instruments, known = self._columns(path, path, stencil, dry, torques)
-        instruments = self._endogenous(instruments, known, values)
+        own = known + instruments[..., self._plain] @ values[self._plain]
+        instruments = self._endogenous(instruments, own)
         columns, known = self._columns(path, raw, stencil, dry, torques)
         target = torques - known
         for place, each in self._special:
@@ -234,7 +239,7 @@ class _Problem:
             elif each.kind in ("delay", "encoder"):
                 columns[..., place] = instruments[..., place]
                 target = target + columns[..., place] * values[place]
-        return _Equation(instruments, columns, target, stencil, doubt)
+        return _Equation(instruments, columns, target, stencil, own, doubt)
 
     def _columns(
         self, path: Path, raw: Path, stencil: Vector, dry: Vector | None, torques: Vector
@@ -328,10 +333,8 @@ class _Problem:
         prior, mean = self._priors()
         return np.column_stack([prior[:, fitted], mean - prior @ values])
 
-    def _endogenous(self, columns: Vector, known: Vector, values: Vector) -> Vector:
+    def _endogenous(self, columns: Vector, own: Vector) -> Vector:
         """Return columns whose torques are the model's own instead of measured ones."""
-        plain = [p.kind not in ("gain", "delay", "encoder") for p in self._parameters]
-        own = known + columns[..., plain] @ values[plain]
         found = columns.copy()
         for place, each in self._special:
             if each.kind == "delay":
@@ -405,9 +408,10 @@ class _Problem:
         inner = np.linalg.inv(z[:, free].T @ a[:, free])
         covariance = inner @ square @ inner.T
         sort = np.argsort(free)
+        own = equation.instruments[..., self._plain] @ (values - before)[self._plain]
         return Fit(
             values, free[sort], held, mixing[sort], covariance[np.ix_(sort, sort)], noise, step,
-            False, y - a @ values, z, a, equation.target - target + equation.instruments @ values,
+            False, y - a @ values, z, a, equation.torques + own,
             target - columns @ values, equation.instruments[..., free[sort]], used, path, whitener,
             np.full(rank, float(used.sum() - rank)), self._known_of(free[sort], values),
         )  # fmt: skip

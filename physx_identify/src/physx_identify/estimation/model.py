@@ -243,7 +243,8 @@ class Model:
         if bodies.any():
             regress, model, data = pinocchio.computeJointTorqueRegressor, self._pin, self._data
             for place, (q_k, v_k, a_k) in enumerate(zip(q, v, a, strict=True)):
-                np.dot(regress(model, data, q_k, v_k, a_k), bodies, out=found[place])
+                own = regress(model, data, q_k, v_k, a_k).reshape(count, -1)  # flat of one joint
+                np.dot(own, bodies, out=found[place])
         else:
             found[:] = 0.0
         rest = directions[10 * count :].reshape(4, count, -1)

@@ -83,3 +83,33 @@ class LogNoise:
     order: int
     innovations: Sequence[float]
     regression: Sequence[Sequence[float]]
+
+
+DEPENDENT = 3.0
+"""Difference between engines, in standard errors, above which a value depends on the engine."""
+
+
+@dataclass(frozen=True)
+class EngineFit:
+    """What the log says with the steps of an engine in place of the fit's own.
+
+    Attributes:
+        engine: Name of the engine.
+        values: Of each parameter that the log tells, by name.
+        differences: Of these values from the fit's, in standard errors.
+        torques: Root mean square of what the torques of its steps differ by, of each joint, in N m
+            or N, at the fit's values if these do not depend on the engine.
+        stopped: Number of samples that are left out, as no torque leads to the next one on the
+            engine: at limits of joints, or where they stick.
+    """
+
+    engine: str
+    values: Mapping[str, float]
+    differences: Mapping[str, float]
+    torques: Sequence[float]
+    stopped: int = 0
+
+    @property
+    def dependent(self) -> list[str]:
+        """Names of the parameters whose values depend on the engine."""
+        return [name for name, each in self.differences.items() if abs(each) > DEPENDENT]

@@ -12,11 +12,13 @@ from typing import Any
 from physx_identify.errors import IdentificationError
 from physx_identify.estimation.structure import ResidualTest
 from physx_identify.result import wording
-from physx_identify.result.estimates import Combination, Estimate, LogNoise
+from physx_identify.result.estimates import Combination, EngineFit, Estimate, LogNoise
 from physx_sim import JointSettings, Robot
 
 SETTINGS = ("damping", "friction", "armature")
 """Kinds that are settings of a robot's joints."""
+UNSETTABLE = ("inertia", "payload", "stribeck")
+"""Kinds that are of a robot, but that no option of one holds."""
 
 
 @dataclass(frozen=True)
@@ -41,6 +43,7 @@ class Identification:
         mean: Posterior mean of all parameters.
         covariance: Posterior covariance.
         draws: Physical draws from the posterior, one a row.
+        engines: What the log says with other engines' steps.
     """
 
     robot: str
@@ -60,6 +63,7 @@ class Identification:
     mean: Sequence[float]
     covariance: Sequence[Sequence[float]]
     draws: Sequence[Sequence[float]]
+    engines: Sequence[EngineFit] = ()
 
     @property
     def lacks(self) -> list[str]:
@@ -71,6 +75,11 @@ class Identification:
     def holds(self) -> bool:
         """Whether the intervals may be called by their level."""
         return self.converged and not self.lacks
+
+    @property
+    def dependent(self) -> list[str]:
+        """Names of the parameters whose values depend on the engine, of those fitted with."""
+        return list(dict.fromkeys(name for each in self.engines for name in each.dependent))
 
     @property
     def verdict(self) -> list[str]:
@@ -101,7 +110,7 @@ class Identification:
                 of a robot holds: inertia, payload, Stribeck friction.
         """
         given = [each.value for each in self.estimates] if values is None else list(values)
-        odd = [e.name for e in self.estimates if e.kind in ("inertia", "payload", "stribeck")]
+        odd = [e.name for e in self.estimates if e.kind in UNSETTABLE]
         if odd:
             raise IdentificationError(
                 f'No option of a robot holds "{odd[0]}": edit its file, or identify its mass.'
@@ -122,13 +131,18 @@ class Identification:
         return plain
 
     def to_json(self) -> str:
-        """Return all of it as JSON, with what it amounts to: ``holds`` and ``lacks``."""
-        return json.dumps({"holds": self.holds, "lacks": self.lacks, **self.to_plain()}, indent=1)
+        """Return all of it as JSON, with what it amounts to.
+
+        That is ``holds``, ``lacks`` and, if there are engines, what of it is ``dependent`` on them.
+        """
+        amounts = {"holds": self.holds, "lacks": self.lacks, "dependent": self.dependent}
+        return json.dumps({**amounts, **self.to_plain()}, indent=1)
 
     def __str__(self) -> str:
         begin = wording.origin_text(self.robot, self.source, self.samples, self.period)
         lines = textwrap.wrap(begin, wording.WIDTH)
-        lines += ["", *wording.columns([wording.HEAD, *map(wording.row_of, self.estimates)])]
+        rows = [wording.HEAD, *map(wording.row_of, self.estimates)]
+        lines += ["", *wording.columns(rows, wording.WORDS)]
         if self.combinations:
             lines += ["", f"{wording.TOGETHER}:"]
         for each in self.combinations:
@@ -139,4 +153,9 @@ class Identification:
         lines.append("")
         for text in (wording.noise_text(self.noise), *self.verdict):
             lines += textwrap.wrap(text, wording.WIDTH)
+        if self.engines:
+            rows = wording.engine_rows(self.engines)
+            lines += ["", f"{wording.ELSEWHERE}:", *wording.columns(rows)]
+            for text in wording.engine_lines(self.engines):
+                lines += textwrap.wrap(text, wording.WIDTH)
         return "\n".join(lines)

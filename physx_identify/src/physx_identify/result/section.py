@@ -29,6 +29,10 @@ def _blocks(run: Run) -> Iterator[Text | Table]:
     if found.combinations:
         texts = [wording.combination_text(each) for each in found.combinations]
         yield Text([f"{wording.TOGETHER}:", *texts])
+    if found.engines:
+        engines = wording.engine_rows(found.engines)
+        yield Table(engines[0], engines[1:], wording.ELSEWHERE)
+        yield Text(wording.engine_lines(found.engines), "verdict")
     rows = [
         [each.joint or "all", each.lacks, f"{each.probability:.3g}", "yes" if each.failed else ""]
         for each in found.tests

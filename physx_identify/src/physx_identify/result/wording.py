@@ -2,13 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
-from physx_identify.result.estimates import Combination, Estimate, LogNoise
+from physx_identify.result.estimates import (
+    DEPENDENT,
+    Combination,
+    EngineFit,
+    Estimate,
+    LogNoise,
+)
 
 WIDTH = 80
 TOGETHER = "Inseparable in this log; told of them together"
+ELSEWHERE = "Fitted with the steps of engines: differences in standard errors"
 HEAD = ("parameter", "unit", "nominal", "value", "interval", "")
+WORDS = (0, 1, 5)
+"""Which of these columns are words."""
 
 
 def number(value: float) -> str:
@@ -68,12 +77,37 @@ def noise_text(noise: LogNoise) -> str:
     )
 
 
-def columns(rows: Sequence[Sequence[str]]) -> list[str]:
-    """Return rows as lines with aligned columns."""
+def engine_rows(engines: Sequence[EngineFit]) -> list[tuple[str, ...]]:
+    """Return a head, and for each parameter its differences on engines."""
+    names = list(engines[0].differences) if engines else []
+    return [
+        ("parameter", *(each.engine for each in engines)),
+        *((name, *(f"{each.differences[name]:+.2f}" for each in engines)) for name in names),
+    ]
+
+
+def engine_lines(engines: Sequence[EngineFit]) -> list[str]:
+    """Return which values depend on the engine, and what was left out."""
+    lines = [
+        f"Depends on the engine: {name}, {each.values[name]:.4g} on {each.engine}."
+        for each in engines
+        for name in each.dependent
+    ]
+    lines = lines or [f"None is {DEPENDENT:g} standard errors off: no value depends on the engine."]
+    return lines + [
+        f"On {each.engine}, no torque leads to the next sample from {each.stopped} (limits of "
+        "joints, or dry friction): left out."
+        for each in engines
+        if each.stopped
+    ]
+
+
+def columns(rows: Sequence[Sequence[str]], words: Collection[int] = (0,)) -> list[str]:
+    """Return rows as lines with aligned columns, those of words to the left."""
     widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
     return [
         "  ".join(
-            f"{cell:{width}}" if place < 2 or place == len(row) - 1 else f"{cell:>{width}}"
+            f"{cell:{width}}" if place in words else f"{cell:>{width}}"
             for place, (cell, width) in enumerate(zip(row, widths, strict=True))
         ).rstrip()
         for row in rows
