@@ -5,6 +5,7 @@ from __future__ import annotations
 import sys
 from collections.abc import Collection, Mapping, Sequence
 
+from physx_core.cells import in_notebook as in_notebook
 from physx_core.errors import printable
 from physx_core.terminal import width as width
 from physx_core.terminal import wrapped
