@@ -58,8 +58,7 @@ def test_a_tumbling_body_keeps_its_energy_for_ten_seconds(backend, integrator):
         simulation.step(10_000)
         w = simulation.velocities()[3:]
         error = abs(w @ mass @ w / (v[3:] @ mass @ v[3:]) - 1)
-        accuracy = 1e-5 if simulation.engine == "pinocchio" else 0.05
-        assert error < (1e-9 if integrator == "rk4" else accuracy)
+        assert error < (1e-9 if integrator == "rk4" else 0.05)
 
 
 @pytest.mark.parametrize(("restitution", "accuracy"), [(1.0, 0.01), (0.5, 0.02)])

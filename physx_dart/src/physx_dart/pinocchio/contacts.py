@@ -284,7 +284,7 @@ class ContactFinder:
             if not len(rows):
                 continue
             gaps = gaps.take(rows)
-            normals = axes.take(rows, 0) if len(axes) > 1 else np.repeat(axes, len(rows), 0)
+            normals = axes.take(rows, 0) if len(axes) > 1 else axes.repeat(len(rows), 0)
             depths = self._radii.take(rows) + 0.5 * np.minimum(gaps, 0.0)
             touched = points.take(rows, 0) - depths[:, None] * normals[:, 2]
             frames = np.concatenate([normals, surface.moments(touched, normals)], 2)

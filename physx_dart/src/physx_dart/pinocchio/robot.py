@@ -3,7 +3,7 @@
 Pinocchio has no simulator, so the step is implemented here in the same way as DART's:
 semi-implicit Euler with implicit damping and springs; impulses for contacts, limits, servos, and
 Coulomb friction; and a floating base integrated with its velocities in the world frame. Unlike
-DART's, gyroscopic forces of objects are those of the middle of a step.
+DART's, gyroscopic forces of objects that touch something are those of the middle of a step.
 """
 
 from __future__ import annotations
@@ -85,8 +85,8 @@ class PinocchioRobot(RobotEngine):
         self._forces = None if forces.all() else forces
         self._positions, self._velocities = np.zeros(self.nq), np.zeros(self.nv)
         self._earlier, self._before = self._positions, self._velocities
-        self._free_acceleration = self.allowed = self._velocities
-        self.gyrates = False  # whether gyroscopic forces of the middle mattered in the last step
+        self._free = self.allowed = self._velocities
+        self.gyrates = False  # whether those of the middle of the last step mattered
         self._safe_steps, self._bound = 0, 0.0
         # Multiplying two arrays takes half the time of multiplying an array by a number.
         self._periods, self._motion = np.full(self.nv, dt), np.zeros(self.nv)
@@ -134,9 +134,6 @@ class PinocchioRobot(RobotEngine):
             if self._smooth:
                 for _ in range(count):
                     self._step_free(1, self._net_torques(self._positions, self._velocities))
-            elif self._tumbles:
-                for _ in range(count):
-                    self.finish(self.free_velocities())
             else:
                 self._step_free(count, self._torques)
             v = self._velocities[self.base :]
@@ -185,8 +182,8 @@ class PinocchioRobot(RobotEngine):
         q, v = self._positions, self._velocities
         torques = self._net_torques(q, v) if self._smooth else self._torques
         a = pinocchio.aba(self.model_in_motion, self.data, q, v, torques, *self._more)
-        self._free_acceleration = a
-        return v + self._period * a
+        self._free = v + self._period * a
+        return self._free
 
     def free_derivatives(self) -> tuple[Vector, Vector, Vector]:
         """Return derivatives of `free_velocities` of the last step, each of shape (nv, nv).
@@ -226,8 +223,8 @@ class PinocchioRobot(RobotEngine):
 
     def finish(self, velocities: Vector) -> None:
         """End the step with the velocities (nv,) that the constraints allow."""
-        self.allowed = velocities
-        if self._tumbles:
+        self.allowed, self.gyrates = velocities, False
+        if self._tumbles and velocities is not self._free:
             change = self._gyroscopic(velocities)
             self.gyrates = bool(change.dot(change) > _SOLVED**2)
             if self.gyrates:
@@ -240,15 +237,15 @@ class PinocchioRobot(RobotEngine):
     def _gyroscopic(self, velocities: Vector) -> Vector:
         """Return the change of velocities at the end of the step by gyroscopic forces, (nv,).
 
-        Those at its start, which are in the free velocities, do work: what tumbles, or rolls along
-        its rim, would gain energy. Those in its middle, where constraints have changed the
-        velocities by half, do none. The difference is of second order in the period.
+        Those at its start, which are in the free velocities, do work on what constraints turn: a
+        disk that rolls along its rim would gain energy. Those in its middle, where constraints have
+        changed the velocities by half, do none. The difference is of second order in the period.
         """
         middle = 0.5 * (self._velocities + velocities)
         a = pinocchio.aba(
             self.model_in_motion, self.data, self._positions, middle, self._torques, *self._more
         )
-        change: Vector = self._period * (a - self._free_acceleration)
+        change: Vector = self._period * a - (self._free - self._velocities)
         return change
 
     def constrained(self, v: Vector) -> Vector:
