@@ -55,7 +55,7 @@ class GroupDerivatives:
         spans = [slice(*pair) for pair in itertools.pairwise(ends)]
         self._robots, self._period = list(zip(robots, spans, strict=True)), period
         nv = self._nv = spans[-1].stop
-        self._after = np.concatenate([robot.native()[1] for robot in robots])
+        self._after = np.concatenate([robot.allowed for robot in robots])
         # Columns: positions, velocities, torques, and the target velocities of motors.
         self._change = np.zeros((nv, 4, nv))
         for robot, span in self._robots:
@@ -63,6 +63,12 @@ class GroupDerivatives:
                 self._change[span, number, span] = block
         if solved is not None and len(solved.impulses):
             self._constrain(self._with_resting(solved))
+        for robot, span in self._robots:
+            if robot.gyrates:
+                by_q, by_v, by_allowed = robot.gyroscopic_derivatives()
+                self._change[span] += np.tensordot(by_allowed, self._change[span], 1)
+                self._change[span, 0, span] += by_q
+                self._change[span, 1, span] += by_v
 
     def _with_resting(self, solved: Solved) -> Solved:
         """Return the problem with the friction of joints at rest, which did not need to act."""
@@ -161,7 +167,7 @@ class GroupDerivatives:
             q, v, _ = robot.last_step()
             moved, by_motion = unit(robot.nv), unit(robot.nv)
             if robot.base:
-                motion = period * self._after[span]
+                motion = period * robot.native()[1]
                 moved, by_motion = pinocchio.dIntegrate(robot.model_in_motion, q, motion)
                 _to_world(before, span.start, nv, q, v)
                 _to_base(after, span.start, nv, *robot.native())
