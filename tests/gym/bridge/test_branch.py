@@ -9,7 +9,7 @@ import pytest
 import sizes
 
 from physx_core import DataGeneration, Dataset, EnvironmentConfig
-from physx_core.errors import UnknownOptionError, UntrustedReferenceError
+from physx_core.errors import PhysxError, UnknownOptionError, UntrustedReferenceError
 from physx_core.pipelines import Branch
 from physx_gym import make_env
 
@@ -91,6 +91,52 @@ def test_an_own_robot_is_branched_if_its_class_is_trusted():
         Branch("sessions/Own", 3, change, quiet=True).execute()
     with pytest.raises(UntrustedReferenceError, match="which is not a class"):
         Branch("sessions/make", 3, change, trust=True, quiet=True).execute()
+
+
+@pytest.fixture
+def log():
+    """Record an episode of an ant in ant.h5."""
+    env = make_env("physx/Ant-v0", {})
+    env.unwrapped.eval()
+    env.reset(seed=7, options={"log_path": "ant.h5"})
+    env.action_space.seed(1)
+    for _ in range(12):
+        env.step(env.action_space.sample())
+    env.close()
+
+
+@pytest.mark.usefixtures("log")
+def test_a_log_is_simulated_again_and_branched():
+    environment = EnvironmentConfig(
+        "gym/physx/Ant-v0", {"policy": "ant.h5"}, as_tcp_ip_client=False, seed=0
+    )
+    with DataGeneration(environment, episodes=1, session_name="again", quiet=True) as run:
+        run.execute()
+    with Dataset.open("sessions/again") as dataset:
+        assert dataset.num_samples("training") == 12
+    branch = Branch("sessions/again", 5, {"push": {"torso": [200.0, 0.0, 0.0]}}, quiet=True)
+    branch.execute()
+    was, changed = branch.futures
+    assert branch.rows_equal == (6, 6)
+    assert np.array_equal(was["action"], changed["action"])
+    assert not np.array_equal(was["next_observation"], changed["next_observation"])
+
+
+@pytest.mark.usefixtures("log")
+@pytest.mark.parametrize(
+    ("policy", "backend", "message"),
+    [
+        ("ant.csv", "dart", "lacks the seed, the actions and the states"),
+        ("none.h5", "dart", "There is no log"),
+        ("ant.h5", "pinocchio", "has another state after .* steps"),
+    ],
+)
+def test_a_log_that_cannot_be_simulated_again_says_why(policy, backend, message):
+    environment = EnvironmentConfig(
+        "gym/physx/Ant-v0", {"policy": policy, "backend": backend}, as_tcp_ip_client=False
+    )
+    with pytest.raises(PhysxError, match=message):
+        DataGeneration(environment, episodes=1, quiet=True).execute()
 
 
 def test_what_a_robot_cannot_be_told_is_named():
