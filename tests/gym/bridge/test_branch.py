@@ -9,7 +9,12 @@ import pytest
 import sizes
 
 from physx_core import DataGeneration, Dataset, EnvironmentConfig
-from physx_core.errors import PhysxError, UnknownOptionError, UntrustedReferenceError
+from physx_core.errors import (
+    PhysxError,
+    UnknownOptionError,
+    UntrustedReferenceError,
+    UsageError,
+)
 from physx_core.pipelines import Branch
 from physx_gym import make_env
 
@@ -112,6 +117,8 @@ def test_a_log_is_simulated_again_and_branched():
     )
     with DataGeneration(environment, episodes=1, session_name="again", quiet=True) as run:
         run.execute()
+    with pytest.raises(UsageError, match="physx generate gym/ID .*policy=ant.h5 --episodes 1"):
+        Branch("ant.h5", 5, {"gravity": [0, 0, -1]}, quiet=True).execute()
     with Dataset.open("sessions/again") as dataset:
         assert dataset.num_samples("training") == 12
     branch = Branch("sessions/again", 5, {"push": {"torso": [200.0, 0.0, 0.0]}}, quiet=True)
