@@ -179,6 +179,12 @@ class Branch(NewSessionPipeline):
     def _open(self, resources: contextlib.ExitStack) -> None:
         if not self.change and self.policy is None:
             raise UsageError("Nothing changes: give change (--set NAME=VALUE ...) or a policy.")
+        if Path(self.data).is_file():
+            raise UsageError(
+                f"{self.data} is a file: give the folder of a session or dataset. The log of a "
+                "robot is simulated again, as a policy, by physx generate gym/ID "
+                f"--environment.env-kwargs policy={self.data} --episodes 1."
+            )
         dataset = self._dataset = resources.enter_context(Dataset.open(self.data))
         if self.policy is not None:
             self._learner = load_learner(self.policy, trust=self.trust)
