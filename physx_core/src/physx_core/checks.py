@@ -117,20 +117,24 @@ def store_declared(where: str, description: Any) -> None:
         ConfigError: If a value is not of the declared kind: see `number`, `integer`, `boolean`.
     """
     cls: Any = type(description)
-    for name, convert in conversions(cls):
+    for name, convert in _conversions(cls):
         given = getattr(description, name)
         stored = convert(where + name, given)
         if stored is not given:
             object.__setattr__(description, name, stored)
 
 
-@functools.cache
 def conversions(cls: Any) -> tuple[tuple[str, Convert], ...]:
     """Return the options of a dataclass that hold numbers, and the conversion of each.
 
     Args:
         cls: The dataclass.
     """
+    return _conversions(cls)
+
+
+@functools.cache
+def _conversions(cls: Any) -> tuple[tuple[str, Convert], ...]:
     hints = _hints(cls)
     found = ((f.name, _conversion(hints.get(f.name))) for f in dataclasses.fields(cls) if f.init)
     return tuple((name, convert) for name, convert in found if convert is not None)

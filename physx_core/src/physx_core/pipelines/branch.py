@@ -15,7 +15,8 @@ from physx_core.components.scene.event import Event
 from physx_core.config import EnvironmentConfig, at_least, from_plain, options, to_plain
 from physx_core.dataset import Dataset
 from physx_core.errors import UsageError
-from physx_core.pipelines.learning.learner import Learner, load_learner
+from physx_core.pipelines.learning.learner import Learner
+from physx_core.pipelines.learning.loading import load_learner
 from physx_core.pipelines.pipeline import NewSessionPipeline
 from physx_core.pipelines.redrawing import Redrawing
 from physx_core.pipelines.replay import recorded_environment
