@@ -17,6 +17,7 @@ from scipy.linalg import qr, solve_triangular
 
 from physx_core.typing import Array, Vector
 from physx_identify.errors import IdentificationError
+from physx_identify.estimation.base import COORDINATES, Base
 from physx_identify.estimation.model import Model, Path
 from physx_identify.estimation.noise import ORDERS, LikelyNoise, Noise, Whitener
 from physx_identify.estimation.smooth import Smoother
@@ -40,6 +41,8 @@ _SEPARABLE = 1e-6
 """Relative length of what is left of a column without the others, below which it is one of them."""
 _NEAR = 0.01
 """Share of the encoders' errors in differences that derivatives are made of."""
+_FAINT = 1e-9
+"""Least noise of positions that counts."""
 SLOWEST, _UNSURE = 0.02, 2.0
 """Velocity below which dry friction is unknown: in rad/s or m/s, and in standard errors."""
 
@@ -54,6 +57,8 @@ class Data:
         period: In s.
         instant: As in `Path`.
         slowest: Velocity below which dry friction is unknown, in rad/s or m/s.
+        base: Measured orientations of a floating base, whose coordinates come first.
+        flight: Whether nothing but gravity acts on a floating base, so that its forces are known.
     """
 
     positions: Vector
@@ -61,6 +66,17 @@ class Data:
     period: float
     instant: bool = False
     slowest: float = SLOWEST
+    base: Base | None = None
+    flight: bool = False
+
+    @property
+    def rows(self) -> slice:
+        """Which coordinates have known torques."""
+        return slice(0 if self.flight or self.base is None else len(COORDINATES), None)
+
+    def path(self, positions: Vector) -> Path:
+        """Return a motion at its times."""
+        return Path(positions, self.period, self.instant, self.base)
 
 
 @dataclass(frozen=True)
@@ -144,7 +160,8 @@ class _Equation:
             parameters).
         columns: Columns of what was measured, of the same shape.
         target: Shape (samples, joints).
-        stencil: As in `Model.stencil`, along the same path as the instruments.
+        stencil: As in `Model.stencil`, along the same path as the instruments, by positions in
+            deviations of the encoders, shape (3, samples, joints, positions).
         torques: Of the model along that path, of the same shape as the target.
         doubt: By what dry friction differs if it is applied another way, shape (samples, joints).
     """
@@ -171,7 +188,7 @@ class _Problem:
             if each.kind in ("gain", "bias", "encoder", "delay")
         ]  # fmt: skip
         self._plain = [each.kind not in ("gain", "delay", "encoder") for each in parameters]
-        joints = model.joints
+        self._rows, joints = data.rows, model.coordinates
         dry = np.zeros(len(joints), bool)
         rubbing = model.numbers[11 * len(joints) : 13 * len(joints)].reshape(2, -1)
         dry |= rubbing.any(axis=0)
@@ -179,13 +196,14 @@ class _Problem:
             if each.kind in ("friction", "stribeck"):
                 dry[joints.index(each.of)] = True
         self._dry = dry
+        self._scale = np.ones(len(joints))
 
     def _positions(self, values: Vector) -> Vector:
         """Return measured positions without the encoders' offsets."""
         found = self._data.positions
         for place, each in self._special:
             if each.kind == "encoder":
-                offset = values[place] * (np.array(self._model.joints) == each.of)
+                offset = values[place] * (np.array(self._model.coordinates) == each.of)
                 found = found - offset
         return found
 
@@ -239,7 +257,15 @@ class _Problem:
             elif each.kind in ("delay", "encoder"):
                 columns[..., place] = instruments[..., place]
                 target = target + columns[..., place] * values[place]
-        return _Equation(instruments, columns, target, stencil, own, doubt)
+        rows = self._rows
+        return _Equation(
+            instruments[:, rows],
+            columns[:, rows],
+            target[:, rows],
+            self._scale * stencil[:, :, rows],
+            own[:, rows],
+            doubt[:, rows],
+        )
 
     def _columns(
         self, path: Path, raw: Path, stencil: Vector, dry: Vector | None, torques: Vector
@@ -261,7 +287,7 @@ class _Problem:
             if each.kind == "delay":
                 columns[..., place] = -np.gradient(torques, path.period, axis=0)
                 continue
-            joint = self._model.joints.index(each.of)
+            joint = self._model.coordinates.index(each.of)
             if each.kind == "encoder":
                 columns[..., place] = -stencil.sum(axis=0)[:, :, joint]
             else:
@@ -272,18 +298,19 @@ class _Problem:
         """Repeat: noise of the residual, values, path."""
         values = self._nominal if start is None else start
         smoother, fixed = Smoother(self._positions(values)), noise is not None
+        self._scale = self._noises(smoother.noise)
         corrections: Vector | float = 0.0
         whole, settled = 0, False
-        slow = np.full(len(self._model.joints), self._data.slowest)
+        slow = np.full(len(self._model.coordinates), self._data.slowest)
         found: Fit | None = None
         likely: LikelyNoise | None = None
         for step in range(1, _STEPS + 1):
             measured = self._positions(values)
-            raw = Path(measured, self._data.period, self._data.instant)
+            raw = self._data.path(measured)
             moving = step <= _PATH_STEPS or (not settled and step <= _LONGEST)
             if moving:  # then it stays, or the sign of slow motions may never settle
                 path = dataclasses.replace(raw, positions=smoother(measured + corrections))
-                used = ~(self._dry & _unsure(path.ends, slow))
+                used = ~(self._dry & _unsure(path.ends, slow))[:, self._rows]
                 whole = round(self._late(values))
                 used[: max(_EDGE, -whole)] = used[-max(_EDGE, whole) :] = False
             equation = self._equation(path, raw, values, whole)
@@ -308,10 +335,11 @@ class _Problem:
             if not moving and (moved < _CLOSE).all():
                 found = dataclasses.replace(found, converged=True)
                 break
-            corrections = whitener.corrections(found.residual, noise)
+            corrections = self._scale * whitener.corrections(found.residual, noise)
             if self._dry.any() and moving:
                 errors, left = whitener.draw(noise)
-                unsure = np.diff(smoother(errors + whitener.corrections(left, noise)), axis=0)
+                errors = self._scale * (errors + whitener.corrections(left, noise))
+                unsure = np.diff(smoother(errors), axis=0)
                 slow = np.maximum(
                     self._data.slowest, _UNSURE * unsure.std(axis=0) / self._data.period
                 )
@@ -328,6 +356,15 @@ class _Problem:
             found, covariance=covariance, freedom=sure.freedom, likely=likely
         )
 
+    def _noises(self, noise: Vector) -> Vector:
+        """Return the noise of each position, shape (coordinates,), relative to the encoders'."""
+        scale = np.ones(len(noise))
+        if self._data.base is not None:
+            encoder = max(_size(noise[6:]), _FAINT)
+            for part in (slice(0, 3), slice(3, 6)):
+                scale[part] = max(_size(noise[part]), _FAINT) / encoder
+        return scale
+
     def _known_of(self, fitted: Array, values: Vector) -> Vector:
         """Return what is known beforehand as rows: of the fitted values, and what is left."""
         prior, mean = self._priors()
@@ -340,16 +377,16 @@ class _Problem:
             if each.kind == "delay":
                 found[..., place] = -np.gradient(own, self._data.period, axis=0)
             elif each.kind == "gain":
-                joint = self._model.joints.index(each.of)
+                joint = self._model.coordinates.index(each.of)
                 found[:, joint, place] = -own[:, joint]
         return found
 
     def _first(self, path: Path, smoother: Smoother, used: Array) -> Vector:
         """Return the values of least squares along a smoothed path, for torques smoothed alike."""
         smooth = dataclasses.replace(self._data, torques=smoother(self._data.torques))
-        equation = _Problem(self._model, self._parameters, smooth)._equation(
-            path, path, self._nominal, 0
-        )
+        problem = _Problem(self._model, self._parameters, smooth)
+        problem._scale = self._scale
+        equation = problem._equation(path, path, self._nominal, 0)
         target, flat = equation.target, equation.columns[used]
         weights = 1 / np.sqrt(np.mean(np.where(used, target, 0.0) ** 2, axis=0) + 1e-12)
         weights = np.broadcast_to(weights, used.shape)[used]
@@ -415,6 +452,10 @@ class _Problem:
             target - columns @ values, equation.instruments[..., free[sort]], used, path, whitener,
             np.full(rank, float(used.sum() - rank)), self._known_of(free[sort], values),
         )  # fmt: skip
+
+
+def _size(values: Vector) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _unsure(velocities: Vector, slow: Vector) -> Array:
