@@ -152,6 +152,20 @@ def test_dry_friction_that_fades_is_named_and_can_be_left_out():
         identify(log, arm.KNOWN, UNKNOWN, slowest=0.0)
 
 
+def test_an_interval_is_a_profile_where_the_likelihood_is_not_quadratic(clean):
+    known = identify(arm.noisy(clean), arm.hidden(), "delay")["delay"]
+    assert known.method == "quadratic"
+    assert known.low < 0.0 < known.high
+    log = arm.noisy(clean, torque=20.0)
+    found = identify(log, arm.hidden(), "delay")
+    assert "by profile" in str(found)
+    hardly = found["delay"]
+    assert hardly.method == "profile"
+    assert abs(np.log((hardly.high - hardly.value) / (hardly.value - hardly.low))) > 0.1
+    narrow = identify(log, arm.hidden(), "delay", level=0.5)["delay"]
+    assert hardly.low < narrow.low < narrow.high < hardly.high
+
+
 def test_a_hidden_friction_is_named_and_the_level_refused(clean):
     positions, torques = clean
     speed = np.gradient(positions[:, 0], arm.PERIOD)
@@ -428,6 +442,7 @@ def test_the_command_line_prints_stores_and_reports(clean, tmp_path, capsys, mon
     main([*words, "--json"])
     plain = json.loads(capsys.readouterr().out)
     assert plain["estimates"][0]["unit"] == "kg"
+    assert plain["estimates"][0]["method"] == "quadratic"
     assert plain["holds"] is found.holds
 
 

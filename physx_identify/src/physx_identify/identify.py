@@ -16,6 +16,7 @@ from physx_identify.engines import find_engines, refits, world_of
 from physx_identify.estimation.fit import SLOWEST, Data, Fit, fit
 from physx_identify.estimation.inertia import cholesky_of, from_cholesky, is_physical
 from physx_identify.estimation.model import GRAVITY, Model
+from physx_identify.estimation.profile import profile_interval
 from physx_identify.estimation.structure import structure_tests
 from physx_identify.logs.checks import check_log
 from physx_identify.logs.log import Log
@@ -100,7 +101,32 @@ def identify(
     names = model.coordinates[data.rows]
     summary = _summary(log, robot, parameters, found, again, level, seed, names)
     refitted = refits(others, world, model, parameters, found, summary)
-    return dataclasses.replace(summary, engines=refitted)
+    if not summary.converged:
+        return dataclasses.replace(summary, engines=refitted)
+    estimates = [
+        _profiled(each, model, parameters, data, found, level) for each in summary.estimates
+    ]
+    return dataclasses.replace(summary, estimates=estimates, engines=refitted)
+
+
+def _profiled(
+    estimate: Estimate,
+    model: Model,
+    parameters: Sequence[Parameter],
+    data: Data,
+    found: Fit,
+    level: float,
+) -> Estimate:
+    """Return an estimate with the interval of its profile, where that is another one."""
+    place = [each.name for each in parameters].index(estimate.name)
+    if estimate.error is None:
+        return estimate
+    freedom = found.freedom[int(np.flatnonzero(found.independent == place)[0])]
+    width = float(student.ppf(0.5 + 0.5 * level, freedom))
+    ends = profile_interval(model, parameters, data, found, place, width)
+    if ends is None:
+        return estimate
+    return dataclasses.replace(estimate, low=ends[0], high=ends[1], method="profile")
 
 
 def _summary(

@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.linalg import qr, solve_triangular
 
 from physx_core.typing import Array, Vector
@@ -31,6 +32,8 @@ that correct the path at least, and at most. What wrong values leave looks like 
 that comes second."""
 _SETTLED = 1.0
 """Change of a value between two steps, in standard errors, below which the path needs no more."""
+_AROUND = 2
+"""Steps of the other parameters around a value that one is given."""
 _CLOSE = 0.1
 """Change of a value between two steps, in standard errors, that ends them."""
 _LOWEST = 0.2
@@ -148,7 +151,7 @@ def fit(
         start: Values to start at; None: those of least squares along the smoothed path.
         noise: Noise of the log to start with; None: found from the first residual.
     """
-    return _Problem(model, parameters, data).solve(start, noise)
+    return Problem(model, parameters, data).solve(start, noise)
 
 
 @dataclass(frozen=True)
@@ -174,7 +177,15 @@ class _Equation:
     doubt: Vector
 
 
-class _Problem:
+class Problem:
+    """Parameters of a robot in a log.
+
+    Args:
+        model: The robot.
+        parameters: What is unknown.
+        data: The log.
+    """
+
     def __init__(self, model: Model, parameters: Sequence[Parameter], data: Data) -> None:
         self._model, self._parameters, self._data = model, parameters, data
         self._nominal = np.array([each.nominal for each in parameters])
@@ -188,7 +199,10 @@ class _Problem:
             if each.kind in ("gain", "bias", "encoder", "delay")
         ]  # fmt: skip
         self._plain = [each.kind not in ("gain", "delay", "encoder") for each in parameters]
-        self._rows, joints = data.rows, model.coordinates
+        self._rows, self._scale = data.rows, _noises(data)
+        delayed = any(each.kind == "delay" for _, each in self._special)
+        self._smooth = Smoother(data.torques) if delayed else None
+        joints = model.coordinates
         dry = np.zeros(len(joints), bool)
         rubbing = model.numbers[11 * len(joints) : 13 * len(joints)].reshape(2, -1)
         dry |= rubbing.any(axis=0)
@@ -196,7 +210,6 @@ class _Problem:
             if each.kind in ("friction", "stribeck"):
                 dry[joints.index(each.of)] = True
         self._dry = dry
-        self._scale = np.ones(len(joints))
 
     def _positions(self, values: Vector) -> Vector:
         """Return measured positions without the encoders' offsets."""
@@ -222,12 +235,18 @@ class _Problem:
         time = np.arange(len(torques))
         rows = np.clip(time[1:-1] + whole, 0, time[-1])
         rest = self._late(values) - whole
-        if not rest:
+        if not rest or self._smooth is None:
             return torques[rows]
-        smooth = Smoother(torques)(torques)
-        moved = [np.interp(rows + rest, time, own) for own in smooth.T]
-        late: Vector = torques[rows] + np.stack(moved, axis=1) - smooth[rows]
+        smooth = self._smooth(torques)
+        late: Vector = torques[rows] + CubicSpline(time, smooth)(rows + rest) - smooth[rows]
         return late
+
+    def _slopes(self, torques: Vector) -> Vector:
+        """Return how torques change with a delay, without noise, shape (samples - 2, joints)."""
+        assert self._smooth is not None
+        found = np.gradient(self._smooth(np.pad(torques, ((1, 1), (0, 0)), mode="edge")), axis=0)
+        slopes: Vector = -found[1:-1] / self._data.period
+        return slopes
 
     def _equation(self, path: Path, raw: Path, values: Vector, whole: int) -> _Equation:
         """Return what is linear in the parameters, near values of them.
@@ -255,7 +274,8 @@ class _Problem:
             if each.kind == "gain":
                 target = target + columns[..., place]
             elif each.kind in ("delay", "encoder"):
-                columns[..., place] = instruments[..., place]
+                if each.kind == "encoder":
+                    columns[..., place] = instruments[..., place]
                 target = target + columns[..., place] * values[place]
         rows = self._rows
         return _Equation(
@@ -285,7 +305,7 @@ class _Problem:
         columns, known = found[..., :-1], found[..., -1]
         for place, each in self._special:
             if each.kind == "delay":
-                columns[..., place] = -np.gradient(torques, path.period, axis=0)
+                columns[..., place] = self._slopes(torques)
                 continue
             joint = self._model.coordinates.index(each.of)
             if each.kind == "encoder":
@@ -298,7 +318,6 @@ class _Problem:
         """Repeat: noise of the residual, values, path."""
         values = self._nominal if start is None else start
         smoother, fixed = Smoother(self._positions(values)), noise is not None
-        self._scale = self._noises(smoother.noise)
         corrections: Vector | float = 0.0
         whole, settled = 0, False
         slow = np.full(len(self._model.coordinates), self._data.slowest)
@@ -356,14 +375,36 @@ class _Problem:
             found, covariance=covariance, freedom=sure.freedom, likely=likely
         )
 
-    def _noises(self, noise: Vector) -> Vector:
-        """Return the noise of each position, shape (coordinates,), relative to the encoders'."""
-        scale = np.ones(len(noise))
-        if self._data.base is not None:
-            encoder = max(_size(noise[6:]), _FAINT)
-            for part in (slice(0, 3), slice(3, 6)):
-                scale[part] = max(_size(noise[part]), _FAINT) / encoder
-        return scale
+    def distance(self, found: Fit, place: int, value: float) -> float:
+        """Return half the squared distance of the torques if one parameter had another value.
+
+        It is that of the part that instruments explain, whitened by the fit's noise; the other
+        fitted parameters are what makes it least.
+
+        Args:
+            found: The fit.
+            place: Place of the parameter, an independent one.
+            value: Its value.
+        """
+        others = found.independent != place
+        row, free = int(np.argmin(others)), found.independent[others]
+        values, prior = found.values.copy(), self._priors()
+        near = found.covariance[:, row] / found.covariance[row, row]
+        values[found.independent] += near * (value - found.values[place])
+        moved = self._positions(values) - self._positions(found.values)
+        path = dataclasses.replace(found.path, positions=found.path.positions + moved)
+        raw = dataclasses.replace(path, positions=self._positions(values))
+        whole = round(self._late(found.values))
+        for _ in range(_AROUND):
+            equation = self._equation(path, raw, values, whole)
+            whitener = Whitener(equation.stencil, found.used)
+            z, a, y = _whitened(whitener, equation, found.noise, *prior)
+            basis = np.linalg.qr(z[:, found.independent])[0]
+            left = basis.T @ (y - a @ values)
+            slopes = basis.T @ a[:, free]
+            step = np.linalg.lstsq(slopes, left, rcond=None)[0] if len(free) else np.zeros(0)
+            values[free] += step
+        return 0.5 * float(np.sum((left - slopes @ step) ** 2))
 
     def _known_of(self, fitted: Array, values: Vector) -> Vector:
         """Return what is known beforehand as rows: of the fitted values, and what is left."""
@@ -375,7 +416,7 @@ class _Problem:
         found = columns.copy()
         for place, each in self._special:
             if each.kind == "delay":
-                found[..., place] = -np.gradient(own, self._data.period, axis=0)
+                found[..., place] = self._slopes(own)
             elif each.kind == "gain":
                 joint = self._model.coordinates.index(each.of)
                 found[:, joint, place] = -own[:, joint]
@@ -384,9 +425,9 @@ class _Problem:
     def _first(self, path: Path, smoother: Smoother, used: Array) -> Vector:
         """Return the values of least squares along a smoothed path, for torques smoothed alike."""
         smooth = dataclasses.replace(self._data, torques=smoother(self._data.torques))
-        problem = _Problem(self._model, self._parameters, smooth)
-        problem._scale = self._scale
-        equation = problem._equation(path, path, self._nominal, 0)
+        equation = Problem(self._model, self._parameters, smooth)._equation(
+            path, path, self._nominal, 0
+        )
         target, flat = equation.target, equation.columns[used]
         weights = 1 / np.sqrt(np.mean(np.where(used, target, 0.0) ** 2, axis=0) + 1e-12)
         weights = np.broadcast_to(weights, used.shape)[used]
@@ -418,13 +459,7 @@ class _Problem:
         used: Array,
     ) -> Fit:
         target, columns = equation.target, equation.columns
-        factor = whitener.factor(noise)
-        prior, mean = self._priors()
-        z, a = (
-            np.concatenate([whitener.whitened(each, noise, factor), prior])
-            for each in (equation.instruments, columns)
-        )
-        y = np.concatenate([whitener.whitened(target, noise, factor), mean])
+        z, a, y = _whitened(whitener, equation, noise, *self._priors())
         scale = np.linalg.norm(z, axis=0)
         scale[scale == 0] = 1.0
         _, triangle, order = qr(z / scale, mode="economic", pivoting=True)
@@ -454,8 +489,31 @@ class _Problem:
         )  # fmt: skip
 
 
+def _noises(data: Data) -> Vector:
+    """Return the noise of each position, shape (coordinates,), relative to the encoders'."""
+    scale = np.ones(data.positions.shape[1])
+    if data.base is not None:
+        noise = Smoother(data.positions).noise
+        encoder = max(_size(noise[6:]), _FAINT)
+        for part in (slice(0, 3), slice(3, 6)):
+            scale[part] = max(_size(noise[part]), _FAINT) / encoder
+    return scale
+
+
 def _size(values: Vector) -> float:
     return float(np.sqrt(np.mean(values**2)))
+
+
+def _whitened(
+    whitener: Whitener, equation: _Equation, noise: Noise, prior: Vector, mean: Vector
+) -> tuple[Vector, Vector, Vector]:
+    """Return whitened instruments, columns and target, with what is known beforehand as rows."""
+    factor = whitener.factor(noise)
+    z, a = (
+        np.concatenate([whitener.whitened(each, noise, factor), prior])
+        for each in (equation.instruments, equation.columns)
+    )
+    return z, a, np.concatenate([whitener.whitened(equation.target, noise, factor), mean])
 
 
 def _unsure(velocities: Vector, slow: Vector) -> Array:

@@ -23,6 +23,8 @@ class Estimate:
         error: Standard error; None: the parameter cannot be told from others.
         low: Lower end of the interval; None likewise, or if the fit did not converge.
         high: Upper end.
+        method: How the interval was found: ``"quadratic"``, from the standard error; or
+            ``"profile"``, from the likelihood, where it is not quadratic.
         blocks: Standard error from the spread between blocks of the log, relative to `error`: a
             check, about 1.
     """
@@ -39,6 +41,7 @@ class Estimate:
     low: float | None = None
     high: float | None = None
     blocks: float | None = None
+    method: str = "quadratic"
 
 
 @dataclass(frozen=True)

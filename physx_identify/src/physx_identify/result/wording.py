@@ -32,7 +32,8 @@ def between(low: float | None, high: float | None) -> str:
 
 def row_of(each: Estimate) -> tuple[str, ...]:
     """Return the cells of an estimate's row under `HEAD`."""
-    told = "" if each.verdict == "told" else each.verdict
+    words = ["by profile"] if each.method == "profile" else []
+    told = ", ".join(words if each.verdict == "told" else [each.verdict, *words])
     values = number(each.nominal), number(each.value), between(each.low, each.high)
     return each.name, each.unit, *values, told
 
