@@ -21,7 +21,7 @@ from physx_identify.estimation.model import STRIBECK
 from physx_identify.estimation.noise import LikelyNoise
 from physx_identify.estimation.uncertainty import NEW, Values, values_of
 
-SIZE = 0.04
+SIZE = 0.03
 """Share of logs without model error in which the tests together find one, by their probabilities;
 these are approximate, and 1 of 20 is promised."""
 _LAGS = 8
