@@ -15,13 +15,14 @@ Some are also verified, opened for writing, repaired and rebuilt.
 from __future__ import annotations
 
 import argparse
-import itertools
 import multiprocessing
 import os
 import shutil
 import sys
 import tempfile
 import time
+from concurrent.futures import ProcessPoolExecutor
+from itertools import count, repeat
 from pathlib import Path
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "core" / "crash"))
@@ -45,7 +46,7 @@ def work(first: int, step: int, seconds: float) -> Result:
     """Examine every `step`-th history, starting at `first`."""
     root = folder()
     try:
-        return campaign(itertools.count(first, step), root, seconds)
+        return campaign(count(first, step), root, seconds)
     finally:
         shutil.rmtree(root)
 
@@ -53,9 +54,10 @@ def work(first: int, step: int, seconds: float) -> Result:
 def examine(first: int, processes: int, seconds: float) -> Result:
     """Examine histories in several processes."""
     total = Result()
-    with multiprocessing.get_context("spawn").Pool(processes) as pool:
-        jobs = [(first + number, processes, seconds) for number in range(processes)]
-        for result in pool.starmap(work, jobs, chunksize=1):
+    context = multiprocessing.get_context("spawn")
+    with ProcessPoolExecutor(processes, context) as pool:  # tells that one of them has ended
+        firsts = range(first, first + processes)
+        for result in pool.map(work, firsts, repeat(processes), repeat(seconds)):
             total.add(result)
     return total
 

@@ -429,7 +429,6 @@ KNOWN: dict[tuple[str, str], float] = {
     ("plate that swings upwards", "mujoco"): 0.05,
     ("V-groove", "mujoco"): 0.08,
     ("box that spins on its corners", "mujoco"): 0.1,
-    ("Euler's disk, growth of energy", "pinocchio"): 0.01,
     ("Euler's disk, growth of energy", "mujoco"): 0.14,
 }
 """Limits of engines that docs/contacts.md names."""

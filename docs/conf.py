@@ -11,6 +11,7 @@ from sphinx.util.docutils import SphinxDirective
 
 sys.path.insert(0, str(Path(__file__).parent))
 
+import gallery
 import plain_pages
 import public_names
 
@@ -62,6 +63,11 @@ def escape(
     lines[:] = map(public_names.escaped, lines)
 
 
+def write_notebooks(app: Sphinx) -> None:
+    """Write the gallery's scripts as notebooks, which its pages offer."""
+    gallery.write_notebooks()
+
+
 def write_plain_pages(app: Sphinx, error: Exception | None) -> None:
     """Write the pages as plain Markdown beside the site."""
     if error is None:
@@ -70,6 +76,7 @@ def write_plain_pages(app: Sphinx, error: Exception | None) -> None:
 
 def setup(app: Sphinx) -> dict[str, bool]:
     """Add the directive."""
+    app.connect("builder-inited", write_notebooks)
     app.connect("build-finished", write_plain_pages)
     app.add_directive("face", FaceDirective)
     app.connect("autodoc-process-docstring", escape)

@@ -1,17 +1,18 @@
-"""Runs examples in full, keeps their output and pictures, and shows them in docs/gallery.md.
+"""Runs examples in full, keeps their output and pictures, and shows each on a page of its own.
 
 python docs/gallery.py NAME ...    # runs examples/NAME, such as 02_train: minutes
-python docs/gallery.py             # writes the page from the output kept in docs/examples/
+python docs/gallery.py             # writes docs/gallery.md and docs/gallery/ from what is kept
 
-An example's section is built from its beginning: the docstring of a script, the comment of a TOML
-file, or the README of a folder up to its first table. A script draws the picture (``--picture``),
-as a film if its docstring says ``--picture NAME.webp``; other examples leave it where their
-commands are run.
+What is kept is in docs/examples/. An example's page is built from its beginning: the docstring of a
+script, the comment of a TOML file, or the README of a folder up to its first table. A script draws
+the picture (``--picture``), as a film if its docstring says ``--picture NAME.webp``; other examples
+leave it where their commands are run. A script is a notebook as well.
 """
 
 from __future__ import annotations
 
 import ast
+import json
 import re
 import shutil
 import sys
@@ -95,22 +96,64 @@ def draw(name: str, drawn: Path) -> int:
     return status
 
 
-def section(name: str) -> str:
-    """Return an example's section of the page."""
-    title, told = title_of(name), beginning(name).partition("\n")[2]
+def head(name: str, fence: str) -> str:
+    """Return an example's introduction as Markdown, its commands as blocks after `fence`."""
+    told = beginning(name).partition("\n")[2]
+    return f"# {title_of(name)}\n\n{kept.markdown(told.strip(), fence)}"
+
+
+def page(name: str) -> str:
+    """Return an example's page: what it shows, its picture, its output and its source."""
     path, drawn = path_of(name), picture(name)
-    place = f"../examples/{path.name}" + ("/README.md" if path.is_dir() else "")
-    told = kept.markdown(told.strip(), f"{TEST}\n```sh")
-    parts = [f"## {title}", f"[examples/{path.name}]({place})", told]
+    parts = [head(name, f"{TEST}\n```sh")]
     if drawn.is_file():
-        parts.append(f"![{title}](examples/{drawn.name})")
+        parts.append(f"![{title_of(name)}](../examples/{drawn.name})")
     if (PAGE.kept / f"{name}.txt").is_file():
         parts.append(PAGE.printed(name).rstrip("\n"))
-    return "\n\n".join(part for part in parts if part) + "\n"
+    place = f"../../examples/{path.name}"
+    if path.is_dir():
+        parts.append(f"Files: [examples/{path.name}]({place}/README.md)")
+    else:
+        links = f"Source: [{path.name}]({place})"
+        if path.suffix == ".py":
+            links += f", or as a notebook, [{name}.ipynb]({name}.ipynb)"
+            links += "; both import modules of the folder `examples`: put them there"
+        language = {".py": "python"}.get(path.suffix, path.suffix[1:])
+        source = f"```{{literalinclude}} {place}\n:language: {language}\n```"
+        parts += [f"{links}.", source]
+    return "\n\n".join(parts) + "\n"
+
+
+def notebook(name: str) -> str:
+    """Return a script as a notebook in JSON: its docstring as text, its parts as cells."""
+    source = path_of(name).read_text(encoding="utf-8")
+    code = source.split('"""', 2)[2].strip()
+    code = re.sub(r"(?:sys\.exit|raise SystemExit)\((.*)\)$", r"\1", code)  # a kernel goes on
+    begin = (
+        f'import sys\n\n__file__, __doc__ = "{name}.py", {title_of(name)!r}\n'
+        'sys.argv = [__file__, "--small"]  # without it in full'
+    )
+    cells = [("markdown", head(name, "```sh")), ("code", begin)]
+    cells += [("code", part) for part in re.split(r"\n{3,}", code)]
+    only = {"markdown": {}, "code": {"execution_count": None, "outputs": []}}
+    made = [
+        {"cell_type": kind, "id": f"{number}", "metadata": {}, "source": text, **only[kind]}
+        for number, (kind, text) in enumerate(cells)
+    ]
+    kernel = {"name": "python3", "display_name": "Python 3", "language": "python"}
+    whole = {"nbformat": 4, "nbformat_minor": 5, "metadata": {"kernelspec": kernel}, "cells": made}
+    return json.dumps(whole, indent=1, ensure_ascii=False) + "\n"
+
+
+def write_notebooks() -> None:
+    """Write the scripts as notebooks beside their pages."""
+    for name in names():
+        if path_of(name).suffix == ".py":
+            PAGES.joinpath(f"{name}.ipynb").write_text(notebook(name), encoding="utf-8")
 
 
 def title_of(name: str) -> str:
-    """Return the title of an example's section."""
+    """Return the title of an example's page."""
     return beginning(name).partition("\n")[0].rstrip(".")
 
 
@@ -119,12 +162,12 @@ def overview() -> str:
     cells = []
     for name in filter(lambda each: picture(each).is_file(), names()):
         title = title_of(name)
-        anchor = re.sub(r"[^\w -]", "", title.lower()).replace(" ", "-")
-        cells.append(f"[![{title}](examples/{picture(name).name}) {title}](#{anchor})")
+        cells.append(f"[![{title}](examples/{picture(name).name}) {title}](gallery/{name}.md)")
     return "\n" + "\n".join(cells) + "\n"
 
 
-PAGE = kept.Page(HERE / "gallery.md", HERE / "examples", names, run, section, overview)
+PAGES = HERE / "gallery"
+PAGE = kept.Page(HERE / "gallery.md", HERE / "examples", names, run, page, overview, PAGES)
 
 if __name__ == "__main__":
     sys.exit(PAGE.main(__doc__ or ""))

@@ -25,7 +25,7 @@ def markdown(told: str, fence: str) -> str:
 
 @dataclass(frozen=True)
 class Page:
-    """A page that ends with programs and the output of their last runs.
+    """A page that ends with programs and the output of their last runs, or leads to them.
 
     Attributes:
         path: The page. Everything before its mark is written by hand.
@@ -34,6 +34,7 @@ class Page:
         run: Runs a program and returns its exit status; its output goes through `keep`.
         section: Returns a program's section of the page.
         overview: Returns what comes before the sections.
+        folder: Folder of the sections, if each is a page of its own.
     """
 
     path: Path
@@ -42,17 +43,28 @@ class Page:
     run: Callable[[str], int]
     section: Callable[[str], str]
     overview: Callable[[], str] = str
+    folder: Path | None = None
 
     @property
     def mark(self) -> str:
         """The line after which nothing is written by hand."""
         return f"<!-- What follows is written by {self.path.stem}.py. -->"
 
-    def text(self) -> str:
-        """Return the page as it should be, with its hand-written part unchanged."""
+    def texts(self) -> dict[Path, str]:
+        """Return the pages as they should be, by path, with the hand-written part unchanged."""
         written = self.path.read_text(encoding="utf-8").partition(self.mark)[0]
         begin = f"{written}{self.mark}\n{self.overview()}"
-        return "\n".join([begin, *map(self.section, self.names())])
+        sections = {name: self.section(name) for name in self.names()}
+        if self.folder is None:
+            return {self.path: "\n".join([begin, *sections.values()])}
+        pages = {self.folder / f"{name}.md": text for name, text in sections.items()}
+        return {self.path: begin, **pages}
+
+    def write(self) -> None:
+        """Write the pages."""
+        for path, text in self.texts().items():
+            path.parent.mkdir(exist_ok=True)
+            path.write_text(text, encoding="utf-8")
 
     def keep(self, name: str, words: Sequence[str], folder: Path | None = None) -> int:
         """Run a command in a folder, keep what it prints, and return its exit status."""
@@ -82,7 +94,7 @@ class Page:
         if unknown := set(asked) - set(self.names()):
             parser.error(f"no {', '.join(unknown)}; there are {', '.join(self.names())}")
         failed = [name for name in asked if self.run(name)]
-        self.path.write_text(self.text(), encoding="utf-8")
+        self.write()
         for name in failed:
             print(f"{name} misses a target", file=sys.stderr)
         return len(failed) > 0

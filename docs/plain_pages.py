@@ -17,6 +17,7 @@ ROOT = Path(__file__).parents[1]
 INDEX = ROOT / "docs/index.md"
 _TOCTREE = re.compile(r"```\{toctree\}\n(.*?)```\n*", re.DOTALL)
 _FACE = re.compile(r"```\{eval-rst\}\n\.\. face:: ([\w.]+)\n```")
+_SOURCE = re.compile(r"```\{literalinclude\} (\S+)\n:language: (\w+)\n```")
 _COMMENT = re.compile(r"<!--.*?-->\n", re.DOTALL)
 
 
@@ -41,6 +42,7 @@ def _pages(page: Path, body: str) -> Iterator[Path]:
 def plain(page: Path) -> str:
     """Return a page without the site's directives; the reference has the docstrings instead."""
     text = _COMMENT.sub("", _TOCTREE.sub("", page.read_text()))
+    text = _SOURCE.sub(lambda it: f"```{it[2]}\n{(page.parent / it[1]).read_text()}```", text)
     return _FACE.sub(lambda match: _docstrings(match[1]), text)
 
 

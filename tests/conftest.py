@@ -73,6 +73,7 @@ def pytest_report_header():
 
 
 def pytest_runtest_setup(item):
+    os.environ["COLUMNS"] = "1000"  # tests look for sentences: what is printed has whole lines
     RUNNING["quick"] = not any(map(item.get_closest_marker, ("processes", "slow", "faults")))
 
 

@@ -121,7 +121,22 @@ def test_an_example_is_short_and_tells_what_it_is(path):
 
 
 def test_the_gallery_is_what_the_examples_say():
-    assert gallery.PAGE.path.read_text() == gallery.PAGE.text(), "python docs/gallery.py writes it"
+    pages = gallery.PAGE.texts()
+    for path, text in pages.items():
+        assert path.read_text() == text, "python docs/gallery.py writes it"
+    assert set(gallery.PAGES.glob("*.md")) == pages.keys() - {gallery.PAGE.path}
+
+
+def test_each_script_is_a_notebook():
+    nbformat = pytest.importorskip("nbformat")
+    for path in SCRIPTS:
+        made = nbformat.reads(gallery.notebook(path.stem), 4)
+        nbformat.validate(made)
+        first, *cells = made.cells
+        assert first.source.startswith(f"# {gallery.title_of(path.stem)}\n")
+        [*same, last] = [ast.unparse(each) for c in cells[1:] for each in ast.parse(c.source).body]
+        [*script, end] = map(ast.unparse, ast.parse(path.read_text()).body[1:])
+        assert same == script and last.split("\n")[-1].strip() in end and "xit(" not in last
 
 
 def test_the_gallery_has_everything_there_is():

@@ -40,7 +40,7 @@ from physx_identify.estimation.noise import Noise, Whitener
 from physx_identify.excitation import expected_errors
 from physx_mujoco import MujocoBackend
 from physx_report import write_report
-from physx_sim import JointSettings, Motor, Robot, World
+from physx_sim import JointCoupling, JointSettings, Motor, Robot, World
 
 UNKNOWN = ("mass", "damping", "friction")
 
@@ -458,6 +458,9 @@ def test_wrong_unknowns_are_named(clean):
         identify(log, arm.KNOWN, ["mass", "mass:lower"])
     with pytest.raises(IdentificationError, match="floats"):
         identify(log, Robot("double_pendulum", fixed_base=False), "mass")
+    coupled = Robot("double_pendulum", couplings=[JointCoupling({"shoulder": 1, "elbow": 2})])
+    with pytest.raises(IdentificationError, match="of coupled joints"):
+        identify(log, coupled, "mass")
     with pytest.raises(ConfigError, match="level"):
         identify(log, arm.KNOWN, "mass", level=2.0)
 

@@ -63,9 +63,11 @@ GIVEN: dict[type[Any], dict[str, Any]] = {
         **{"damping": 0.5, "friction": 0.25, "stiffness": 2.0, "rest": 0.5, "armature": 0.125}
     },
     physx_sim.Mimic: {"leader": "knee", "multiplier": -0.5, "offset": 0.25},
+    physx_sim.JointCoupling: {"joints": {"knee": 0.5, "hip": -2.0}, "offset": 0.25},
     physx_sim.Weld: {"body_a": "hand", "position": (1.0, 0.5, 0.25)}
     | {"orientation": BODY["orientation"]},
     physx_sim.Connect: {"body_a": "hand", "point_a": (1.0, 0.5, 0.25), "point_b": (0.5, 2.0, 1.0)},
+    physx_sim.Wheel: {"link": "wheel", "radius": 0.25, "axis": (1.0, 0.5, 0.25)},
     physx_sim.Robot: {
         "urdf": "arm.urdf",
         "feet": {"foot": 0.25},

@@ -57,7 +57,11 @@ def test_a_page_to_learn_from_is_short(page):
 
 
 def test_code_fits_the_page():
-    written = [page for page in run_pages.PAGES if page.name not in GENERATED]
+    written = [
+        page
+        for page in run_pages.PAGES
+        if page.name not in GENERATED and page.parent.name != "gallery"
+    ]
     blocks = [block for page in written for block in run_pages.read(page)]
     code = [block for block in blocks if block.language not in ("", "text")]
     assert [
@@ -178,7 +182,8 @@ def test_every_error_has_a_cause_and_a_cure(root):
 
 
 def test_the_page_of_figures_is_what_the_benchmarks_say():
-    assert figures.PAGE.path.read_text() == figures.PAGE.text()
+    [(path, text)] = figures.PAGE.texts().items()
+    assert path.read_text() == text
     for page, table in figures.tables().items():
         assert page.read_text() == figures.with_table(page, table)
 
@@ -198,7 +203,7 @@ def test_llms_txt_lists_every_page_and_each_page_is_plain_markdown(root, tmp_pat
     assert pages - {"docs/index.md"} <= set(listed)
     for name in listed:
         plain = (tmp_path / name).read_text()
-        assert plain.startswith("# ") and "{toctree}" not in plain and "{eval-rst}" not in plain
+        assert plain.startswith("# ") and not re.search(r"^```\{", plain, re.MULTILINE)
     reference = plain_pages.plain(root / "docs/reference/physx_core.md")
     assert "### Environment(" in reference and "#### Dataset.append(" in reference
 

@@ -11,7 +11,7 @@ from numpy.testing import assert_array_equal
 
 from physx_core import Dataset, Field
 from physx_core.errors import ConfigError
-from physx_formats import ExportOptions, export
+from physx_formats import ExportOptions, export, import_file
 
 pytestmark = pytest.mark.processes
 
@@ -89,6 +89,16 @@ def test_xarray_opens_the_zarr_folder(dataset, tmp_path):
         assert list(tree.children) == ["training"]
 
 
+def link_ffmpeg(folder):
+    """Return a folder with PyAV's FFmpeg under the names by which LeRobot's decoder finds it."""
+    folder.mkdir(exist_ok=True)
+    own = Path(pytest.importorskip("av").__file__).parents[1] / "av.libs"
+    for path in [*own.glob("libav*.so.*"), *own.glob("libsw*.so.*")]:
+        name, _, version = path.name.partition(".so.")
+        (folder / f"{name.split('-')[0]}.so.{version.split('.')[0]}").symlink_to(path)
+    return folder
+
+
 def run_lerobot(tmp_path, program, *words):
     """Run a program with LeRobot, and return what it printed."""
     library = Path(sys.prefix) / "lerobot"
@@ -96,7 +106,8 @@ def run_lerobot(tmp_path, program, *words):
         assert not os.environ.get("CI"), f"{library} is missing: make test installs it"
         pytest.skip(f"LeRobot is not installed in {library}: make test installs it")
     offline = {"HF_HUB_OFFLINE": "1", "HF_HOME": str(tmp_path / "home")}
-    variables = os.environ | offline | {"PYTHONPATH": str(library)}
+    places = {"PYTHONPATH": str(library), "LD_LIBRARY_PATH": str(link_ffmpeg(tmp_path / "ffmpeg"))}
+    variables = os.environ | offline | places
     command = [sys.executable, PROGRAMS / program, *words]
     ended = subprocess.run(command, env=variables, capture_output=True, text=True, check=False)
     assert not ended.returncode, ended.stderr
@@ -144,3 +155,48 @@ def test_lerobot_loads_its_format(dataset, tmp_path):
         assert_array_equal(found["ahead"][:, 1], rows["state"].astype("f4")[following])
         assert found["mean"] == pytest.approx(rows["state"].mean(axis=0))
         assert set(found["tasks"]) == {"swing"}
+
+
+def camera_rows():
+    """Rows of three trajectories, with pictures that change smoothly."""
+    step, y, x = np.ogrid[:ROWS, :24, :32]
+    phases = [step / 9 + x / 30 + 0 * y, step / 7 - y / 20 + 0 * x, (x + y - step) / 30]
+    pictures = (128 + 100 * np.sin(np.stack(phases, axis=3))).astype("u1")
+    episode, number = np.divmod(np.arange(ROWS), 20)
+    state = np.arange(ROWS * 2.0).reshape(ROWS, 2)
+    return {"q": state, "camera": pictures, "episode": episode, "step": number}
+
+
+@pytest.mark.faults
+def test_lerobot_decodes_its_videos(tmp_path):
+    """Its decoder, torchcodec, finds by their times the pictures that the import finds, too."""
+    rows = camera_rows()
+    with Dataset.create(tmp_path / "data") as dataset:
+        dataset.append("training", rows)
+        named = {"observation.state": ["q"], "observation.images.top": ["camera"]}
+        options = ExportOptions(features=named, fps=50)
+        export(dataset, "lerobot", tmp_path / "arm", options=options)
+    run_lerobot(tmp_path, "read_lerobot.py", tmp_path / "arm", tmp_path / "out.npz")
+    import_file(tmp_path / "arm", tmp_path / "back")
+    with np.load(tmp_path / "out.npz") as found, Dataset.open(tmp_path / "back") as back:
+        seen = 255 * found["observation.images.top"].transpose(0, 2, 3, 1)
+        assert np.abs(seen - rows["camera"]).mean() < 2
+        assert_array_equal(seen.round(), back["training"]["camera"][:])
+
+
+@pytest.mark.faults
+def test_what_lerobot_has_recorded_is_imported(tmp_path):
+    rows = camera_rows()
+    np.savez(tmp_path / "rows.npz", **rows)
+    run_lerobot(tmp_path, "write_lerobot.py", tmp_path / "rows.npz", tmp_path / "recorded")
+    import_file(tmp_path / "recorded", tmp_path / "data")
+    with Dataset.open(tmp_path / "data") as dataset:
+        found = dataset["training"]
+        assert_array_equal(found["observation_state"][:], rows["q"])
+        assert_array_equal(found["observation_images_png"][:], rows["camera"])
+        for row, picture in enumerate(found["observation_images_video"][:].astype("f8")):
+            apart = np.abs(rows["camera"] - picture).mean(axis=(1, 2, 3))
+            assert apart.argmin() == row and apart[row] < 8
+        assert_array_equal(found["episode"][:], rows["episode"])
+        assert_array_equal(found["task_index"][:], rows["episode"])
+        assert dataset.info["tasks"] == ["task 0", "task 1", "task 2"]

@@ -1,5 +1,6 @@
 """Notebooks: classes of cells run in clients; what cells show is short."""
 
+from html import unescape
 from pathlib import Path
 
 import pytest
@@ -24,7 +25,7 @@ def run(folder, *cells):
 
 
 def shown(outputs):
-    found = {"stdout": "", "stderr": "", "result": "", "html": "", "error": ""}
+    found = {"stdout": "", "stderr": "", "result": "", "html": "", "error": "", "widget": ""}
     for each in outputs:
         if each.output_type == "stream":
             found[each.name] += each.text
@@ -33,17 +34,22 @@ def shown(outputs):
         else:
             found["result"] += each.data.get("text/plain", "")
             found["html"] += each.data.get("text/html", "")
+            found["widget"] += str(each.data.get("application/vnd.jupyter.widget-view+json", ""))
     return found
 
 
 def test_the_page_runs_as_a_notebook(tmp_path):
     cells = [block.text for block in run_pages.read(PAGE)]
-    _, generated, trained, dataset, pipeline = run(tmp_path, *cells, "training")
-    assert generated["error"] == trained["error"] == ""
+    *others, dataset, pipeline = run(tmp_path, *cells, "training")
+    _, generated, trained, report = others
+    assert [each["error"] for each in (*others, dataset)] == [""] * 5
     assert "samples: 1,000 training in sessions/pendulum/dataset" in generated["stdout"]
     assert generated["stderr"] == ""
     assert "<table>" in trained["html"]
-    assert dataset["result"] == "<Dataset sessions/pendulum/dataset: 1,000 training>"
+    assert 'srcdoc="&lt;!doctype html&gt;' in report["html"] and report["stdout"] == ""
+    assert "next_state" in report["html"] and "<script" not in unescape(report["html"])
+    assert dataset["widget"] and dataset["stdout"] == ""
+    assert dataset["result"].endswith("<Dataset sessions/pendulum/dataset: 1,000 training>")
     assert pipeline["result"].startswith("Training(") and len(pipeline["result"]) < 400
 
 

@@ -419,6 +419,8 @@ def test_mistakes_are_named(capsys):
         write_report("sessions/data", "nowhere/else/page.html")
     assert main(["report", "sessions/data", "--output", "page.html"]) == 0
     assert "report: page.html" in capsys.readouterr().out
+    read_results("sessions/data")["data_generation"].show()
+    assert capsys.readouterr().out == "report: sessions/data/report.html\n"
 
 
 def test_a_figure_depends_on_its_numbers_alone():

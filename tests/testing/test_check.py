@@ -16,6 +16,7 @@ PROGRAMS = Path(__file__).with_name("programs")
 def test_a_plugin_that_keeps_its_contracts(capsys):
     assert main(["check", "toy"]) == 0
     lines = capsys.readouterr().out.splitlines()
+    assert max(map(len, lines)) <= 80
     assert lines[0].split() == ["kind", "component", "passed", "failed", "expected", "skipped"]
     rows = {tuple(line.split()[:2]): line.split()[2:] for line in lines[1:]}
     assert rows.keys() == {

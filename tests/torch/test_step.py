@@ -11,6 +11,7 @@ from physx_sim import (
     Cylinder,
     Ground,
     HeightField,
+    JointCoupling,
     JointSettings,
     Mimic,
     Robot,
@@ -23,6 +24,7 @@ from physx_torch import Step
 
 GROUND = Ground(friction=0.5)
 UPRIGHT = [0.0, 0.0, 0.0, 1.0]
+DIFFERENTIAL = JointCoupling({"shoulder": 1, "elbow": 2}, 0.5)
 LIMITED = {"shoulder": JointSettings(damping=0.2), "elbow": JointSettings(friction=0.3)}
 
 
@@ -96,6 +98,10 @@ CASES = {
     ),
     "followed": arm(
         {"elbow": JointSettings(mimic=Mimic("shoulder", 0.5))}, [0.3, 0.15], [0.2, 0.1], [0.1, 0.2]
+    ),
+    "coupled": (
+        World([Robot("double_pendulum", couplings=[DIFFERENTIAL])]),
+        [0.3, 0.1], [0.2, -0.1], [0.1, 0.2],
     ),
 }  # fmt: skip
 

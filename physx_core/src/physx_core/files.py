@@ -24,6 +24,7 @@ from physx_core.typing import Array
 FULL = (errno.ENOSPC, errno.EDQUOT, errno.EFBIG)
 """Error numbers for a full disk, an exhausted quota, and the maximum file size."""
 
+_BLOCK = 2**18
 _SAFELY = os.O_NOFOLLOW | os.O_NONBLOCK | os.O_CLOEXEC
 
 
@@ -87,6 +88,16 @@ def open_regular(path: Path | str, flags: int = os.O_RDONLY) -> int:
         os.close(descriptor)
         raise OSError(errno.EINVAL, "it is not a regular file", str(path))
     return descriptor
+
+
+@contextlib.contextmanager
+def opened(path: Path, flags: int = os.O_RDONLY) -> Iterator[int]:
+    """Open a file as `open_regular` does, and close it at the end of the block."""
+    descriptor = open_regular(path, flags)
+    try:
+        yield descriptor
+    finally:
+        os.close(descriptor)
 
 
 def create_new(path: Path) -> int:
@@ -203,19 +214,16 @@ def read_content(path: Path, limit: int) -> bytes:
         return file.read(size)
 
 
-def read_blocks(path: Path, nbytes: int = 2**18) -> Iterator[memoryview]:
+def read_blocks(path: Path) -> Iterator[memoryview]:
     """Yield the contents of a file in blocks; each is valid until the next one.
 
     Raises:
         OSError: If it cannot be read.
     """
-    descriptor = open_regular(path)
-    try:
-        buffer = memoryview(bytearray(nbytes))
+    with opened(path) as descriptor:
+        buffer = memoryview(bytearray(_BLOCK))
         while count := os.readv(descriptor, [buffer]):
             yield buffer[:count]
-    finally:
-        os.close(descriptor)
 
 
 def read_head(descriptor: int, limit: int) -> bytes:
@@ -323,11 +331,8 @@ def sync(descriptor: int) -> None:
 
 def start_sync(path: Path) -> None:
     """Start writing the content of a file to the disk, without waiting for it."""
-    descriptor = open_regular(path)
-    try:
+    with opened(path) as descriptor:
         os.posix_fadvise(descriptor, 0, 0, os.POSIX_FADV_DONTNEED)
-    finally:
-        os.close(descriptor)
 
 
 def sync_file(path: Path) -> None:
@@ -337,11 +342,8 @@ def sync_file(path: Path) -> None:
         SyncError: If the disk fails.
         OSError: If there is no such file.
     """
-    descriptor = open_regular(path)
-    try:
+    with opened(path) as descriptor:
         sync(descriptor)
-    finally:
-        os.close(descriptor)
 
 
 def sync_folder(folder: Path) -> None:

@@ -47,7 +47,7 @@ def join(field: Field, rows: Sequence[Array]) -> tuple[Array, Index]:
     buffers: Any = rows
     try:
         content = bytearray().join(buffers)  # NumPy would copy entry by entry
-    except BufferError:  # not contiguous
+    except TypeError:  # not contiguous
         buffers = [np.ascontiguousarray(row) for row in rows]
         content = bytearray().join(buffers)
     entries = np.frombuffer(content, field.numpy_dtype) if content else np.empty(0, field.dtype)

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
@@ -22,6 +21,12 @@ IDENTITY: Quaternion = (0.0, 0.0, 0.0, 1.0)
 """Quaternion of no rotation."""
 _CONJUGATE = np.array([-1.0, -1.0, -1.0, 1.0])
 _NEXT = np.array([1, 2, 0])
+_UNIT = np.eye(3).ravel()
+_TO_MATRIX = np.zeros((16, 9))
+"""Maps the products of all pairs of components to the matrix minus the unit matrix, by rows."""
+_TO_MATRIX[[5, 10, 1, 11, 2, 7], [0, 0, 1, 1, 2, 2]] = -2.0, -2.0, 2.0, -2.0, 2.0, 2.0
+_TO_MATRIX[[1, 11, 0, 10, 6, 3], [3, 3, 4, 4, 5, 5]] = 2.0, 2.0, -2.0, -2.0, 2.0, -2.0
+_TO_MATRIX[[2, 7, 6, 3, 0, 5], [6, 6, 7, 7, 8, 8]] = 2.0, -2.0, 2.0, 2.0, -2.0, -2.0
 
 
 # Products ---------------------------------------------------------------------------------------
@@ -178,21 +183,20 @@ def to_roll_pitch_yaw_rows(quaternions: Vector) -> Vector:
 def to_matrix(quaternion: Vector | Sequence[float]) -> Vector:
     """Return the rotation matrix of a quaternion, shape (3, 3)."""
     x, y, z, w = map(float, quaternion)
-    return np.array(_matrix(x, y, z, w))
+    return np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
+            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
+            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
+        ]
+    )
 
 
 def to_matrix_rows(quaternions: Vector) -> Vector:
     """Return the rotation matrices of quaternions (..., 4), shape (..., 3, 3)."""
-    x, y, z, w = np.moveaxis(quaternions, -1, 0)
-    return np.moveaxis(np.array(_matrix(x, y, z, w)), (0, 1), (-2, -1))
-
-
-def _matrix(x: Any, y: Any, z: Any, w: Any) -> list[list[Any]]:
-    return [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-        [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-        [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-    ]
+    products = quaternions[..., :, None] * quaternions[..., None, :]
+    found: Vector = products.reshape(*quaternions.shape[:-1], 16) @ _TO_MATRIX
+    return (found + _UNIT).reshape(*quaternions.shape[:-1], 3, 3)
 
 
 def from_matrix_rows(matrices: Vector) -> Vector:

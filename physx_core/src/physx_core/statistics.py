@@ -189,7 +189,7 @@ class Cells(NamedTuple):
     """Statistics of several sets of rows, each apart, as `RunningStatistics.arrays` has them.
 
     Attributes:
-        rows: Numbers of rows, int64, shape (cells,).
+        rows: Numbers of rows, int64, shape (cells,); 0: the others say nothing.
         mean, squares, minimum, maximum: float64, shape (*statistics shape, cells).
     """
 
@@ -239,6 +239,10 @@ class Cells(NamedTuple):
             running.update(block)
         return cls(*(array[..., None] for array in running.arrays().values()))
 
+    def empty(self) -> Cells:
+        """Return a cell without rows, beside these."""
+        return Cells(*(np.zeros((*column.shape[:-1], 1), column.dtype) for column in self))
+
     @classmethod
     def joined(cls, parts: Sequence[Cells]) -> Cells:
         """Return the cells of all parts, in order."""
@@ -252,6 +256,8 @@ class Cells(NamedTuple):
     def merged(self) -> RunningStatistics:
         """Return the statistics of all rows; they depend on the cells and their order alone."""
         found = RunningStatistics()
+        if not self.rows.all():
+            return self.take(np.flatnonzero(self.rows)).merged()
         if not len(self.rows):
             return found
         found._start_at(self.mean[..., 0].copy())

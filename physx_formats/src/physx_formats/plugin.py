@@ -17,7 +17,7 @@ def physx_formats() -> Components:
         "vtkhdf": "physx_formats.files.vtkhdf:FORMAT",
         "zarr": "physx_formats.files.zarr:FORMAT",
         "minari": "physx_formats.files.minari:FORMAT",
-        "lerobot": "physx_formats.files.lerobot:FORMAT",
+        "lerobot": "physx_formats.files.lerobot.format:FORMAT",
         "mcap": "physx_formats.files.mcap:FORMAT",
         "deepphysx": "physx_formats.files.deepphysx:FORMAT",
     }

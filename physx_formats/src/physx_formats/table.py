@@ -44,7 +44,8 @@ class ExportOptions:
         fps: Frames per second of simulated time (lerobot, which requires it, and vtkhdf).
         task: Description of the task (lerobot only).
         features: Fields of a feature, by its name: "observation.state" (lerobot only). Those of
-            several fields are one vector.
+            several fields are one vector; pictures, uint8 of shape (height, width, 3), that are
+            observations, such as "observation.images.top", become videos.
         points: Field with the positions of the mesh's points, of rows or of episodes, shape
             (points, 1 to 3) (vtkhdf only, and required there).
         cells: Field with the numbers of each cell's points, shape (cells, points of each)
@@ -145,6 +146,12 @@ class Column(Protocol):
     def read(self, start: int, count: int) -> Array:
         """Return the next `count` rows, which begin at `start`."""
         ...
+
+
+def is_picture(field: Field) -> bool:
+    """Return whether a field has the colors of pictures, uint8 of shape (height, width, 3)."""
+    shape = field.shape or ()
+    return field.numpy_dtype == np.uint8 and len(shape) == 3 and shape[2] == 3 and 0 not in shape
 
 
 def check_new(path: Path) -> None:

@@ -22,6 +22,20 @@ class Window:
         return np.ndarray(self.shape, self.dtype, self.whole, self.offset, self.strides)
 
 
+def whole_of(array: NDArray[Any]) -> NDArray[Any]:
+    """Return the array that another one is a part of, or that itself."""
+    while type(array.base) is np.ndarray:
+        array = array.base
+    return array
+
+
+def window_of(array: NDArray[Any]) -> Window | None:
+    """Return an array as a part of the whole; None if it is the whole, or that is not its own."""
+    whole = whole_of(array)
+    owns = whole.base is None and whole.flags.c_contiguous
+    return Window(whole, array) if owns and whole is not array else None
+
+
 class SharedArrays:
     """An object whose views of its arrays, even in containers, stay views through pickling."""
 
@@ -43,11 +57,7 @@ def _close(value: Any) -> Any:
     """Return a value with windows instead of views."""
     if type(value) is not np.ndarray:
         return _map(_close, value)
-    whole = value
-    while type(whole.base) is np.ndarray:
-        whole = whole.base
-    owns = whole.base is None and whole.flags.c_contiguous
-    return Window(whole, value) if owns and whole is not value else value
+    return window_of(value) or value
 
 
 def _open(value: Any) -> Any:

@@ -101,11 +101,9 @@ def identify(
     names = model.coordinates[data.rows]
     summary = _summary(log, robot, parameters, found, again, level, seed, names)
     refitted = refits(others, world, model, parameters, found, summary)
-    if not summary.converged:
-        return dataclasses.replace(summary, engines=refitted)
-    estimates = [
-        _profiled(each, model, parameters, data, found, level) for each in summary.estimates
-    ]
+    estimates = summary.estimates
+    if summary.converged:
+        estimates = [_profiled(each, model, parameters, data, found, level) for each in estimates]
     return dataclasses.replace(summary, estimates=estimates, engines=refitted)
 
 

@@ -5,17 +5,18 @@ A step is repeated with adjusted torques until it ends with the desired velociti
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 
 import mujoco
 import numpy as np
 
 from physx_core.typing import Vector
 from physx_mujoco.robot import Running
-from physx_sim import Layout, Mimic
+from physx_sim import Layout
+from physx_sim.engines import Parts
 
 _STIFF = 1e6
-"""Inertia, in kg m² or kg, with which joints that follow others move together."""
+"""Inertia, in kg m² or kg, with which coupled joints move together."""
 _MOST, _EXACT = 30, 1e-10
 """Maximum repetitions of a step, and the relative velocity error at which they end."""
 
@@ -24,27 +25,29 @@ class Drives:
     """The joints whose velocities are controlled or limited; `idle` if there are none.
 
     Args:
-        layout: The joints.
-        followers: Those that follow others, with their leaders and how: the velocity limit of a
-            follower limits its leader.
+        parts: The world; the velocity limit of a joint that follows another limits its leader.
+        layout: Its joints.
         running: The world.
         step: Simulates a physics step.
     """
 
     def __init__(
-        self,
-        layout: Layout,
-        followers: Iterable[tuple[int, int, Mimic]],
-        running: Running,
-        step: Callable[[], None],
+        self, parts: Parts, layout: Layout, running: Running, step: Callable[[], None]
     ) -> None:
         self._running, self._step, modes = running, step, np.array(layout.modes)
         self._driven = modes != "force"
         self._places = np.array(list(layout.velocity_index.values()), np.intp)
         fastest = layout.max_velocity.copy()
-        for follower, leader, mimic in followers:
-            fastest[leader] = min(fastest[leader], fastest[follower] / abs(mimic.multiplier))
-            fastest[follower] = np.inf
+        rows = [np.zeros((0, len(fastest)))]
+        for movable, part in zip(parts.movables, layout.parts.values(), strict=True):
+            own = fastest[part.joints]
+            for follower, leader, mimic in movable.model.followers:
+                own[leader] = min(own[leader], own[follower] / abs(mimic.multiplier))
+                own[follower] = np.inf
+            coupled = movable.model.coupling_rows[0]
+            rows.append(np.zeros((len(coupled), len(fastest))))
+            rows[-1][:, part.joints] = coupled
+        self._rows = np.concatenate(rows)
         self._fastest = np.where(self._driven, np.inf, fastest)
         self._strongest = np.where(modes == "velocity", np.inf, layout.max_torque)
         self.idle = not (self._driven.any() or np.isfinite(self._fastest).any())
@@ -87,10 +90,7 @@ class Drives:
         model, period = self._running.model, self._running.model.opt.timestep
         mass = np.diag(period * model.dof_damping)
         mass += np.diag(period**2 * model.jnt_stiffness[model.dof_jntid])
-        for place in np.flatnonzero(model.eq_type == mujoco.mjtEq.mjEQ_JOINT):
-            pair = model.jnt_dofadr[[model.eq_obj1id[place], model.eq_obj2id[place]]]
-            row = np.array([1.0, -model.eq_data[place, 1]])
-            mass[np.ix_(pair, pair)] += _STIFF * np.outer(row, row)
+        mass[np.ix_(self._places, self._places)] += _STIFF * self._rows.T @ self._rows
         plain = np.zeros_like(mass)
         mujoco.mj_fullM(model, self._running.data, plain)
         found: Vector = np.linalg.inv(plain + mass)[np.ix_(self._places, self._places)]

@@ -14,7 +14,7 @@ import numpy as np
 
 from physx_core.rotations import to_matrix
 from physx_core.typing import Index, Vector
-from physx_sim import Ground, HeightField, Mimic, Stairs
+from physx_sim import Ground, HeightField, Stairs
 from physx_sim.engines import (
     CollisionShape,
     Joint,
@@ -192,9 +192,7 @@ class ModelBuilder:
                 ):  # else it collides with its fixed parent
                     self._spec.add_exclude(bodyname1=new.parent.name, bodyname2=new.name)
             added.append(new)
-        for follower, leader, mimic in movable.model.followers:
-            names = (f"{place} {movable.model.joints[each].name}" for each in (follower, leader))
-            self._couple(mimic, *names)
+        self._couple(place, movable)
         masks = self._masks(place, movable)
         for shape in movable.model.shapes:
             link = 0 if movable.is_object else movable.model.links.index(shape.body)
@@ -210,12 +208,16 @@ class ModelBuilder:
         self._count += 1
         return new
 
-    def _couple(self, mimic: Mimic, follower: str, leader: str) -> None:
-        """Make a joint follow another, given their names in the model."""
-        kind = mujoco.mjtEq.mjEQ_JOINT
-        added = self._spec.add_equality(type=kind, name1=follower, name2=leader)
-        added.data[:5] = mimic.offset, mimic.multiplier, 0.0, 0.0, 0.0
-        added.solref, added.solimp = self._hard.values()
+    def _couple(self, place: int, movable: MovableBody) -> None:
+        """Couple joints: a tendon has the length of a sum of their positions."""
+        for number, (row, length) in enumerate(zip(*movable.model.coupling_rows, strict=True)):
+            tendon = self._spec.add_tendon(name=f"{place} {number}")
+            for joint in np.flatnonzero(row):
+                tendon.wrap_joint(f"{place} {movable.model.joints[joint].name}", row[joint])
+            kind = mujoco.mjtEq.mjEQ_TENDON
+            added = self._spec.add_equality(type=kind, name1=tendon.name)
+            added.data[:5] = length, 0.0, 0.0, 0.0, 0.0
+            added.solref, added.solimp = self._hard.values()
 
     def _add_joint(self, new: Any, joint: Joint, axis: Vector, name: str) -> None:
         kind = mujoco.mjtJoint

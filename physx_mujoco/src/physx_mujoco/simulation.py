@@ -63,7 +63,9 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
     """A world in MuJoCo."""
 
     engine = "mujoco"
-    lacks: ClassVar[frozenset[str]] = frozenset({"derivatives", "restitution", "step_derivatives"})
+    lacks: ClassVar[frozenset[str]] = frozenset(
+        {"derivatives", "restitution", "rolling", "step_derivatives"}
+    )
     caveats: ClassVar[Mapping[str, str]] = {
         "attachments": f"while it runs, {SPARE} more than at the start; soft",
         "cameras": "with EGL or OSMesa",
@@ -96,12 +98,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
             for movable, part in zip(parts.movables, layout.parts.values(), strict=True)
         ]
         self._contact_rows = ContactRows(self._world, data)
-        followers = [
-            (part.joints.start + follower, part.joints.start + leader, mimic)
-            for movable, part in zip(parts.movables, layout.parts.values(), strict=True)
-            for follower, leader, mimic in movable.model.followers
-        ]
-        self._drives = Drives(layout, followers, self._running, self._contact_rows.step)
+        self._drives = Drives(parts, layout, self._running, self._contact_rows.step)
         self._touches = model.geom_contype.copy(), model.geom_conaffinity.copy()
         super().__init__(parts, robots, () if world.integrator == "euler" else RK4_LACKS)
 
@@ -111,6 +108,8 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
             raise FeatureNotSupportedError(self.engine, f"detector {world.detector}", features)
         if world.integrator == "rk4":
             check_rk4(parts, self.engine, features)
+        if parts.rolling:
+            raise FeatureNotSupportedError(self.engine, "rolling", features)
         shapes = [shape for movable in parts.movables for shape in movable.model.shapes]
         if any(shape.restitution for shape in shapes):
             raise FeatureNotSupportedError(self.engine, "restitution", features)

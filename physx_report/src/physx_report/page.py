@@ -5,12 +5,14 @@ from __future__ import annotations
 import base64
 from collections.abc import Iterable
 from functools import cache
+from html import escape
 from pathlib import Path
 from typing import Any
 
 from jinja2 import Environment, PackageLoader, StrictUndefined
 
-from physx_core import files
+from physx_core import cli, files
+from physx_core.cli import in_notebook
 from physx_core.errors import PhysxError, SessionError
 from physx_report.blocks import Block, Figure, Picture, Table, Text
 from physx_report.errors import ReportError
@@ -19,6 +21,7 @@ from physx_report.section import Section, all_sections
 
 NAME = "report.html"
 """Name of the page in the session's folder."""
+_FRAME = "width: 100%; height: 40em; border: 0"
 
 
 def write_report(
@@ -47,6 +50,29 @@ def write_report(
     except OSError as error:
         raise SessionError(f"{place} cannot be written: {error}.") from error
     return place
+
+
+def show(session: str | Path, path: str | Path | None = None, *, trust: bool = False) -> None:
+    """Write a session's page: see `write_report`. Show it below the notebook's cell.
+
+    Elsewhere, print its path. The notebook keeps the page, also if its file is removed.
+
+    Args:
+        session: The session's folder.
+        path: The page, which is replaced; None: ``report.html`` in the session's folder.
+        trust: Whether to import whatever code the session's files name.
+
+    Raises:
+        PhysxError: If the page cannot be written.
+    """
+    place = write_report(session, path, trust=trust)
+    if not in_notebook():
+        cli.show(f"report: {place}")
+        return
+    from IPython.display import HTML, display
+
+    text = escape(place.read_text(encoding="utf-8"))
+    display(HTML(f'<div><iframe sandbox srcdoc="{text}" style="{_FRAME}"></iframe></div>'))
 
 
 def page_of(run: Run, sections: Iterable[Section]) -> str:

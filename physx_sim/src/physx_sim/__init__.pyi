@@ -9,6 +9,7 @@ from .description.attachment import Attachment as Attachment
 from .description.attachment import Connect as Connect
 from .description.attachment import Weld as Weld
 from .description.body_settings import BodySettings as BodySettings
+from .description.coupling import JointCoupling as JointCoupling
 from .description.ground import Ground as Ground
 from .description.ground import HeightField as HeightField
 from .description.ground import Stairs as Stairs
@@ -21,6 +22,7 @@ from .description.objects import WorldObject as WorldObject
 from .description.robot import JointSettings as JointSettings
 from .description.robot import Mimic as Mimic
 from .description.robot import Robot as Robot
+from .description.wheel import Wheel as Wheel
 from .description.world import World as World
 from .description.wrench import Wrench as Wrench
 from .devices import steps_of as steps_of

@@ -454,7 +454,7 @@ class Simulation(Closeable):
         """Return the accelerations, shape (nv,), caused by torques (nv,) in a state.
 
         Joint damping, springs, and Coulomb friction are included; contacts, limits, attachments,
-        and what makes joints follow others are not. All joints are driven by torques here,
+        and couplings of joints, such as `Mimic`, are not. All joints are driven by torques here,
         regardless of their mode. Accelerations are the time derivatives of the velocities, so those
         of a base are in its own frame.
         """

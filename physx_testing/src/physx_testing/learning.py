@@ -15,6 +15,7 @@ from physx_core.fields import Field
 from physx_core.pipelines import Learner, create_network
 from physx_core.typing import Batch
 from physx_testing.report import NotApplicableError
+from physx_testing.subject import expect, expect_close
 
 SHAPES: Sequence[tuple[tuple[int, ...], tuple[int, ...]]] = (
     ((4,), (3,)),
@@ -30,6 +31,8 @@ SHAPES: Sequence[tuple[tuple[int, ...], tuple[int, ...]]] = (
 """Shapes of inputs and targets to try in turn if no fields are given."""
 SEED = 3
 ROWS = 8
+TOLERANCE = 1e-4
+"""For float32, where sums may round differently with a different number of rows."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -94,6 +97,24 @@ class Case:
     def network_fields(self) -> Sequence[str]:
         """Names of the fields that the network reads."""
         return tuple(create_network(self.config).net_fields)
+
+
+def predict(learner: Learner, batch: Batch) -> Batch:
+    """Return a prediction; neither what is given nor what is returned is used elsewhere."""
+    found = learner.predict({name: values.copy() for name, values in batch.items()})
+    return {name: np.array(values) for name, values in found.items()}
+
+
+def expect_rows_apart(learner: Learner, batch: Batch) -> None:
+    """Check that each row is predicted alone as it is in a batch of `ROWS`."""
+    together = predict(learner, batch)
+    for row in range(ROWS):
+        alone = predict(learner, {name: values[row : row + 1] for name, values in batch.items()})
+        for name, values in alone.items():
+            rows = len(together[name])
+            expect(rows == ROWS, f'"{name}" has {rows} rows for {ROWS} samples')
+            text = f'"{name}" of a sample alone and in a batch of {ROWS} differ'
+            expect_close(values[0], together[name][row], TOLERANCE, text)
 
 
 def find_case(config: NetworkConfig, fields: Sequence[Field]) -> Case:

@@ -15,9 +15,7 @@ from physx_core.components import Network
 from physx_core.config import NetworkConfig
 from physx_core.errors import CheckpointError, FieldsMismatchError
 from physx_core.fields import Field
-from physx_core.pipelines import Learner
-from physx_core.typing import Batch
-from physx_testing.learning import ROWS, Case, find_case, parameters_of
+from physx_testing.learning import ROWS, Case, expect_rows_apart, find_case, parameters_of, predict
 from physx_testing.process_state import unchanged
 from physx_testing.report import NotApplicableError, Report
 from physx_testing.running import TIMEOUT, plain_options, run_checks
@@ -25,13 +23,9 @@ from physx_testing.subject import (
     Check,
     Subject,
     expect,
-    expect_close,
     expect_equal,
     refuses_unknown_options,
 )
-
-_TOLERANCE = 1e-4
-"""For float32, where sums may round differently with a different number of rows."""
 
 
 def check_network(
@@ -70,16 +64,11 @@ def _case(subject: Subject) -> Case:
     return find_case(config, subject.fields)
 
 
-def _predict(learner: Learner, batch: Batch) -> Batch:
-    found = learner.predict({name: values.copy() for name, values in batch.items()})
-    return {name: np.array(values) for name, values in found.items()}
-
-
 def _predicts(subject: Subject) -> None:
     case = _case(subject)
     learner = case.learner()
     network = learner.network
-    found = _predict(learner, case.batch())
+    found = predict(learner, case.batch())
     expect(
         set(found) == set(network.pred_fields),
         f"it predicts {sorted(found)}, but pred_fields are {list(network.pred_fields)}",
@@ -97,28 +86,18 @@ def _predicts(subject: Subject) -> None:
 
 def _rows_apart(subject: Subject) -> None:
     case = _case(subject)
-    learner, batch = case.learner(), case.batch()
-    together = _predict(learner, batch)
-    for row in range(ROWS):
-        alone = _predict(learner, {name: values[row : row + 1] for name, values in batch.items()})
-        for name, values in alone.items():
-            expect_close(
-                values[0],
-                together[name][row],
-                _TOLERANCE,
-                f'"{name}" of a sample alone and in a batch of {ROWS} differ',
-            )
+    expect_rows_apart(case.learner(), case.batch())
 
 
 def _twice(subject: Subject) -> None:
     case = _case(subject)
     learner, batch = case.learner(), case.batch()
-    first = _predict(learner, batch)
-    expect_equal(_predict(learner, batch), first, "a second prediction in evaluation mode differs")
+    first = predict(learner, batch)
+    expect_equal(predict(learner, batch), first, "a second prediction in evaluation mode differs")
     learner.network.set_train()
     learner.network.set_eval()
     expect_equal(
-        _predict(learner, batch), first, "after set_train() and set_eval() a prediction differs"
+        predict(learner, batch), first, "after set_train() and set_eval() a prediction differs"
     )
 
 
@@ -154,8 +133,8 @@ def _stores(subject: Subject) -> None:
         "parameters that were saved and loaded differ",
     )
     expect_equal(
-        _predict(other, batch),
-        _predict(learner, batch),
+        predict(other, batch),
+        predict(learner, batch),
         "with parameters that were saved and loaded it predicts differently: something that it "
         "needs is not among them",
     )
@@ -229,7 +208,7 @@ def _types(subject: Subject) -> None:
     case = _case(subject)
     config = dataclasses.replace(case.config, data_type="float64")
     learner = dataclasses.replace(case, config=config).learner()
-    for name, values in _predict(learner, case.batch()).items():
+    for name, values in predict(learner, case.batch()).items():
         if values.dtype.kind == "f":
             expect(
                 values.dtype == np.float64,
@@ -252,9 +231,9 @@ def _finite(subject: Subject) -> None:
 
 def _quiet(subject: Subject) -> None:
     case = _case(subject)
-    _predict(case.learner(), case.batch())
+    predict(case.learner(), case.batch())
     with unchanged(subject.before):
-        _predict(case.learner(), case.batch())
+        predict(case.learner(), case.batch())
 
 
 CHECKS: dict[str, Check] = {

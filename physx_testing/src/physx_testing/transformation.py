@@ -13,7 +13,7 @@ from physx_core.config import NetworkConfig
 from physx_core.fields import Field
 from physx_core.pipelines import Learner
 from physx_core.typing import Batch, Tensors
-from physx_testing.learning import ROWS, Case, find_case
+from physx_testing.learning import TOLERANCE, Case, expect_rows_apart, find_case
 from physx_testing.process_state import unchanged
 from physx_testing.report import NotApplicableError, Report
 from physx_testing.running import TIMEOUT, plain_options, run_checks
@@ -26,7 +26,6 @@ from physx_testing.subject import (
     refuses_unknown_options,
 )
 
-_TOLERANCE = 1e-4
 _LINEAR = "physx_testing.linear:LinearNetwork"
 
 
@@ -110,7 +109,7 @@ def _invert(case: Case, *, normalized: bool) -> None:
         expect_close(
             predicted[pred],
             wanted[opt],
-            _TOLERANCE,
+            TOLERANCE,
             f'a target that equals the prediction "{pred}" in physical units compares as '
             "different: transform_before_apply() does not undo transform_before_loss()",
         )
@@ -169,21 +168,7 @@ def _keeps(subject: Subject) -> None:
 
 def _rows(subject: Subject) -> None:
     case = _case(subject)
-    learner, batch = case.learner(normalized=True), case.batch()
-    together = {n: np.array(v) for n, v in learner.predict(batch).items()}
-    for row in range(ROWS):
-        alone = learner.predict({name: values[row : row + 1] for name, values in batch.items()})
-        for name, values in alone.items():
-            expect(
-                len(together[name]) == ROWS,
-                f'"{name}" has {len(together[name])} rows for {ROWS} samples',
-            )
-            expect_close(
-                np.asarray(values)[0],
-                together[name][row],
-                _TOLERANCE,
-                f'"{name}" of a sample alone and in a batch of {ROWS} differ',
-            )
+    expect_rows_apart(case.learner(normalized=True), case.batch())
 
 
 def _quiet(subject: Subject) -> None:

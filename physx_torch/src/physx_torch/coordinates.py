@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections.abc import Sequence
 
 import numpy as np
+import torch
 from torch import Tensor, float64
 
 from physx_core.rotations import (
@@ -20,21 +22,28 @@ from physx_sim import Layout
 from physx_sim.errors import SimulationError
 
 
-def check_widths(names: Sequence[str], given: Sequence[Tensor], widths: Sequence[int]) -> None:
-    """Check the last axes of tensors.
+def as_rows(
+    names: Sequence[str], given: Sequence[Tensor], widths: Sequence[int]
+) -> tuple[list[Tensor], torch.Size, torch.dtype]:
+    """Return tensors as rows, shape (n, width) each, in double precision on the CPU.
+
+    Returns:
+        The rows, the leading axes that the tensors have together, and the type that holds all.
 
     Raises:
-        SimulationError: If one of them has another length.
+        SimulationError: If the last axis of one of them has another length.
     """
     for name, tensor, width in zip(names, given, widths, strict=True):
         if tensor.shape[-1:] != (width,):
             raise SimulationError(
                 f"{name} have shape {tuple(tensor.shape)} but need (..., {width})."
             )
+    leading = torch.broadcast_shapes(*(tensor.shape[:-1] for tensor in given))
+    dtype = functools.reduce(torch.promote_types, (tensor.dtype for tensor in given))
+    return [_as_rows(tensor, leading) for tensor in given], leading, dtype
 
 
-def as_rows(tensor: Tensor, leading: Sequence[int]) -> Tensor:
-    """Return a tensor as rows, shape (n, last), in double precision on the CPU."""
+def _as_rows(tensor: Tensor, leading: torch.Size) -> Tensor:
     tensor = tensor.to("cpu", float64)
     if len(leading) == 1 and tensor.shape[:-1] == leading:
         return tensor

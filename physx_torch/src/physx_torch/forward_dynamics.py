@@ -12,7 +12,7 @@ from torch.autograd.function import once_differentiable
 from physx_core.typing import Vector
 from physx_sim import Simulation
 from physx_sim.errors import FeatureNotSupportedError, SimulationError
-from physx_torch.coordinates import as_rows, check_widths, to_position_gradients
+from physx_torch.coordinates import as_rows, to_position_gradients
 
 
 class ForwardDynamics:
@@ -61,15 +61,9 @@ class ForwardDynamics:
             SimulationError: If a shape does not match, a value is not finite, a quaternion does not
                 have length 1 (within 0.001), or one of the processes has ended.
         """
-        given = (positions, velocities, torques)
-        layout = self.simulation.layout
-        check_widths(
-            ("positions", "velocities", "torques"), given, (layout.nq, layout.nv, layout.nv)
-        )
-        dtype = torch.promote_types(positions.dtype, velocities.dtype)
-        dtype = torch.promote_types(dtype, torques.dtype)
-        leading = torch.broadcast_shapes(*(tensor.shape[:-1] for tensor in given))
-        rows = [as_rows(tensor, leading) for tensor in given]
+        given, layout = (positions, velocities, torques), self.simulation.layout
+        names, widths = ("positions", "velocities", "torques"), (layout.nq, layout.nv, layout.nv)
+        rows, leading, dtype = as_rows(names, given, widths)
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given):
             found: Tensor = _Function.apply(self, *rows)
         else:

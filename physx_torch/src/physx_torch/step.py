@@ -15,7 +15,6 @@ from physx_sim import Simulation
 from physx_sim.errors import FeatureNotSupportedError, SimulationError
 from physx_torch.coordinates import (
     as_rows,
-    check_widths,
     to_motion_gradients,
     to_position_gradients,
 )
@@ -82,11 +81,8 @@ class Step:
         """
         given, layout = (positions, velocities, commands), self.simulation.layout
         widths = layout.nq, layout.nv, len(layout.joints)
-        check_widths(("positions", "velocities", "commands"), given, widths)
-        dtype = torch.promote_types(positions.dtype, velocities.dtype)
-        dtype = torch.promote_types(dtype, commands.dtype)
-        leading = torch.broadcast_shapes(*(tensor.shape[:-1] for tensor in given))
-        rows = [as_rows(tensor, leading) for tensor in given]
+        names = ("positions", "velocities", "commands")
+        rows, leading, dtype = as_rows(names, given, widths)
         if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in given):
             q, v, asymmetry = _Function.apply(self, *rows)
             self.asymmetry = asymmetry.reshape(leading) if self.compare_sides else None

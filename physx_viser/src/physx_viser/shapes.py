@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 import trimesh
 
-from physx_core.components import map_values, parse_color
+from physx_core.components import grid_mesh, map_values, parse_color
 from physx_core.errors import VisualizerError
 from physx_core.typing import Array
 
@@ -49,16 +49,6 @@ def pose(values: Values) -> dict[str, Any]:
     return found
 
 
-def grid(heights: Array, spacing: Array) -> tuple[Array, Array]:
-    """Return the vertices and triangles of a height field, in its own frame."""
-    x, y = (gap * np.arange(count) for gap, count in zip(spacing, heights.shape, strict=True))
-    points = np.stack([*np.meshgrid(x, y, indexing="ij"), heights], axis=-1).reshape(-1, 3)
-    count, across = heights.shape
-    first = (np.arange(count - 1)[:, None] * across + np.arange(across - 1)).ravel()
-    corners = [first, first + across, first + across + 1, first, first + across + 1, first + 1]
-    return points.astype(np.float32), np.stack(corners, axis=1).reshape(-1, 3).astype(np.int32)
-
-
 def _solid(make: Callable[[Values], trimesh.Trimesh]) -> Draw:
     def draw(scene: SceneApi, name: str, values: Values) -> Any:
         found = make(values)
@@ -73,7 +63,7 @@ def _solid(make: Callable[[Values], trimesh.Trimesh]) -> Draw:
 def _surface(scene: SceneApi, name: str, values: Values) -> Any:
     """Draw a mesh or a height field; viser has colors of vertices only in files."""
     if "heights" in values:
-        points, cells = grid(np.asarray(values["heights"]), values["spacing"])
+        points, cells = grid_mesh(np.asarray(values["heights"]), values["spacing"])
     else:
         points, cells = values["positions"], values["cells"]
     found, colors = trimesh.Trimesh(points, cells, process=False), rgb(values)

@@ -74,7 +74,8 @@ def test_the_figure_shows_the_results(study):
         draw_figure(study, Path("study.what"))
 
 
-def test_curves_are_as_short_as_the_columns_beside_them_need(write, training, capsys):
+def test_curves_are_as_short_as_the_columns_beside_them_need(write, training, capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "100")
     name = "a_pipeline_whose_name_leaves_so_little_room"
     definition = Definition.read(
         write(pipelines={name: {"training": training}}, parameters={"training.network.lr": [0.1]})

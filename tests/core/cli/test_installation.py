@@ -7,6 +7,7 @@ import subprocess
 import sys
 
 import pytest
+from wide_lines import wide_lines
 
 from physx_core import __version__
 from physx_core.cli import installation
@@ -41,13 +42,14 @@ def package(folder, name, version, files=(), entries=""):
 
 
 def test_it_names_interpreter_versions_and_places():
-    text = doctor(PHYSX_TOKEN="0123secret", PHYSX_IMPORT_TIMEOUT="50")
+    text = doctor(PHYSX_TOKEN="0123secret", PHYSX_IMPORT_TIMEOUT="50", COLUMNS="")
     assert sys.executable in text and __version__ in text
     assert "physx-core" in text and "numpy" in text
     assert "vulkan" in text and "display" in text
     assert "conflicts: none" in text
     assert "toy  (physx-core" in text and "broken" not in text
-    assert "0123secret" not in text and "PHYSX_IMPORT_TIMEOUT 50" in text
+    assert "0123secret" not in text and "PHYSX_IMPORT_TIMEOUT  50" in text
+    assert wide_lines(text) == []
 
 
 def test_a_module_in_another_place_is_named(tmp_path):

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from numpy.testing import assert_allclose, assert_array_equal
 
-from physx_core import Dataset, View
+from physx_core import Dataset, Field, View
 from physx_core.dataset import EpisodeRecord
 from physx_core.dataset.read import ordered_statistics
 from physx_core.dataset.read.reader import Reader
@@ -168,3 +168,51 @@ def test_the_order_is_extended_as_if_it_were_read_anew(folder):
                 rows = np.arange(found.rows)
                 stored = rows if fresh.index is None else fresh.index
                 assert_array_equal(found.stored(rows), stored)
+
+
+def mesh(episode, rows=5):
+    """The nodes of the rows of an episode; some rows have none, and some episodes."""
+    sizes = np.arange(rows) * episode % 4
+    return [100 + np.random.default_rng([episode, n]).normal(size=(n, 2)) for n in sizes]
+
+
+def store_meshes(dataset, *episodes):
+    for episode in episodes:
+        record = EpisodeRecord(episode=episode, rows=5)
+        dataset.append_episodes("training", {"x": mesh(episode)}, [record])
+
+
+def test_entries_of_free_axes_are_read_once(folder, rows_read, cells):
+    with Dataset.create(folder) as dataset:
+        dataset.define_fields("training", [Field("x", ("node", 2))])
+        store_meshes(dataset, *range(20, 0, -1))
+        expected = statistics(dataset)
+        rows_read[0] = 0
+        assert statistics(dataset) == expected
+        assert rows_read[0] == 0
+    assert rows_read[0] == 0
+    entries = np.concatenate([np.concatenate(mesh(episode)) for episode in range(1, 21)])
+    with Dataset.open(folder) as dataset:
+        assert statistics(dataset) == expected
+        assert rows_read[0] == 0
+        assert_allclose(dataset.normalization["x"].mean, entries.mean(axis=0), rtol=1e-12)
+        assert_allclose(dataset.normalization["x"].std, entries.std(axis=0), rtol=1e-12)
+        dataset.recompute_normalization()
+        assert rows_read[0] == 100
+        assert statistics(dataset) == expected
+    with Dataset.open(folder, writable=True) as dataset:
+        store_meshes(dataset, *range(21, 31))
+        rows_read[0] = 0
+    assert rows_read[0] == (50 if cells == 5 else 150 - 96)
+
+
+def test_episodes_without_entries_have_no_part_in_statistics(folder, rows_read):
+    with Dataset.create(folder) as dataset:
+        dataset.define_fields("training", [Field("x", ("node", 2))])
+        store_meshes(dataset, 4, 8)  # whose meshes are all empty
+    with Dataset.open(folder, writable=True) as dataset:
+        assert rows_read[0] == 10 and "x" not in dataset.normalization
+        store_meshes(dataset, 5)
+        expected = np.concatenate(mesh(5))
+        assert_allclose(dataset.normalization["x"].mean, expected.mean(axis=0), rtol=1e-12)
+        assert_array_equal(dataset.normalization["x"].minimum, expected.min(axis=0))

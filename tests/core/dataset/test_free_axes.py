@@ -363,3 +363,14 @@ def test_removed_sizes_are_an_error_in_open_batches(tmp_path):
         dataset.remove_partition("training", 0)
         with pytest.raises(DatasetError, match="open them again"):
             batches[0]
+
+
+def test_edges_may_be_given_transposed(tmp_path):
+    sides = np.arange(8).reshape(2, 4)
+    with Dataset.create(tmp_path) as dataset:
+        dataset.define_fields("training", [Field("e", ("edge", 2), "int64")])
+        dataset.append("training", {"e": [sides.T, sides[:, :1].T]})
+        assert [each.tolist() for each in dataset["training"]["e"][:]] == [
+            sides.T.tolist(),
+            [[0, 4]],
+        ]

@@ -9,7 +9,7 @@ from importlib import metadata
 import pytest
 
 from physx_core import Environment, plugins
-from physx_core.cli import command, main
+from physx_core.cli import main
 from physx_core.errors import (
     ComponentNotFoundError,
     PluginError,
@@ -17,7 +17,7 @@ from physx_core.errors import (
     ReferenceFormError,
 )
 from physx_core.origin import install_hint
-from physx_core.plugins import registry
+from physx_core.plugins import commands, registry
 from physx_core.plugins.references import locate
 
 pytestmark = pytest.mark.processes
@@ -287,7 +287,7 @@ def test_commands_of_other_packages(tmp_path):
     [("serve", "physx-remote"), ("log", "physx-gym"), ("robots", "physx-dart")],
 )
 def test_a_command_of_a_missing_package_names_it(name, package, monkeypatch, capsys):
-    monkeypatch.setattr(command, "find_entries", lambda group: {})
+    monkeypatch.setattr(commands, "find_entries", lambda group: {})
     assert main([name]) == 1
     assert install_hint(package) in capsys.readouterr().err
 

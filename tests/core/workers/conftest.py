@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import subprocess
 import sys
-import time
 
 import numpy as np
 import pytest
@@ -61,13 +60,6 @@ class Rows:
         for size in sizes:
             batch = self._source.batch(size)
             self._parts.append({name: values.copy() for name, values in batch.items()})
-
-    def take_until(self, happened):
-        """Take rows one by one until something has happened."""
-        deadline = time.monotonic() + 60
-        while not happened():
-            assert time.monotonic() < deadline
-            self.take(1)
 
     def check(self, source):
         """Check that another source makes the same rows, to the last bit."""

@@ -19,7 +19,6 @@ from physx_core.workers.journal import Journal
 
 ENVS = Path(__file__).parents[1] / "programs" / "restart_envs.py"
 WANDERER = f"{ENVS}:SimulatedWanderer"
-ONCE = {"run_ahead": 0, "retries": 1}
 
 
 @pytest.fixture

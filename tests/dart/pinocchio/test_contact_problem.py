@@ -15,10 +15,9 @@ def random_problem(rng, points, limits, bounded, spare):
     size = 3 * points + limits + bounded
     root = rng.normal(size=(size, size + spare))
     friction = rng.uniform(0.0, 1.0, points)
-    upper = rng.random(limits) < 0.5
     strength = rng.exponential(size=bounded)
-    least = np.concatenate([np.where(upper, -np.inf, 0.0), -strength])
-    most = np.concatenate([np.where(upper, 0.0, np.inf), strength])
+    least = np.concatenate([np.zeros(limits), -strength])
+    most = np.concatenate([np.full(limits, np.inf), strength])
     return root @ root.T / size, root @ rng.normal(size=size + spare), friction, least, most
 
 

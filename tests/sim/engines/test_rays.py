@@ -100,6 +100,20 @@ def test_a_ray_from_inside_leaves_unseen():
         assert caster.cast(outside[None], inside[None], poses, ())["hit"].all()
 
 
+@pytest.mark.parametrize("far", [1e3, 1e6, 1e8])
+def test_rays_hit_the_same_far_from_the_origin(far):
+    rng = np.random.default_rng(3)
+    things = shapes(rng)
+    begins, ends = rng.uniform(-3, 3, (2, 2000, 3))
+    caster = Caster(read_parts(World(objects=things)))
+    poses = np.array([[*thing.position, *thing.orientation] for thing in things])
+    near = caster.cast(begins, ends, poses, ())
+    poses[:, :3] += far
+    hits = caster.cast(begins + far, ends + far, poses, ())
+    assert near["hit"].sum() > 100
+    assert (hits["body"] == near["body"]).mean() > 0.98  # rounding moves what a ray only grazes
+
+
 def test_meshes_are_hit_at_their_triangles(tmp_path):
     path = tmp_path / "tetrahedron.obj"
     path.write_text(TETRAHEDRON)

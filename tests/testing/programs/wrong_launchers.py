@@ -11,7 +11,6 @@ from physx_core import ClientHandle, Launcher
 
 class Handle(ClientHandle):
     session = True
-    last_words = True
 
     def __init__(self, instance_id, address, token, folder):
         self.instance_id = instance_id

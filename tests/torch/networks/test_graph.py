@@ -16,7 +16,7 @@ from physx_core import (
     View,
 )
 from physx_core.errors import FieldsMismatchError
-from physx_core.pipelines.learning.learner import load_learner
+from physx_core.pipelines import load_learner
 
 pytestmark = pytest.mark.processes
 

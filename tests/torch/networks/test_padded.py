@@ -9,7 +9,7 @@ from numpy.testing import assert_allclose
 
 from physx_core import Dataset, Field, NetworkConfig, Training
 from physx_core.errors import ConfigError, FieldShapeError, FieldsMismatchError
-from physx_core.pipelines.learning.learner import load_learner
+from physx_core.pipelines import load_learner
 
 POOLED = f"{Path(__file__).parents[1] / 'programs' / 'pooled.py'}:Pooled"
 NAMES = {"net_fields": ["x", "edge", "load"], "opt_fields": "u"}

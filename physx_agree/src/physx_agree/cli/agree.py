@@ -60,7 +60,10 @@ def run(words: Sequence[str]) -> None:
         env_kwargs=options.env_kwargs,
         trust=options.trust,
     )
-    show(found.to_json() if options.json else found)
+    if options.json:
+        print(found.to_json())
+    else:
+        show(found)
     if options.output is not None:
         store_agreement(options.output, found, time.monotonic() - begin)
         if not options.json:

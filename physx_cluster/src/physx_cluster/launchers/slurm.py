@@ -12,7 +12,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from physx_cluster.launchers.slurm_guard import start_guard
+from physx_cluster.launchers.slurm_guard import Guard
 from physx_cluster.launchers.slurm_queue import (
     UNKNOWN_TO_SCHEDULER,
     JobState,
@@ -27,7 +27,6 @@ from physx_core.components import ClientHandle, Launcher
 from physx_core.errors import ClientError, ConfigError
 from physx_core.net import TOKEN_VARIABLE
 from physx_core.origin import install_hint
-from physx_core.processes import ChildProcess
 
 try:
     import submitit
@@ -86,12 +85,11 @@ class SlurmLauncher(Launcher):
         """
         if cluster not in ("slurm", "local"):
             raise ConfigError(f'cluster is {cluster!r}, but must be "slurm" or "local".')
-        self._cluster, self._place, self._queue_time = cluster, Path(folder), queue_time
+        self._cluster, self._place, self.queue_time = cluster, Path(folder), queue_time
         self._parameters = {"timeout_min": timeout_min, **parameters}
         self._queue: Queue | None = None
         self._folder = Path()
-        self._guard: ChildProcess | None = None
-        self._pipe = -1
+        self._guard: Guard | None = None
         self._handles: dict[int, JobHandle] = {}
         self._asked, self._states = 0.0, dict[str, JobState]()
         logging.getLogger("submitit").setLevel(logging.WARNING)
@@ -120,7 +118,7 @@ class SlurmLauncher(Launcher):
         except Exception:
             self._folder.rmdir()
             raise
-        self._guard, self._pipe = start_guard(self._folder, "" if controller is None else name)
+        self._guard = Guard(self._folder, "" if controller is None else name)
         return None if controller is None else address_towards(controller)
 
     def launch(self, instances: Sequence[int], address: str, token: str) -> list[ClientHandle]:
@@ -148,8 +146,7 @@ class SlurmLauncher(Launcher):
             time.sleep(_SOON)
         guard, self._guard = self._guard, None
         if guard is not None:
-            os.close(self._pipe)  # the guard does the rest, as if this process had been killed
-            guard.wait()
+            guard.close()
 
     def state_of(self, job: Any, max_age: float) -> JobState:
         """Return the state of a job in the queue; all jobs are queried at once.
@@ -176,11 +173,6 @@ class SlurmLauncher(Launcher):
         assert self._queue is not None
         self._queue.cancel([job])
         self._asked = 0.0
-
-    @property
-    def queue_time(self) -> float:
-        """Longest time in s that a job may be queued."""
-        return self._queue_time
 
     def _submit(self, instances: Sequence[int], address: str) -> dict[int, Any]:
         work = [ClientJob(self._folder, number, address) for number in instances]
@@ -276,18 +268,12 @@ class JobHandle(ClientHandle):
         """Return whether it is queued: see `ClientHandle.is_queued`."""
         if not self.look(_RARELY).is_queued:
             return False
-        if time.monotonic() - self._began < self._launcher.queue_time:
+        most = self._launcher.queue_time
+        if time.monotonic() - self._began < most:
             return True
-        self._end(
-            _INTERRUPTED,
-            f"{self.state()}, queued for longer than queue_time, {self.queue_time:g} s",
-        )
+        said = f"{self.state()}, queued for longer than queue_time, {most:g} s"
+        self._end(_INTERRUPTED, said)
         return False
-
-    @property
-    def queue_time(self) -> float:
-        """Longest time in s that the job may be queued."""
-        return self._launcher.queue_time
 
     def terminate(self) -> None:
         """Ask the client to exit, unless Slurm requeues its job: see `ClientHandle.terminate`."""

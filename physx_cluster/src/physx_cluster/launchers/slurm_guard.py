@@ -14,10 +14,6 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
-
-if TYPE_CHECKING:
-    from physx_core.processes import ChildProcess
 
 _PATIENCE = 20.0  # s, for jobs to leave the queue
 _TERMINATION_GRACE = 3.0  # s, for processes to obey Ctrl-C, which they ignore if the run did
@@ -26,25 +22,30 @@ _PAUSE = 0.1
 _MODULES = {b"submitit.local._local", b"submitit.core._submit"}
 
 
-def start_guard(folder: Path, name: str) -> tuple[ChildProcess, int]:
-    """Start a guard.
+class Guard:
+    """The process that ends a run's jobs, once it is told to or this process ends."""
 
-    Args:
-        folder: The run's folder.
-        name: Name of its jobs in Slurm's queue; empty if they are local processes.
+    def __init__(self, folder: Path, name: str) -> None:
+        """Start it.
 
-    Returns:
-        The guard, and the descriptor whose closing activates it.
-    """
-    from physx_core.processes import ChildProcess
+        Args:
+            folder: The run's folder.
+            name: Name of its jobs in Slurm's queue; empty if they are local processes.
+        """
+        from physx_core.processes import ChildProcess
 
-    reading, pipe = os.pipe()
-    module = "physx_cluster.launchers.slurm_guard"
-    words = [sys.executable, "-P", "-m", module, str(reading), str(folder), name]
-    try:
-        return ChildProcess(words, pass_fds=[reading], detached=True), pipe
-    finally:
-        os.close(reading)
+        reading, self._pipe = os.pipe()
+        module = "physx_cluster.launchers.slurm_guard"
+        words = [sys.executable, "-P", "-m", module, str(reading), str(folder), name]
+        try:
+            self._process = ChildProcess(words, pass_fds=[reading], detached=True)
+        finally:
+            os.close(reading)
+
+    def close(self) -> None:
+        """Have it end the jobs, as if this process had been killed, and wait until it has."""
+        os.close(self._pipe)
+        self._process.wait()
 
 
 def main(descriptor: int, folder: Path, name: str) -> None:

@@ -13,7 +13,7 @@ from physx_cluster.sweep.executors.executor import Executor, Job
 from physx_cluster.sweep.plan import Plan
 from physx_cluster.sweep.results import FAILED, FAILURE, OUTPUT, Failure, Result, Trial
 from physx_cluster.sweep.study import TABLE, Study
-from physx_core import files, plugins, results
+from physx_core import Closeable, files, plugins, results
 from physx_core.errors import PhysxError
 
 Say = Callable[[str], None]
@@ -89,7 +89,7 @@ class _Attempts:
     reached: frozenset[str] = field(default_factory=frozenset)
 
 
-class _Workers:
+class _Workers(Closeable):
     """Runs trials concurrently, and restarts those that end without a result."""
 
     def __init__(self, study: Study, start: Start, say: Say, total: int) -> None:
@@ -101,10 +101,8 @@ class _Workers:
         self._given_up: list[tuple[Trial, str]] = []
         self._is_in_vain = False  # whether every trial would end with the same error
 
-    def __enter__(self) -> _Workers:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """End the trials that are still running."""
         if self._executor is not None:
             self._executor.close()
 

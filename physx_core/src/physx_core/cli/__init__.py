@@ -2,7 +2,8 @@
 
 A package adds a command with an entry point in the group ``physx.commands`` that names a module
 with a function ``run(words)``. The first line of the module's docstring, after the colon, is the
-command's summary in ``physx --help``.
+command's summary in ``physx --help``. The commands ``report`` and ``view`` have a function ``show``
+as well: see `physx_core.Result.show` and `physx_core.Dataset.show`.
 """
 
 from __future__ import annotations

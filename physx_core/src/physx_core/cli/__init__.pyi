@@ -4,6 +4,7 @@ from .arguments import argument_registry as argument_registry
 from .command import main as main
 from .commands.stats import spark_line as spark_line
 from .dataset_tables import count as count
+from .output import in_notebook as in_notebook
 from .output import show as show
 from .output import show_table as show_table
 from .output import width as width

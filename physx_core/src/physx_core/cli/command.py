@@ -17,16 +17,9 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from physx_core.errors import PhysxError, PluginError, UsageError, nearest, printable
-from physx_core.origin import install_hint
-from physx_core.plugins.entries import (
-    COMMANDS,
-    describe_conflict,
-    find_entries,
-    official_package,
-    owner_of,
-)
-from physx_core.plugins.loading import loading
+from physx_core.errors import PhysxError, UsageError, printable
+from physx_core.plugins.commands import find_command
+from physx_core.plugins.entries import COMMANDS, describe_conflict, find_entries
 from physx_core.processes import Terminated, describe_ending, ends_in, raised_at_sigterm
 
 if TYPE_CHECKING:
@@ -120,25 +113,14 @@ def _dispatch(words: list[str]) -> int:
 
 
 def _run(name: str, words: list[str]) -> None:
-    commands = find_entries(COMMANDS)
-    if name not in commands:
-        package = official_package(name, COMMANDS)
-        if package is not None:
-            raise UsageError(f"physx {name} is part of {package}. {install_hint(package)}")
-        guess = nearest(name, commands)
-        raise UsageError(f'There is no command "{name}".{guess} See physx --help.')
-    entry, *others = commands[name]
-    if others:
-        raise PluginError(name, describe_conflict("command", commands[name]))
-    with loading(name, f"physx {name} ({owner_of(entry)})", f"fails to import {entry.value}"):
-        run = entry.load().run
+    module = find_command(name)
     try:
-        run(words)
+        module.run(words)
     except SystemExit as end:
         if end.code == _USAGE:
             for line in _suggestions(name, words):
                 print(f"physx: {printable(line)}", file=sys.stderr)
-        ours = entry.value.partition(".")[0]
+        ours = module.__name__.partition(".")[0]
         if end.code or not ours.startswith("physx_") or ends_in(end, "argparse", "tyro", ours):
             raise
         raise UsageError(f"{describe_ending(end)}, but the command is not finished.") from end

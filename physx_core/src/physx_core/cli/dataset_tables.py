@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from physx_core.cli.output import show, show_table, width
+from physx_core.cli.output import show, show_table
 from physx_core.config import read_toml
 from physx_core.dataset import EPISODES, Dataset, Progress
 from physx_core.dataset.read.episodes import episode_lengths
@@ -79,7 +78,7 @@ def _print_mode(dataset: Dataset, mode: str, rows: Sequence[dict[str, Any]]) -> 
             show(f"  shuffled by default: {dataset.default_order(mode)}")
             _print_episodes(dataset, mode)
     except DatasetError as error:
-        show(textwrap.fill(f"damaged: {error}", width(), initial_indent="  "))
+        show(f"  damaged: {error}")
         stored = 0
     likes = ["like"] if any(row["like"] for row in rows) else []
     show_table(
@@ -174,7 +173,7 @@ def _print_normalization(dataset: Dataset, mode: str) -> None:
     try:
         found = dataset.normalization_of(mode)
     except DatasetError as error:
-        show(textwrap.fill(f"normalization: {error}", width(), initial_indent="  "))
+        show(f"  normalization: {error}")
         return
     fields = dataset.fields(mode)
     lines = [line for name, item in found.items() for line in _components(fields[name], item)]
@@ -216,4 +215,4 @@ def _print_integrity(dataset: Dataset, *, content: bool) -> None:
     found = count(len(problems), "problem") if problems else "sound"
     show(f"integrity: {found} ({what})")
     for text in problems:
-        show(textwrap.fill(text, width(), initial_indent="  ", subsequent_indent="    "))
+        show(f"  {text}")

@@ -2,39 +2,24 @@
 
 from __future__ import annotations
 
-import shutil
 import sys
-import textwrap
 from collections.abc import Collection, Mapping, Sequence
 
+from physx_core.cells import in_notebook as in_notebook
 from physx_core.errors import printable
-
-WIDTH = 100
-"""Line width for output to a file or a pipe; a terminal has its own."""
+from physx_core.terminal import width as width
+from physx_core.terminal import wrapped
 
 
 def show(text: object = "") -> None:
-    """Print text whose names from files or packages must not control the terminal."""
-    print(printable(text))
-
-
-def width() -> int:
-    """Return the maximum line width in columns."""
-    return shutil.get_terminal_size().columns if sys.stdout.isatty() else WIDTH
+    """Print text, wrapped, whose names from files or packages must not control the terminal."""
+    print(wrapped(printable(text)))
 
 
 def show_values(values: Mapping[str, str]) -> None:
-    """Print texts by name, indented, and wrapped where they are longer than a line."""
+    """Print texts by name, indented."""
     for name, text in values.items():
-        show(
-            textwrap.fill(
-                printable(f"  {name:<12} {text}"),
-                width(),
-                subsequent_indent=" " * 15,
-                break_long_words=False,
-                break_on_hyphens=False,
-            )
-        )
+        show(f"  {name:<11}  {text}")
 
 
 def show_table(

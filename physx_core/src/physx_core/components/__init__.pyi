@@ -20,6 +20,7 @@ from .scene.colors import map_values as map_values
 from .scene.colors import parse_color as parse_color
 from .scene.event import Event as Event
 from .scene.factory import Factory as Factory
+from .scene.geometry import grid_mesh as grid_mesh
 from .scene.geometry import vertex_normals as vertex_normals
 from .scene.kinds import KINDS as KINDS
 from .services import Services as Services

@@ -36,6 +36,7 @@ from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError, UsageError
 from physx_core.fields import Field
 from physx_core.normalization import Normalization, Normalize, compute_normalization
+from physx_core.plugins.commands import find_command
 from physx_core.typing import Batch
 
 MAX_FILE_SIZE = 0.25
@@ -67,6 +68,24 @@ class Dataset(EpisodeReading, Closeable):
             return f"<Dataset {self.directory}: closed>"
         counts = [f"{self.num_samples(mode):,} {mode}" for mode in self.modes]
         return f"<Dataset {self.directory}: {', '.join(counts) or 'empty'}>"
+
+    def show(self, row: int | None = None) -> None:
+        """Show the rows in the viewer's widget below the notebook's cell.
+
+        Without the widget a picture of a row is shown there, and elsewhere its path is printed.
+
+        Args:
+            row: Number of the row where the cursor stands; None: the last one.
+
+        Raises:
+            UsageError: If physx-rerun is not installed.
+            DatasetError: If there is no such row.
+            PhysxError: If there is neither a widget nor a driver for pictures.
+        """
+        rows = max(map(self.num_samples, self.modes), default=0)
+        if row is not None and not 0 <= row < rows:
+            raise DatasetError(f"{self.directory} has no row {row}: it has {rows:,}, from 0.")
+        find_command("view").show(self.directory, row=row)
 
     # Opening and closing --------------------------------------------------------------------
 

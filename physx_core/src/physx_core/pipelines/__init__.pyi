@@ -7,7 +7,7 @@ from .evaluating import trace_episode as trace_episode
 from .learning.batches.drawn_rows import read_drawn_rows as read_drawn_rows
 from .learning.components import create_network as create_network
 from .learning.learner import Learner as Learner
-from .learning.learner import load_learner as load_learner
+from .learning.loading import load_learner as load_learner
 from .learning.unseen import Unseen as Unseen
 from .learning.unseen import open_unseen as open_unseen
 from .pipeline import Pipeline as Pipeline

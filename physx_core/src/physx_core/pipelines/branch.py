@@ -15,7 +15,8 @@ from physx_core.components.scene.event import Event
 from physx_core.config import EnvironmentConfig, at_least, from_plain, options, to_plain
 from physx_core.dataset import Dataset
 from physx_core.errors import UsageError
-from physx_core.pipelines.learning.learner import Learner, load_learner
+from physx_core.pipelines.learning.learner import Learner
+from physx_core.pipelines.learning.loading import load_learner
 from physx_core.pipelines.pipeline import NewSessionPipeline
 from physx_core.pipelines.redrawing import Redrawing
 from physx_core.pipelines.replay import recorded_environment
@@ -179,6 +180,12 @@ class Branch(NewSessionPipeline):
     def _open(self, resources: contextlib.ExitStack) -> None:
         if not self.change and self.policy is None:
             raise UsageError("Nothing changes: give change (--set NAME=VALUE ...) or a policy.")
+        if Path(self.data).is_file():
+            raise UsageError(
+                f"{self.data} is a file: give the folder of a session or dataset. The log of a "
+                "robot is simulated again, as a policy, by physx generate gym/ID "
+                f"--environment.env-kwargs policy={self.data} --episodes 1."
+            )
         dataset = self._dataset = resources.enter_context(Dataset.open(self.data))
         if self.policy is not None:
             self._learner = load_learner(self.policy, trust=self.trust)

@@ -15,16 +15,13 @@ from physx_core.dataset import Dataset, EpisodeRecord, EpisodeStatus
 from physx_core.dataset.read.order.records import Flags, RecordedEpisodes
 from physx_core.errors import ConfigError, DatasetError, listed
 from physx_core.fields import Field
-from physx_core.pipelines.storage import describe_environment
+from physx_core.pipelines.storage import EPISODE_OPTIONS, describe_environment
 from physx_core.typing import Batch
 from physx_core.workers.row_queue import NONE_ENDED, Ended
 
 CAMPAIGNS = "campaigns"
 """Entry in a dataset's info: what its campaigns simulated, in order."""
-_SAME = (
-    *("environment", "env_kwargs", "independent_episodes", "episode_steps"),
-    *("simulations_per_step", "sampler", "sampler_kwargs", "state_every", "seed"),
-)
+_SAME = (*EPISODE_OPTIONS, "state_every", "seed")
 """Entries of a description on which the rows of an episode depend."""
 
 

@@ -13,21 +13,10 @@ from physx_core.config import MODES, SETS, WRONG, EnvironmentConfig
 from physx_core.dataset import Dataset
 from physx_core.dataset.store.manifest import to_plain_info
 from physx_core.errors import ConfigError
-from physx_core.pipelines.storage import GENERATIONS, end_generation
+from physx_core.pipelines.storage import EPISODE_OPTIONS, GENERATIONS, end_generation
 from physx_core.workers.pasts import NOTHING, Skip
 
-_SAME = (
-    "environment",
-    "env_kwargs",
-    "num_clients",
-    "independent_episodes",
-    "episode_steps",
-    "simulations_per_step",
-    "sampler",
-    "sampler_kwargs",
-    "state_every",
-    "seed",
-)
+_SAME = (*EPISODE_OPTIONS, "num_clients", "state_every", "seed")
 """Entries of a description on which the rows of streams depend."""
 
 

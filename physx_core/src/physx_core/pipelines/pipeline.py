@@ -4,9 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import os
-import shutil
 import sys
-import textwrap
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -37,6 +35,7 @@ from physx_core.results import Result
 from physx_core.results.stored import store_result
 from physx_core.session import Session
 from physx_core.sources.source import Source
+from physx_core.terminal import wrapped
 from physx_core.workers.pasts import NOTHING, Skip
 
 _STREAMS = {"training": 0, "validation": 1, "prediction": 2}
@@ -214,14 +213,12 @@ class Pipeline(ABC):
     def _say(self, *lines: str) -> None:
         """Print lines, in the process that writes the session.
 
-        They go to stderr, in a notebook to stdout, as it shows stderr as if all of it were errors;
-        on a terminal they are wrapped.
+        They go to stderr, in a notebook to stdout, as it shows stderr as if all of it were errors.
         """
         stream = sys.stdout if in_notebook() else sys.stderr
         if self._is_main and not self.quiet and stream is not None:
             with contextlib.suppress(OSError, ValueError):  # a closed stream must not end a run
-                columns = shutil.get_terminal_size().columns if stream.isatty() else 0
-                stream.write("".join(f"{_wrapped(line, columns)}\n" for line in lines))
+                stream.write("".join(f"{wrapped(line)}\n" for line in lines))
                 stream.flush()
 
     def _describe_components(self) -> None:
@@ -435,19 +432,3 @@ def derive_seed(seed: int, mode: str, offset: int) -> list[int]:
             generate them again.
     """
     return [seed, _STREAMS[mode], offset]
-
-
-def _wrapped(line: str, columns: int) -> str:
-    """Return a line in pieces of a width at most; a command can be copied with its pieces."""
-    if not columns or len(line) <= columns:
-        return line
-    ending = " \\" if line.startswith("next: ") else ""
-    indent = " " * (len(line) - len(line.lstrip()) + 4)
-    pieces = textwrap.wrap(
-        line,
-        max(20, columns - len(ending)),
-        subsequent_indent=indent,
-        break_long_words=False,
-        break_on_hyphens=False,
-    )
-    return f"{ending}\n".join(pieces)

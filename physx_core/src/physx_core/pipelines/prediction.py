@@ -13,7 +13,8 @@ from physx_core.components.environment import not_finite_prediction
 from physx_core.config import EnvironmentConfig, NetworkConfig, at_least, options
 from physx_core.dataset import Dataset
 from physx_core.fields import Field, first_not_finite, is_finite
-from physx_core.pipelines.learning.learner import Learner, load_learner
+from physx_core.pipelines.learning.learner import Learner
+from physx_core.pipelines.learning.loading import load_learner
 from physx_core.pipelines.pipeline import Pipeline, choose_seed, derive_seed
 from physx_core.pipelines.run_description import (
     describe_environment_config,

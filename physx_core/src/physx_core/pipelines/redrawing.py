@@ -64,7 +64,7 @@ class Redrawing(Closeable):
             UntrustedReferenceError: If the environment is code that is not trusted.
             ConfigError: If the dataset does not name its environment.
         """
-        self._dataset, self._mode, self._trust = dataset, mode, trust
+        self._dataset, self._mode = dataset, mode
         self._predict, self._patience = predict, patience
         self._events: list[Event] = []
         self._instance: Instance | None = None

@@ -38,6 +38,11 @@ GENERATION = "generation"
 STREAMS = "streams"
 """Entry that describes the last data generation by streams."""
 GENERATIONS = (GENERATION, STREAMS)
+EPISODE_OPTIONS = (
+    *("environment", "env_kwargs", "independent_episodes", "episode_steps"),
+    *("simulations_per_step", "sampler", "sampler_kwargs"),
+)
+"""Options of an environment on which the rows of an episode depend, except its seed."""
 
 
 def open_own(session: Session, config: DatasetConfig) -> Dataset:

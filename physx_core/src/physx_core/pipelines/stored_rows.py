@@ -9,6 +9,7 @@ from physx_core.dataset import Dataset
 from physx_core.errors import DatasetError, listed
 from physx_core.pipelines.storage import other_samples
 from physx_core.pipelines.stored_sets import find_sets
+from physx_core.rows import concatenate
 from physx_core.typing import Batch
 
 _AHEAD = 1 << 22
@@ -90,4 +91,4 @@ class StoredRows:
             count -= len(index)
         if len(parts) == 1:
             return rows
-        return {name: np.concatenate([part[name] for part in parts]) for name in rows}
+        return concatenate(parts)

@@ -471,7 +471,7 @@ class Training(NewSessionPipeline):
 
     def validate(self) -> dict[str, float]:
         """Return the mean loss and other statistics over the validation samples."""
-        batches = self.data.validation_batches(self.learner.batch_fields)
+        batches = self.data.stored.validation_batches(self.learner.batch_fields)
         return self.learner.mean_losses(batches)
 
     def save_checkpoint(self) -> Path:

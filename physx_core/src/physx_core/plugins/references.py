@@ -239,7 +239,7 @@ def check_recorded(
     """
     if trust:
         is_code = isinstance(reference, str) and ":" in reference
-        if is_code and not isinstance(find(kind, reference), type):
+        if is_code and not _names_class(kind, reference):
             raise UntrustedReferenceError(
                 f'{file} names "{reference}", which is not a class. Functions are not taken from '
                 f"a file, even if you trust it. Name it yourself: {advice}."
@@ -255,6 +255,16 @@ def check_recorded(
                 f"name it yourself: {advice}. If you trust everything that the file names, use "
                 "--trust (in Python trust=True)."
             )
+
+
+def _names_class(kind: str, reference: str) -> bool:
+    """Return whether ``"module:Class"`` names a class; after ``"plugin/"``, also an id."""
+    adapted = _adapted(kind, reference)
+    if adapted is None:
+        return isinstance(find(kind, reference), type)
+    named: str = adapted.keywords[ADAPTER]
+    is_id = not all(part.isidentifier() for part in named.rpartition(":")[2].split("."))
+    return is_id or isinstance(import_component(kind, named), type)
 
 
 def is_of_plugin(kind: str, reference: Any) -> bool:

@@ -275,7 +275,7 @@ def compare(network: Errors, rival: Errors, unit: str) -> dict[str, Any]:
     own, other = network.sums[some], rival.sums[some]
     ratio = float((own.sum() / other.sum()) ** power) if other.sum() else float("nan")
     if len(some) < FEWEST:
-        why = f"too few to say: {len(some)} {unit}, fewer than {FEWEST}"
+        why = _too_few(len(some), unit)
         return {"verdict": "unknown", "ratio": ratio, "interval": None, "why": why}
     sums, others = drawn_sums(own, other)
     tails = _LEVEL / 2, 1 - _LEVEL / 2
@@ -288,6 +288,11 @@ def compare(network: Errors, rival: Errors, unit: str) -> dict[str, Any]:
     if abs(ratio - 1) < _SAME or is_chance(own - other):
         verdict = "even"
     return {"verdict": verdict, "ratio": ratio, "interval": interval, "why": ""}
+
+
+def _too_few(count: int, unit: str) -> str:
+    counted = unit.removesuffix("s") if count == 1 else unit
+    return f"too few to say: {count} {counted}, fewer than {FEWEST}"
 
 
 def mean_interval(values: Sequence[float]) -> Interval | None:
@@ -308,7 +313,7 @@ def compare_rewards(policy: Sequence[float], rival: Sequence[float]) -> dict[str
     differences = np.asarray(policy, np.float64) - np.asarray(rival, np.float64)
     mean, count = float(differences.mean()), len(differences)
     if count < FEWEST:
-        why = f"too few to say: {count} episodes, fewer than {FEWEST}"
+        why = _too_few(count, "episodes")
         return {"verdict": "unknown", "difference": mean, "interval": None, "why": why}
     [sums] = drawn_sums(differences)
     low, high = (np.quantile(sums, (_LEVEL / 2, 1 - _LEVEL / 2)) / count).tolist()

@@ -9,6 +9,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, Literal
 
+from physx_core.plugins.commands import find_command
 from physx_core.results.policy import PolicyResult
 from physx_core.results.sweep import SweepResult
 from physx_core.results.wording import WORDS, Interval, Verdict, between, number, percent, plain
@@ -277,6 +278,18 @@ class Result:
         if self.why:
             found.append(f"not judged: {self.why}")
         return found
+
+    def show(self, *, trust: bool = False) -> None:
+        """Show the page of ``physx report`` below the notebook's cell; elsewhere print its path.
+
+        Args:
+            trust: Whether to import whatever code the session's files name.
+
+        Raises:
+            UsageError: If physx-report is not installed.
+            PhysxError: If the page cannot be written.
+        """
+        find_command("report").show(self.session, trust=trust)
 
     def __str__(self) -> str:
         return "\n".join(self.lines)

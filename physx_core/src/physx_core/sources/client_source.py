@@ -187,7 +187,7 @@ class ClientSource(Source):
         self._first, self._asked = self._asked, self._asked + size
         try:
             if stored is not None:
-                self._send_shares(Kind.STORED, stored, "a stored row", at_once=True)
+                self._send_shares(Kind.STORED, stored, "a stored row")
             self._grant()
             if not self._table:
                 self._group.wait(self._without_table)
@@ -208,22 +208,17 @@ class ClientSource(Source):
         self.sets.note(rows)
         return rows
 
-    def apply(self, prediction: Batch, *, at_once: bool = True) -> None:
+    def apply(self, prediction: Batch) -> None:
         """Pass predictions to the instances: see `Source.apply`.
 
         An error that an environment raises here is raised by the next call to `batch` or `close`.
-
-        Args:
-            prediction: See `Source.apply`.
-            at_once: Whether the instances get them now; otherwise with the next call to `batch`,
-                which costs less.
 
         Raises:
             UsageError: If the clients run ahead of the last batch.
         """
         if self._run_ahead != 0:
             raise UsageError("apply() needs ClientSource(run_ahead=0).")
-        self._send_shares(Kind.APPLY, prediction, "the prediction", at_once)
+        self._send_shares(Kind.APPLY, prediction, "the prediction")
 
     def pop_rejected(self) -> Batch:
         """Return the rejected samples: see `Source.pop_rejected`."""
@@ -260,7 +255,7 @@ class ClientSource(Source):
         self._failed = self._failed or kind is not None
         super().__exit__(kind, error, trace)
 
-    def _send_shares(self, kind: Kind, batch: Batch, what: str, at_once: bool) -> None:
+    def _send_shares(self, kind: Kind, batch: Batch, what: str) -> None:
         """Send each instance the rows that correspond to its rows of the last batch."""
         size = self._asked - self._first
         for number in range(1, self.instance_nb + 1):
@@ -273,11 +268,7 @@ class ClientSource(Source):
             }
             count = len(range(start, size, self.instance_nb))
             if count:
-                peer, message = self._group.peer(number), pack(kind, encode(rows, what), count)
-                if at_once:
-                    peer.send(message)
-                else:
-                    peer.send_with_next(message)
+                self._group.peer(number).send(pack(kind, encode(rows, what), count))
 
     def _end_of_rejected(self, number: int) -> int | None:
         """Return the step before which an instance's rejected rows belong to the last batch.

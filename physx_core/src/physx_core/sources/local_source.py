@@ -136,7 +136,7 @@ class LocalSource(Source):
 
     def _open(self, instance: Instance) -> None:
         draw, with_states = self._config.visualizer is not None, self._config.state_every > 0
-        choose = partial(self._choose, instance.instance_id)
+        choose = partial(self.sets.choose, instance.instance_id)
         number, services = instance.instance_id, self._services
         journal = self._journals.get(number)
         if journal is not None:
@@ -147,9 +147,6 @@ class LocalSource(Source):
         past = self._skip.pasts.get(number)
         if past is not None and past.state:
             instance.set_state(decode(past.state)["instance"])
-
-    def _choose(self, instance_id: int, episode: int) -> dict[str, Any]:
-        return self.sets.choose(instance_id, episode)
 
     def _fill(self, size: int, stored: Batch | None = None) -> RowBuffer:
         """Generate the next rows; return the buffer with them."""

@@ -157,8 +157,9 @@ class Source(Opened):
         if not self.is_independent:
             raise UsageError(
                 f"{self._name} is a stream, which has no episodes to count: set episode_steps, or "
-                "independent_episodes = True and call end_episode(), or give batch_nb and "
-                "batch_size instead of episodes, without min_clients and max_clients."
+                "independent_episodes = True and call end_episode(); of a Gymnasium environment "
+                "that ends its episodes, give --environment.independent-episodes. Or give batch_nb "
+                "and batch_size instead of episodes, without min_clients and max_clients."
             )
 
     def cancel(self) -> None:

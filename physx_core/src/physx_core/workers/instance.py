@@ -309,7 +309,7 @@ class Instance(Closeable):
         """
         environment = self.environment or self._alive()
         if not self._is_numbered:
-            self._count_episodes(environment)
+            self._is_numbered, self._counts = True, self._episode_steps is not None
         self._rows = 0
         if self._hand is not None:
             self._call("perturb", self._hand.let_go)
@@ -317,10 +317,6 @@ class Instance(Closeable):
             environment.begin_number(number, values)
         except (Exception, SystemExit) as error:
             raise self._failure("reset_parameters", error) from error
-
-    def _count_episodes(self, environment: Environment) -> None:
-        """Let `begin` begin all episodes."""
-        self._is_numbered, self._counts = True, self._episode_steps is not None
 
     @property
     def makes_single_rows(self) -> bool:

@@ -1,4 +1,4 @@
-"""Drives: rotors, joints that follow others, and servos that leave a limit, which DART lacks.
+"""Drives: rotors, couplings of joints, and servos that leave a limit, which DART lacks.
 
 Each is written as torques and settings before a physics step. DART's solver for contacts, limits
 and servos knows nothing of them, so what its impulses change there is corrected in the next step.
@@ -15,8 +15,8 @@ import numpy as np
 from physx_core.typing import Vector
 from physx_sim.engines import RobotModel
 
-_FASTEST_FOLLOWER = 10.0
-"""Maximum speed, in rad/s or m/s, at which a joint returns to where its leader has it."""
+_FASTEST_RETURN = 10.0
+"""Maximum speed, in rad/s or m/s, at which joints return to where their couplings hold."""
 _NEAR = 1e-6
 """Distance from a limit, in rad or m, within which a servo is at it."""
 _SERVOS = ("servo", "position")
@@ -41,10 +41,7 @@ class Drives:
         armature = np.array([joint.armature for joint in joints])
         # Implicit damping of I / h, and the opposite torque, are an inertia of I.
         self._rotors = armature / period
-        self._rows = np.zeros((len(model.followers), len(joints)))
-        for row, (follower, leader, mimic) in zip(self._rows, model.followers, strict=True):
-            row[follower], row[leader] = 1.0, -mimic.multiplier
-        self._offsets = np.array([mimic.offset for *_, mimic in model.followers])
+        self._rows, self._sums = model.coupling_rows
         self._forces = np.array([joint.mode == "force" for joint in joints], np.bool_)
         lower, upper = np.array([(joint.lower, joint.upper) for joint in joints]).reshape(-1, 2).T
         self._lower, self._upper = lower, upper
@@ -81,8 +78,8 @@ class Drives:
             return
         skeleton.computeForwardDynamics()
         free = (v + self._period * skeleton.getAccelerations())[base:]
-        gaps = self._rows @ skeleton.getPositions()[base:] - self._offsets
-        aims = np.clip(-gaps / self._period, -_FASTEST_FOLLOWER, _FASTEST_FOLLOWER)
+        gaps = self._rows @ skeleton.getPositions()[base:] - self._sums
+        aims = np.clip(-gaps / self._period, -_FASTEST_RETURN, _FASTEST_RETURN)
         at = self._dynamic
         rows = np.concatenate([np.zeros((len(gaps), base)), self._rows], axis=1)[:, at]
         spread = np.linalg.solve(skeleton.getAugMassMatrix()[np.ix_(at, at)], rows.T)

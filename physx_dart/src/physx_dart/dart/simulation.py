@@ -55,6 +55,8 @@ _STATELESS = ("dart", "dantzig")
 kept by this detector depend on memory addresses, so even a rerun differs."""
 _HEAVY = 20
 """Ratio of masses above which the iterative solvers let a body sink into one below it."""
+_CORRECTED = "what contacts, limits and servos change is corrected in the next step"
+"""What the table of features says about couplings of joints."""
 _SWEEPS, _TOLERANCE = 50, 1e-6
 """Maximum iterations of ``nsgs`` per step, and the error in m/s that ends them. They start from
 the impulses of the last step, so more iterations mostly sharpen impacts (docs/contacts.md)."""
@@ -87,15 +89,16 @@ class DartSimulation(RobotSimulation[DartRobot]):
 
     engine = "dart"
     lacks: ClassVar[frozenset[str]] = frozenset(
-        {"cameras", "step_derivatives", "torsional_friction"}
+        {"cameras", "rolling", "step_derivatives", "torsional_friction"}
     )
     caveats: ClassVar[Mapping[str, str]] = {
         "armature": "impulses of contacts, limits and servos do not know it: a warning",
+        "couplings": _CORRECTED,
         "exact_restore": "not with the detector `dart` and an iterative solver",
         "isotropic_friction": "not with the solver `dantzig`",
         "joint_wrenches": "not while anything is attached",
         "moving_statics": "a surface that moves along itself pushes what touches its ends",
-        "mimic": "what contacts, limits and servos change is corrected in the next step",
+        "mimic": _CORRECTED,
     }
 
     def __init__(self, world: World) -> None:
@@ -145,6 +148,8 @@ class DartSimulation(RobotSimulation[DartRobot]):
         features = frozenset(FEATURES) - self.lacks
         if parts.world.integrator == "rk4":
             check_rk4(parts, self.engine, features)
+        if parts.rolling:
+            raise FeatureNotSupportedError(self.engine, "rolling", features)
         shapes = [shape for each in parts.movables for shape in each.model.shapes]
         if parts.turning and parts.world.contacts != "none":
             advice = "Robot(torsional_friction=0.0, rolling_friction=0.0) leaves out a file's."

@@ -9,13 +9,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from physx_core.typing import Index, Vector
-from physx_dart.pinocchio.contact_problem import unit
-from physx_dart.pinocchio.contacts import ContactPoints, Indices, Spins, joined, together
+from physx_dart.pinocchio.contacts import ContactPoints, Indices, joined, together, widened
 from physx_dart.pinocchio.limits import JointConstraints, solve
 from physx_dart.pinocchio.solver import ImpulseSolver
 
 _REACH = 1.0
 """Margin, in rad/s or m/s, within which a limit is included while there are contacts."""
+_NOTHING = np.zeros((0, 3))
 _MISSED = 1e-9
 """Excess of a velocity over its bound at which a joint counts as outside its limits."""
 
@@ -79,7 +79,7 @@ class Constraints:
         joints: Constraints of its joints.
         inverse: Returns the inverse of its mass matrix, shape (nv, nv).
         touching: Points that touch planes, or None.
-        acts: Which rows of the joints act, shape (rows,).
+        acts: The rows of the joints that act.
         impulses: Impulses of the touching points along their axes, shape (k, 3), once known.
         nv: Length of its velocities.
         solved: What was solved, once it is, together with other robots that touch it.
@@ -115,29 +115,31 @@ class Constraints:
         self._warmth, self._bounds = warmth, joints.bounds(positions)
         self.acts = joints.acting(self._bounds, velocities, _REACH if touched else 0.0)
         self.nv = joints.base + len(velocities)
-        self.impulses = np.zeros((0, 3))
+        self.impulses = _NOTHING
         self.solved: Solved | None = None
 
     def aims(self) -> Vector:
         """Return the target velocities of all rows, shape (rows,)."""
         return self.joints.aims(self._bounds)
 
-    def rows(self) -> tuple[Indices, Vector, Vector, Vector, Vector]:
-        """Return columns, smallest and largest impulses, targets, and last impulses of all rows."""
-        joints = self.joints
-        return joints.columns, joints.least, joints.most, self.aims(), self._warmth.rows
+    def rows(self) -> tuple[Vector, Vector, Vector, Vector]:
+        """Return smallest and largest impulses, targets, and last impulses of all rows."""
+        return self.joints.least, self.joints.most, self.aims(), self._warmth.rows
 
     def last(self) -> Vector:
         """Return the last impulses of the touching points, shape (3 k,)."""
-        numbers = slice(0) if self.touching is None else self.touching.numbers
-        return self._warmth.points[numbers].ravel()
+        points = self._warmth.points
+        if self.touching is None:
+            return points[:0].ravel()
+        return points.take(self.touching.numbers, 0).ravel()
 
     def add_missed(self, velocities: Vector) -> bool:
         """Activate the rows that velocities (nv,) require; return whether any were inactive."""
         ahead = self.joints.acting(self._bounds, velocities[self.joints.base :], -_MISSED)
-        missed = ahead > self.acts
-        self.acts |= missed
-        return bool(np.count_nonzero(missed))
+        missed = [row for row in ahead if row not in self.acts]
+        if missed:
+            self.acts = sorted(self.acts + missed)
+        return bool(missed)
 
     def clear_warm_start(self) -> None:
         """Start the next step with no impulses."""
@@ -154,16 +156,15 @@ class Constraints:
 
 def limited(part: Constraints, v: Vector) -> Vector:
     """Return the velocities after the impulses of the joint rows only."""
-    joints, rows = part.joints, part.acts.nonzero()[0]
     part.clear_warm_start()
-    if not len(rows):
+    if not part.acts:
         return v
-    column, least, most = joints.columns[rows], joints.least[rows], joints.most[rows]
-    inverse = part.inverse()
-    spread = inverse.take(column, 1)
-    response, change = spread[column], part.aims()[rows] - v[column]
-    impulses, along = solve(response, change, least, most), unit(len(v)).take(column, 0)
-    none = change[:0]
+    joints, rows = part.joints, np.array(part.acts)
+    inverse, along = part.inverse(), joints.jacobian.take(rows, 0)
+    spread = inverse.dot(along.T)
+    response, change = along.dot(spread), part.aims().take(rows) - along.dot(v)
+    least, most, none = joints.least.take(rows), joints.most.take(rows), v[:0]
+    impulses = solve(response, change, least, most)
     part.solved = Solved(
         [part], inverse, along, spread, response, -change, none, least, most, impulses, rows, none
     )
@@ -192,81 +193,107 @@ def constrained(
         warm: Impulses of these points to start with, shape (k, 3).
         ties: Jacobian (m, nv) of what is held together, and the velocities along its rows (m,).
     """
-    ends = itertools.accumulate((part.nv for part in parts), initial=0)
-    spans = [slice(*pair) for pair in itertools.pairwise(ends)]
-    inverse = _diagonal([part.inverse() for part in parts], spans)
-    touching = [] if pairs is None else [pairs]
-    guess = [np.zeros(0) if warm is None else warm.ravel()]
-    for part, span in zip(parts, spans, strict=True):
-        if part.touching is not None:
-            touching.append(part.touching.widened(span, len(v)))
-        guess.append(part.last())
-    points = joined([each.jacobian for each in touching]) if touching else np.zeros((0, len(v)))
-    bias = joined([each.bias(before, period) for each in touching]) if touching else v[:0]
-    friction = joined([each.friction for each in touching]) if touching else v[:0]
-    of_parts = zip(*(part.rows() for part in parts), strict=True)
-    columns, least, most, aims, last = (joined(each) for each in of_parts)
-    spins = together(touching)
-    more, fixed, endless, turning = _last_rows(ties, spins, len(v))
-    if len(parts) > 1:
-        starts, counts = [span.start for span in spans], [len(part.acts) for part in parts]
-        columns = columns + np.repeat(starts, counts)
+    group = _Group(parts, before, v, period, pairs, warm, ties)
     missed = True
     while missed:
-        rows = joined([part.acts for part in parts]).nonzero()[0]
-        if len(parts) > 1:  # the solver expects rows with one bound first
-            two_sided = np.isinf(least[rows]) == np.isinf(most[rows])
-            rows = rows[np.argsort(two_sided, kind="stable")]
-        jacobian = [points, unit(len(v)).take(columns[rows], 0)]
-        targets, low, high = [bias, -aims[rows]], least[rows], most[rows]
-        begin = [*guess, last[rows]]
-        if len(fixed):
+        solved = group.solve(v, solver)
+        after = v + solved.spread.dot(solved.impulses)
+        missed = group.add_missed(after)
+    return after, group.keep(solved)
+
+
+class _Group:
+    """Constraints that are solved together, with all that does not depend on which limits act."""
+
+    def __init__(
+        self,
+        parts: Sequence[Constraints],
+        before: Vector,
+        v: Vector,
+        period: float,
+        pairs: ContactPoints | None,
+        warm: Vector | None,
+        ties: tuple[Vector, Vector] | None,
+    ) -> None:
+        """Collect the constraints; the arguments are those of `constrained`."""
+        self._parts, self._spans = parts, _spans([part.nv for part in parts])
+        nothing = v[:0]
+        self._touching = touching = [] if pairs is None else [pairs]
+        self._guess = [nothing if warm is None else warm.ravel()]
+        for part, span in zip(parts, self._spans, strict=True):
+            if part.touching is not None:
+                touching.append(part.touching.widened(span, len(v)))
+            self._guess.append(part.last())
+        self._inverse = _diagonal([part.inverse() for part in parts], self._spans)
+        self._points, self._bias, self._friction = np.zeros((0, len(v))), nothing, nothing
+        if touching:
+            self._points = joined([each.jacobian for each in touching])
+            self._bias = joined([each.bias(before, period) for each in touching])
+            self._friction = joined([each.friction for each in touching])
+        self._of_rows = _spans([len(part.joints.columns) for part in parts])
+        of_parts = zip(*(part.rows() for part in parts), strict=True)
+        self._least, self._most, self._aims, self._last = map(joined, of_parts)
+        wide = zip(parts, self._spans, strict=True)
+        self._joints = joined([widened(part.joints.jacobian, span, len(v)) for part, span in wide])
+        self._pace, self._turning = nothing, None
+        self._more: list[tuple[Vector, Vector]] = []  # Jacobians and targets of further rows
+        if ties is not None:
+            self._pace = ties[1]
+            self._more.append((ties[0], -self._pace))
+        if (spins := together(touching)) is not None:
+            self._turning = spins.points, spins.bounds
+            self._more.append((spins.jacobian, -spins.drift))
+
+    def solve(self, v: Vector, solver: ImpulseSolver) -> Solved:
+        """Return the impulses of all constraints, with the rows of joints that act."""
+        pairs = zip(self._parts, self._of_rows, strict=True)
+        rows = joined([np.array(part.acts, np.intp) + span.start for part, span in pairs])
+        least, most = self._least.take(rows), self._most.take(rows)
+        if len(self._parts) > 1:  # the solver expects rows with one bound first
+            order = np.argsort(np.isinf(least) == np.isinf(most), kind="stable")
+            rows, least, most = rows[order], least[order], most[order]
+        jacobian = [self._points, self._joints.take(rows, 0)]
+        targets, guess = [self._bias, -self._aims.take(rows)], [*self._guess, self._last.take(rows)]
+        for more, aims in self._more:
             jacobian.append(more)
-            targets.append(fixed)
-            begin.append(np.zeros(len(fixed)))
-            low, high = np.concatenate([low, -endless]), np.concatenate([high, endless])
-        along = np.concatenate(jacobian)
-        spread = inverse.dot(along.T)
+            targets.append(aims)
+            guess.append(np.zeros(len(aims)))
+        if len(self._pace):
+            endless = np.full(len(self._pace), np.inf)
+            least, most = np.concatenate([least, -endless]), np.concatenate([most, endless])
+        along, turning = np.concatenate(jacobian), self._turning
+        spread = self._inverse.dot(along.T)
         response, free = along.dot(spread), along.dot(v) + np.concatenate(targets)
-        if len(bias):
-            first = np.concatenate(begin)
-            impulses = solver.solve(response, free, friction, low, high, first, turning)
+        if len(self._bias):
+            first, friction = np.concatenate(guess), self._friction
+            impulses = solver.solve(response, free, friction, least, most, first, turning)
         else:
-            impulses = solve(response, -free, low, high)
-        after = v + spread.dot(impulses)
-        missed = False
-        for part, span in zip(parts, spans, strict=True):
-            missed |= part.add_missed(after[span])
-    solved = Solved(
-        parts,
-        *(inverse, along, spread, response, free, friction, low, high, impulses, rows),
-        v[:0] if ties is None else ties[1],
-        turning,
-    )
-    of_rows = np.zeros(len(columns))
-    of_rows[rows] = impulses[len(bias) : len(bias) + len(rows)]
-    _keep_turning(touching, impulses)
-    point = ahead = len(guess[0])
-    row = 0
-    for part, warmed in zip(parts, guess[1:], strict=True):
-        end, last_row = point + len(warmed), row + len(part.acts)
-        part.keep(impulses[point:end], of_rows[row:last_row])
-        part.solved = solved
-        point, row = end, last_row
-    return after, impulses[:ahead].reshape(-1, 3)
+            impulses = solve(response, -free, least, most)
+        return Solved(
+            *(self._parts, self._inverse, along, spread, response, free, self._friction),
+            *(least, most, impulses, rows, self._pace, turning),
+        )
 
+    def add_missed(self, velocities: Vector) -> bool:
+        """Activate the rows of joints that velocities require; return whether any were inactive."""
+        pairs = zip(self._parts, self._spans, strict=True)
+        missed = [part.add_missed(velocities[span]) for part, span in pairs]
+        return any(missed)
 
-def _last_rows(
-    ties: tuple[Vector, Vector] | None, spins: Spins | None, width: int
-) -> tuple[Vector, Vector, Vector, tuple[Index, Vector] | None]:
-    """Return Jacobian, velocities and bounds of the last rows, and what resists turning."""
-    held, pace = (np.zeros((0, width)), np.zeros(0)) if ties is None else ties
-    endless = np.full(len(pace), np.inf)
-    if spins is None:
-        return held, -pace, endless, None
-    jacobian = np.concatenate([held, spins.jacobian])
-    targets = -np.concatenate([pace, spins.drift])
-    return jacobian, targets, endless, (spins.points, spins.bounds)
+    def keep(self, solved: Solved) -> Vector:
+        """Store the impulses where they can be read; return those of pairs, shape (k, 3)."""
+        impulses, rows = solved.impulses, solved.rows
+        of_rows = np.zeros(len(self._last))
+        of_rows[rows] = impulses[len(self._bias) : len(self._bias) + len(rows)]
+        if self._turning is not None:
+            _keep_turning(self._touching, impulses)
+        first = end = len(self._guess[0])
+        of_parts = zip(self._parts, self._guess[1:], self._of_rows, strict=True)
+        for part, warmed, span in of_parts:
+            begin, end = end, end + len(warmed)
+            part.keep(impulses[begin:end], of_rows[span])
+            part.solved = solved
+        return impulses[:first].reshape(-1, 3)
 
 
 def _keep_turning(touching: Sequence[ContactPoints], impulses: Vector) -> None:
@@ -276,6 +303,14 @@ def _keep_turning(touching: Sequence[ContactPoints], impulses: Vector) -> None:
             first = len(impulses) - len(each.spins.drift)
             each.spins.impulses[:] = impulses[first:].reshape(-1, 3)
             impulses = impulses[:first]
+
+
+def _spans(lengths: Sequence[int]) -> list[slice]:
+    """Return the slices of parts that follow each other."""
+    if len(lengths) == 1:
+        return [slice(0, lengths[0])]
+    ends = itertools.accumulate(lengths, initial=0)
+    return [slice(*pair) for pair in itertools.pairwise(ends)]
 
 
 def _diagonal(blocks: Sequence[Vector], spans: Sequence[slice]) -> Vector:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 import functools
 import math
 from collections.abc import Sequence
@@ -18,6 +17,9 @@ _STUCK = 1e-14
 """Response, relative to the largest, below which a direction counts as immobile."""
 _ACCURACY = 1e-9
 """Accuracy of velocities, in m/s, for free velocities of 1 m/s or less."""
+_Turned = tuple[slice, slice | list[int], Sequence[Sequence[float]]]
+"""Rows that a projection changes, the rows on which the result depends, and how; (): on none."""
+_NOWHERE = slice(0)
 
 
 class ContactProblem:
@@ -75,33 +77,37 @@ class ContactProblem:
             self.matrix.flat[:: len(free) + 1] = rates
         self.free = free
         self.friction, self.least, self.most = friction, least, most
-        for place in range(0, 3 * len(friction), 3):
+        self._coefficients = friction.tolist()
+        for place in range(0, 3 * len(self._coefficients), 3):
             rates[place : place + 3] = [max(rates[place : place + 3])] * 3
         self._turning: list[tuple[int, float, float]] = []
         if turning is not None:
             points, bounds = turning
             self._turning = list(zip((3 * points + 2).tolist(), *bounds.T.tolist(), strict=True))
-            for place in range(len(free) - 3 * len(points), len(free), 3):
+            for place in range(len(free) - self.turning_rows, len(free), 3):
                 rates[place : place + 2] = [max(rates[place : place + 2])] * 2
         self._rates = np.array(rates)
         # A step against the velocities, scaled per row.
         self._unit, self._scaled = unit(len(free)), self.matrix / self._rates[:, None]
         self._back = self._unit - self._scaled
         self._start = -free / self._rates
-        self._coefficients = friction.tolist()
         self._bounds = list(zip(least.tolist(), most.tolist(), strict=True))
         self.accuracy = _ACCURACY * max(1.0, *map(abs, free.tolist()))
 
+    @property
+    def turning_rows(self) -> int:
+        """Number of rows of the points that resist turning."""
+        return 3 * len(self._turning)
+
     def error(self, impulses: Vector) -> float:
         """Return the distance of impulses from a solution, as a velocity."""
-        projected, _ = self._project(impulses)
-        return self._error(projected - impulses)
+        return self._error(self._project(impulses)[0] - impulses)
 
     def newton(self, impulses: Vector, most: int) -> tuple[Vector, float]:
         """Return the best impulses within `most` steps from given ones, and their error."""
         best, least_error = impulses, math.inf
         for _ in range(most):
-            projected, slope = self._project(impulses)
+            projected, turned = self._project(impulses)
             change = projected - impulses
             error = self._error(change)
             if error < least_error:
@@ -110,6 +116,7 @@ class ContactProblem:
                     break
             elif not error < math.inf:
                 break
+            slope = self._slope(turned, self._scaled, self._back)
             impulses = impulses + eigenpy.PartialPivLU(slope).solve(change)
         return best, least_error
 
@@ -121,12 +128,10 @@ class ContactProblem:
         Args:
             impulses: The solution.
         """
-        _, slope = self._project(impulses)
-        # The projection alone: at the same place, but as if impulses had no response.
-        alone, n = copy.copy(self), len(impulses)
-        alone._start = self._back.dot(impulses) + self._start - impulses
-        alone._back, alone._scaled = self._unit, np.zeros((n, n))
-        _, rest = alone._project(impulses)
+        _, turned = self._project(impulses)
+        slope = self._slope(turned, self._scaled, self._back)
+        # The projection alone, as if impulses had no response.
+        rest = self._slope(turned, np.zeros(slope.shape), self._unit)
         found: Vector = eigenpy.PartialPivLU(slope).solve((rest - self._unit) / self._rates)
         return found
 
@@ -134,62 +139,78 @@ class ContactProblem:
         velocities = change * self._rates
         return math.sqrt(velocities.dot(velocities))
 
-    def _project(self, impulses: Vector) -> tuple[Vector, Vector]:
+    def _project(self, impulses: Vector) -> tuple[Vector, list[_Turned]]:
         """Return impulses (n,) after a step and a projection onto the cones and bounds.
 
-        Also return the derivative of the given impulses minus these, shape (n, n).
+        Also return where the projection changed them.
         """
         values = (self._back.dot(impulses) + self._start).tolist()
-        unit, slope, place = self._unit, self._scaled.copy(), 0
+        turned: list[_Turned] = []
+        place = 0
         for friction in self._coefficients:
             x, y, normal = values[place : place + 3]
             if normal <= 0:
                 values[place : place + 3] = 0.0, 0.0, 0.0
-                slope[place : place + 3] = unit[place : place + 3]
+                turned.append((slice(place, place + 3), _NOWHERE, ()))
             elif (across := math.hypot(x, y)) > (bound := friction * normal):
                 share, x, y = bound / across, x / across, y / across
                 values[place], values[place + 1] = bound * x, bound * y
-                turn = np.array(
-                    (
-                        (share * y * y, -share * x * y, friction * x),
-                        (-share * x * y, share * x * x, friction * y),
-                    )
+                turn = (
+                    (share * y * y, -share * x * y, friction * x),
+                    (-share * x * y, share * x * x, friction * y),
                 )
-                rows = unit[place : place + 2] - turn.dot(self._back[place : place + 3])
-                slope[place : place + 2] = rows
+                turned.append((slice(place, place + 2), slice(place, place + 3), turn))
             place += 3
         for least, most in self._bounds:
-            value = values[place]
-            if value <= least or value >= most:
-                values[place] = least if value <= least else most
-                slope[place] = unit[place]
+            if not least < values[place] < most:
+                values[place] = least if values[place] <= least else most
+                turned.append((slice(place, place + 1), _NOWHERE, ()))
             place += 1
         for normal, across, about in self._turning:
-            self._limit_turning(values, slope, place, normal, (across, about))
+            turned += _limit_turning(values, place, normal, (across, about))
             place += 3
-        return np.array(values), slope
+        return np.array(values), turned
 
-    def _limit_turning(
-        self, values: list[float], slope: Vector, place: int, normal: int, bounds: Sequence[float]
-    ) -> None:
-        """Project the angular impulses of a point, from a row on, given its normal's row."""
-        across, about = (bound * values[normal] for bound in bounds)
-        unit, back = self._unit, self._back
-        x, y, z = values[place : place + 3]
-        if not across:
-            values[place : place + 2] = 0.0, 0.0
-            slope[place : place + 2] = unit[place : place + 2]
-        elif (size := math.hypot(x, y)) > across:
-            share, x, y = across / size, x / size, y / size
-            values[place], values[place + 1] = across * x, across * y
-            turn = np.array(((share * y * y, -share * x * y), (-share * x * y, share * x * x)))
-            rows = unit[place : place + 2] - turn.dot(back[place : place + 2])
-            slope[place : place + 2] = rows - bounds[0] * np.outer((x, y), back[normal])
-        if abs(z) >= about:
-            values[place + 2] = math.copysign(about, z)
-            slope[place + 2] = unit[place + 2]
-            if about:
-                slope[place + 2] -= math.copysign(bounds[1], z) * back[normal]
+    def _slope(self, turned: Sequence[_Turned], scaled: Vector, back: Vector) -> Vector:
+        """Return the derivative of impulses minus their projection, shape (n, n).
+
+        Args:
+            turned: Where the projection changed them.
+            scaled: The derivative of the impulses minus those after the step, shape (n, n).
+            back: The derivative of the impulses after the step, in the same form.
+        """
+        slope, unit = scaled.copy(), self._unit
+        for rows, sources, turn in turned:
+            slope[rows] = unit[rows] - np.array(turn).dot(back[sources]) if turn else unit[rows]
+        return slope
+
+
+def _limit_turning(
+    values: list[float], place: int, normal: int, bounds: Sequence[float]
+) -> list[_Turned]:
+    """Project the angular impulses of a point, from a row on, given its normal's row.
+
+    Return where that changed them.
+    """
+    across, about = (bound * values[normal] for bound in bounds)
+    turned: list[_Turned] = []
+    x, y, z = values[place : place + 3]
+    if not across:
+        values[place : place + 2] = 0.0, 0.0
+        turned.append((slice(place, place + 2), _NOWHERE, ()))
+    elif (size := math.hypot(x, y)) > across:
+        share, x, y = across / size, x / size, y / size
+        values[place], values[place + 1] = across * x, across * y
+        turn = (
+            (share * y * y, -share * x * y, bounds[0] * x),
+            (-share * x * y, share * x * x, bounds[0] * y),
+        )
+        turned.append((slice(place, place + 2), [place, place + 1, normal], turn))
+    if abs(z) >= about:
+        values[place + 2] = math.copysign(about, z)
+        slope = ((math.copysign(bounds[1], z),),) if about else ()
+        turned.append((slice(place + 2, place + 3), [normal], slope))
+    return turned
 
 
 def regularized(response: Vector) -> Vector:

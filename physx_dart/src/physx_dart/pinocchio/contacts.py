@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 
 from physx_core.typing import Records, Vector
 from physx_dart.pinocchio.models import twists_of
-from physx_dart.pinocchio.surfaces import Heights, Plane, surface_of
+from physx_dart.pinocchio.surfaces import Heights, Plane, Surface, surface_of
 from physx_sim import CONTACT, Ground, HeightField, Stairs
 from physx_sim.engines import CollisionShape, MovableBody, Static
 from physx_sim.errors import FeatureNotSupportedError, SimulationError
@@ -107,9 +107,9 @@ class ContactPoints:
         """Return the points with a wider Jacobian, in which `span` holds their columns."""
         if self.jacobian.shape[1] == width:
             return self
-        found = replace(self, jacobian=_widened(self.jacobian, span, width))
+        found = replace(self, jacobian=widened(self.jacobian, span, width))
         if self.spins is not None:
-            jacobian = _widened(self.spins.jacobian, span, width)
+            jacobian = widened(self.spins.jacobian, span, width)
             found.spins = replace(self.spins, jacobian=jacobian)
         return found
 
@@ -252,8 +252,8 @@ class ContactFinder:
         self._links = np.array([row[3] for row in anchors], np.intp)[spread]
         self._radii = np.array([row[2] for row in points] + [0.0] * (around * len(rims)))
         self._joint_of = joints[spread]
-        self._moved = np.repeat(moved[joints[spread]], 3, axis=0)
-        self._frames = np.zeros((len(spread), 3, 6))
+        self._moved = moved[joints[spread]]
+        self._frames = np.zeros((len(spread), 6))
 
     def __bool__(self) -> bool:
         """Return whether anything can ever touch."""
@@ -280,36 +280,55 @@ class ContactFinder:
         for place, surface in self._surfaces:
             gaps, axes = surface.distances(points)
             gaps -= self._radii
-            depths = self._radii + 0.5 * np.minimum(gaps, 0.0)
-            touched = points - depths[:, None] * axes[:, 2]
-            frames = self._frames
-            frames[:, :, :3] = axes
-            frames[:, :, 3:] = surface.moments(touched, axes)
-            jacobian = frames.reshape(-1, 6).dot(motions)
-            jacobian *= self._moved
-            ahead = gaps + period * jacobian[2::3].dot(v)
-            rows = (np.minimum(gaps, ahead) < MARGIN).nonzero()[0]
+            rows = self._near(surface, points, axes, gaps, motions, v, period)
             if not len(rows):
                 continue
-            numbers, normals = place * len(points) + rows, frames.take(rows, 0)[:, :, :3]
-            spins = None
+            gaps = gaps.take(rows)
+            normals = axes.take(rows, 0) if len(axes) > 1 else axes.repeat(len(rows), 0)
+            depths = self._radii.take(rows) + 0.5 * np.minimum(gaps, 0.0)
+            touched = points.take(rows, 0) - depths[:, None] * normals[:, 2]
+            frames = np.concatenate([normals, surface.moments(touched, normals)], 2)
+            moved = self._moved.take(rows, 0)
+            jacobian = frames.reshape(-1, 6).dot(motions).reshape(len(rows), 3, -1)
+            jacobian *= moved[:, None]
+            numbers, spins = place * len(points) + rows, None
             if self._spins is not None:
-                bounds, moved = self._spins[numbers], self._moved[3 * rows]
-                spins = Spins.of(bounds, normals, motions, moved)
+                spins = Spins.of(self._spins[numbers], normals, motions, moved)
             found.append(
                 ContactPoints(
                     numbers,
-                    touched.take(rows, 0),
+                    touched,
                     normals,
-                    gaps.take(rows),
+                    gaps,
                     self._friction.take(numbers),
                     self._restitution.take(numbers),
-                    jacobian.reshape(len(points), 3, -1).take(rows, 0).reshape(3 * len(rows), -1),
+                    jacobian.reshape(3 * len(rows), -1),
                     self._drift(place, normals, rows, rolling),
                     spins,
                 )
             )
         return _together(found) if found else None
+
+    def _near(
+        self,
+        surface: Surface,
+        points: Vector,
+        axes: Vector,
+        gaps: Vector,
+        motions: Vector,
+        v: Vector,
+        period: float,
+    ) -> Indices:
+        """Return the points (n, 3) that touch a surface or may touch it within the next step."""
+        frames = self._frames
+        frames[:, :3], frames[:, 3:] = axes[:, 2], surface.levers(points, axes)
+        speeds = frames.dot(motions)
+        speeds *= self._moved
+        ahead = speeds.dot(v)
+        ahead *= period
+        ahead += gaps
+        near: Indices = (np.minimum(gaps, ahead, out=ahead) < MARGIN).nonzero()[0]
+        return near
 
     def _drift(
         self, static: int, axes: Vector, points: Indices, rolling: Vector | None
@@ -452,7 +471,10 @@ def joined(arrays: Sequence[Any]) -> Any:
     return arrays[0] if len(arrays) == 1 else np.concatenate(arrays)
 
 
-def _widened(jacobian: Vector, span: slice, width: int) -> Vector:
+def widened(jacobian: Vector, span: slice, width: int) -> Vector:
+    """Return a Jacobian with zeros for velocities outside a span."""
+    if jacobian.shape[1] == width:
+        return jacobian
     wide = np.zeros((len(jacobian), width))
     wide[:, span] = jacobian
     return wide

@@ -32,7 +32,7 @@ class Coupling:
         self.finder = PairFinder(parts, robots, features)
         self._touching: PairPoints | None = None
         self._impulses = np.zeros((0, 3))
-        self.ties = Ties(robots, self._period)
+        self.ties = Ties(robots, parts.world)
         # Impulses of pairs in the last step, in the world frame, which warm-start the next one.
         self._warmth = np.zeros((len(self.finder), 3))
 

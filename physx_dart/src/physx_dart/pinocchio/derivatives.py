@@ -23,7 +23,7 @@ from physx_dart.pinocchio.constraints import Solved
 from physx_dart.pinocchio.contact_problem import ContactProblem, unit
 from physx_dart.pinocchio.contacts import ContactPoints, joined
 from physx_dart.pinocchio.robot import PinocchioRobot
-from physx_dart.pinocchio.ties import FASTEST_FOLLOWER
+from physx_dart.pinocchio.ties import FASTEST_JOINT
 from physx_sim import StepDerivatives
 from physx_sim.errors import SimulationError
 
@@ -55,7 +55,7 @@ class GroupDerivatives:
         spans = [slice(*pair) for pair in itertools.pairwise(ends)]
         self._robots, self._period = list(zip(robots, spans, strict=True)), period
         nv = self._nv = spans[-1].stop
-        self._after = np.concatenate([robot.native()[1] for robot in robots])
+        self._after = np.concatenate([robot.allowed for robot in robots])
         # Columns: positions, velocities, torques, and the target velocities of motors.
         self._change = np.zeros((nv, 4, nv))
         for robot, span in self._robots:
@@ -63,13 +63,19 @@ class GroupDerivatives:
                 self._change[span, number, span] = block
         if solved is not None and len(solved.impulses):
             self._constrain(self._with_resting(solved))
+        for robot, span in self._robots:
+            if robot.gyrates:
+                by_q, by_v, by_allowed = robot.gyroscopic_derivatives()
+                self._change[span] += np.tensordot(by_allowed, self._change[span], 1)
+                self._change[span, 0, span] += by_q
+                self._change[span, 1, span] += by_v
 
     def _with_resting(self, solved: Solved) -> Solved:
         """Return the problem with the friction of joints at rest, which did not need to act."""
         first, more = 0, []
         for part, (_, span) in zip(solved.parts, self._robots, strict=True):
             more.append(first + part.joints.resting(self._after[span][part.joints.base :]))
-            first += len(part.acts)
+            first += len(part.joints.columns)
         rows = np.setdiff1d(joined(more), solved.rows)
         if not len(rows):
             return solved
@@ -144,7 +150,7 @@ class GroupDerivatives:
         missing[places, at] -= joined(limits)[solved.rows]
         missing[places, 3 * nv + at] -= motors
         for tie, speed in enumerate(solved.pace.tolist(), of_joints.stop):
-            if abs(speed) < FASTEST_FOLLOWER:
+            if abs(speed) < FASTEST_JOINT:
                 missing[tie, :nv] += solved.along[tie] / self._period
         change += solved.spread.dot(problem.slope(solved.impulses).dot(missing))
 
@@ -161,7 +167,7 @@ class GroupDerivatives:
             q, v, _ = robot.last_step()
             moved, by_motion = unit(robot.nv), unit(robot.nv)
             if robot.base:
-                motion = period * self._after[span]
+                motion = period * robot.native()[1]
                 moved, by_motion = pinocchio.dIntegrate(robot.model_in_motion, q, motion)
                 _to_world(before, span.start, nv, q, v)
                 _to_base(after, span.start, nv, *robot.native())

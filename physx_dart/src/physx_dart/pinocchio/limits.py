@@ -27,12 +27,14 @@ class JointConstraints:
     brings it to its target velocity as far as their bounds allow. A motor without bounds ignores
     the limits.
 
-    Each constraint is a row: a target velocity and bounds on the impulse. The lower limits of all
-    joints come first, then the upper limits, then friction and motors, if any.
+    Each constraint is a row: a direction, a target velocity and bounds on the impulse. The lower
+    limits of all joints come first, then the upper limits, whose directions are downward, then
+    friction and motors, if any.
 
     Attributes:
         base: Degrees of freedom of the robot's base.
         columns: Index of each row's joint in the robot's velocities, shape (rows,).
+        jacobian: Directions of the rows, 1 or -1 at their joints, shape (rows, nv).
         least: Smallest impulse of each row, in N m s or N s, shape (rows,).
         most: Largest impulse of each row, in the same form.
         targets: Target velocities of the motors, shape (n,), in rad/s or m/s.
@@ -54,10 +56,10 @@ class JointConstraints:
         friction[free], strength[free] = 0.0, np.inf
         self._rubs, self._motors = np.flatnonzero(friction), np.flatnonzero(modes != "force")
         self._arrange(friction[self._rubs], strength[self._motors], len(joints))
-        signs = np.array([[1.0], [-1.0]])
-        self._signs, self._pace = signs, signs / period
-        self._limits = self._pace * [lower, upper]
-        self._slowest = -fastest
+        self._pace = 1 / period
+        # Lists, because operations on short arrays take longer.
+        limits = self._pace * lower, self._pace * upper, -fastest
+        self._limits = list(zip(*(each.tolist() for each in limits), strict=True))
         self._period = period
         self.targets = np.zeros(len(joints))
         self.acts = bool(len(self._rubs) or len(self._motors))
@@ -73,9 +75,11 @@ class JointConstraints:
         """Set the constant parts of the rows."""
         nothing, places = np.zeros(n), np.arange(n)
         joints = np.concatenate([places, places, self._rubs, self._motors])
-        self.columns, self._every = joints + self.base, np.ones(len(joints), np.bool_)
-        self.least = np.concatenate([nothing, nothing - np.inf, -friction, -strength])
-        self.most = np.concatenate([nothing + np.inf, nothing, friction, strength])
+        self.columns = joints + self.base
+        self.jacobian = unit(self.base + n)[self.columns]
+        self.jacobian[n : 2 * n] *= -1.0
+        self.least = np.concatenate([nothing, nothing, -friction, -strength])
+        self.most = np.concatenate([nothing + np.inf, nothing + np.inf, friction, strength])
 
     def safe(self, positions: Vector, velocities: Vector) -> tuple[int, float]:
         """Return for how many steps no limit can act while the speed stays below a bound.
@@ -98,22 +102,29 @@ class JointConstraints:
             return 0, 0.0
         return int(min(slack / (bound * self._period), 2**30)), bound * bound
 
-    def bounds(self, positions: Vector) -> Vector:
+    def bounds(self, positions: Vector) -> list[float]:
         """Return the least velocities of joints, upward for lower and downward for upper limits.
 
         Args:
             positions: Positions before the step, shape (n,).
 
         Returns:
-            Shape (2, n), in rad/s or m/s: mostly negative, because most joints need not move.
+            For each lower, then each upper limit, in rad/s or m/s: mostly negative, because most
+            joints need not move.
         """
-        needed = self._limits - self._pace * positions
-        bounds, (lower, upper) = np.maximum(needed, self._slowest), needed > 0
-        np.copyto(bounds, needed, where=lower | upper)
-        return np.minimum(bounds, _FASTEST_RETURN, out=bounds)
+        pace, upward, downward = self._pace, [], []
+        for place, (lower, upper, slowest) in zip(positions.tolist(), self._limits, strict=True):
+            up, down = lower - pace * place, pace * place - upper
+            if up > 0 or down > 0:  # outside: it returns regardless of its velocity limit
+                up, down = min(up, _FASTEST_RETURN), min(down, _FASTEST_RETURN)
+            else:
+                up, down = up if up > slowest else slowest, down if down > slowest else slowest
+            upward.append(up)
+            downward.append(down)
+        return upward + downward
 
-    def acting(self, bounds: Vector, velocities: Vector, reach: float) -> NDArray[np.bool_]:
-        """Return which rows act, shape (rows,): motors, friction of moving joints, and some limits.
+    def acting(self, bounds: list[float], velocities: Vector, reach: float) -> list[int]:
+        """Return the rows that act: motors, friction of moving joints, and some limits.
 
         Limits of joints outside them always act, because other joints may push them further out.
 
@@ -122,12 +133,13 @@ class JointConstraints:
             velocities: Velocities after the step, shape (n,).
             reach: Margin above its bound at which a velocity makes a limit act.
         """
-        acts = self._every.copy()
-        limits = acts[: bounds.size].reshape(bounds.shape)
-        np.less(self._signs * velocities, bounds + reach, out=limits)
-        limits |= bounds > 0
-        if len(self._rubs):  # a joint that is at rest without friction stays so, as in DART
-            acts[bounds.size : bounds.size + len(self._rubs)] = velocities[self._rubs] != 0
+        speeds, first = velocities.tolist(), len(bounds)
+        along = zip(range(first), speeds + [-speed for speed in speeds], bounds, strict=True)
+        acts = [row for row, speed, least in along if speed < least + reach or least > 0]
+        if self.acts:
+            # A joint that is at rest without friction stays so, as in DART.
+            acts += [first + row for row, joint in enumerate(self._rubs.tolist()) if speeds[joint]]
+            acts += range(first + len(self._rubs), len(self.columns))
         return acts
 
     def slopes(self, positions: Vector) -> Vector:
@@ -136,9 +148,10 @@ class JointConstraints:
         Args:
             positions: Positions before the step, shape (n,).
         """
-        needed = self._limits - self._pace * positions
-        found = np.zeros(len(self.columns))
-        found[: needed.size][(self.bounds(positions) == needed).ravel()] = -1 / self._period
+        lower, upper, _ = np.array(self._limits).reshape(-1, 3).T
+        needed = np.concatenate([lower - self._pace * positions, self._pace * positions - upper])
+        found, pace = np.zeros(len(self.columns)), np.repeat([-self._pace, self._pace], len(lower))
+        found[: len(needed)] = np.where(self.bounds(positions) == needed, pace, 0.0)
         return found
 
     def motors(self) -> Vector:
@@ -153,12 +166,11 @@ class JointConstraints:
         still: Indices = first + (velocities[self._rubs] == 0).nonzero()[0]
         return still
 
-    def aims(self, bounds: Vector) -> Vector:
+    def aims(self, bounds: list[float]) -> Vector:
         """Return the target velocity of each row, shape (rows,)."""
-        limits = (self._signs * bounds).ravel()
         if not self.acts:
-            return limits
-        return np.concatenate([limits, np.zeros(len(self._rubs)), self.targets[self._motors]])
+            return np.array(bounds)
+        return np.concatenate([bounds, np.zeros(len(self._rubs)), self.targets[self._motors]])
 
 
 def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vector:
@@ -186,16 +198,15 @@ def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vect
     best, blocks = n + 1, 3
     for _ in range(50 * (n + 1)):
         impulses = _pivoted(matrix, change, sides, bounds)
-        excess = (matrix.dot(impulses) - change).tolist()
-        right = [
-            (0 if side * over > 0 else side) if side else _side(impulse, each)
-            for side, over, impulse, each in zip(
-                sides, excess, impulses.tolist(), bounds, strict=True
-            )
-        ]
+        right = [_side(*each) for each in zip(impulses.tolist(), bounds, strict=True)]
+        if any(sides):
+            excess = (matrix.dot(impulses) - change).tolist()
+            for place, (side, over) in enumerate(zip(sides, excess, strict=True)):
+                if side:
+                    right[place] = 0 if side * over > 0 else side
+        if right == sides:
+            return impulses
         wrong = [place for place, side in enumerate(right) if side != sides[place]]
-        if not wrong:
-            break
         if len(wrong) < best:
             best, blocks = len(wrong), 3
         elif blocks:
@@ -216,8 +227,8 @@ def _pivoted(
     matrix: Vector, change: Vector, sides: list[int], bounds: list[tuple[float, float]]
 ) -> Vector:
     """Return the impulses (n,) with rows on a side held at their bounds and the rest solved."""
-    system, wanted = matrix.copy(), change.copy()
     held = [(place, bounds[place][side > 0]) for place, side in enumerate(sides) if side]
+    system, wanted = (matrix.copy(), change.copy()) if held else (matrix, change)
     for place, bound in held:
         system[place], wanted[place] = unit(len(change))[place], bound
     impulses: Vector = eigenpy.PartialPivLU(system).solve(wanted)

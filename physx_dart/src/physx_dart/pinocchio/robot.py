@@ -2,7 +2,8 @@
 
 Pinocchio has no simulator, so the step is implemented here in the same way as DART's:
 semi-implicit Euler with implicit damping and springs; impulses for contacts, limits, servos, and
-Coulomb friction; and a floating base integrated with its velocities in the world frame.
+Coulomb friction; and a floating base integrated with its velocities in the world frame. Unlike
+DART's, gyroscopic forces of objects that touch something are those of the middle of a step.
 """
 
 from __future__ import annotations
@@ -33,6 +34,8 @@ from physx_sim.engines import MovableBody, RobotEngine, Static, rk4_step, twist_
 
 _UNSEEN = 10
 """Steps between checks of whether a limit might have acted."""
+_SOLVED = 1e-9
+"""Change of velocities, in m/s or rad/s, that is not made, as constraints are no more exact."""
 
 
 class PinocchioRobot(RobotEngine):
@@ -74,6 +77,7 @@ class PinocchioRobot(RobotEngine):
             features,
         )
         self._acted_on = bool(self.contact_finder) or self._joints.acts
+        self._tumbles = self.nv == self.base == 6
         self._solver = solver
         self._rk4 = world.integrator == "rk4"
         modes = [joint.mode for joint in self.model.joints]
@@ -81,6 +85,8 @@ class PinocchioRobot(RobotEngine):
         self._forces = None if forces.all() else forces
         self._positions, self._velocities = np.zeros(self.nq), np.zeros(self.nv)
         self._earlier, self._before = self._positions, self._velocities
+        self._free = self.allowed = self._velocities
+        self.gyrates = False  # whether those of the middle of the last step mattered
         self._safe_steps, self._bound = 0, 0.0
         # Multiplying two arrays takes half the time of multiplying an array by a number.
         self._periods, self._motion = np.full(self.nv, dt), np.zeros(self.nv)
@@ -92,7 +98,8 @@ class PinocchioRobot(RobotEngine):
         self._constraints: Constraints | None = None
         self._warmth = Warmth(len(self.contact_finder), len(self._joints.columns))
         # Pinocchio only computes the upper triangle of the inverse mass matrix.
-        self._upper = np.triu(np.ones((self.nv, self.nv)), 1) + 0.5 * np.eye(self.nv)
+        rows, columns = np.indices((self.nv, self.nv))
+        self._mirrored = self.nv * np.minimum(rows, columns) + np.maximum(rows, columns)
 
     # Stepping -------------------------------------------------------------------------------
 
@@ -153,7 +160,7 @@ class PinocchioRobot(RobotEngine):
             multiply(v, periods, v)
             add(v, before, v)
             q = integrate(model, q, multiply(v, periods, motion))
-        self._positions, self._velocities = q, v
+        self._positions, self._velocities, self.allowed = q, v, v
         self._earlier, self._before = earlier, before
 
     def _net_torques(self, q: Vector, v: Vector) -> Vector:
@@ -175,7 +182,8 @@ class PinocchioRobot(RobotEngine):
         q, v = self._positions, self._velocities
         torques = self._net_torques(q, v) if self._smooth else self._torques
         a = pinocchio.aba(self.model_in_motion, self.data, q, v, torques, *self._more)
-        return v + self._period * a
+        self._free = v + self._period * a
+        return self._free
 
     def free_derivatives(self) -> tuple[Vector, Vector, Vector]:
         """Return derivatives of `free_velocities` of the last step, each of shape (nv, nv).
@@ -193,12 +201,52 @@ class PinocchioRobot(RobotEngine):
             by_v -= by_tau * (resists.damping + period * resists.stiffness)
         return period * by_q, np.eye(self.nv) + period * by_v, period * by_tau
 
+    def gyroscopic_derivatives(self) -> tuple[Vector, Vector, Vector]:
+        """Return derivatives of what `finish` added in the last step, each of shape (nv, nv).
+
+        They are w.r.t. positions, along small motions, velocities before the step, and those that
+        constraints allowed.
+        """
+        q, v, torques = self._earlier, self._before, self._torques
+        middle = 0.5 * (v + self.allowed)
+        (late_q, late_v), (early_q, early_v) = (
+            [
+                np.array(each)
+                for each in pinocchio.computeABADerivatives(
+                    self.model_in_motion, self.data, q, each, torques
+                )[:2]
+            ]
+            for each in (middle, v)
+        )
+        by_allowed = 0.5 * self._period * late_v
+        return self._period * (late_q - early_q), by_allowed - self._period * early_v, by_allowed
+
     def finish(self, velocities: Vector) -> None:
-        """End the step with these velocities."""
+        """End the step with the velocities (nv,) that the constraints allow."""
+        self.allowed, self.gyrates = velocities, False
+        if self._tumbles and velocities is not self._free:
+            change = self._gyroscopic(velocities)
+            self.gyrates = bool(change.dot(change) > _SOLVED**2)
+            if self.gyrates:
+                velocities = velocities + change
         self._earlier, self._before = self._positions, self._velocities
         motion = self._period * velocities
         self._positions = pinocchio.integrate(self.model_in_motion, self._positions, motion)
         self._velocities = velocities
+
+    def _gyroscopic(self, velocities: Vector) -> Vector:
+        """Return the change of velocities at the end of the step by gyroscopic forces, (nv,).
+
+        Those at its start, which are in the free velocities, do work on what constraints turn: a
+        disk that rolls along its rim would gain energy. Those in its middle, where constraints have
+        changed the velocities by half, do none. The difference is of second order in the period.
+        """
+        middle = 0.5 * (self._velocities + velocities)
+        a = pinocchio.aba(
+            self.model_in_motion, self.data, self._positions, middle, self._torques, *self._more
+        )
+        change: Vector = self._period * a - (self._free - self._velocities)
+        return change
 
     def constrained(self, v: Vector) -> Vector:
         """Return the velocities (nv,) after the impulses of the ground and the joints."""
@@ -232,8 +280,9 @@ class PinocchioRobot(RobotEngine):
 
     def _inverse(self, model: Any) -> Vector:
         """Return the inverse of the mass matrix of a model, shape (nv, nv)."""
-        upper = self._upper * pinocchio.computeMinverse(model, self._data, self._positions)
-        return upper + upper.T
+        upper = pinocchio.computeMinverse(model, self._data, self._positions)
+        inverse: Vector = upper.take(self._mirrored)
+        return inverse
 
     def change_gravity(self, gravity: tuple[float, ...]) -> None:
         """Change the acceleration of free fall, in m/s²."""

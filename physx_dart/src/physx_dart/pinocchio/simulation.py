@@ -56,7 +56,7 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
     engine = "pinocchio"
     lacks: ClassVar[frozenset[str]] = frozenset({"cameras", "mesh_contacts"})
     caveats: ClassVar[Mapping[str, str]] = {
-        "joint_wrenches": "not while anything is attached",
+        "joint_wrenches": "not while anything is attached, or wheels roll without slip",
         "step_derivatives": "not where shapes touch: [gradients](contacts.md#gradients)",
     }
 
@@ -141,6 +141,8 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
         for robot in self._robots:
             robot.contact_finder.move_surface(static, surface)
         self._coupling.finder.place_static(static, pose, velocity, surface)
+        if self.parts.statics[static].name == "ground":
+            self._coupling.ties.move_ground(surface)
 
     def bind(self, number: int, bond: Bond) -> None:
         """Hold two bodies together until `unbind`."""

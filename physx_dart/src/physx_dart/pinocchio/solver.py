@@ -57,10 +57,11 @@ class ImpulseSolver:
         if name not in SOLVERS:
             raise UnknownOptionError("World.solver for pinocchio", [name], SOLVERS)
         self._order = sorted(SOLVERS, key=lambda each: each != name)
+        self._solvers = {each: _KINDS[each][0]() for each in SOLVERS}
         self._points: dict[float, Any] = {}
         self._limits: dict[int, Any] = {}
         self._chains: dict[int, Any] = {}
-        self._known: dict[tuple[bytes, ...], tuple[Any, Any, Vector, Vector]] = {}
+        self._known: dict[tuple[bytes, ...], tuple[Any, Any]] = {}
 
     def solve(
         self,
@@ -79,7 +80,8 @@ class ImpulseSolver:
             free: Velocities without impulses minus the target ones, shape (n,): of k points along
                 two tangents and the normal, of m rows, then of s points about these axes.
             friction: Coefficients of the points, shape (k,).
-            least: Smallest impulses of the rows, shape (m,); rows with one bound come first.
+            least: Smallest impulses of the rows, shape (m,); rows of limits, which only push upward
+                (from 0 to infinity), come first.
             most: Largest impulses of the rows, shape (m,).
             guess: Impulses to start with, shape (n,).
             turning: These s points, as indices, and their largest angular impulses per normal
@@ -119,19 +121,17 @@ class ImpulseSolver:
             limits: Maximum number of iterations, and the accuracy at which it stops.
             guess: Impulses to start with.
         """
-        models, data, signs, flips = self._models(problem)
-        known = len(signs)
-        delassus = pinocchio.DelassusOperatorDense(problem.matrix[:known, :known] * flips)
-        solver, result = _KINDS[name][0](), _KINDS[name][2]()
-        result.setConstraintImpulseGuess(signs * guess[:known])
-        settings = _settings(name, *limits)
-        solver.solve(delassus, signs * problem.free[:known], models, data, settings, result)
+        known, result = len(guess) - problem.turning_rows, _KINDS[name][2]()
+        delassus = pinocchio.DelassusOperatorDense(problem.matrix[:known, :known])
+        result.setConstraintImpulseGuess(guess[:known])
+        models, settings = self._models(problem), _settings(name, *limits)
+        self._solvers[name].solve(delassus, problem.free[:known], *models, settings, result)
         found = np.zeros(len(guess))
-        found[:known] = signs * result.retrieveConstraintImpulses()
+        found[:known] = result.retrieveConstraintImpulses()
         return found
 
-    def _models(self, problem: ContactProblem) -> tuple[Any, Any, Vector, Vector]:
-        """Return Pinocchio's description of a problem, with the signs of its rows and matrix."""
+    def _models(self, problem: ContactProblem) -> tuple[Any, Any]:
+        """Return Pinocchio's description of a problem."""
         least, most = problem.least, problem.most
         key = problem.friction.tobytes(), least.tobytes(), most.tobytes()
         if key in self._known:
@@ -146,13 +146,10 @@ class ImpulseSolver:
             models.append(self._bounds_model(least[one_sided:], most[one_sided:]))
         for model in models:
             data.append(model.createData())
-        # Limits in Pinocchio only push upward.
-        signs = np.ones(3 * len(problem.friction) + len(least))
-        signs[3 * len(problem.friction) :][np.isinf(least) & np.isfinite(most)] = -1.0
         if len(self._known) >= _MOST_KNOWN:
             self._known.clear()
-        self._known[key] = models, data, signs, np.outer(signs, signs)
-        return self._known[key]
+        self._known[key] = models, data
+        return models, data
 
     def _point(self, coefficient: float) -> Any:
         if coefficient not in self._points:

@@ -9,6 +9,7 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from physx_core.rotations import cross_rows
 from physx_core.typing import Vector
 from physx_sim import Ground, HeightField, Stairs
 from physx_sim.engines import Static
@@ -41,6 +42,10 @@ class Surface(ABC):
         """Return the cross products of points (n, 3) with the axes there, shape (n, 3, 3)."""
         return moments_of(points, axes)
 
+    def levers(self, points: Vector, axes: Vector) -> Vector:
+        """Return the cross products of points (n, 3) with the normals there, shape (n, 3)."""
+        return cross_rows(points, axes[:, 2])
+
 
 @dataclass(frozen=True, eq=False)
 class Plane(Surface):
@@ -66,6 +71,10 @@ class Plane(Surface):
     def moments(self, points: Vector, axes: Vector) -> Vector:
         """Return the cross products with the plane's axes."""
         return points.dot(self._moments).reshape(-1, 3, 3)
+
+    def levers(self, points: Vector, axes: Vector) -> Vector:
+        """Return the cross products with the plane's normal."""
+        return points.dot(self._moments[:, 6:])
 
 
 @dataclass(frozen=True, eq=False)

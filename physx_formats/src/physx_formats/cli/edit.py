@@ -13,6 +13,7 @@ from physx_core.errors import UsageError
 from physx_core.observers import ProgressBar
 from physx_core.views import View
 from physx_formats import edit
+from physx_formats.cli.pairs import parse_pairs
 
 
 @dataclass
@@ -92,9 +93,9 @@ def run(words: Sequence[str]) -> None:
             derive=options.derive,
             keep=options.keep,
             drop=options.drop,
-            cast=_pairs("cast", options.cast),
-            units=_pairs("units", options.units),
-            rename=_pairs("rename", options.rename),
+            cast=parse_pairs("cast", options.cast),
+            units=parse_pairs("units", options.units),
+            rename=parse_pairs("rename", options.rename),
             advance=bar.advance,
         )
     finally:
@@ -103,19 +104,9 @@ def run(words: Sequence[str]) -> None:
         show(f"{count(rows, f'{mode} sample')}: {options.out}")
 
 
-def _pairs(option: str, words: Sequence[str]) -> dict[str, str]:
-    found = {}
-    for word in words:
-        name, is_given, value = word.partition("=")
-        if not (name and is_given):
-            raise UsageError(f"--{option} {word} names no value: write FIELD=VALUE.")
-        found[name] = value
-    return found
-
-
 def _ranges(words: Sequence[str]) -> dict[str, Any]:
     found: dict[str, Any] = {}
-    for name, value in _pairs("episodes", words).items():
+    for name, value in parse_pairs("episodes", words).items():
         if name == "status":
             found[name] = value
             continue

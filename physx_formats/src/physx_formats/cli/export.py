@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass
 from typing import Annotated
 
 import tyro
@@ -12,7 +12,9 @@ from physx_core.cli import count, show
 from physx_core.dataset import EPISODES, Dataset
 from physx_core.observers import ProgressBar
 from physx_formats import ExportOptions, export
-from physx_formats.format import LOSSES, find_format
+from physx_formats.cli.pairs import parse_pairs
+from physx_formats.format import LOSSES, Format, find_format
+from physx_formats.table import is_picture
 
 
 @dataclass
@@ -23,7 +25,7 @@ class Export:
     polars, and databases. csv: text. safetensors: arrays. zarr: chunked arrays, for xarray.
     vtkhdf: a mesh and its fields over time, for ParaView. minari: episodes for offline
     reinforcement learning. lerobot: episodes for imitation learning, in version 3 of LeRobot's
-    format.
+    format; its observations that are pictures become videos.
     """
 
     directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
@@ -50,11 +52,11 @@ class Export:
     """lerobot, vtkhdf: frames per second of simulated time; required for lerobot."""
     task: str | None = None
     """lerobot: description of the task."""
-    features: Annotated[dict[str, str], tyro.conf.arg(name="as", metavar="FEATURE=FIELDS")] = field(
-        default_factory=dict
-    )
-    """lerobot: fields of features, separated by commas: observation.state=q,v. Other observations
-    are then those that are named only."""
+    features: Annotated[
+        tuple[str, ...], tyro.conf.arg(name="as", metavar="[FEATURE=FIELDS ...]")
+    ] = ()
+    """lerobot: fields of features, separated by commas: observation.state=q,v
+    observation.images.top=camera. Other observations are then those that are named only."""
     points: str | None = None
     """vtkhdf: field with the positions of the mesh's points, of samples or episodes; required."""
     cells: str | None = None
@@ -73,7 +75,7 @@ def run(words: Sequence[str]) -> None:
         options.rewards,
         options.fps,
         options.task,
-        {name: of.split(",") for name, of in options.features.items()},
+        {name: of.split(",") for name, of in parse_pairs("as", options.features).items()},
         options.points,
         options.cells,
         options.cell_type,
@@ -99,7 +101,7 @@ def run(words: Sequence[str]) -> None:
         stored = {mode: dataset.num_samples(mode) for mode in written}
         if dataset.has_episodes and EPISODES in stored:
             stored[EPISODES] = written[EPISODES]
-        lost = [n for n in find_format(options.to).loses if n != "records" or dataset.has_episodes]
+        lost = _lost(find_format(options.to), dataset, written)
     for mode, rows in written.items():
         show(f"{count(rows, f'{mode} sample')}: {options.out}")
         if rows < stored[mode]:
@@ -107,3 +109,10 @@ def run(words: Sequence[str]) -> None:
             show(f"left out: {left:,} samples in trajectories of a single sample")
     for name in lost:
         show(f"{options.to} {LOSSES[name]}")
+
+
+def _lost(form: Format, dataset: Dataset, modes: Iterable[str]) -> list[str]:
+    """Return what a format does not keep, of `LOSSES`, of what the modes of a dataset have."""
+    has_pictures = any(is_picture(of) for mode in modes for of in dataset.fields(mode).values())
+    has = {"records": dataset.has_episodes, "colors": has_pictures}
+    return [name for name in form.loses if has.get(name, True)]

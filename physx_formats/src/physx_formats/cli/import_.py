@@ -1,4 +1,4 @@
-"""``physx import``: import an npz file, an HDF5 file, or a DeepPhysX dataset."""
+"""``physx import``: store the arrays of a file of another format as a dataset."""
 
 from __future__ import annotations
 
@@ -22,8 +22,8 @@ class Import:
     """
 
     file: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="FILE")]
-    """A NumPy archive (npz), an HDF5 file, a DeepPhysX database, or the folder of a DeepPhysX
-    dataset or session."""
+    """A NumPy archive (npz), an HDF5, Parquet, CSV or safetensors file, a DeepPhysX database, or
+    the folder of a LeRobot dataset, or of a DeepPhysX dataset or session."""
     directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
     """The dataset's folder; rows are appended to an existing dataset that has the same fields."""
     mode: str | None = None

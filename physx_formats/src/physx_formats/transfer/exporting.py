@@ -56,28 +56,40 @@ def export(
     out, options = Path(out), options or ExportOptions()
     form = _choose_format(to, options)
     tables = _make_tables(dataset, modes, advance, with_episodes=form.several)
+    _check_tables(to, form, tables)
+    check_new(out)
+    left_out = _write(form, tables, out, options)
+    return {table.mode: table.rows - left_out for table in tables}
+
+
+def _check_tables(to: str, form: Format, tables: Sequence[Table]) -> None:
+    """Check that a format has a place for the fields of some modes."""
     if len(tables) > 1 and not form.several:
         raise ConfigError(
             f"{to} holds one mode. Choose one with modes (--mode on the command line): "
             f"{listed(table.mode for table in tables)}."
         )
-    free = [f.name for table in tables for f in table.fields.values() if f.free_axis]
+    fields = [field for table in tables for field in table.fields.values()]
+    free = [field.name for field in fields if field.free_axis]
     if free and not form.free_axes:
         raise ExchangeError(
             f"{to} holds rows of one size, but these fields have a free axis: {listed(free)}. Read "
             "them from the dataset's HDF5 files, or leave them out with `physx edit`."
         )
-    texts = [f.name for table in tables for f in table.fields.values() if f.is_text]
+    texts = [field.name for field in fields if field.is_text]
     if texts and not form.text:
         raise ExchangeError(
             f"{to} holds numbers, but these fields are text: {listed(texts)}. Leave them out with "
             "`physx edit --drop`."
         )
-    check_new(out)
+
+
+def _write(form: Format, tables: Sequence[Table], out: Path, options: ExportOptions) -> int:
+    """Write tables to a path; it appears once it is complete. Return how many rows are left out."""
+    assert form.write is not None
     try:
         with tempfile.TemporaryDirectory(dir=out.absolute().parent, prefix=".export-") as folder:
             draft = Path(folder) / out.name
-            assert form.write is not None
             left_out = form.write(tables, draft, options)
             draft.rename(out)
     except PhysxError:
@@ -87,7 +99,7 @@ def export(
         raise ExchangeError(
             f"{out} cannot be written: {reason}. Nothing was left behind."
         ) from error
-    return {table.mode: table.rows - left_out for table in tables}
+    return left_out
 
 
 def _choose_format(to: str, options: ExportOptions) -> Format:

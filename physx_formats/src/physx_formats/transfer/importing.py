@@ -45,8 +45,9 @@ def import_file(
 
     Args:
         path: A NumPy archive (npz), an HDF5, Parquet, safetensors or MCAP file or a DeepPhysX
-            database, of any name; a file ``*.csv``; the folder of a DeepPhysX dataset or session,
-            or of a recording of ROS 2; or what the formats of other plugins recognize.
+            database, of any name; a file ``*.csv``; the folder of a LeRobot dataset, a DeepPhysX
+            dataset or session, or of a recording of ROS 2; or what the formats of other plugins
+            recognize.
         directory: The dataset's folder. Rows are appended if the dataset exists.
         mode: Mode for the rows, regardless of the mode in the file; for a file with several modes,
             the one to import. None: the modes that the file names, or else ``training``.
@@ -102,7 +103,7 @@ def _take_records(
 def _size_of(path: Path) -> int:
     """Return the size in bytes of a file, or of the files in a folder."""
     try:
-        files = [path, *(path.iterdir() if path.is_dir() else ())]
+        files = [path, *(path.rglob("*") if path.is_dir() else ())]
         return sum(file.lstat().st_size for file in files)
     except OSError:  # the reader reports it
         return 0

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import gymnasium
@@ -41,7 +42,7 @@ class GymEnvironment(Environment):
             id: Its id in Gymnasium, or where it is: see `make_env`.
             policy: What chooses the actions: ``"random"`` samples the action space; ``"network"``
                 is the network of the run; ``"package.module:function"`` is called with the
-                observation.
+                observation; ``"FILE.h5"``, a log of a robot, repeats its episode.
             kwargs: Arguments of `Environment`; all others go to the Gymnasium environment.
         """
         own = {
@@ -59,6 +60,7 @@ class GymEnvironment(Environment):
         Raises:
             ConfigError: If there is no such environment or policy, or values of a space do not have
                 a fixed shape.
+            LogError: If the policy is a log that cannot be repeated.
         """
         self.env = make_env(self._id, self._options)
         spec = self.env.spec
@@ -68,6 +70,8 @@ class GymEnvironment(Environment):
         self._next = SpaceFields(self.env.observation_space, "next_observation")
         self._actions = SpaceFields(self.env.action_space, "action")
         self.policy = self._policy
+        if self._log is not None:
+            self.independent_episodes = True  # which end with the log
         world = getattr(getattr(self.env.unwrapped, "simulator", None), "world", None)
         if world is not None and hasattr(self.env.unwrapped, "pull"):
             gravity = Parameter("gravity", -20, 20, shape=(3,), unit="m/s^2")
@@ -119,12 +123,15 @@ class GymEnvironment(Environment):
         self._observation = None
 
     def _draw_seeds(self) -> None:
-        self._seed: int | None = int(self.rng.integers(1 << 31))
+        drawn = int(self.rng.integers(1 << 31))
+        self._seed: int | None = drawn if self._log is None else self._log.seed
         self.env.action_space.seed(int(self.rng.integers(1 << 31)))
 
     def _begin_episode(self) -> None:
         self._observation, _ = self.env.reset(seed=self._seed)
         self._seed = None
+        if self._log is not None:
+            self._log.begin()
 
     def _render(self) -> Any:
         return self.env.render()
@@ -152,7 +159,7 @@ class GymEnvironment(Environment):
         self._observation = observation
         if self.factory:
             self._show()
-        if terminated or truncated:
+        if terminated or truncated or (self._log is not None and self._log.is_over()):
             self._observation = None
             if self.independent_episodes:
                 self.end_episode()
@@ -178,6 +185,8 @@ class GymEnvironment(Environment):
             self.policy = values.pop("policy")
         if self._observation is None and values:
             self._begin_episode()  # which would undo it
+        if self._log is not None:
+            self._log.compares = False
         env: Any = self.env.unwrapped
         if hasattr(env, "perturb"):
             env.perturb(**values)
@@ -189,6 +198,8 @@ class GymEnvironment(Environment):
         """Pull at a robot's body or an object: see `RobotEnv.pull`."""
         if self._observation is None:
             self._begin_episode()
+        if self._log is not None:
+            self._log.compares = False
         env: Any = self.env.unwrapped
         env.pull(name, node, force)
 
@@ -205,6 +216,7 @@ class GymEnvironment(Environment):
 
     @policy.setter
     def policy(self, policy: str | Callable[..., Any]) -> None:
+        self._log: Any = None
         if policy == "random":
             space = self.env.action_space  # a snapshot of a robot leaves its random numbers out
             self._act: Callable[[Any], Any] = lambda _: space.sample()
@@ -212,14 +224,22 @@ class GymEnvironment(Environment):
             self._act = self._ask_network
         elif not isinstance(policy, str):
             self._act = policy
+        elif ":" not in policy and Path(policy).suffix:
+            self._act = self._log = self._logged_actions(policy)
         elif ":" not in policy:
             raise ConfigError(
-                f'policy is "{policy}" but must be "random", "network" or '
-                '"package.module:function".'
+                f'policy is "{policy}" but must be "random", "network", '
+                '"package.module:function", or the path of a log.'
             )
         else:
             self._act = import_component("policy", policy)
         self._policy = policy
+
+    def _logged_actions(self, path: str) -> Any:
+        env: Any = self.env.unwrapped
+        if not hasattr(env, "logged_actions"):
+            raise ConfigError(f"policy is {path}, the log of a robot, which {self._id} is not.")
+        return env.logged_actions(path)
 
     def _ask_network(self, observation: Any) -> Any:
         predicted = self.get_prediction(**self._observations.arrays(observation))

@@ -87,7 +87,7 @@ def run(words: Sequence[str]) -> None:
             given = {"env": options.env, "backend": options.backend, "policy": options.policy}
             known = {name: asdict(each) for name, each in result.rivals.items()}
             figures = {"summary": summary(found), "episodes": found, "rivals": known}
-            show(json.dumps(given | figures))
+            print(json.dumps(given | figures))
         else:
             where = "" if options.backend is None else f" on {options.backend}"
             show(f"{options.env}{where}: {len(found)} episodes, seeds {seeds[0]} to {seeds[-1]}\n")

@@ -17,7 +17,7 @@ from typing import Any
 
 import numpy as np
 
-from physx_gym.shared_arrays import SharedArrays, Window
+from physx_gym.shared_arrays import SharedArrays, Window, whole_of, window_of
 from physx_sim.errors import SimulationError
 
 _KNOWN = "known"
@@ -128,7 +128,7 @@ def _collect(name: str, value: Any, found: dict[str, Any], seen: set[int]) -> No
         return
     seen.add(id(value))
     if isinstance(value, np.ndarray):
-        _collect(f"{name}.whole", _whole(value), found, seen)
+        _collect(f"{name}.whole", whole_of(value), found, seen)
     elif isinstance(value, (tuple, list)):
         for number, each in enumerate(value):
             _collect(f"{name}.{number}", each, found, seen)
@@ -143,13 +143,6 @@ def _collect(name: str, value: Any, found: dict[str, Any], seen: set[int]) -> No
 # Copies -----------------------------------------------------------------------------------------
 
 
-def _whole(array: np.ndarray[Any, Any]) -> np.ndarray[Any, Any]:
-    """Return the array that has the memory of a view."""
-    while type(array.base) is np.ndarray:
-        array = array.base
-    return array
-
-
 def _replace(value: Any, memo: dict[int, Any]) -> None:
     """Have windows in place of the views in a value, and names in place of methods of the known."""
     for array in _leaves(value, memo, set()):
@@ -158,10 +151,8 @@ def _replace(value: Any, memo: dict[int, Any]) -> None:
             if isinstance(owner, _Known):
                 memo[id(array)] = _Known(owner.name, array.__name__)
             continue
-        whole = _whole(array)
-        if whole is not array and whole.base is None and whole.flags.c_contiguous:
-            window = Window(whole, array)
-            window.whole = copy.deepcopy(whole, memo)
+        if (window := window_of(array)) is not None:
+            window.whole = copy.deepcopy(window.whole, memo)
             memo[id(array)] = window
 
 
@@ -274,7 +265,7 @@ class _Settling:
 
     def _opened(self, current: Any, window: Window) -> Any:
         is_array = type(current) is np.ndarray
-        window.whole = self(_whole(current) if is_array else None, window.whole)
+        window.whole = self(whole_of(current) if is_array else None, window.whole)
         found = window.open()
         same = ("shape", "strides", "dtype", "__array_interface__")
         if is_array and all(getattr(current, name) == getattr(found, name) for name in same):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 import weakref
 from collections.abc import Callable, Mapping, Sequence
+from pathlib import Path
 from typing import Any, ClassVar
 
 import gymnasium
@@ -28,6 +29,7 @@ from physx_gym.env.timing import StepTiming
 from physx_gym.simulator.simulator import make_simulator, simulator_options
 from physx_gym.spaces import copy_tree, fill, neutral
 from physx_gym.telemetry.episode_recorder import EpisodeRecorder
+from physx_gym.telemetry.logged_actions import LoggedActions
 from physx_sim import BodySettings, Wrench
 from physx_sim.errors import SimulationError
 
@@ -629,6 +631,17 @@ class RobotEnv(PipelineEnv):
         from physx_gym.visualization.environment_drawing import EnvironmentDrawing
 
         return EnvironmentDrawing(self, factory).draw
+
+    def logged_actions(self, path: str | Path) -> LoggedActions:
+        """Return the actions of an episode that this environment, made as now, has recorded.
+
+        Args:
+            path: Its log.
+
+        Raises:
+            LogError: If it is no log, or lacks the seed, actions or states.
+        """
+        return LoggedActions(path, self.simulator, self.derived.action_space)
 
     def perturb(self, **values: Any) -> None:
         """Change something in a running episode: see `physx_core.Environment.perturb`.

@@ -13,7 +13,7 @@ from physx_sim.engines import read_robot
 _NAMES = frozenset(
     {
         *("name", "joint", "urdf", "package_dirs", "joints", "feet", "path", "heights", "mimic"),
-        "network",
+        *("couplings", "wheels", "network"),
     }
 )
 """Fields that identify a thing rather than configure it; these are not options."""

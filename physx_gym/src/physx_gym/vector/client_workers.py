@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import sys
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
@@ -14,26 +13,22 @@ import numpy as np
 
 from physx_core import EnvironmentConfig, Field
 from physx_core.errors import PhysxError, UsageError
-from physx_core.net import Frame, Kind, decode, decode_error, encode
+from physx_core.net import Frame, Kind, decode_error, encode
 from physx_core.sources import ClientSource
 from physx_core.typing import Array, Batch
 from physx_gym.vector.batch import COMMAND, SharedBatch
 from physx_gym.vector.env_slice_environment import COUNT, ENTRIES, ORDER, ORDER_SIZE
 from physx_gym.vector.rows import ROW, RowLayout, copy_results
+from physx_gym.vector.worker_group import WorkerGroup
 
 _ENVIRONMENT = "physx_gym.vector.env_slice_environment:EnvSliceEnvironment"
 
 
-class ClientWorkers:
-    """The interface of `Workers`, with clients of a run in place of processes that share memory.
+class ClientWorkers(WorkerGroup):
+    """Clients of a run, in place of processes that share memory.
 
     Entries are sent when their results are awaited: all requested ones, in one message to each
     client.
-
-    Attributes:
-        is_open: Whether the clients are running.
-        asked: For each worker, how many entries its queue has had.
-        messages: What workers sent besides their results and errors: their numbers, and frames.
     """
 
     def __init__(
@@ -46,20 +41,17 @@ class ClientWorkers:
             setup: What the workers run, with their ``shares``.
             config: Options of `EnvironmentConfig`.
         """
-        self._batch, self._owner = batch, os.getpid()
         shares: Sequence[int] = setup["shares"]
+        super().__init__(len(shares))
+        self._batch = batch
         self._most = max(shares)
         fields = [Field.from_dict(each) for each in setup["observations"]]
         self._layout = RowLayout(fields, self._most, has_finals=bool(batch.finals))
         starts = np.cumsum([0, *shares]).tolist()
         self._slices = [slice(*pair) for pair in pairwise(starts)]
-        self._errors: dict[int, PhysxError] = {}
         self._queues: list[list[int]] = [[] for _ in shares]
         self._orders = [b""] * len(shares)
         self._done = [0] * len(shares)
-        self.is_open = True
-        self.asked = [0] * len(shares)
-        self.messages: list[tuple[int, Frame]] = []
         path = [str(Path(entry).resolve()) for entry in sys.path]
         environment = EnvironmentConfig(
             _ENVIRONMENT,
@@ -76,12 +68,12 @@ class ClientWorkers:
         self._raise(is_step=True)
 
     def ask(self, number: int, entries: Sequence[int] | Array) -> None:
-        """Add entries to the queue of a worker."""
+        """Add entries to the queue of a worker: see `WorkerGroup.ask`."""
         self._queues[number] += np.asarray(entries).tolist()
         self.asked[number] += len(entries)
 
     def command(self, name: str, arguments: Sequence[Any]) -> list[Any]:
-        """Have each worker execute a command after its other entries: see `Workers.command`."""
+        """Have each worker execute a command after its other entries: see `WorkerGroup.command`."""
         orders = [encode({"name": name, "arguments": each}, name) for each in arguments]
         self.wait(sum(self.asked))
         self._orders = orders
@@ -90,29 +82,19 @@ class ClientWorkers:
         try:
             self.wait(sum(self.asked), is_step=False)
         finally:
-            answers = {n: decode(f.payload) for n, f in self.messages if f.kind is Kind.ANSWER}
-            self.messages = [(n, f) for n, f in self.messages if f.kind is not Kind.ANSWER]
-        return [answers.get(number) for number in range(len(arguments))]
+            answers = self._take_answers()
+        return answers
 
     def wait(self, entries: int, *, is_step: bool = True) -> list[int]:
-        """Wait until the workers together have finished a number of entries: see `Workers.wait`."""
+        """Wait until the workers have finished some entries: see `WorkerGroup.wait`."""
         if sum(self._done) < entries:
             self._execute()
         self._raise(is_step=is_step)
         return list(self._done)
 
-    def close(self, *, orderly: bool) -> None:
-        """End the clients; none is left when this returns.
-
-        Args:
-            orderly: Whether to raise what environments raise as they are closed.
-        """
-        if not self.is_open:
-            return
-        self.is_open = False
-        if os.getpid() == self._owner:
-            with contextlib.nullcontext() if orderly else contextlib.suppress(PhysxError):
-                self._source.close()
+    def _end(self, orderly: bool) -> None:
+        with contextlib.nullcontext() if orderly else contextlib.suppress(PhysxError):
+            self._source.close()
 
     def _execute(self) -> None:
         """Have the workers execute their queues, and store the results."""
@@ -158,19 +140,6 @@ class ClientWorkers:
                 self._errors.setdefault(number, decode_error(frame.payload))
             else:
                 self.messages.append((instance_id - 1, frame))
-
-    def _raise(self, *, is_step: bool) -> None:
-        """Raise the error of the first environment that sent one."""
-        if self._errors:
-            error = self._errors[min(self._errors)]
-            self._errors.clear()
-            if is_step:
-                self._fail(error)
-            raise error
-
-    def _fail(self, error: PhysxError) -> NoReturn:
-        self.close(orderly=False)
-        raise error
 
 
 class _MessageSink:

@@ -74,7 +74,7 @@ class EnvSliceEnvironment(Environment):
 
     def close(self) -> None:
         """Close the environments."""
-        if hasattr(self, "_share"):
+        if hasattr(self, "_slice"):
             self._slice.close()
             for kind, content, _ in self._messages:
                 if kind is Kind.ERROR:

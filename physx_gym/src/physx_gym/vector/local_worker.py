@@ -2,27 +2,22 @@
 
 from __future__ import annotations
 
-import os
 import traceback
 from collections.abc import Mapping, Sequence
 from typing import Any, NoReturn
 
-from physx_core.errors import EnvironmentFailedError, PhysxError
+from physx_core.errors import EnvironmentFailedError
 from physx_core.net import Frame, Kind, decode, decode_error, encode
 from physx_core.typing import Array
 from physx_gym.vector.batch import SharedBatch
 from physx_gym.vector.env_slice import EnvSlice
+from physx_gym.vector.worker_group import WorkerGroup
 
 
-class LocalWorker:
-    """The interface of `Workers`, without a process: nothing could be computed at the same time.
+class LocalWorker(WorkerGroup):
+    """One worker without a process: nothing could be computed at the same time.
 
     Entries are executed when their results are awaited.
-
-    Attributes:
-        is_open: Whether the environment can be stepped.
-        asked: How many entries its queue has had, one element.
-        messages: What it sent besides its results and errors: the number 0, and frames.
     """
 
     def __init__(self, batch: SharedBatch, setup: Mapping[str, Any]) -> None:
@@ -32,13 +27,9 @@ class LocalWorker:
             batch: Its arrays.
             setup: What to run.
         """
-        self._owner = os.getpid()
+        super().__init__(1)
         self._queue: list[int] = []
         self._done = 0
-        self._errors: list[PhysxError] = []
-        self.is_open = True
-        self.asked = [0]
-        self.messages: list[tuple[int, Frame]] = []
         # What is given and returned is copied, as it is by a process.
         plain = decode(bytearray(encode({**setup, "number": 0}, "env_kwargs")))
         self._slice = EnvSlice(plain, batch, self._take)
@@ -49,25 +40,24 @@ class LocalWorker:
         self._raise(is_step=True)
 
     def ask(self, number: int, entries: Sequence[int] | Array) -> None:
-        """Add entries to the queue."""
+        """Add entries to the queue: see `WorkerGroup.ask`."""
         self._queue.extend(entries)
         self.asked[number] += len(entries)
 
     def command(self, name: str, arguments: Sequence[Any]) -> list[Any]:
-        """Execute a command after the other entries: see `Workers.command`."""
+        """Execute a command after the other entries: see `WorkerGroup.command`."""
         command = decode(bytearray(encode({"name": name, "arguments": arguments[0]}, name)))
         self.wait(self.asked[0])
         try:
             self._slice.execute(command)
         except BaseException as error:
             self._interrupt(error, name)
-        answers = [decode(f.payload) for _, f in self.messages if f.kind is Kind.ANSWER]
-        self.messages = [(n, f) for n, f in self.messages if f.kind is not Kind.ANSWER]
+        answers = self._take_answers()
         self._raise(is_step=False)
-        return answers or [None]
+        return answers
 
     def wait(self, entries: int, *, is_step: bool = True) -> list[int]:
-        """Execute entries until a number of them is done: see `Workers.wait`."""
+        """Execute entries until a number of them is done: see `WorkerGroup.wait`."""
         if self._done < entries:
             queue, self._queue = self._queue, []
             try:
@@ -79,37 +69,14 @@ class LocalWorker:
             self._raise(is_step=is_step)
         return [self._done]
 
-    def close(self, *, orderly: bool) -> None:
-        """Close the environment.
-
-        Args:
-            orderly: Whether to raise what it raises.
-        """
-        if not self.is_open:
-            return
-        self.is_open = False
-        if os.getpid() == self._owner:  # a forked process leaves it alone
-            self._slice.close()
-        if orderly and self._errors:
-            raise self._errors[0]
+    def _end(self, orderly: bool) -> None:
+        self._slice.close()
 
     def _take(self, kind: Kind, content: bytes, number: int) -> None:
         if kind is Kind.ERROR:
-            self._errors.append(decode_error(bytearray(content)))
+            self._errors.setdefault(number, decode_error(bytearray(content)))
         else:
             self.messages.append((0, Frame(kind, number, bytearray(content))))
-
-    def _raise(self, *, is_step: bool) -> None:
-        if self._errors:
-            error = self._errors[0]
-            self._errors.clear()
-            if is_step:
-                self._fail(error)
-            raise error
-
-    def _fail(self, error: PhysxError) -> NoReturn:
-        self.close(orderly=False)
-        raise error
 
     def _interrupt(self, error: BaseException, method: str) -> NoReturn:
         """Close the environment, which the user interrupts, or whose own code exits the process."""

@@ -27,6 +27,7 @@ from physx_gym.vector.batch import SharedBatch
 from physx_gym.vector.client_workers import ClientWorkers
 from physx_gym.vector.infos import InfoKind, InfoLayout, unpack
 from physx_gym.vector.local_worker import LocalWorker
+from physx_gym.vector.worker_group import WorkerGroup
 from physx_gym.vector.workers import Workers
 
 FORBIDDEN = ("reset", "step", "close")
@@ -138,7 +139,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         has_finals = self.autoreset_mode is AutoresetMode.SAME_STEP
         with anonymous_file("physx_vector") as file:
             self._batch = SharedBatch(file.fileno(), shares, *fields, has_finals=has_finals)
-            self._workers: Workers | ClientWorkers | LocalWorker
+            self._workers: WorkerGroup
             if launcher is None and num_envs == 1:
                 self._workers = LocalWorker(self._batch, setup)
             elif launcher is None:
@@ -489,7 +490,7 @@ class ParallelVectorEnv(VectorEnv[Any, Any, Any], Closeable):
         if workers is not None:
             workers.close(orderly=True)
 
-    def _open(self) -> Workers | ClientWorkers | LocalWorker:
+    def _open(self) -> WorkerGroup:
         if not self._workers.is_open:
             raise UsageError("This vector environment is closed, or ended with an error.")
         return self._workers

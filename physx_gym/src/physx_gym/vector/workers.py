@@ -3,21 +3,18 @@
 from __future__ import annotations
 
 import contextlib
-import os
 import select
 import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Any, NoReturn
+from typing import Any
 
-from physx_core.errors import ClientError, PhysxError
+from physx_core.errors import ClientError
 from physx_core.net import (
     MAX_PAYLOAD,
-    Frame,
     FrameReader,
     Kind,
-    decode,
     decode_error,
     encode,
     fence,
@@ -29,6 +26,7 @@ from physx_core.processes import WorkerProcess
 from physx_core.typing import Array
 from physx_gym.vector.batch import COMMAND, END, NEVER, SharedBatch
 from physx_gym.vector.spinning import Spinner
+from physx_gym.vector.worker_group import WorkerGroup
 
 _WAKEUP = pack(Kind.ACTIONS)
 _TICK = 0.1
@@ -39,14 +37,8 @@ _MAKE_TIME = 60.0
 """Shortest time limit for processes to create their environments, and to close them, in s."""
 
 
-class Workers:
-    """Processes that execute the entries of their queues; if one fails, all are ended.
-
-    Attributes:
-        is_open: Whether the processes are running.
-        asked: For each worker, how many entries its queue has had.
-        messages: What workers sent besides their results and errors: their numbers, and frames.
-    """
+class Workers(WorkerGroup):
+    """Processes that share memory with this one."""
 
     def __init__(
         self, batch: SharedBatch, file: int, setup: Mapping[str, Any], timeout: float
@@ -61,17 +53,13 @@ class Workers:
         """
         self._batch, self._timeout = batch, max(timeout, _MAKE_TIME)
         self._shares: Sequence[int] = setup["shares"]
-        self._owner = os.getpid()
+        super().__init__(len(self._shares))
         self._workers: list[_Worker] = []
         self._by_file: dict[int, int] = {}
         self._poll = select.poll()
         spins = has_core_for_each(len(self._shares) + 1)  # including this process
         self._spinner = Spinner(spins=spins)
-        self._errors: dict[int, PhysxError] = {}
         self._received = [0] * len(self._shares)
-        self.is_open = True
-        self.asked = [0] * len(self._shares)
-        self.messages: list[tuple[int, Frame]] = []
         batch.awaited[0] = NEVER
         path = [str(Path(entry).resolve()) for entry in sys.path]
         shared = {**setup, "path": path}
@@ -93,7 +81,7 @@ class Workers:
         self._timeout = timeout
 
     def ask(self, number: int, entries: Sequence[int] | Array) -> None:
-        """Add entries to the queue of a worker."""
+        """Add entries to the queue of a worker: see `WorkerGroup.ask`."""
         batch, start = self._batch, self.asked[number] % self._batch.capacity
         queue, count = batch.queues[number], len(entries)
         fitting = min(count, batch.capacity - start)
@@ -108,18 +96,7 @@ class Workers:
             self._workers[number].wake()
 
     def command(self, name: str, arguments: Sequence[Any]) -> list[Any]:
-        """Have each worker execute a command after its other entries.
-
-        Args:
-            name: Name of the command.
-            arguments: The argument for each worker.
-
-        Returns:
-            The answer of each worker; None if it has none.
-
-        Raises:
-            UsageError: If the arguments cannot be sent.
-        """
+        """Have each worker execute a command: see `WorkerGroup.command`."""
         messages = [_message({"name": name, "arguments": each}, name) for each in arguments]
         self.wait(sum(self.asked))  # a worker that sends something may not receive
         for number, message in enumerate(messages):
@@ -128,24 +105,11 @@ class Workers:
         try:
             self.wait(sum(self.asked), is_step=False)
         finally:
-            answers = {n: decode(f.payload) for n, f in self.messages if f.kind is Kind.ANSWER}
-            self.messages = [(n, f) for n, f in self.messages if f.kind is not Kind.ANSWER]
-        return [answers.get(number) for number in range(len(arguments))]
+            answers = self._take_answers()
+        return answers
 
     def wait(self, entries: int, *, is_step: bool = True) -> list[int]:
-        """Wait until the workers together have finished a number of entries since the start.
-
-        Args:
-            entries: The number.
-            is_step: Whether an environment that raises ends the processes.
-
-        Returns:
-            For each worker, how many it has finished.
-
-        Raises:
-            ClientError: If a worker ends, or an entry takes too long.
-            PhysxError: If environments raise: the error of the first one.
-        """
+        """Wait until the workers have finished some entries: see `WorkerGroup.wait`."""
         batch = self._batch
 
         def is_done() -> bool:
@@ -165,32 +129,16 @@ class Workers:
             is_read = sent <= self._received[number] or self._receive(number)
             if not is_read and done[number] < self.asked[number]:
                 self._fail(self._end_of(number))
-        if self._errors:
-            error = self._errors[min(self._errors)]
-            self._errors.clear()
-            if is_step:
-                self._fail(error)
-            raise error
+        self._raise(is_step=is_step)
         return done
 
     def close(self, *, orderly: bool) -> None:
-        """End the processes; none is left when this returns.
-
-        Args:
-            orderly: Whether to wait until they have closed their environments, and raise what these
-                raise; otherwise they get only a moment to do so.
-        """
-        if not self.is_open:
-            return
-        self.is_open = False
+        """End the processes: see `WorkerGroup.close`."""
         try:
-            if os.getpid() == self._owner:  # a forked process leaves them alone
-                self._end(orderly)
+            super().close(orderly=orderly)
         finally:
             for worker in self._workers:
                 worker.process.link.close()
-        if orderly and self._errors:
-            raise self._errors[min(self._errors)]
 
     def _sleep(self, is_done: Callable[[], bool]) -> None:
         """Sleep until something is done; detect workers that exit or hang."""
@@ -239,10 +187,6 @@ class Workers:
         link.setblocking(False)
 
     # Ends -----------------------------------------------------------------------------------
-
-    def _fail(self, error: PhysxError) -> NoReturn:
-        self.close(orderly=False)
-        raise error
 
     def _end(self, orderly: bool) -> None:
         """Ask the processes to exit, and kill those that do not."""

@@ -104,7 +104,10 @@ def run(words: Sequence[str]) -> None:
         slowest=options.slowest,
         flight=options.flight,
     )
-    show(found.to_json() if options.json else found)
+    if options.json:
+        print(found.to_json())
+    else:
+        show(found)
     notes = []
     if log.left_out:
         notes.append(f"columns not used: {', '.join(log.left_out)}")

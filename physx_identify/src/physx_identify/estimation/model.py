@@ -107,7 +107,8 @@ class Model:
         Raises:
             ModelError: If it cannot be loaded.
             ComponentNotFoundError: If there is no joint of a name.
-            IdentificationError: If it has no joints, or joints follow others or have springs.
+            IdentificationError: If it has no joints, or joints follow others, are coupled, or have
+                springs.
         """
         self.robot = robot
         world = World(robots=[robot], gravity=tuple(gravity))
@@ -143,6 +144,11 @@ class Model:
             raise IdentificationError(
                 f'{what}: the joint "{odd[0]}" has a spring or follows another, which is not '
                 'identified yet; set JointSettings(stiffness=0.0, mimic=Mimic("")).'
+            )
+        if movable.model.couplings:
+            raise IdentificationError(
+                f"{what}: what a motor bears of coupled joints is not known, so they are not "
+                "identified; uncouple them, and set Robot(couplings=())."
             )
 
     def check_fixed(self, what: str) -> None:

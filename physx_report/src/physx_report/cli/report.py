@@ -8,8 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from physx_core.cli import show
-from physx_report import write_report
+from physx_report import show
 
 
 @dataclass
@@ -29,6 +28,6 @@ class Report:
 
 
 def run(words: Sequence[str]) -> None:
-    """Write the page and print its name."""
+    """Write the page and print its name, or show it in a notebook."""
     options = tyro.cli(Report, args=words, prog="physx report")
-    show(f"report: {write_report(options.session, options.output, trust=options.trust)}")
+    show(options.session, options.output, trust=options.trust)

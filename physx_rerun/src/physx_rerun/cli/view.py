@@ -10,8 +10,9 @@ from typing import Annotated
 
 import tyro
 
-from physx_core.cli import show
+from physx_core import cli
 from physx_core.errors import VisualizerError
+from physx_rerun.notebook import show as show
 from physx_rerun.recordings import recording_of
 from physx_rerun.viewer.cursor import USUAL_PORT
 from physx_rerun.viewer.viewer import Viewer, has_display, start_web_viewer
@@ -64,7 +65,7 @@ def _open(recording: Path, options: View) -> Viewer:
     port = options.port or (USUAL_PORT if options.live else 0)
     if options.web:
         viewer = start_web_viewer(port, options.page_port, str(recording))
-        show(f"viewer: {viewer.page}  (Ctrl-C stops it)")
+        cli.show(f"viewer: {viewer.page}  (Ctrl-C stops it)")
         return viewer
     if not has_display():
         raise VisualizerError(

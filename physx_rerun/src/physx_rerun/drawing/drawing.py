@@ -92,8 +92,8 @@ class Drawing:
             "symbols": self._symbols,
             "box": self._box,
             "sphere": self._sphere,
-            "capsule": self._capsule,
-            "cylinder": self._cylinder,
+            "capsule": self._round,
+            "cylinder": self._round,
             "image": self._image,
             "text": self._text,
             "scalars": self._scalars,
@@ -478,24 +478,16 @@ class Drawing:
             self._see(drawn, np.concatenate([-half, half]))
         self._add(drawn, rr.Ellipsoids3D, times, look)
 
-    def _capsule(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
-        look = self._fill(drawn, changes, times)
+    def _round(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
+        look, is_capsule = self._fill(drawn, changes, times), drawn.kind == "capsule"
         if changes.keys() & {"radius", "length"}:
             radius, length = drawn.values["radius"], drawn.values["length"]
             look["radii"], look["lengths"] = np.array([radius]), np.array([length])
-            look["translations"] = np.array([[0.0, 0.0, -length / 2]])
-            half = np.array([radius, radius, radius + length / 2])
+            if is_capsule:
+                look["translations"] = np.array([[0.0, 0.0, -length / 2]])
+            half = np.array([radius, radius, length / 2 + (radius if is_capsule else 0.0)])
             self._see(drawn, np.stack([-half, half]))
-        self._add(drawn, rr.Capsules3D, times, look)
-
-    def _cylinder(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
-        look = self._fill(drawn, changes, times)
-        if changes.keys() & {"radius", "length"}:
-            radius, length = drawn.values["radius"], drawn.values["length"]
-            look["radii"], look["lengths"] = np.array([radius]), np.array([length])
-            half = np.array([radius, radius, length / 2])
-            self._see(drawn, np.stack([-half, half]))
-        self._add(drawn, rr.Cylinders3D, times, look)
+        self._add(drawn, rr.Capsules3D if is_capsule else rr.Cylinders3D, times, look)
 
     def _robot(self, drawn: Item, changes: dict[str, Any], times: Times) -> None:
         values = drawn.values

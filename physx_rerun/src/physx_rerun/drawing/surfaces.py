@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from physx_core.components import grid_mesh
 from physx_core.typing import Array
 from physx_rerun.drawing.framing import extremes
 
@@ -59,15 +60,9 @@ def mesh_of(kind: str, values: Mapping[str, Any]) -> tuple[Array, Array]:
     if kind == "mesh":
         return values["positions"], values["cells"]
     # Rerun's `GridMap` is flat, with square cells of one color each instead of values at points.
-    shape = (values["heights"] if kind == "height_field" else values["values"]).shape
-    heights = values["heights"] if kind == "height_field" else np.zeros(shape, np.float32)
-    x, y = (spacing * np.arange(n) for spacing, n in zip(values["spacing"], shape, strict=True))
-    points = np.stack([*np.meshgrid(x, y, indexing="ij"), heights], axis=-1)
-    nx, ny = shape
-    first = (np.arange(nx - 1)[:, None] * ny + np.arange(ny - 1)).ravel()
-    corners = [first, first + ny, first + ny + 1, first, first + ny + 1, first + 1]
-    cells = np.stack(corners, axis=1).reshape(-1, 3)
-    return points.reshape(-1, 3).astype(np.float32), cells.astype(np.int32)
+    is_field = kind == "height_field"
+    heights = values["heights"] if is_field else np.zeros(values["values"].shape, np.float32)
+    return grid_mesh(heights, values["spacing"])
 
 
 GRIDS = ("height_field", "slice", "volume")

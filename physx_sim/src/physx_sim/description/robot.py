@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
 from physx_core import checks
 from physx_core.errors import ConfigError, UnknownOptionError
+from physx_sim.description.coupling import JointCoupling
 from physx_sim.description.ground import MATERIAL
+from physx_sim.description.wheel import Wheel
 
 Mode = Literal["force", "servo", "velocity", "position"]
 _RESISTANCE = ("damping", "friction", "stiffness", "rest", "armature")
@@ -126,6 +128,9 @@ class Robot:
         rolling_friction: Friction torque against rolling per normal force, in m, in the same form
             (condim 6).
         joints: Settings of joints, by their name in the file.
+        couplings: Which joints move together, besides those that follow others; None: those of an
+            MJCF file, otherwise none. It starts at positions that couplings allow.
+        wheels: Links that roll on the ground without slip.
         mass_factors: Scale factors for the mass and moments of inertia of links, by their name in
             the file; 1 for all others.
 
@@ -150,6 +155,8 @@ class Robot:
     root: str = ""
     torsional_friction: float | None = None
     rolling_friction: float | None = None
+    couplings: Sequence[JointCoupling] | None = None
+    wheels: Sequence[Wheel] = ()
 
     def __post_init__(self) -> None:
         checks.name("robot", self.name)
@@ -169,8 +176,15 @@ class Robot:
         for option in MATERIAL:
             if (value := getattr(self, option)) is not None:
                 checks.not_negative(f"{where}{option}", value)
-        for joint, settings in self.joints.items():
-            if not isinstance(settings, JointSettings):
-                raise ConfigError(f'{where}joints["{joint}"] must be JointSettings(...).')
+        kinds: tuple[tuple[type, Iterable[object]], ...]
+        kinds = (
+            (JointSettings, self.joints.values()),
+            (JointCoupling, self.couplings or ()),
+            (Wheel, self.wheels),
+        )
+        for kind, things in kinds:
+            wrong = [thing for thing in things if not isinstance(thing, kind)]
+            if wrong:
+                raise ConfigError(f"{where}{wrong[0]!r} is not a {kind.__name__}.")
         for link, factor in self.mass_factors.items():
             checks.positive(f'{where}mass_factors["{link}"]', factor)

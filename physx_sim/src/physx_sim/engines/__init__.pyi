@@ -13,7 +13,7 @@ from .models.meshes import bounding_box as bounding_box
 from .models.meshes import bounding_capsule as bounding_capsule
 from .models.meshes import geometry_file as geometry_file
 from .models.meshes import read_vertices as read_vertices
-from .models.mjcf import is_mjcf as is_mjcf
+from .models.mjcf_file import is_mjcf as is_mjcf
 from .models.parts import MovableBody as MovableBody
 from .models.parts import Parts as Parts
 from .models.parts import Static as Static

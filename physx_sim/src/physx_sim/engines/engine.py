@@ -43,6 +43,9 @@ class RobotEngine(ABC):
         joints = found[len(base) :]
         for follower, leader, mimic in self.model.followers:
             joints[follower] = mimic.multiplier * joints[leader] + mimic.offset
+        if self.model.couplings:
+            rows, sums = self.model.coupling_rows
+            joints -= np.linalg.pinv(rows) @ (rows @ joints - sums)
         return found
 
     @abstractmethod

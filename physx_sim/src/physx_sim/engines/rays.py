@@ -81,7 +81,6 @@ class Caster:
             poses: Poses of all bodies, static ones included, shape (bodies, 7).
             ignored: Bodies that rays pass, as indices into `Layout.names`.
         """
-        rays = np.arange(len(begins))
         ways, best, normals = ends - begins, np.full(len(begins), np.inf), np.zeros(begins.shape)
         touched = np.full(len(begins), -1)
         if len(self._shapes) and len(begins):
@@ -89,19 +88,21 @@ class Caster:
             places = (turns @ self._places[..., None])[..., 0] + poses[self.bodies, :3]
             turns = turns @ self._turns
             shapes, near = self._near(places, begins, ways, ignored)
-            starts = ((begins[near] - places[shapes])[:, None] @ turns[shapes])[:, 0]
-            along = (ways[near][:, None] @ turns[shapes])[:, 0]
-            fractions = np.full((len(places), len(begins)), np.inf)
-            fractions[shapes, near] = self._fractions(shapes, starts, along)
-            first = fractions.argmin(axis=0)
-            best = fractions[first, rays]
-            hit = (best <= 1.0).nonzero()[0]
-            pairs = np.empty(fractions.shape, np.intp)
-            pairs[shapes, near] = np.arange(len(shapes))
-            chosen, which = pairs[first[hit], hit], first[hit]
-            local = self._normals(which, starts[chosen], along[chosen], best[hit])
-            normals[hit] = (turns[which] @ local[..., None])[..., 0]
-            touched[hit] = self.bodies[which]
+            turned = turns[shapes]
+            starts = ((begins[near] - places[shapes])[:, None] @ turned)[:, 0]
+            along = (ways[near][:, None] @ turned)[:, 0]
+            fractions = self._fractions(shapes, starts, along)
+            entered = (fractions <= 1.0).nonzero()[0]
+            # Of the pairs of a ray, the nearest comes last and stays.
+            entered = entered[fractions[entered].argsort(kind="stable")[::-1]]
+            first = touched.copy()
+            first[near[entered]] = entered
+            rays = (first >= 0).nonzero()[0]
+            chosen = first[rays]
+            best[rays], which = fractions[chosen], shapes[chosen]
+            local = self._normals(which, starts[chosen], along[chosen], best[rays])
+            normals[rays] = (turns[which] @ local[..., None])[..., 0]
+            touched[rays] = self.bodies[which]
         for body, normal, height in self._planes:
             if body not in ignored:
                 above, speed = begins @ normal - height, ways @ normal
@@ -134,15 +135,19 @@ class Caster:
         self, places: Vector, begins: Vector, ways: Vector, ignored: Collection[int]
     ) -> tuple[Index, Index]:
         """Return pairs of a shape and a ray that comes near it, ordered by the shapes."""
-        apart = places[:, None] - begins
-        lengths = np.maximum(np.einsum("ri,ri->r", ways, ways), _TINY)
-        share = np.einsum("sri,ri->sr", apart, ways) / lengths
-        np.clip(share, 0.0, 1.0, out=share)
-        apart -= share[..., None] * ways
-        reaches = (self._reaches * (1 + 1e-9) + 1e-12) ** 2
+        # Squared distances by products of matrices, from a point near the rays: an array of vectors
+        # takes several times as long. What this costs in accuracy is added to the reaches.
+        places, begins = places - begins[0], begins - begins[0]
+        apart, lengths = _dot(places, places)[:, None] + _dot(begins, begins), _dot(ways, ways)
+        lost = 1e-14 * (apart.max() + lengths.max())
+        along = places @ ways.T - _dot(begins, ways)
+        share = along / np.maximum(lengths, _TINY)
+        np.minimum(np.maximum(share, 0.0, out=share), 1.0, out=share)
+        apart -= 2.0 * (places @ begins.T) + share * (2.0 * along - share * lengths)
+        reaches = (self._reaches * (1 + 1e-9) + 1e-12) ** 2 + lost
         if ignored:
-            reaches[np.isin(self.bodies, list(ignored))] = -1.0
-        close = np.einsum("sri,sri->sr", apart, apart) <= reaches[:, None]
+            reaches[np.isin(self.bodies, list(ignored))] = -np.inf
+        close = apart <= reaches[:, None]
         shapes, rays = close.nonzero()
         return shapes, rays
 
@@ -167,11 +172,10 @@ class Caster:
         """Return the normals (n, 3) of shapes where rays enter them, in their frames."""
         points, size = starts + fractions[:, None] * along, self._sizes[which]
         found, (boxes, meshes) = points.copy(), self._ends
-        found[:, 2] -= np.clip(points[:, 2], -size[:, 1], size[:, 1])
-        caps = self._flat[which]
-        if caps.any():
+        if boxes:
+            found[:, 2] -= np.minimum(np.maximum(points[:, 2], -size[:, 1]), size[:, 1])
             depth = size[:, 0] - np.hypot(points[:, 0], points[:, 1])
-            caps &= size[:, 1] - np.abs(points[:, 2]) < depth
+            caps = self._flat[which] & (size[:, 1] - np.abs(points[:, 2]) < depth)
             found[caps] = np.sign(points[caps, 2])[:, None] * (0.0, 0.0, 1.0)
         rows = ((which >= boxes) & (which < meshes)).nonzero()[0]
         if len(rows):
@@ -181,9 +185,14 @@ class Caster:
         for row in (which >= meshes).nonzero()[0].tolist():
             mesh = self._meshes[int(which[row])]
             found[row] = _enter_mesh(starts[row, None], along[row, None], mesh)[1][0]
-        lengths = np.sqrt(np.einsum("ij,ij->i", found, found))
-        found /= np.maximum(lengths, _TINY)[:, None]
+        found /= np.maximum(np.sqrt(_dot(found, found)), _TINY)[:, None]
         return found
+
+
+def _dot(one: Vector, other: Vector) -> Vector:
+    """Return the dot products of rows."""
+    found: Vector = np.einsum("...i,...i->...", one, other)
+    return found
 
 
 def _enter_box(o: Vector, d: Vector, half: Vector) -> Vector:
@@ -203,9 +212,7 @@ def _enter(a: Vector, b: Vector, c: Vector) -> Vector:
 
 
 def _enter_ball(o: Vector, d: Vector, radius: Vector) -> Vector:
-    dot = "...i,...i->..."
-    squares = np.einsum(dot, o, o) - radius**2
-    return _enter(np.einsum(dot, d, d), np.einsum(dot, o, d), squares)
+    return _enter(_dot(d, d), _dot(o, d), _dot(o, o) - radius**2)
 
 
 def _enter_round(o: Vector, d: Vector, radius: Vector, half: Vector, flat: Mask) -> Vector:
@@ -222,7 +229,7 @@ def _enter_round(o: Vector, d: Vector, radius: Vector, half: Vector, flat: Mask)
             if flat.any():
                 cap = np.where((away >= 0) & (speed < 0), -away / speed, np.inf)
                 reached = o[:, :2] + cap[:, None] * d[:, :2]
-                valid |= flat & (np.einsum("ij,ij->i", reached, reached) <= radius**2)
+                valid |= flat & (_dot(reached, reached) <= radius**2)
                 t = np.where(flat, cap, t)
             found = np.minimum(found, np.where(valid, t, np.inf))
     return found

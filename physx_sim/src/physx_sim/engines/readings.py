@@ -64,7 +64,8 @@ class ReadableSimulation(SimulationCore[Engine]):
         """Return the reactions of the joints that lead to links, shape (names, 6).
 
         Raises:
-            SimulationError: If no joint leads to a link, or anything is attached.
+            SimulationError: If no joint leads to a link, anything is attached, or wheels roll
+                without slip.
         """
         self._check_has("joint_wrenches")
         places = self._checks.bodies(names)
@@ -79,9 +80,10 @@ class ReadableSimulation(SimulationCore[Engine]):
 
     def _reactions(self, links: Sequence[int]) -> Vector:
         self._check_has("joint_wrenches")
-        if len(self._attachments):
+        if len(self._attachments) or self.parts.rolling:
             raise SimulationError(
-                "Reactions of joints need the forces of all attachments, which are not known."
+                "Reactions of joints need the forces of all attachments and of wheels that roll "
+                "without slip, which are not known."
             )
         if self._made_reactions is None:
             self._made_reactions = Reactions(self.parts)

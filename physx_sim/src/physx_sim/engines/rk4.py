@@ -15,12 +15,14 @@ RK4_LACKS = (
     "attachments",
     "contacts",
     "body_contacts",
+    "couplings",
     "isotropic_friction",
     "joint_friction",
     "limits",
     "mimic",
     "moving_statics",
     "restitution",
+    "rolling",
     "self_collisions",
     "step_derivatives",
     "torsional_friction",
@@ -32,15 +34,20 @@ def check_rk4(parts: Parts, engine: str, features: Collection[str]) -> None:
     """Raise an error if a world needs constraints.
 
     Raises:
-        FeatureNotSupportedError: If there may be contacts, attachments, or a joint has limits,
-            friction, a leader, or a mode other than ``"force"``.
+        FeatureNotSupportedError: If there may be contacts, attachments, couplings, wheels, or a
+            joint has limits, friction, a leader, or a mode other than ``"force"``.
     """
     advice = 'Use World(integrator="euler").'
     solid = sum(bool(movable.model.shapes) for movable in parts.movables) + len(parts.statics)
     if parts.world.contacts != "none" and solid > 1:
         raise FeatureNotSupportedError(engine, "contacts in rk4", features, advice)
-    if parts.attachments:
-        raise FeatureNotSupportedError(engine, "attachments in rk4", features, advice)
+    for what, needed in (
+        ("attachments", bool(parts.attachments)),
+        ("couplings", any(movable.model.couplings for movable in parts.movables)),
+        ("rolling", parts.rolling),
+    ):
+        if needed:
+            raise FeatureNotSupportedError(engine, f"{what} in rk4", features, advice)
     for joint in (joint for movable in parts.movables for joint in movable.model.joints):
         limits = [joint.lower, joint.upper, joint.max_velocity]
         for name, asked in (

@@ -195,6 +195,7 @@ class RobotSimulation(ChangeableSimulation[Engine]):
             (len(self._positioned), 'joints with the mode "position"; "servo" has them'),
             (self._movers, "static bodies that move"),
             (self._frozen, "hidden objects"),
+            (self.parts.rolling, "wheels that roll without slip"),
         ):
             if acts:
                 raise SimulationError(f"A step has no derivatives while there are {what}.")

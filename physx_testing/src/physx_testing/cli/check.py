@@ -16,6 +16,7 @@ from physx_core.fields import Field
 from physx_testing import Report, check_plugin
 
 _STATUSES = ("passed", "failed", "expected", "skipped")
+_NAME = 45  # columns of kind and name, which leave 35 for the numbers
 
 
 @dataclass
@@ -109,12 +110,11 @@ def _fields(given: Mapping[str, Any]) -> list[Field]:
 def _shown(reports: Iterable[Report]) -> list[Report]:
     """Print a line for each report as it arrives, then the findings."""
     done = []
-    show(f"{'kind':14}  {'component':32}" + "".join(f"  {name:>8}" for name in _STATUSES))
+    show(_row("kind", "component", _STATUSES))
     for report in reports:
         counts = report.counts()
-        numbers = "".join(f"  {counts[name]:8}" for name in _STATUSES)
         name = report.component.rpartition("/")[2] if ":" in report.component else report.component
-        show(f"{report.kind:14}  {name:32}{numbers}")
+        show(_row(report.kind, name, [counts[status] for status in _STATUSES]))
         done.append(report)
     for report in done:
         for check in report.findings():
@@ -123,3 +123,11 @@ def _shown(reports: Iterable[Report]) -> list[Report]:
                 f"\n{check.status}: {report.kind} {report.component}\n  {check.name}:\n    {lines}"
             )
     return done
+
+
+def _row(kind: str, name: str, cells: Sequence[object]) -> str:
+    """Return a row of the table; its numbers follow in another line if the name is long."""
+    begin = f"{kind:14}  {name:{_NAME - 16}}"
+    begin += f"\n{'':{_NAME}}" if len(begin) > _NAME else ""
+    of = zip(_STATUSES, cells, strict=True)
+    return begin + "".join(f"  {cell!s:>{len(status)}}" for status, cell in of)

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 import sys
 from abc import abstractmethod
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 
 from physx_core import Closeable
-from physx_core.processes import describe_exit
+from physx_core.processes import ChildProcess, describe_exit
 
 PATIENCE = 20.0
 """Time in s that a trial has to write a checkpoint when it is asked to end."""
@@ -49,6 +50,21 @@ class Executor(Closeable):
 def command_of(folder: Path) -> list[str]:
     """Return the command that runs a trial in the working directory of this process."""
     return [sys.executable, "-m", "physx_cluster.sweep.trial", str(folder), str(Path.cwd())]
+
+
+def start_process(
+    words: Sequence[str], variables: Mapping[str, str], output: str | Path
+) -> ChildProcess:
+    """Start a process whose output is appended to a file.
+
+    Args:
+        words: Its command.
+        variables: Its further environment variables.
+        output: The file.
+    """
+    with Path(output).open("ab") as file:
+        place = file.fileno()
+        return ChildProcess(words, variables=variables, stdout=place, stderr=place)
 
 
 def variables_of(threads: int) -> dict[str, str]:

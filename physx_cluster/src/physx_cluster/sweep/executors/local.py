@@ -12,6 +12,7 @@ from physx_cluster.sweep.executors.executor import (
     Job,
     command_of,
     describe_status,
+    start_process,
     variables_of,
 )
 from physx_cluster.sweep.results import OUTPUT
@@ -41,10 +42,7 @@ class LocalExecutor(Executor):
 
     def start(self, folder: Path) -> LocalJob:
         """Start the process of a trial; see `Executor.start`."""
-        with (folder / OUTPUT).open("ab") as output:
-            place = output.fileno()
-            command, variables = command_of(folder), self._variables
-            process = ChildProcess(command, variables=variables, stdout=place, stderr=place)
+        process = start_process(command_of(folder), self._variables, folder / OUTPUT)
         self._jobs = [job for job in self._jobs if not job.has_ended()]
         self._jobs.append(LocalJob(process))
         return self._jobs[-1]

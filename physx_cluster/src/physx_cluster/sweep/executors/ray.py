@@ -13,11 +13,11 @@ from physx_cluster.sweep.executors.executor import (
     Job,
     command_of,
     describe_status,
+    start_process,
     variables_of,
 )
 from physx_cluster.sweep.results import OUTPUT
 from physx_core.errors import ConfigError, MissingLibraryError
-from physx_core.processes import ChildProcess
 
 
 class RayExecutor(Executor):
@@ -116,9 +116,7 @@ def run_command(command: Sequence[str], variables: Mapping[str, str], output: st
         variables: Environment variables in addition to the worker's.
         output: File to append the output to.
     """
-    with Path(output).open("ab") as file:
-        place = file.fileno()
-        process = ChildProcess(command, variables=variables, stdout=place, stderr=place)
+    process = start_process(command, variables, output)
     try:
         while process.wait(0.1) is None:
             pass  # between polls, Ray can cancel the task, which raises KeyboardInterrupt here

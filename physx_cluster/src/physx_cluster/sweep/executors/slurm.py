@@ -5,14 +5,13 @@ from __future__ import annotations
 import contextlib
 import hashlib
 import logging
-import os
 import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
 
-from physx_cluster.launchers.slurm_guard import start_guard
+from physx_cluster.launchers.slurm_guard import Guard
 from physx_cluster.launchers.slurm_queue import (
     UNKNOWN_TO_SCHEDULER,
     JobState,
@@ -25,6 +24,7 @@ from physx_cluster.sweep.executors.executor import (
     Job,
     command_of,
     describe_status,
+    start_process,
     variables_of,
 )
 from physx_cluster.sweep.results import OUTPUT
@@ -80,8 +80,7 @@ class SlurmExecutor(Executor):
         self._states: dict[str, JobState] = {}
         self._asked = 0.0
         self._executor: Any = None
-        self._guard: ChildProcess | None = None
-        self._pipe = -1
+        self._guard: Guard | None = None
         self._jobs: list[SlurmJob] = []
 
     def start(self, folder: Path) -> SlurmJob:
@@ -123,8 +122,7 @@ class SlurmExecutor(Executor):
             job.close()
         guard, self._guard = self._guard, None
         if guard is not None:
-            os.close(self._pipe)  # the guard does the rest, as if this process had been killed
-            guard.wait()
+            guard.close()
 
     def _open(self, folder: Path) -> None:
         """End an earlier sweep's remaining jobs, and make new ones end with this process."""
@@ -141,7 +139,7 @@ class SlurmExecutor(Executor):
             self._executor.update_parameters(name=name, **self._options)
         except (NameError, TypeError, ValueError, AssertionError) as error:
             raise ConfigError(f"submitit rejects the options of the executor: {error}") from None
-        self._guard, self._pipe = start_guard(folder, name if self._queue is not None else "")
+        self._guard = Guard(folder, name if self._queue is not None else "")
 
 
 class SlurmJob(Job):
@@ -198,11 +196,7 @@ class TrialJob:
 
     def __call__(self) -> int | None:
         """Run the command and return its exit status."""
-        with Path(self._output).open("ab") as file:
-            place = file.fileno()
-            process = ChildProcess(
-                self._command, variables=self._variables, stdout=place, stderr=place
-            )
+        process = start_process(self._command, self._variables, self._output)
         _RUNNING.append(process)
         try:
             return process.wait()

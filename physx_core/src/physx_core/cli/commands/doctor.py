@@ -8,7 +8,7 @@ from pathlib import Path
 
 from physx_core.cli import installation
 from physx_core.cli.commands.plugins import load_all
-from physx_core.cli.output import show, show_table, show_values
+from physx_core.cli.output import show, show_values
 from physx_core.errors import UsageError
 
 _HELP = """usage: physx doctor
@@ -36,8 +36,11 @@ def run(words: Sequence[str]) -> None:
         show(title if values else f"{title}: none relevant")
         show_values(values)
     show("packages")
-    rows = [(each.name, each.version, each.place) for each in packages]
-    show_table(("name", "version", "imported from"), rows, indent=2)
+    places: dict[str, list[str]] = {}
+    for each in packages:
+        places.setdefault(each.place, []).append(f"{each.name} {each.version}")
+    for place, names in places.items():
+        show(f"  {place}: {', '.join(names)}")
     problems = [f"{each.name}: {text}" for each in packages for text in each.problems]
     show(f"conflicts: {'' if problems else 'none'}")
     for text in problems:

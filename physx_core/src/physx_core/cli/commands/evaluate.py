@@ -58,7 +58,10 @@ def run(words: Sequence[str]) -> None:
         invariants=options.invariants,
         trust=options.trust,
     )
-    show(result.to_json() if options.json else result)
+    if options.json:
+        print(result.to_json())
+    else:
+        show(result)
 
 
 def _other(session: Path) -> Evaluation | None:

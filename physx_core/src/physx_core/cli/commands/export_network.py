@@ -12,7 +12,7 @@ import tyro
 from physx_core import checkpoint
 from physx_core.cli.output import show
 from physx_core.config import NetworkConfig
-from physx_core.pipelines.learning.learner import load_learner
+from physx_core.pipelines.learning.loading import load_learner
 
 
 @dataclass

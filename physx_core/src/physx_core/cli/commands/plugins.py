@@ -2,11 +2,10 @@
 
 from __future__ import annotations
 
-import textwrap
 from collections.abc import Iterator, Sequence
 
 from physx_core import plugins
-from physx_core.cli.output import show, width
+from physx_core.cli.output import show
 from physx_core.errors import PhysxError, UsageError, printable
 from physx_core.plugins import Plugin
 from physx_core.plugins.entries import find_unreadable
@@ -21,17 +20,7 @@ def run(words: Sequence[str]) -> None:
         raise UsageError(f"physx plugins takes no options, not {' '.join(words)}.")
     for name, plugin in load_all():
         for kind, components in plugin.components.items():
-            text = f"{kind}: {', '.join(f'{name}/{key}' for key in components)}"
-            show(
-                textwrap.fill(
-                    text,
-                    width(),
-                    initial_indent="  ",
-                    subsequent_indent=" " * 4,
-                    break_long_words=False,
-                    break_on_hyphens=False,
-                )
-            )
+            show(f"  {kind}: {', '.join(f'{name}/{key}' for key in components)}")
 
 
 def load_all() -> Iterator[tuple[str, Plugin]]:

@@ -92,9 +92,7 @@ class EpisodeReading(ABC):
             DatasetError: If there is no such mode, or no table of episodes, or it is damaged.
         """
         self._prepare_reading()
-        total = self._reader.stored_rows(EPISODES)
-        fields = self._reader.mode(EPISODES).fields
-        table = {name: self._reader.read(EPISODES, name, 0, total) for name in fields}
+        table = self._reader.table()
         parts = [{name: column[:0] for name, column in table.items()}]
         for mode in modes:
             order = self._reader.order(mode)

@@ -277,16 +277,12 @@ class ModeRows:
         for first in range(start, stop, count):
             block = {name: buffer[: stop - first] for name, buffer in buffers.items()}
             for name, out in block.items():
-                if self.fields[name].free_axis:
-                    out[:] = (
-                        self._reader.read(self.mode, name, first, first + len(out))
-                        if (self.stored is None)
-                        else self.gather(name, np.arange(first, first + len(out)))
-                    )
-                elif self.stored is None:
-                    self._reader.read_into(out, self.mode, name, first, checks[name])
-                else:
+                if self.stored is not None:
                     out[:] = self.gather(name, np.arange(first, first + len(out)))
+                elif self.fields[name].free_axis:
+                    out[:] = self._reader.read(self.mode, name, first, first + len(out))
+                else:
+                    self._reader.read_into(out, self.mode, name, first, checks[name])
             yield first, block
 
     def episode_values(self, name: str, rows: Index) -> Array:

@@ -78,7 +78,7 @@ def compute_of_rows(
     """
     field = known.fields[of.field]
     cells = _divide(known, field, starts, counts)
-    special = of.log or of.since or of.pooled != field.pooled or field.free_axis
+    special = of.log or of.since or of.pooled != field.pooled
     if known.order is None or special:
         return _read(known, of, cells).merged()
     return _Keeper(known, of).find(cells).merged()
@@ -100,8 +100,7 @@ def store_in_order(reader: Reader) -> None:
             found |= {
                 (name, field): kept
                 for field, of in mode.counted_fields.items()
-                if not of.free_axis
-                and len((kept := _Keeper(known, kept_of(known.fields[field])).stored()).keys)
+                if len((kept := _Keeper(known, kept_of(known.fields[field])).stored()).keys)
             }
     if found:
         order_file.write(reader.directory, found)
@@ -210,14 +209,13 @@ def _read(known: ModeRows, of: Measured, cells: _Division) -> Cells:
 
 
 def _read_entries(known: ModeRows, of: Measured, cells: _Division) -> Cells:
-    """Return the statistics of the entries of cells, of those that have some."""
+    """Return the statistics of the entries of cells."""
     found = [nothing(known.fields[of.field], of.pooled).cells]
     for cell in range(len(cells.size)):
         rows = cells.rows(cell)
         blocks = (rows[begin : begin + _FREE_ROWS] for begin in range(0, len(rows), _FREE_ROWS))
         values = [of.of({n: known.entries(n, block)[0] for n in of.names}) for block in blocks]
-        if any(map(len, values)):
-            found.append(Cells.one(values, of.pooled))
+        found.append(Cells.one(values, of.pooled) if any(map(len, values)) else found[0].empty())
     return Cells.joined(found)
 
 
@@ -237,7 +235,7 @@ class _Keeper:
             missing = np.flatnonzero(place < 0)
             if len(kept.keys) and len(missing):
                 rest = cells.take(missing)
-                there = kept.places(self._keys(rest, identify), rest.size)
+                there = kept.places(self._keys(rest, identify), self._counts(rest))
                 place[missing] = np.where(there < 0, -1, count + there)
                 parts.append(kept.cells)
                 count += len(kept.keys)
@@ -248,6 +246,10 @@ class _Keeper:
             place[missing] = count + np.arange(len(missing))
             self._keep(live, KeptCells.of(self._keys(rest, self._live), parts[-1]))
         return (parts[0] if len(parts) == 1 else Cells.joined(parts)).take(place)
+
+    def _counts(self, cells: _Division) -> Index | None:
+        """Return the numbers of rows of cells; None: they are counted by entries."""
+        return None if self._field.free_axis else cells.size
 
     def _keep(self, known: KeptCells, new: KeptCells) -> None:
         """Keep cells in memory, beside those that are known unless these are too large."""

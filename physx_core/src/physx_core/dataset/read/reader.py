@@ -20,7 +20,7 @@ from physx_core.dataset.store.partition.spans import Span
 from physx_core.errors import DatasetError, listed, nearest
 from physx_core.fields import ENDS, Field
 from physx_core.packing import split
-from physx_core.typing import Array, Index
+from physx_core.typing import Array, Batch, Index
 
 
 class Reader:
@@ -255,6 +255,11 @@ class Reader:
             block = buffer[: end - first]
             self.read_into(block, mode, name, first, checks)
             yield block
+
+    def table(self) -> Batch:
+        """Return all records of episodes, by field, in the order of writing."""
+        total = self.stored_rows(EPISODES)
+        return {name: self.read(EPISODES, name, 0, total) for name in self.mode(EPISODES).fields}
 
     def _read_table(self, name: str, start: int, stop: int) -> Array:
         return self.read(EPISODES, name, start, stop)

@@ -65,12 +65,9 @@ def _entries(directory: Path, mode: Mode, partition: Partition, rows: int) -> di
 
 def _write(path: Path, offset: int, ends: Index) -> None:
     """Store where the entries of a copied partition's rows end there."""
-    descriptor = files.open_regular(path, os.O_WRONLY)
-    try:
+    with files.opened(path, os.O_WRONLY) as descriptor:
         files.write_at(descriptor, files.as_bytes(ends.astype("<u8")), offset)
         files.sync(descriptor)
-    finally:
-        files.close(descriptor)
 
 
 def _reserve(directory: Path, mode: Mode, partition: Partition, run: Range) -> Partition:

@@ -62,12 +62,9 @@ def append(directory: Path, end: End, change: Mapping[str, Any]) -> End:
     body = json.dumps(change).encode()[:-1]
     crc = crc32(body, end.crc32)
     content = body + b', "crc32": "%08x"}\n' % crc
-    descriptor = files.open_regular(directory / FILE, os.O_RDWR | os.O_CREAT)
-    try:
+    with files.opened(directory / FILE, os.O_RDWR | os.O_CREAT) as descriptor:
         files.write_at(descriptor, content, end.nbytes)
         files.sync(descriptor)
-    finally:
-        files.close(descriptor)
     if not end.nbytes:
         files.sync_folder(directory)
     return end._replace(crc32=crc, nbytes=end.nbytes + len(content))

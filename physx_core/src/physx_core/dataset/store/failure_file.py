@@ -42,16 +42,13 @@ class FailedEpisode(NamedTuple):
 def append(directory: Path, failures: Iterable[FailedEpisode]) -> None:
     """Append failures to the file, which is created if needed."""
     lines = [json.dumps(f._replace(reason=f.reason[:_LONGEST])._asdict()) for f in failures]
-    descriptor = files.open_regular(directory / FILE, os.O_RDWR | os.O_CREAT)
-    try:
+    with files.opened(directory / FILE, os.O_RDWR | os.O_CREAT) as descriptor:
         end, last = files.size(descriptor), bytearray(b"\n")
         if end:
             files.read_at(descriptor, memoryview(last), end - 1)
         start = b"" if last == b"\n" else b"\n"  # a line is torn: its writer died
         content = start + "".join(line + "\n" for line in lines).encode()
         files.write_at(descriptor, content, end)
-    finally:
-        files.close(descriptor)
 
 
 def read(directory: Path) -> list[FailedEpisode]:

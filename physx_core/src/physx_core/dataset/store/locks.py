@@ -70,20 +70,13 @@ def lock_shared(directory: Path) -> tuple[files.FileLock, bool]:
 
 def is_written(directory: Path) -> bool:
     """Return whether another process has locked a dataset as its only writer; changes nothing."""
-    try:
-        descriptor = files.open_regular(directory / LOCK)
-    except OSError:
-        return False
-    try:
-        fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
-    except BlockingIOError:
-        return os.pread(descriptor, 20, 0) != str(os.getpid()).encode()
-    except OSError:  # a file system without locks
-        return False
-    else:
-        return False
-    finally:
-        files.close(descriptor)
+    # There may be no file, or a file system without locks.
+    with contextlib.suppress(OSError), files.opened(directory / LOCK) as descriptor:
+        try:
+            fcntl.flock(descriptor, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            return os.pread(descriptor, 20, 0) != str(os.getpid()).encode()
+    return False
 
 
 def share(directory: Path, lock: files.FileLock) -> None:

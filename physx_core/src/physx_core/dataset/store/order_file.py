@@ -48,12 +48,19 @@ class KeptCells(NamedTuple):
         chosen = place[known != 0]
         return cls(known[known != 0], cells.take(chosen))
 
-    def places(self, keys: Keys, counts: Index) -> Index:
-        """Return the places of cells with some keys and numbers of rows; -1: they are unknown."""
+    def places(self, keys: Keys, counts: Index | None) -> Index:
+        """Return the places of cells with some keys and numbers of rows; -1: they are unknown.
+
+        Args:
+            keys: The keys.
+            counts: The numbers of rows; None: any.
+        """
         if not len(self.keys):
             return np.full(len(keys), -1)
         place = np.minimum(self.keys.searchsorted(keys), len(self.keys) - 1)
-        right = (self.keys[place] == keys) & (self.cells.rows[place] == counts)
+        right = self.keys[place] == keys
+        if counts is not None:
+            right &= self.cells.rows[place] == counts
         return np.where(right, place, -1)
 
 
@@ -119,7 +126,8 @@ def _checked(field: Field, columns: list[Array | None]) -> KeptCells | None:
     ):
         return None
     keys, rows, mean, squares, least, most = known
-    right = (np.diff(keys) > 0).all() and (rows > 0).all() and (squares >= 0).all()
+    enough = (rows >= 0 if field.free_axis else rows > 0).all()
+    right = (np.diff(keys) > 0).all() and enough and (squares >= 0).all()
     if not (right and all(np.isfinite(array).all() for array in (mean, least, most))):
         return None
     return KeptCells(keys, Cells(rows, mean, squares, least, most))

@@ -125,12 +125,9 @@ def unseal(directory: Path, fields: Mapping[str, Field], partition: Partition) -
         settled = Commit.unchecked(partition.rows_of(field))
         found = partition.inspect(directory, field)
         if set(found.commits) != {settled}:
-            descriptor = files.open_regular(partition.path(directory, name), os.O_WRONLY)
-            try:
+            with files.opened(partition.path(directory, name), os.O_WRONLY) as descriptor:
                 files.write_at(descriptor, encode(settled), found.rows_offset)
                 files.sync(descriptor)
-            finally:
-                files.close(descriptor)
     return replace(partition, checksums={}, counted=False)
 
 

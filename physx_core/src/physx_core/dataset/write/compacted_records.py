@@ -10,7 +10,7 @@ from physx_core.dataset.read.order.addresses import Addresses
 from physx_core.dataset.read.order.order import Order
 from physx_core.dataset.read.order.rewriting import records_at
 from physx_core.dataset.read.reader import Reader
-from physx_core.dataset.store.episode_table import EPISODES, mode_index
+from physx_core.dataset.store.episode_table import mode_index
 from physx_core.dataset.store.manifest import Mode, Partition, Partitions
 from physx_core.dataset.write.writer import Writer
 from physx_core.typing import Batch
@@ -30,9 +30,7 @@ def compacted_records(
         orders: The modes to compact, and the order of their rows; records of others stay.
         partitions: The partitions in which their rows will be, in order.
     """
-    total = reader.stored_rows(EPISODES)
-    fields = writer.store.manifest.modes[EPISODES].fields
-    table = {name: reader.read(EPISODES, name, 0, total) for name in fields}
+    table = reader.table()
     others = ~np.isin(table["mode_index"], [mode_index(name) for name in orders])
     parts = [{name: column[others] for name, column in table.items()}]
     for name, order in orders.items():

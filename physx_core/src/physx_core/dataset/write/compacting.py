@@ -25,9 +25,8 @@ from physx_core.dataset.repair.report import find_problem
 from physx_core.dataset.store.episode_table import EPISODES
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition, Partitions
 from physx_core.dataset.store.partition.segment import rows_per_block
-from physx_core.dataset.store.sealing import seal
+from physx_core.dataset.store.sealing import remove_files, seal
 from physx_core.dataset.write.compacted_records import compacted_records
-from physx_core.dataset.write.merging import forget
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError
 from physx_core.fields import ENDS, free_axes
@@ -118,14 +117,12 @@ def _replace(
             new[name] = _reserve(writer, manifest.modes, name, rows, sizes)
         own = {name: [*stay[name], *new[name]] for name in orders}
         table = compacted_records(writer, reader, orders, own)
-        axes = free_axes(manifest.modes[EPISODES].fields.values())
-        sizes = {axis: lengths(table[names[0]]) for axis, names in axes.items()}
-        new[EPISODES] = _reserve(writer, manifest.modes, EPISODES, len(table["rows"]), sizes)
+        new[EPISODES] = reserve(writer, manifest.modes, EPISODES, table)
     try:
         for name in orders:
             read = _rows_of(reader, name, begin[name])
-            sealed[name] = list(_write(writer, new[name], read))
-        sealed[EPISODES] = list(_write(writer, new[EPISODES], _rows_in(table)))
+            sealed[name] = list(write(writer, new[name], read))
+        sealed[EPISODES] = list(write(writer, new[EPISODES], rows_in(table)))
         files.sync_folder(store.directory)
         with store.change() as manifest:
             for name, partitions in sealed.items():
@@ -144,6 +141,20 @@ def _sizes(reader: Reader, mode: str, order: Order, begin: int) -> dict[str, Ind
     if not reader.mode(mode).axes:
         return {}
     return reader.sizes(mode, order.stored(np.arange(begin, order.rows)))
+
+
+def reserve(writer: Writer, modes: Mapping[str, Mode], name: str, table: Batch) -> list[Partition]:
+    """Return partitions for rows of a mode, which the manifest lists as dropped until they count.
+
+    Args:
+        writer: Writer of the dataset.
+        modes: The modes, in a change of the manifest.
+        name: Name of the mode.
+        table: The rows, by field.
+    """
+    axes = free_axes(modes[name].fields.values())
+    sizes = {axis: lengths(table[names[0]]) for axis, names in axes.items()}
+    return _reserve(writer, modes, name, len(next(iter(table.values()))), sizes)
 
 
 def _reserve(
@@ -175,11 +186,12 @@ def _rows_of(reader: Reader, mode: str, begin: int) -> ReadRows:
     return lambda name, start, stop: view[name][begin + start : begin + stop]
 
 
-def _rows_in(table: Batch) -> ReadRows:
+def rows_in(table: Batch) -> ReadRows:
+    """Return what reads rows of a table."""
     return lambda name, start, stop: table[name][start:stop]
 
 
-def _write(writer: Writer, partitions: Sequence[Partition], read: ReadRows) -> Iterator[Partition]:
+def write(writer: Writer, partitions: Sequence[Partition], read: ReadRows) -> Iterator[Partition]:
     """Write rows to the files of reserved partitions, and yield these, sealed."""
     done, directory = 0, writer.store.directory
     for entry in partitions:
@@ -225,3 +237,16 @@ def _exchange(mode: Mode, old: Sequence[Partition], new: Sequence[Partition]) ->
 def _without(partitions: Sequence[Partition], others: Sequence[Partition]) -> list[Partition]:
     keys = {partition.key for partition in others}
     return [partition for partition in partitions if partition.key not in keys]
+
+
+def forget(writer: Writer, partitions: Mapping[str, list[Partition]]) -> None:
+    """Remove the files of dropped partitions, then their entries."""
+    for name, dropped in partitions.items():
+        mode = writer.store.manifest.modes[name]
+        for partition in dropped:
+            remove_files(writer.store.directory, mode.files, partition)
+    with writer.store.change() as manifest:
+        for name, dropped in partitions.items():
+            keys = {partition.key for partition in dropped}
+            mode = manifest.modes[name]
+            mode.dropped = [p for p in mode.dropped if p.key not in keys]

@@ -13,6 +13,7 @@ from physx_core.dataset.store.episode_record import OPEN, EpisodeStatus
 from physx_core.dataset.store.episode_table import EPISODES, RECORDED, has_table, mode_index
 from physx_core.dataset.store.manifest import Manifest
 from physx_core.dataset.write.recording import Recorder, stream_record
+from physx_core.rows import concatenate
 from physx_core.typing import Batch
 
 
@@ -38,13 +39,9 @@ class MergedRecords:
         self._recorder, self._source = recorder, source
         self._manifest, self._given = recorder.manifest, given
         self._campaigns = {mode: recorder.next_campaign(mode) for mode in RECORDED}
-        self._other = self._read(source)
+        self._other = Reader(source, given).table() if has_table(given) else {}
         parts = [part for mode in RECORDED for part in self._merge(mode)]
-        self.rows: Batch = (
-            {name: np.concatenate([part[name] for part in parts]) for name in parts[0]}
-            if parts
-            else {}
-        )
+        self.rows = concatenate(parts)
         self.count = len(self.rows["rows"]) if parts else 0
 
     def take_effect(self) -> None:
@@ -57,17 +54,6 @@ class MergedRecords:
             for failure in failure_file.read(self._source)
             if failure.mode in self._campaigns
         )
-
-    def _read(self, source: Path) -> Batch:
-        """Return the other dataset's records."""
-        if not has_table(self._given):
-            return {}
-        reader = Reader(source, self._given)
-        total = reader.stored_rows(EPISODES)
-        return {
-            name: reader.read(EPISODES, name, 0, total)
-            for name in self._manifest.modes[EPISODES].fields
-        }
 
     def _merge(self, mode: str) -> list[Batch]:
         """Return the further records of a mode."""

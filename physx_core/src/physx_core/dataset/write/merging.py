@@ -16,9 +16,8 @@ from physx_core.dataset.store import statistics_file
 from physx_core.dataset.store.episode_table import EPISODES, has_table
 from physx_core.dataset.store.manifest import Manifest, Mode, Partition
 from physx_core.dataset.store.partition.file import copy
-from physx_core.dataset.store.sealing import remove_files, seal
+from physx_core.dataset.write.compacting import forget, reserve, rows_in, write
 from physx_core.dataset.write.merged_records import MergedRecords
-from physx_core.dataset.write.row_validation import stored_form
 from physx_core.dataset.write.writer import Writer
 from physx_core.errors import DatasetError
 from physx_core.fields import Field
@@ -43,7 +42,7 @@ def add_partitions(writer: Writer, source: Path, given: Manifest) -> None:
         for name, partitions in pairs.items():
             for old, new in partitions:
                 _copy_files(writer.store.directory, source, given.modes[name].files, old, new)
-        sealed = [_write_table(writer, records, entry) for entry in table]
+        sealed = list(write(writer, table, rows_in(records.rows)))
         files.sync_folder(writer.store.directory)
         with writer.store.change() as manifest:
             statistics_file.load(writer.store.directory, manifest)
@@ -113,30 +112,11 @@ def _reserve(writer: Writer, given: Manifest) -> dict[str, Pairs]:
 
 
 def _reserve_table(writer: Writer, records: MergedRecords) -> list[Partition]:
-    """List the partition of the merged records, if there are any, as dropped."""
+    """Reserve partitions for the further records, if there are any."""
     if not records.count:
         return []
     with writer.store.change() as manifest:
-        mode = manifest.modes[EPISODES]
-        entry = writer.new_partition(EPISODES, mode)
-        entry.rows = records.count
-        mode.dropped.append(entry)
-    return [entry]
-
-
-def _write_table(writer: Writer, records: MergedRecords, entry: Partition) -> Partition:
-    """Write the merged records to their partition and return it, sealed."""
-    fields = writer.store.manifest.modes[EPISODES].files
-    rows = stored_form(writer.store.manifest.modes[EPISODES].fields, records.rows)
-    for name, field in fields.items():
-        file = writer.create_file(entry, field, len(rows[name]))
-        try:
-            file.append(0, rows[name], len(rows[name]), durable=True)
-            file.sync()
-            file.publish()
-        finally:
-            file.close()
-    return seal(writer.store.directory, fields, entry)
+        return reserve(writer, manifest.modes, EPISODES, records.rows)
 
 
 def _copy_files(
@@ -165,16 +145,3 @@ def _accept(manifest: Manifest, mode: Mode, other: Mode, pairs: Pairs) -> None:
         mode.add(new)
     if known:
         add_counted(manifest, mode, other.statistics or {})
-
-
-def forget(writer: Writer, partitions: Mapping[str, list[Partition]]) -> None:
-    """Remove the files of dropped partitions, then their entries."""
-    for name, dropped in partitions.items():
-        mode = writer.store.manifest.modes[name]
-        for partition in dropped:
-            remove_files(writer.store.directory, mode.files, partition)
-    with writer.store.change() as manifest:
-        for name, dropped in partitions.items():
-            keys = {partition.key for partition in dropped}
-            mode = manifest.modes[name]
-            mode.dropped = [p for p in mode.dropped if p.key not in keys]

@@ -156,13 +156,10 @@ def _invalidate(store: ManifestStore, mode_name: str, touched: list[Partition]) 
 def _write(path: Path, offset: int, places: Index, rows: Array) -> None:
     """Write rows to places counted from `offset`, each consecutive run at once."""
     row_nbytes = rows[:1].nbytes
-    descriptor = files.open_regular(path, os.O_WRONLY)
-    try:
+    with files.opened(path, os.O_WRONLY) as descriptor:
         for first, last in _runs(places) if row_nbytes else ():
             place = offset + int(places[first]) * row_nbytes
             files.write_at(descriptor, files.as_bytes(rows[first:last]), place)
-    finally:
-        files.close(descriptor)
 
 
 def _runs(places: Index) -> Iterator[tuple[int, int]]:

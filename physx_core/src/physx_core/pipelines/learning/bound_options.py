@@ -8,6 +8,7 @@ from typing import Any
 
 from physx_core.config import to_plain
 from physx_core.errors import ConfigError
+from physx_core.pipelines.storage import EPISODE_OPTIONS
 from physx_core.plugins.references import is_recorded_as
 from physx_core.views.dataset_config import DatasetConfig
 
@@ -22,11 +23,6 @@ _FREE = {
     "dataset": {"existing_dir", "max_file_size", "writers"},
 }
 """Options that a resume may change, by table; new options are bound unless they are named here."""
-_ENVIRONMENT = (
-    *("environment", "env_kwargs", "independent_episodes", "episode_steps"),
-    *("simulations_per_step", "sampler", "sampler_kwargs"),
-)
-"""Options of an environment that are compared even if it has nothing left to generate."""
 _TABLES = ("network", "dataset", "dataset.view", "environment")
 _REFERENCES = {
     *("network", "optimization", "transformation", "loss", "optimizer", "scheduler"),
@@ -55,7 +51,7 @@ def bound_options(training: Any, seed: int, processes: int) -> dict[str, Any]:
         found[table] = {n: value for n, value in options.items() if n not in _FREE[table]}
     if "environment_config" in plain:
         options = plain["environment_config"]
-        found["environment"] = {n: options[n] for n in _ENVIRONMENT if n in options}
+        found["environment"] = {n: options[n] for n in EPISODE_OPTIONS if n in options}
     return found
 
 

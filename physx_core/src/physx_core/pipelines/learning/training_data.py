@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 from physx_core.dataset import Dataset
 from physx_core.fields import Field
@@ -113,10 +113,6 @@ class TrainingData:
     def repeats(self) -> bool:
         """Whether environments would generate the same samples again."""
         return self._generated is not None and self._generated.repeats()
-
-    def validation_batches(self, names: Sequence[str]) -> Iterator[Batch]:
-        """Return the validation batches, in the order of writing."""
-        return self.stored.validation_batches(names)
 
     @property
     def fields(self) -> Mapping[str, Field]:

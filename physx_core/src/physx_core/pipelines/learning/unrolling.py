@@ -13,10 +13,13 @@ from physx_core.components.predicted_batch import PredictedBatch
 from physx_core.components.transformation import Transformation
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import ConfigError, listed
+from physx_core.fields import Field, free_axes
+from physx_core.packing import packed_fields
 from physx_core.pipelines.learning.batches.stored import StoredBatches
 from physx_core.pipelines.learning.learner import Learner
+from physx_core.pipelines.learning.meshes import renumber, split_rows
 from physx_core.results.rivals import NotRunError, same_quantity
-from physx_core.typing import Batch, Tensors
+from physx_core.typing import Array, Batch, Tensors
 from physx_core.views.batches import Batches
 from physx_core.views.sources import window_of
 from physx_core.views.view import View
@@ -71,8 +74,17 @@ class Unrolling:
             raise ConfigError('Training.unroll needs View.edges="inside", where all is known.')
         self.longest = max(self._schedule)
         self._network = network
-        self._at = {name: batches.window(name).at for name in batches.fields}
+        added = packed_fields(free_axes(batches.fields.values()))
+        self._fields = {name: of for name, of in batches.fields.items() if name not in added}
+        self._read: Mapping[str, Field] = self._fields
+        self._at = {name: batches.window(name).at for name in self._fields}
         self._singles = {name for name in self._at if batches.window(name).is_single}
+        self._meshes = {name for name, of in self._fields.items() if of.free_axis or of.indexes}
+        if self._meshes - self._singles:
+            raise ConfigError(
+                "Training.unroll needs windows of one row where axes are free, but "
+                f"{listed(sorted(self._meshes - self._singles))} have several."
+            )
         self._fed = self._find_fed(network, batches)
         self.stride = self._find_stride()
         for name in self._fed:
@@ -136,10 +148,15 @@ class Unrolling:
             steps = range(self.longest)
             if name in self._fed:  # the second one only to check that rows continue each other
                 steps = steps[: 1 + self._fed[name].later]
-            rows = sorted({offset + step * self.stride for offset in at for step in steps})
-            window[name] = (window_of(view, name).field, rows)
-        self._rows = {name: rows for name, (_, rows) in window.items()}
-        return replace(view, window=window)
+            window[name] = sorted({offset + step * self.stride for offset in at for step in steps})
+        shared = sorted({row for name in self._meshes for row in window[name]})
+        self._rows = window | dict.fromkeys(self._meshes, shared)
+        fields = {name: window_of(view, name).field for name in self._at}
+        return replace(view, window={name: (fields[name], self._rows[name]) for name in fields})
+
+    def reads(self, batches: Batches) -> None:
+        """Keep the fields of the batches of the `view`."""
+        self._read = batches.fields
 
     def check(self, stored: StoredBatches, transformation: Transformation) -> None:
         """Check that rows continue each other, and that noise has a scale.
@@ -152,9 +169,10 @@ class Unrolling:
             ConfigError: If not.
         """
         batch = stored.read(0, list(self._at))
+        rows = split_rows(batch, self._read, self._fields).values
         for name, fed in self._fed.items():
             if fed.later and self.longest > 1:
-                self._check_continued(name, fed, batch)
+                self._check_continued(name, fed, rows)
             normalized = transformation.normalization.get(name)
             if self._noise and (normalized is None or normalized.since):
                 raise ConfigError(
@@ -164,10 +182,10 @@ class Unrolling:
             if self._noise and batch[name].dtype.kind != "f":
                 raise ConfigError(f"Training.noise needs real numbers, which {name} has not.")
 
-    def _check_continued(self, name: str, fed: _Fed, batch: Batch) -> None:
+    def _check_continued(self, name: str, fed: _Fed, rows: Mapping[str, Sequence[Array]]) -> None:
         last = max(self._at[fed.target])
-        now = batch[fed.target][:, self._rows[fed.target].index(last)]
-        then = batch[name][:, self._rows[name].index(max(self._at[name]) + self.stride)]
+        now = rows[fed.target][self._rows[fed.target].index(last)]
+        then = rows[name][self._rows[name].index(max(self._at[name]) + self.stride)]
         if not np.allclose(now, then, rtol=1e-3, atol=1e-6):
             raise ConfigError(
                 f'Training.unroll goes on with the next row, but "{name}" of it is not '
@@ -200,17 +218,42 @@ class Unrolling:
         network = self._network
         given = self._noisy(batch, transformation, rank) if self._noise else batch
         self._batch += 1
-        data = network.numpy_to_tensor(given)
-        known: dict[str, dict[int, Any]] = {
-            name: {row: data[name][:, i] for i, row in enumerate(self._rows[name])}
-            for name in self._at
-        }
+        known, added = self._tensors_of(given)
+        fixed = network.numpy_to_tensor(added) if added else {}
         parts: list[PredictedBatch] = []
         for step in range(self.steps):
             if parts:
                 self._feed(parts[-1].physical_prediction, known, step)
-            parts.append(PredictedBatch.of(network, transformation, self._inputs(known, step)))
+            inputs = {**self._inputs(known, step), **fixed}
+            parts.append(PredictedBatch.of(network, transformation, inputs))
+        if added:
+            parts = [self._renumbered(part, added, step) for step, part in enumerate(parts)]
         return PredictedBatch.joined(parts)
+
+    def _tensors_of(self, batch: Batch) -> tuple[dict[str, dict[int, Any]], Batch]:
+        """Return the rows of each field by their numbers, and what packing adds to each."""
+        convert = self._network.numpy_to_tensor
+        if not self._meshes:
+            data = convert(batch)
+            return {
+                name: {row: data[name][:, i] for i, row in enumerate(self._rows[name])}
+                for name in self._at
+            }, {}
+        values, added = split_rows(batch, self._read, self._fields)
+        return {
+            name: {
+                row: convert({name: each})[name]
+                for row, each in zip(self._rows[name], rows, strict=True)
+            }
+            for name, rows in values.items()
+        }, added
+
+    def _renumbered(self, part: PredictedBatch, added: Batch, step: int) -> PredictedBatch:
+        """Return a step as a part of all of them, whose meshes follow one another."""
+        if not step:
+            return part
+        data, inputs = (renumber(of, self._fields, added, step) for of in (part.data, part.inputs))
+        return replace(part, data=data, inputs=inputs)
 
     def _inputs(self, known: Mapping[str, Mapping[int, Any]], step: int) -> Tensors:
         found = {}
@@ -278,6 +321,6 @@ def open_unrolling(
             "replay single rows: generate the samples first."
         )
     unrolling = Unrolling(schedule, noise, learner.network, stored.training, seed)
-    stored.read_as(unrolling.view)
+    unrolling.reads(stored.read_as(unrolling.view))
     learner.unroll(unrolling.predict)
     return unrolling

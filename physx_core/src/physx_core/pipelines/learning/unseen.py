@@ -13,7 +13,8 @@ from physx_core import checkpoint
 from physx_core.dataset import Dataset
 from physx_core.errors import UsageError
 from physx_core.pipelines.learning.data_record import open_data, training_view, unseen_parts
-from physx_core.pipelines.learning.learner import Learner, load_learner
+from physx_core.pipelines.learning.learner import Learner
+from physx_core.pipelines.learning.loading import load_learner
 from physx_core.typing import Batch
 from physx_core.views.batches import Batches
 from physx_core.views.view import View

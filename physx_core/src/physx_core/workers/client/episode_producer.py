@@ -6,11 +6,11 @@ from collections import deque
 from typing import TYPE_CHECKING, Any
 
 from physx_core.dataset import EpisodeRecord
-from physx_core.errors import ConnectionRefusedByPeerError, StateError
+from physx_core.errors import StateError
 from physx_core.net.frames import Frame, Kind, pack
 from physx_core.net.remote_errors import encode_error
 from physx_core.net.values import decode, encode
-from physx_core.workers.client.link import RunEnded, WorkerLink
+from physx_core.workers.client.link import WorkerLink
 from physx_core.workers.episode_runner import EpisodeBlock, EpisodeRunner
 from physx_core.workers.instance import Instance
 from physx_core.workers.lease import Begun, Lease
@@ -68,8 +68,7 @@ class EpisodeProducer:
         count, rejected = (len(rows.get("step", ())) for rows in (block.rows, block.rejected))
         if (count or rejected) and not self._announced:
             self._announced = True
-            table = [field.to_dict() for field in runner.fields]
-            self._link.send(pack(Kind.FIELDS, encode(table)))
+            self._link.tell_fields(runner.fields)
         if count and self._row_files is not None:
             self._row_files.put(block.rows, count, runner.fields)
         elif count:
@@ -90,12 +89,8 @@ class EpisodeProducer:
             self._leased.append(Lease(range(first, first + frame.number), values, begun))
         elif frame.kind is Kind.PARTITION and self._row_files is not None:
             self._row_files.take(frame)
-        elif frame.kind is Kind.CLOSE:
-            raise RunEnded
-        elif frame.kind not in (Kind.ANSWER, Kind.REFUSAL):  # to an abandoned request
-            raise ConnectionRefusedByPeerError(
-                f"The server sent {frame.kind.name}, which only a client sends."
-            )
+        else:
+            self._link.skip(frame)
 
 
 def _plain(record: EpisodeRecord) -> tuple[Any, ...]:

@@ -9,14 +9,16 @@ import signal
 import socket
 import threading
 from collections import deque
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from typing import Any
 
+from physx_core.errors import ConnectionRefusedByPeerError
+from physx_core.fields import Field
 from physx_core.net.frames import Frame, FrameReader, Kind, pack
 from physx_core.net.link import SOCKETS, Link, Transport
 from physx_core.net.liveness import poll_peer
 from physx_core.net.remote_errors import decode_error
-from physx_core.net.values import decode, pack_value
+from physx_core.net.values import decode, encode, pack_value
 from physx_core.processes import BackgroundThread, kill_descendants
 
 _SPIN_TIME = 2e-4
@@ -116,15 +118,29 @@ class WorkerLink:
         """Put back a message that arrived too early: `receive` returns it again."""
         self._postponed.appendleft(frame)
 
-    def has_message(self, seconds: float = 0.0) -> bool:
-        """Return whether `receive` would find a message at once.
-
-        Args:
-            seconds: How long to wait for one, in s.
-        """
+    def has_message(self) -> bool:
+        """Return whether `receive` would find a message at once."""
         if self._postponed or self._reader.has_buffered or self._buffered:
             return True
-        return bool(self._poll.poll(1000 * seconds))
+        return bool(self._poll.poll(0))
+
+    def skip(self, frame: Frame) -> None:
+        """Handle a message that orders nothing: the end of the run, or a late answer.
+
+        Raises:
+            RunEnded: If it ends the run.
+            ConnectionRefusedByPeerError: If only a client sends such messages.
+        """
+        if frame.kind is Kind.CLOSE:
+            raise RunEnded
+        if frame.kind not in (Kind.ANSWER, Kind.REFUSAL):  # to an abandoned request
+            raise ConnectionRefusedByPeerError(
+                f"The server sent {frame.kind.name}, which only a client sends."
+            )
+
+    def tell_fields(self, fields: Iterable[Field]) -> None:
+        """Send the fields of the rows that follow."""
+        self.send(pack(Kind.FIELDS, encode([field.to_dict() for field in fields])))
 
     def ask(self, kind: Kind, value: Any, what: str) -> Any:
         """Send a request and wait for the answer.

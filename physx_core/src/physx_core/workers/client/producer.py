@@ -7,7 +7,6 @@ from collections.abc import Mapping
 from typing import Any
 
 from physx_core.errors import (
-    ConnectionRefusedByPeerError,
     NotFiniteError,
     PhysxError,
     StateError,
@@ -171,8 +170,7 @@ class Producer:
         """Send the fields of the rows, once."""
         if not self._announced:
             self._announced = True
-            table = [field.to_dict() for field in buffer.fields]
-            self._link.send(pack(Kind.FIELDS, encode(table)))
+            self._link.tell_fields(buffer.fields)
 
     def _send_rejected(self) -> None:
         """Send the samples that `check_sample` rejected, once the fields' shapes are known."""
@@ -228,9 +226,5 @@ class Producer:
         elif frame.kind is Kind.STORED:
             stored = decode(frame.payload)
             self._stored.extend(copy_row(stored, row) for row in range(frame.number))
-        elif frame.kind is Kind.CLOSE:
-            raise RunEnded
-        elif frame.kind not in (Kind.ANSWER, Kind.REFUSAL):  # to an abandoned request
-            raise ConnectionRefusedByPeerError(
-                f"The server sent {frame.kind.name}, which only a client sends."
-            )
+        else:
+            self._link.skip(frame)

@@ -172,13 +172,6 @@ class Peer(Connection):
         if self._next_order is None or not is_order:
             self.send_once(message)
 
-    def send_with_next(self, message: bytes) -> None:
-        """Send a message together with the next one, so that the client wakes up once for both."""
-        if self.journal is None and self._next_order is None and not self.closed:
-            self.outgoing += message
-        else:
-            self.send(message)
-
     def send_once(self, message: bytes) -> None:
         """Send a message that no successor needs."""
         if self.closed:

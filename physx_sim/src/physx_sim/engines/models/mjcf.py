@@ -4,48 +4,29 @@ MuJoCo compiles the file, and what physx simulates is read from the result: defa
 inertias from shapes and the like are then what MuJoCo makes of them. A body with several joints
 becomes a chain of links, of which all but the last have no mass and are named after their joint;
 one whose last joint is not at its origin is fixed to such a link. What no engine is told, such as
-tendons, is named in the model's warnings.
+actuators, is named in the model's warnings.
 """
 
 from __future__ import annotations
 
-import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from physx_core.errors import listed, nearest
-from physx_core.files import read_content
-from physx_core.origin import install_hint
-from physx_core.rotations import from_axis_angle, from_matrix_rows, to_matrix
+from physx_core.errors import listed
+from physx_core.rotations import from_axis_angle, to_matrix
 from physx_core.typing import Vector
-from physx_sim import Attachment, Connect, JointSettings, Mimic, Robot, Weld
+from physx_sim import JointSettings, Robot
+from physx_sim.engines.models.mjcf_equalities import Equalities
+from physx_sim.engines.models.mjcf_file import WORLD, MjcfFile, moved, pose_of
 from physx_sim.engines.models.rigid_bodies import Joint, RigidBody
-from physx_sim.engines.models.robot_model import RobotModel, check_names, with_leaders
+from physx_sim.engines.models.robot_model import RobotModel, check_names, coupled
 from physx_sim.engines.models.shapes import CollisionShape, material_of, shape_of_foot, simplified
 from physx_sim.errors import ModelError
 
-WORLD = "world"
-"""Root link of what is attached to the world."""
-_LARGEST = 2**24
-"""Maximum size of a file, in bytes, without those that it includes."""
-_MOST = 400
-"""Maximum number of bodies, as of links in a URDF file."""
-_COMMENT = re.compile(rb"<!--.*?-->", re.DOTALL)
-_ELEMENT = re.compile(rb"<([A-Za-z][\w:.-]*)")
 _NO_MASS = 0.0, np.zeros(3), np.zeros((3, 3))
-
-
-def is_mjcf(path: Path) -> bool:
-    """Return whether a file's root element is ``mujoco``; a missing file is none."""
-    try:
-        text = read_content(path.resolve(), _LARGEST)
-    except OSError:
-        return False
-    first = _ELEMENT.search(_COMMENT.sub(b"", text))
-    return first is not None and first[1] == b"mujoco"
 
 
 def mjcf_robots(path: str | Path, **options: Any) -> tuple[Robot, ...]:
@@ -62,7 +43,7 @@ def mjcf_robots(path: str | Path, **options: Any) -> tuple[Robot, ...]:
     Raises:
         ModelError: If MuJoCo cannot compile the file, or the package mujoco is not installed.
     """
-    file = _File(Path(path).absolute())
+    file = MjcfFile(Path(path).absolute())
     found = []
     if file.attached or file.solid(0):
         found.append(Robot(path, WORLD, **{"root": WORLD, **options}))
@@ -83,7 +64,7 @@ def read_mjcf(robot: Robot, path: Path, *, touching: bool) -> RobotModel:
         path: Its file.
         touching: Whether to read its collision shapes.
     """
-    file = _File(path)
+    file = MjcfFile(path)
     root = file.root(robot)
     links = _Links(file, robot, root)
     names = [body.name for body in links.found]
@@ -92,88 +73,16 @@ def read_mjcf(robot: Robot, path: Path, *, touching: bool) -> RobotModel:
     joints = [body.joint.name for body in links.found if body.joint is not None]
     check_names(robot, names, joints)
     shapes = _Shapes(file, robot, list(links.places))
-    mimics, attachments, untold = _equalities(file, links)
-    left_out = [*_left_out(file, links), *untold, *shapes.left_out]
+    by_body = {body: names[place] for body, place in links.places.items()}
+    equalities = Equalities(file, links.joints, by_body)
+    left_out = [*_left_out(file, links), *equalities.left_out, *shapes.left_out]
     if robot.fixed_base and root in file.floating:
         left_out.append("the free joint of its root body (fixed_base=False lets it float)")
     warnings = (f"physx leaves out {'; '.join(left_out)}",) if left_out else ()
     solid = tuple(shapes.found if touching else ())
+    attachments = tuple(equalities.attachments)
     model = RobotModel(path, tuple(links.found), solid, warnings, attachments)
-    return with_leaders(robot, model, mimics)
-
-
-class _File:
-    """A compiled file.
-
-    Attributes:
-        mujoco: The package.
-        model: MuJoCo's model.
-        floating: Bodies with a free joint.
-        attached: Other bodies whose parent is the world.
-    """
-
-    def __init__(self, path: Path) -> None:
-        self.path, self.mujoco = path, _mujoco()
-        log = self.mujoco.MjLogConfig.get()
-        log.logto_file = log.logto_console = False
-        log.set()
-        try:
-            self.model: Any = self.mujoco.MjModel.from_xml_path(str(path))
-        except ValueError as error:
-            raise ModelError(f"MuJoCo cannot read {path}: {error}") from error
-        if self.model.nbody > _MOST + 1:
-            raise ModelError(f"{path} has {self.model.nbody - 1} bodies; a model may have {_MOST}")
-        model, free = self.model, int(self.mujoco.mjtJoint.mjJNT_FREE)
-        roots = [body for body in range(1, model.nbody) if model.body_parentid[body] == 0]
-        self.floating = [b for b in roots if [*model.jnt_type[self.joints(b)]] == [free]]
-        self.attached = [body for body in roots if body not in self.floating]
-
-    def joints(self, body: int) -> range:
-        """Return the joints of a body."""
-        first = int(self.model.body_jntadr[body])
-        return range(first, first + int(self.model.body_jntnum[body]))
-
-    def geoms(self, body: int) -> range:
-        """Return the geoms of a body."""
-        first = int(self.model.body_geomadr[body])
-        return range(first, first + int(self.model.body_geomnum[body]))
-
-    def solid(self, body: int) -> list[int]:
-        """Return the geoms of a body that can touch, without planes."""
-        model, plane = self.model, int(self.mujoco.mjtGeom.mjGEOM_PLANE)
-        return [
-            geom
-            for geom in self.geoms(body)
-            if (model.geom_contype[geom] or model.geom_conaffinity[geom])
-            and model.geom_type[geom] != plane
-        ]
-
-    def body_name(self, body: int) -> str:
-        """Return the name of a body, or its number if it has none."""
-        return str(self.model.body(body).name) or f"body{body}"
-
-    def root(self, robot: Robot) -> int:
-        """Return the body that is a robot's root link; 0: the world."""
-        names = {self.body_name(body): body for body in self.floating}
-        trees = len(names) + bool(self.attached)
-        names |= {WORLD: 0} if self.attached or self.solid(0) or not names else {}
-        if not robot.root and trees > 1:
-            raise ModelError(
-                f"it has several trees: choose one with Robot(root=...), or take all with "
-                f"mjcf_robots(...). Roots: {listed(names)}"
-            )
-        if robot.root and robot.root not in names:
-            near = nearest(robot.root, names)
-            raise ModelError(f'no tree has the root "{robot.root}".{near} Roots: {listed(names)}')
-        root = names[robot.root] if robot.root else next(iter(names.values()))
-        if root == 0 and not robot.fixed_base:
-            alone = self.attached if len(self.attached) == 1 else []
-            if not alone or len(self.joints(alone[0])):
-                raise ModelError(
-                    "its root link is the world, which cannot float; use fixed_base=True"
-                )
-            root = alone[0]
-        return root
+    return coupled(robot, model, equalities.mimics, equalities.couplings)
 
 
 class _Links:
@@ -185,7 +94,7 @@ class _Links:
         joints: The file's joints.
     """
 
-    def __init__(self, file: _File, robot: Robot, root: int) -> None:
+    def __init__(self, file: MjcfFile, robot: Robot, root: int) -> None:
         self._file, self._robot = file, robot
         name = WORLD if root == 0 else file.body_name(root)
         inertia = _NO_MASS if root == 0 else self._inertia(root)
@@ -200,20 +109,20 @@ class _Links:
 
     def _add(self, body: int, parent: int) -> None:
         model, name = self._file.model, self._file.body_name(body)
-        pose = _pose(model.body_pos[body], model.body_quat[body])
+        pose = pose_of(model.body_pos[body], model.body_quat[body])
         anchor, inertia = np.zeros(3), self._inertia(body)
         joints = self._file.joints(body)
         for number in joints:
             joint, axis = self._joint(number), model.jnt_axis[number].copy()
             here = model.jnt_pos[number]
-            pose = pose @ _moved(here - anchor) @ self._reference(number, joint.unit, axis)
+            pose = pose @ moved(here - anchor) @ self._reference(number, joint.unit, axis)
             anchor = here
             last = number == joints[-1] and not anchor.any()
             mass, link = (inertia, name) if last else (_NO_MASS, f"{name}.{joint.name}")
             parent = self._append(RigidBody(link, parent, pose, joint, axis, *mass))
             pose = np.eye(4)
         if not joints or anchor.any():
-            still = RigidBody(name, parent, pose @ _moved(-anchor), None, np.zeros(3), *inertia)
+            still = RigidBody(name, parent, pose @ moved(-anchor), None, np.zeros(3), *inertia)
             parent = self._append(still)
         self.places[body] = parent
         self.joints += joints
@@ -226,7 +135,7 @@ class _Links:
         """Return mass, center of mass and moments of inertia of a body in its own frame."""
         model = self._file.model
         factor = float(self._robot.mass_factors.get(self._file.body_name(body), 1.0))
-        turn = _pose(np.zeros(3), model.body_iquat[body])[:3, :3]
+        turn = pose_of(np.zeros(3), model.body_iquat[body])[:3, :3]
         moments = factor * (turn * model.body_inertia[body]) @ turn.T
         return factor * float(model.body_mass[body]), model.body_ipos[body].copy(), moments
 
@@ -235,18 +144,14 @@ class _Links:
         model = self._file.model
         back = -float(model.qpos0[model.jnt_qposadr[joint]])
         if unit == "m":
-            return _moved(back * axis)
+            return moved(back * axis)
         found = np.eye(4)
         found[:3, :3] = to_matrix(from_axis_angle(axis.tolist(), back))
         return found
 
-    def joint_name(self, joint: int) -> str:
-        """Return the name of a joint, or its number if it has none."""
-        return str(self._file.model.joint(joint).name) or f"joint{joint}"
-
     def _joint(self, joint: int) -> Joint:
         model, kinds = self._file.model, self._file.mujoco.mjtJoint
-        name = self.joint_name(joint)
+        name = self._file.joint_name(joint)
         kind, place = kinds(int(model.jnt_type[joint])), model.jnt_dofadr[joint]
         if kind not in (kinds.mjJNT_HINGE, kinds.mjJNT_SLIDE):
             raise ModelError(f'joint "{name}" is a ball, which is not supported: use three hinges')
@@ -284,7 +189,7 @@ class _Shapes:
         left_out: What no engine is told.
     """
 
-    def __init__(self, file: _File, robot: Robot, bodies: list[int]) -> None:
+    def __init__(self, file: MjcfFile, robot: Robot, bodies: list[int]) -> None:
         self._file, self._robot = file, robot
         self.found: list[CollisionShape] = []
         self._odd: dict[str, int] = {}
@@ -300,7 +205,7 @@ class _Shapes:
     def _shape(self, geom: int, link: str) -> CollisionShape | None:
         model, kinds = self._file.model, self._file.mujoco.mjtGeom
         kind = kinds(int(model.geom_type[geom]))
-        size, pose = model.geom_size[geom], _pose(model.geom_pos[geom], model.geom_quat[geom])
+        size, pose = model.geom_size[geom], pose_of(model.geom_pos[geom], model.geom_quat[geom])
         found: tuple[float, ...]
         mesh = None
         if kind == kinds.mjGEOM_BOX:
@@ -343,7 +248,7 @@ class _Shapes:
         model = self._file.model
         names = bytes(model.paths)
         begin = int(model.mesh_pathadr[mesh])
-        centered = _pose(model.mesh_pos[mesh], model.mesh_quat[mesh])
+        centered = pose_of(model.mesh_pos[mesh], model.mesh_quat[mesh])
         offset: Vector = np.asarray(np.linalg.inv(centered), np.float64)
         if begin < 0:
             return None, (1.0, 1.0, 1.0), offset
@@ -352,64 +257,15 @@ class _Shapes:
         return path, tuple(model.mesh_scale[mesh].tolist()), offset
 
 
-def _equalities(
-    file: _File, links: _Links
-) -> tuple[dict[str, Mimic], tuple[Attachment, ...], list[str]]:
-    """Return how joints follow others, what holds links together, and what no engine is told."""
-    model, kinds = file.model, file.mujoco.mjtEq
-    mimics: dict[str, Mimic] = {}
-    attachments: list[Attachment] = []
-    left_out = 0
-    for place in range(model.neq):
-        kind, data = kinds(int(model.eq_type[place])), model.eq_data[place]
-        pair = [int(model.eq_obj1id[place]), int(model.eq_obj2id[place])]
-        found: Attachment | None = None
-        if not model.eq_active0[place]:
-            pass
-        elif kind == kinds.mjEQ_JOINT and set(pair) <= set(links.joints):
-            if data[1] and not data[2:5].any():
-                first, second = (float(model.qpos0[model.jnt_qposadr[each]]) for each in pair)
-                follower, leader = map(links.joint_name, pair)
-                offset = first + float(data[0]) - float(data[1]) * second
-                mimics[follower] = Mimic(leader, float(data[1]), offset)
-                continue
-        elif kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
-            found = _attachment(file, links, place, pair)
-        if found is None:
-            left_out += 1
-        else:
-            attachments.append(found)
-    untold = f"equality constraints ({left_out}: what they hold together is free)"
-    return mimics, tuple(attachments), [untold] if left_out else []
-
-
-def _attachment(file: _File, links: _Links, place: int, pair: list[int]) -> Attachment | None:
-    """Return what holds two links together; None if one of them is not of this robot."""
-    model, data = file.model, file.model.eq_data[place]
-    weld = model.eq_type[place] == file.mujoco.mjtEq.mjEQ_WELD
-    if model.eq_objtype[place] == file.mujoco.mjtObj.mjOBJ_SITE:
-        first, second = (_pose(model.site_pos[site], model.site_quat[site]) for site in pair)
-        pair = [int(model.site_bodyid[site]) for site in pair]
-    elif weld:
-        first, second = _pose(data[3:6], data[6:10]), _moved(data[:3])
-    else:
-        first, second = _moved(data[:3]), _moved(data[3:6])
-    if not set(pair) <= links.places.keys():
-        return None
-    one, other = (links.found[links.places[body]].name for body in pair)
-    if not weld:
-        return Connect(one, other, tuple(first[:3, 3].tolist()), tuple(second[:3, 3].tolist()))
-    held = first @ np.linalg.inv(second)
-    turn = from_matrix_rows(held[None, :3, :3])[0]
-    return Weld(one, other, tuple(held[:3, 3].tolist()), tuple(turn.tolist()))
-
-
-def _left_out(file: _File, links: _Links) -> Iterator[str]:
+def _left_out(file: MjcfFile, links: _Links) -> Iterator[str]:
     """Yield what of a file no engine is told, and what that changes."""
     model, option = file.model, file.model.opt
+    acting = model.tendon_limited | model.tendon_actfrclimited
+    for forces in ("stiffness", "damping", "frictionloss", "armature"):
+        acting = acting | (getattr(model, f"tendon_{forces}") != 0)
     for count, what, effect in (
         (model.nu, "actuators", "command the joints, with JointSettings or Motors"),
-        (model.ntendon, "tendons", "neither their forces nor their limits act"),
+        (int(acting.sum()), "tendons", "neither their forces nor their limits act"),
         (model.npair + model.nexclude, "contact pairs", "Robot(self_collisions=...) decides"),
         (model.nflex, "deformable bodies", "they are missing"),
         (model.nplugin, "plugins", "they do not run"),
@@ -447,28 +303,3 @@ def _capsule_of(size: Vector) -> tuple[str, tuple[float, ...], Vector]:
     length = 2 * max(float(size[longest]) - radius, 0.0)
     axes = np.roll(np.eye(3), 2 - longest, axis=1)
     return ("capsule", (radius, length), axes) if length > 0 else ("sphere", (radius,), axes)
-
-
-def _pose(position: Vector, quaternion: Vector) -> Vector:
-    """Return a pose with MuJoCo's quaternion w, x, y, z as a homogeneous matrix (4, 4)."""
-    w, x, y, z = quaternion.tolist()
-    found = np.eye(4)
-    found[:3, :3], found[:3, 3] = to_matrix((x, y, z, w)), position
-    return found
-
-
-def _moved(motion: Vector) -> Vector:
-    found = np.eye(4)
-    found[:3, 3] = motion
-    return found
-
-
-def _mujoco() -> Any:
-    try:
-        import mujoco  # only MJCF files need it
-    except ImportError as error:
-        raise ModelError(
-            f"MJCF files are compiled by the package mujoco, which cannot be imported: {error}. "
-            f"{install_hint('physx-sim', 'mjcf')}"
-        ) from error
-    return mujoco

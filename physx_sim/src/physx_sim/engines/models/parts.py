@@ -96,17 +96,26 @@ class Parts:
         whats = [*touching, *(static.what for static in self.statics)]
         return any(what.torsional_friction or what.rolling_friction for what in whats)
 
+    @property
+    def rolling(self) -> bool:
+        """Whether anything has wheels that roll without slip."""
+        return any(movable.model.wheels for movable in self.movables)
+
 
 def read_parts(world: World) -> Parts:
     """Read a world's files, and warn once about robots whose inertia is wrong.
 
     Raises:
-        ModelError: If a robot or mesh cannot be loaded, or nothing can move.
+        ModelError: If a robot or mesh cannot be loaded, nothing can move, or wheels have no plane
+            to roll on.
     """
-    movables = [_robot(robot, _touches(world, robot.self_collisions)) for robot in world.robots]
+    movables = [
+        _robot(robot, world.ground, _touches(world, robot.self_collisions))
+        for robot in world.robots
+    ]
     scenery = [movable for movable in movables if not movable.moves]
     if scenery and world.contacts == "static":  # they touch like static objects
-        movables = [_robot(robot, True) for robot in world.robots]
+        movables = [_robot(robot, world.ground, True) for robot in world.robots]
     for movable in movables:
         for text in movable.model.warnings:
             where = f'Robot "{movable.name}", {movable.model.path}'
@@ -135,9 +144,14 @@ def _prefix(world: World, movable: MovableBody) -> str:
     return f"{movable.name}/" if len(world.robots) > 1 else ""
 
 
-def _robot(robot: Robot, touching: bool) -> MovableBody:
+def _robot(robot: Robot, ground: object, touching: bool) -> MovableBody:
     model = read_robot(robot, touching=touching)
     pose = robot.position, robot.orientation
+    if model.wheels and not isinstance(ground, Ground):
+        raise ModelError(
+            f'Robot "{robot.name}", {model.path}: its wheels roll without slip on a plane; the '
+            "world needs ground=Ground(...)."
+        )
     return MovableBody(robot.name, model, robot.fixed_base, *pose, robot.self_collisions)
 
 

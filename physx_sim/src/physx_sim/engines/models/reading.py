@@ -6,9 +6,10 @@ import dataclasses
 
 from physx_sim import Robot
 from physx_sim.engines.models.inertias import inertia_warnings
-from physx_sim.engines.models.mjcf import is_mjcf, read_mjcf
+from physx_sim.engines.models.mjcf import read_mjcf
+from physx_sim.engines.models.mjcf_file import is_mjcf
 from physx_sim.engines.models.robot_files import find_robot
-from physx_sim.engines.models.robot_model import RobotModel
+from physx_sim.engines.models.robot_model import RobotModel, with_wheels
 from physx_sim.engines.models.urdf import read_urdf
 from physx_sim.errors import ModelError
 
@@ -30,6 +31,8 @@ def read_robot(robot: Robot, *, touching: bool = False) -> RobotModel:
             model = read_mjcf(robot, path, touching=touching)
         else:
             model = read_urdf(robot, path, touching=touching)
+        if robot.wheels:
+            model = with_wheels(robot, model)
         doubts = inertia_warnings(model.bodies, robot.fixed_base)
     except (ModelError, ValueError) as error:
         if str(path) in str(error):

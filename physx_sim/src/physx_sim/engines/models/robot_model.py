@@ -10,7 +10,8 @@ from pathlib import Path
 import numpy as np
 
 from physx_core.errors import listed, nearest
-from physx_sim import Attachment, Mimic, Robot
+from physx_core.typing import Vector
+from physx_sim import Attachment, JointCoupling, Mimic, Robot, Wheel
 from physx_sim.engines.models.rigid_bodies import Inertial, Joint, RigidBody
 from physx_sim.engines.models.shapes import CollisionShape
 from physx_sim.errors import ModelError
@@ -25,6 +26,8 @@ class RobotModel:
         bodies: The links, parents before children, in tree order.
         shapes: Collision shapes; empty if there is nothing to touch.
         attachments: What holds its links together besides its joints, by their names in the file.
+        couplings: Which joints move together, besides those that follow others.
+        wheels: Links that roll without slip; their shapes have no friction.
         warnings: What is wrong with the file, although it can be simulated, and what of it no
             engine is told.
     """
@@ -34,6 +37,8 @@ class RobotModel:
     shapes: tuple[CollisionShape, ...] = ()
     warnings: tuple[str, ...] = ()
     attachments: tuple[Attachment, ...] = ()
+    couplings: tuple[JointCoupling, ...] = ()
+    wheels: tuple[Wheel, ...] = ()
 
     @functools.cached_property
     def links(self) -> tuple[str, ...]:
@@ -55,6 +60,24 @@ class RobotModel:
             if joint.mimic is not None
         )
 
+    @functools.cached_property
+    def coupling_rows(self) -> tuple[Vector, Vector]:
+        """Coefficients of positions of joints, (m, joints), and sums that they always have, (m,).
+
+        Joints that follow others come first. The largest coefficient of a coupling is 1 or -1.
+        """
+        places = {joint.name: place for place, joint in enumerate(self.joints)}
+        sums = [mimic.offset for *_, mimic in self.followers]
+        rows = np.zeros((len(self.followers) + len(self.couplings), len(places)))
+        for row, (follower, leader, mimic) in zip(rows, self.followers, strict=False):
+            row[follower], row[leader] = 1.0, -mimic.multiplier
+        for row, coupling in zip(rows[len(sums) :], self.couplings, strict=True):
+            scale = 1 / max(map(abs, coupling.joints.values()))
+            for name, coefficient in coupling.joints.items():
+                row[places[name]] = scale * coefficient
+            sums.append(scale * coupling.offset)
+        return rows, np.array(sums)
+
 
 def model_of_body(name: str, path: Path, inertial: Inertial, shape: CollisionShape) -> RobotModel:
     """Return the model of an object: a robot with one link.
@@ -69,17 +92,75 @@ def model_of_body(name: str, path: Path, inertial: Inertial, shape: CollisionSha
     return RobotModel(path, (body,), (shape,))
 
 
-def with_leaders(robot: Robot, model: RobotModel, file: Mapping[str, Mimic]) -> RobotModel:
-    """Return a model whose joints follow others.
+def coupled(
+    robot: Robot,
+    model: RobotModel,
+    mimics: Mapping[str, Mimic],
+    couplings: Sequence[JointCoupling] = (),
+) -> RobotModel:
+    """Return a model whose joints move together.
 
     Args:
         robot: The robot's description, whose settings come before the file's.
         model: Its model.
-        file: How joints follow others in the file, by name.
+        mimics: How joints follow others in the file, by name.
+        couplings: Couplings of joints in the file.
 
     Raises:
-        ModelError: If a leader does not exist or follows its follower, or a follower has commands.
+        ModelError: If a joint does not exist, a leader follows its follower, a follower has
+            commands, or couplings repeat or contradict each other or leave no motion to a motor.
     """
+    model = _with_leaders(robot, model, mimics)
+    names = [joint.name for joint in model.joints]
+    chosen = tuple(couplings if robot.couplings is None else robot.couplings)
+    for name in (name for coupling in chosen for name in coupling.joints):
+        if name not in names:
+            near = nearest(name, names)
+            raise ModelError(f'a coupling names "{name}", which is not a movable joint.{near}')
+    if chosen:
+        model = replace(model, couplings=chosen)
+        _check_independent(model)
+    return model
+
+
+def with_wheels(robot: Robot, model: RobotModel) -> RobotModel:
+    """Return a model with the wheels of a robot's description.
+
+    Args:
+        robot: The robot's description.
+        model: Its model.
+
+    Raises:
+        ModelError: If a link is named twice.
+    """
+    links = [wheel.link for wheel in robot.wheels]
+    if len(set(links)) < len(links):
+        raise ModelError(f"its wheels need different links, but are {listed(links)}")
+    shapes = tuple(
+        replace(shape, friction=0.0) if shape.body in links else shape for shape in model.shapes
+    )
+    return replace(model, shapes=shapes, wheels=tuple(robot.wheels))
+
+
+def _check_independent(model: RobotModel) -> None:
+    """Check that all couplings can hold at the same time, whatever their motors do."""
+    rows = model.coupling_rows[0]
+    yields = [
+        joint.mode == "force" or (joint.mode != "velocity" and joint.max_torque < np.inf)
+        for joint in model.joints
+    ]
+    for what, some in (
+        ("repeat or contradict each other", rows),
+        ("hold joints whose motors impose their velocities", rows[:, yields]),
+    ):
+        if np.linalg.matrix_rank(some) < len(rows):
+            raise ModelError(
+                f"its couplings {what}; Robot(couplings=...) replaces those of its file"
+            )
+
+
+def _with_leaders(robot: Robot, model: RobotModel, file: Mapping[str, Mimic]) -> RobotModel:
+    """Return a model whose joints follow others; `file`: how they do in the file, by name."""
     names = [joint.name for joint in model.joints]
     given = {name: each.mimic for name, each in robot.joints.items() if each.mimic is not None}
     follows = {name: mimic for name, mimic in {**file, **given}.items() if mimic.leader}
@@ -131,6 +212,7 @@ def check_names(robot: Robot, links: Sequence[str], joints: Sequence[str]) -> No
         ("joints", robot.joints, "movable joint", joints),
         ("mass_factors", robot.mass_factors, "link", links),
         ("feet", robot.feet, "link", links),
+        ("wheels", [wheel.link for wheel in robot.wheels], "link", links),
     ):
         for name in given:
             if name not in known:

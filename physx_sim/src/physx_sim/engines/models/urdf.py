@@ -33,7 +33,7 @@ from physx_sim import (
 from physx_sim.engines.models.inertias import MASSLESS, NEGLIGIBLE
 from physx_sim.engines.models.rigid_bodies import Inertial, Joint, Origin, RigidBody
 from physx_sim.engines.models.robot_files import missing_meshes
-from physx_sim.engines.models.robot_model import RobotModel, check_names, with_leaders
+from physx_sim.engines.models.robot_model import RobotModel, check_names, coupled
 from physx_sim.engines.models.shapes import shapes_of_robot
 from physx_sim.errors import MissingMeshesError, ModelError
 
@@ -72,7 +72,7 @@ def read_urdf(robot: Robot, path: Path, *, touching: bool) -> RobotModel:
     places = {name: place for place, name in enumerate(tree.links)}
     bodies = tuple(_body(robot, tree, name, places) for name in tree.links)
     shapes = shapes_of_robot(robot, path, tree) if touching else ()
-    return with_leaders(robot, RobotModel(path, bodies, shapes, doubts), _mimics(moving))
+    return coupled(robot, RobotModel(path, bodies, shapes, doubts), _mimics(moving))
 
 
 def _odd_joints(moving: Sequence[Element]) -> Iterator[str]:

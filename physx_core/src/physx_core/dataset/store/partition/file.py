@@ -331,8 +331,7 @@ def _copy(
 ) -> int:
     """Copy bytes; return the CRC-32 of them and of what had `crc`."""
     buffer, done = memoryview(bytearray(min(count, _COPY))), 0
-    origin = files.open_regular(source)
-    try:
+    with files.opened(source) as origin:
         while done < count:
             part = buffer[: count - done]
             here, there = source_offset + done, target_offset + done
@@ -343,6 +342,4 @@ def _copy(
             if not shared:
                 files.write_at(target, part, there)
             crc, done = crc32(part, crc), done + len(part)
-    finally:
-        files.close(origin)
     return crc

@@ -140,13 +140,17 @@ class StoredBatches:
         mode, view, part = parts[name]
         return self._open(mode, view, self._validation_batch_size, part)
 
-    def read_as(self, change: Callable[[View], View]) -> None:
+    def read_as(self, change: Callable[[View], View]) -> Batches:
         """Read training batches of another view of the same samples, such as longer windows.
 
         Args:
             change: Returns it for the view that is configured.
+
+        Returns:
+            The batches.
         """
         self._longer = self._open(self.mode, change(self._view), self._batch_size)
+        return self._longer
 
     @property
     def _read(self) -> Batches:
