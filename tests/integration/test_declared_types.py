@@ -168,7 +168,16 @@ RECORDS = {
     ),
     *("CollisionShape", "Joint", "MovableBody", "RigidBody", "Static", "LoadedRobot", "LoadedBody"),
     "Bond",
-    *("Combination", "Estimate", "Identification", "Log", "LogNoise", "Motion", "ResidualTest"),
+    *(
+        "Combination",
+        "Estimate",
+        "EngineFit",
+        "Identification",
+        "Log",
+        "LogNoise",
+        "Motion",
+        "ResidualTest",
+    ),
     *("Agreement", "Cause", "Figure", "Parting", "Ranking"),
     *("Kind", "Format", "Table", "Section", "RolloutResult", "Unseen", "Score", "Cursor"),
 }

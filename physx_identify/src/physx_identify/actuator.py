@@ -81,6 +81,7 @@ def learn_actuators(
         ) from error
 
     model = Model(found.applied_to(robot), gravity, held)
+    model.check_fixed("Actuator networks")
     path = Motion(Smoother(log.positions)(log.positions), log.period)
     needed = model.columns(path, model.numbers[:, None], path.ends)[:, :, 0]
     late = sum(each.value for each in found.estimates if each.kind == "delay")

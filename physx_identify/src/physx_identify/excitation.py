@@ -144,6 +144,7 @@ def expected_errors(
 
 class _Design:
     def __init__(self, model: Model, found: Identification, seconds: float) -> None:
+        model.check_fixed("Proposed motions")
         self.model, self._found = model, found
         self._parameters = _parameters(model, found)
         self._directions = np.stack([model.direction(p) for p in self._parameters], axis=1)

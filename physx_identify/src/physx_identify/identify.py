@@ -48,13 +48,14 @@ def identify(
     instant: bool = False,
     engines: Sequence[str] = (),
     slowest: float = SLOWEST,
+    flight: bool = False,
     seed: int = 0,
 ) -> Identification:
     """Find parameters of a robot in a log, with intervals.
 
     Args:
         log: Positions, and measured or commanded torques, of all joints.
-        robot: The robot as it is known so far, on a fixed base.
+        robot: The robot as it is known so far; if its base floats, the log has the base's pose.
         unknowns: What to find, such as ``["mass:hand", "friction"]``; see `Unknown`.
         level: Nominal probability of the intervals.
         gravity: In m/s².
@@ -65,12 +66,14 @@ def identify(
             which of them depend on the engine.
         slowest: In rad/s or m/s. Samples at which a joint with dry friction is slower are left out,
             since their friction is unknown.
+        flight: Whether nothing but gravity acts on a floating base. Its six equations then count,
+            too, each with noise of its own, which takes many times as long.
         seed: Seed of the draws from the posterior.
 
     Raises:
-        IdentificationError: If the log is bad, see `check_log`; if the robot's base floats; or if
-            nothing unknown acts on its torques; or if there are engines, but something is unknown
-            that no engine's robot can be given.
+        IdentificationError: If the log is bad, see `check_log`; if nothing unknown acts on the
+            robot's torques; or if there are engines, but the robot's base floats, or something is
+            unknown that no engine's robot can be given.
         ConfigError: If an unknown, the level, the slowest velocity or an engine is wrong; or if
             torques are those at instants, which no engine takes.
         ComponentNotFoundError: If the robot has no link or joint of a name.
@@ -85,14 +88,18 @@ def identify(
     model = Model(robot, gravity, held)
     parameters = model.parameters(as_unknowns(unknowns))
     check_log(log, model, len(parameters))
+    if engines:
+        model.check_fixed("Refits on engines")
     if engines and instant:
         raise ConfigError("Engines hold torques from step to step: leave instant out, or engines.")
     world = world_of(robot, log.period, gravity, held)
     others = find_engines(engines, world, parameters)
-    data = Data(log.positions, log.torques, log.period, instant, slowest)
+    torques = np.pad(log.torques, ((0, 0), (len(model.coordinates) - len(log.joints), 0)))
+    data = Data(log.coordinates, torques, log.period, instant, slowest, log.base, flight)
     found = fit(model, parameters, data)
     again = fit(model, parameters, data, np.array([p.nominal for p in parameters]), found.noise)
-    summary = _summary(log, robot, parameters, found, again, level, seed)
+    names = model.coordinates[data.rows]
+    summary = _summary(log, robot, parameters, found, again, level, seed, names)
     refitted = refits(others, world, model, parameters, found, summary)
     estimates = summary.estimates
     if summary.converged:
@@ -128,6 +135,7 @@ def _summary(
     again: Fit,
     level: float,
     seed: int,
+    names: Sequence[str],
 ) -> Identification:
     errors = np.sqrt(np.diag(found.covariance))
     apart = found.values - again.values
@@ -146,11 +154,11 @@ def _summary(
         _estimates(parameters, found, values, width if converged else None),
         _combinations(parameters, found, width if converged else None),
         _noise(found),
-        structure_tests(found, log.joints),
+        structure_tests(found, names),
         converged,
         _residual(found),
         np.abs(log.positions).max(axis=0).tolist(),
-        np.abs(found.path.velocities).max(axis=0).tolist(),
+        np.abs(found.path.velocities).max(axis=0)[-len(log.joints) :].tolist(),
         values.tolist(),
         _covariance(found).tolist(),
         _draws(parameters, found, values, np.random.default_rng(seed)).tolist(),

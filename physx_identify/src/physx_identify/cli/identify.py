@@ -59,6 +59,11 @@ class Identify:
     """In m/s^2."""
     held: tuple[str, ...] = ()
     """Joints that did not move and are not in the log, such as a gripper's: they are at 0."""
+    floating: bool = False
+    """The base of the robot moves, and the log has its pose: base_x, base_y, base_z, and base_qx,
+    base_qy, base_qz, base_qw."""
+    flight: bool = False
+    """Nothing but gravity acts on a base that moves, so that its equations count, too. Slow."""
     instant: bool = False
     """Torques are those at the instants of the samples, instead of held from each to the next."""
     engines: tuple[str, ...] = ()
@@ -75,15 +80,17 @@ class Identify:
 def run(words: Sequence[str]) -> None:
     """Print what the log says, and store it if requested."""
     options = tyro.cli(Identify, args=words, prog="physx identify")
-    robot = Robot(options.robot)
+    robot = Robot(options.robot, fixed_base=not options.floating)
     begin = time.monotonic()
+    model = Model(robot, options.gravity, options.held)
     log = read_log(
         options.log,
-        Model(robot, options.gravity, options.held).joints,
+        model.joints,
         period=options.period,
         columns=options.columns,
         episode=options.episode,
         topic=options.topic,
+        floating=model.floating,
     )
     found = identify(
         log,
@@ -95,6 +102,7 @@ def run(words: Sequence[str]) -> None:
         instant=options.instant,
         engines=options.engines,
         slowest=options.slowest,
+        flight=options.flight,
     )
     if options.json:
         print(found.to_json())

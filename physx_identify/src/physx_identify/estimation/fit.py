@@ -18,6 +18,7 @@ from scipy.linalg import qr, solve_triangular
 
 from physx_core.typing import Array, Vector
 from physx_identify.errors import IdentificationError
+from physx_identify.estimation.base import COORDINATES, Base
 from physx_identify.estimation.model import Model, Path
 from physx_identify.estimation.noise import ORDERS, LikelyNoise, Noise, Whitener
 from physx_identify.estimation.smooth import Smoother
@@ -43,6 +44,8 @@ _SEPARABLE = 1e-6
 """Relative length of what is left of a column without the others, below which it is one of them."""
 _NEAR = 0.01
 """Share of the encoders' errors in differences that derivatives are made of."""
+_FAINT = 1e-9
+"""Least noise of positions that counts."""
 SLOWEST, _UNSURE = 0.02, 2.0
 """Velocity below which dry friction is unknown: in rad/s or m/s, and in standard errors."""
 
@@ -57,6 +60,8 @@ class Data:
         period: In s.
         instant: As in `Path`.
         slowest: Velocity below which dry friction is unknown, in rad/s or m/s.
+        base: Measured orientations of a floating base, whose coordinates come first.
+        flight: Whether nothing but gravity acts on a floating base, so that its forces are known.
     """
 
     positions: Vector
@@ -64,6 +69,17 @@ class Data:
     period: float
     instant: bool = False
     slowest: float = SLOWEST
+    base: Base | None = None
+    flight: bool = False
+
+    @property
+    def rows(self) -> slice:
+        """Which coordinates have known torques."""
+        return slice(0 if self.flight or self.base is None else len(COORDINATES), None)
+
+    def path(self, positions: Vector) -> Path:
+        """Return a motion at its times."""
+        return Path(positions, self.period, self.instant, self.base)
 
 
 @dataclass(frozen=True)
@@ -147,7 +163,8 @@ class _Equation:
             parameters).
         columns: Columns of what was measured, of the same shape.
         target: Shape (samples, joints).
-        stencil: As in `Model.stencil`, along the same path as the instruments.
+        stencil: As in `Model.stencil`, along the same path as the instruments, by positions in
+            deviations of the encoders, shape (3, samples, joints, positions).
         torques: Of the model along that path, of the same shape as the target.
         doubt: By what dry friction differs if it is applied another way, shape (samples, joints).
     """
@@ -182,9 +199,10 @@ class Problem:
             if each.kind in ("gain", "bias", "encoder", "delay")
         ]  # fmt: skip
         self._plain = [each.kind not in ("gain", "delay", "encoder") for each in parameters]
+        self._rows, self._scale = data.rows, _noises(data)
         delayed = any(each.kind == "delay" for _, each in self._special)
         self._smooth = Smoother(data.torques) if delayed else None
-        joints = model.joints
+        joints = model.coordinates
         dry = np.zeros(len(joints), bool)
         rubbing = model.numbers[11 * len(joints) : 13 * len(joints)].reshape(2, -1)
         dry |= rubbing.any(axis=0)
@@ -198,7 +216,7 @@ class Problem:
         found = self._data.positions
         for place, each in self._special:
             if each.kind == "encoder":
-                offset = values[place] * (np.array(self._model.joints) == each.of)
+                offset = values[place] * (np.array(self._model.coordinates) == each.of)
                 found = found - offset
         return found
 
@@ -259,7 +277,15 @@ class Problem:
                 if each.kind == "encoder":
                     columns[..., place] = instruments[..., place]
                 target = target + columns[..., place] * values[place]
-        return _Equation(instruments, columns, target, stencil, own, doubt)
+        rows = self._rows
+        return _Equation(
+            instruments[:, rows],
+            columns[:, rows],
+            target[:, rows],
+            self._scale * stencil[:, :, rows],
+            own[:, rows],
+            doubt[:, rows],
+        )
 
     def _columns(
         self, path: Path, raw: Path, stencil: Vector, dry: Vector | None, torques: Vector
@@ -281,7 +307,7 @@ class Problem:
             if each.kind == "delay":
                 columns[..., place] = self._slopes(torques)
                 continue
-            joint = self._model.joints.index(each.of)
+            joint = self._model.coordinates.index(each.of)
             if each.kind == "encoder":
                 columns[..., place] = -stencil.sum(axis=0)[:, :, joint]
             else:
@@ -294,16 +320,16 @@ class Problem:
         smoother, fixed = Smoother(self._positions(values)), noise is not None
         corrections: Vector | float = 0.0
         whole, settled = 0, False
-        slow = np.full(len(self._model.joints), self._data.slowest)
+        slow = np.full(len(self._model.coordinates), self._data.slowest)
         found: Fit | None = None
         likely: LikelyNoise | None = None
         for step in range(1, _STEPS + 1):
             measured = self._positions(values)
-            raw = Path(measured, self._data.period, self._data.instant)
+            raw = self._data.path(measured)
             moving = step <= _PATH_STEPS or (not settled and step <= _LONGEST)
             if moving:  # then it stays, or the sign of slow motions may never settle
                 path = dataclasses.replace(raw, positions=smoother(measured + corrections))
-                used = ~(self._dry & _unsure(path.ends, slow))
+                used = ~(self._dry & _unsure(path.ends, slow))[:, self._rows]
                 whole = round(self._late(values))
                 used[: max(_EDGE, -whole)] = used[-max(_EDGE, whole) :] = False
             equation = self._equation(path, raw, values, whole)
@@ -328,10 +354,11 @@ class Problem:
             if not moving and (moved < _CLOSE).all():
                 found = dataclasses.replace(found, converged=True)
                 break
-            corrections = whitener.corrections(found.residual, noise)
+            corrections = self._scale * whitener.corrections(found.residual, noise)
             if self._dry.any() and moving:
                 errors, left = whitener.draw(noise)
-                unsure = np.diff(smoother(errors + whitener.corrections(left, noise)), axis=0)
+                errors = self._scale * (errors + whitener.corrections(left, noise))
+                unsure = np.diff(smoother(errors), axis=0)
                 slow = np.maximum(
                     self._data.slowest, _UNSURE * unsure.std(axis=0) / self._data.period
                 )
@@ -391,7 +418,7 @@ class Problem:
             if each.kind == "delay":
                 found[..., place] = self._slopes(own)
             elif each.kind == "gain":
-                joint = self._model.joints.index(each.of)
+                joint = self._model.coordinates.index(each.of)
                 found[:, joint, place] = -own[:, joint]
         return found
 
@@ -460,6 +487,21 @@ class Problem:
             target - columns @ values, equation.instruments[..., free[sort]], used, path, whitener,
             np.full(rank, float(used.sum() - rank)), self._known_of(free[sort], values),
         )  # fmt: skip
+
+
+def _noises(data: Data) -> Vector:
+    """Return the noise of each position, shape (coordinates,), relative to the encoders'."""
+    scale = np.ones(data.positions.shape[1])
+    if data.base is not None:
+        noise = Smoother(data.positions).noise
+        encoder = max(_size(noise[6:]), _FAINT)
+        for part in (slice(0, 3), slice(3, 6)):
+            scale[part] = max(_size(noise[part]), _FAINT) / encoder
+    return scale
+
+
+def _size(values: Vector) -> float:
+    return float(np.sqrt(np.mean(values**2)))
 
 
 def _whitened(

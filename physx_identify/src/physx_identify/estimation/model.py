@@ -10,14 +10,16 @@ import pinocchio
 
 from physx_core.errors import ComponentNotFoundError
 from physx_core.typing import Vector
-from physx_dart.pinocchio.models import frames_of, load_model
+from physx_dart.pinocchio.models import frames_of, load_model, load_stepping_model
 from physx_identify.errors import IdentificationError
+from physx_identify.estimation.base import COORDINATES, Base
 from physx_identify.estimation.inertia import TEN, UNITS, carried, ten_of
 from physx_identify.unknowns import LINKS, Parameter, Unknown
 from physx_sim import Robot, World
 from physx_sim.engines import MovableBody, read_parts
 
 _TORQUE = {"rad": "N m", "m": "N"}
+_RESISTANCE = ("damping", "friction", "stribeck", "armature")
 GRAVITY = (0.0, 0.0, -9.81)
 """In m/s²."""
 STRIBECK = 0.1
@@ -29,20 +31,30 @@ class Path:
     """A motion in discrete time, sampled at physics steps as the engines step them.
 
     Attributes:
-        positions: Before, at and after each sample, shape (samples + 2, joints), in rad or m.
+        positions: Before, at and after each sample, shape (samples + 2, coordinates), in rad or m.
         period: In s.
         instant: Whether torques are those at the instants of the samples, instead of held from each
             sample to the next.
+        base: Measured orientations of a floating base, whose coordinates come before the joints'.
     """
 
     positions: Vector
     period: float
     instant: bool = False
+    base: Base | None = None
 
     @property
     def own(self) -> Vector:
         """Positions, shape (samples, joints)."""
         return self.positions[1:-1]
+
+    @property
+    def configurations(self) -> Vector:
+        """Positions as Pinocchio takes them, with quaternions, shape (samples, numbers)."""
+        if self.base is None:
+            return self.own
+        turned = self.base.turned(self.positions[:, 3:6])[1:-1]
+        return np.concatenate([self.own[:, :3], turned, self.own[:, 6:]], axis=1)
 
     @property
     def velocities(self) -> Vector:
@@ -65,16 +77,18 @@ class Path:
 
 
 class Model:
-    """A robot on a fixed base, as numbers that its torques are linear in.
+    """A robot as numbers that its torques are linear in.
 
-    The numbers are the ten of each moving body, then damping, friction, Stribeck friction and
-    armature of each joint.
+    The numbers are ten of each coordinate, those of the body that it moves last, then damping,
+    friction, Stribeck friction and armature of each. Of a floating base, the first six coordinates
+    are those of `Base`; the bodies of all but its last one are empty.
 
     Attributes:
         robot: The robot.
         movable: The robot as read from its file.
         joints: Names of its joints.
-        numbers: All numbers as in its file and settings, shape (14 * joints,).
+        coordinates: Names of what its torques belong to: those of a floating base, and the joints.
+        numbers: All numbers as in its file and settings, shape (14 * coordinates,).
     """
 
     def __init__(
@@ -93,8 +107,8 @@ class Model:
         Raises:
             ModelError: If it cannot be loaded.
             ComponentNotFoundError: If there is no joint of a name.
-            IdentificationError: If its base floats, it has no joints, or joints follow others, are
-                coupled, or have springs.
+            IdentificationError: If it has no joints, or joints follow others, are coupled, or have
+                springs.
         """
         self.robot = robot
         world = World(robots=[robot], gravity=tuple(gravity))
@@ -103,25 +117,26 @@ class Model:
         self._check(robot, self.movable)
         self.joints = tuple(joint.name for joint in joints)
         self.units = tuple(joint.unit for joint in joints)
-        self._pin = load_model(self.movable, world.gravity, armature=np.zeros(len(joints)))
+        self.floating = not self.movable.fixed_base
+        self.coordinates = (*(COORDINATES if self.floating else ()), *self.joints)
+        count, base = len(self.coordinates), len(self.coordinates) - len(joints)
+        load = load_stepping_model if self.floating else load_model
+        self._pin = load(self.movable, world.gravity, armature=np.zeros(count))
         self._data = self._pin.createData()
         bodies = [
             ten_of(each.mass, each.lever, each.inertia) if each.mass else np.zeros(10)
             for each in list(self._pin.inertias)[1:]
         ]
-        resist = [[getattr(joint, name) for joint in joints] for name in ("damping", "friction")]
-        rest = [np.zeros(len(joints)), [joint.armature for joint in joints]]
-        self.numbers = np.concatenate([*bodies, *resist, *rest])
+        self._empty = count - len(bodies)
+        resist = np.zeros((4, count))
+        for row, name in enumerate(_RESISTANCE):
+            resist[row, base:] = [getattr(joint, name, 0.0) for joint in joints]
+        self.numbers = np.concatenate([np.zeros(10 * self._empty), *bodies, resist.ravel()])
 
     @staticmethod
     def _check(robot: Robot, movable: MovableBody) -> None:
         what = f'Robot "{robot.name}", {movable.model.path}'
         joints = movable.model.joints
-        if not movable.fixed_base:
-            raise IdentificationError(
-                f"{what} floats; parameters are identified on a fixed base: hang the robot up, and "
-                "pass Robot(..., fixed_base=True)."
-            )
         if not joints:
             raise IdentificationError(f"{what} has no movable joint.")
         odd = [joint.name for joint in joints if joint.stiffness or joint.mimic is not None]
@@ -134,6 +149,17 @@ class Model:
             raise IdentificationError(
                 f"{what}: what a motor bears of coupled joints is not known, so they are not "
                 "identified; uncouple them, and set Robot(couplings=())."
+            )
+
+    def check_fixed(self, what: str) -> None:
+        """Check that the base is fixed, as something needs.
+
+        Raises:
+            IdentificationError: If it floats.
+        """
+        if self.floating:
+            raise IdentificationError(
+                f'{what} need a fixed base, but robot "{self.robot.name}" floats. Leave them out.'
             )
 
     # Unknowns -------------------------------------------------------------------------------
@@ -201,7 +227,7 @@ class Model:
     def direction(self, parameter: Parameter) -> Vector:
         """Return the change of `numbers` by a parameter's unit; zeros if it is none of them."""
         found = np.zeros(len(self.numbers))
-        kind, count = parameter.kind, len(self.joints)
+        kind, count = parameter.kind, len(self.coordinates)
         if kind in LINKS:
             place = self.movable.model.links.index(parameter.of)
             frame = self._pin.frames[frames_of(self.movable)[place]]
@@ -212,11 +238,11 @@ class Model:
             else:
                 body = self.movable.model.bodies[place]
                 ten = ten_of(body.mass, body.center, body.inertia) / body.mass
-            start = 10 * (frame.parentJoint - 1)
+            start = 10 * (frame.parentJoint - 1 + self._empty)
             found[start : start + 10] = carried(frame.placement.homogeneous) @ ten
-        elif kind in ("damping", "friction", "stribeck", "armature"):
-            row = ("damping", "friction", "stribeck", "armature").index(kind)
-            found[(10 + row) * count + self.joints.index(parameter.of)] = 1.0
+        elif kind in _RESISTANCE:
+            place = self.coordinates.index(parameter.of)
+            found[(10 + _RESISTANCE.index(kind)) * count + place] = 1.0
         return found
 
     # Torques --------------------------------------------------------------------------------
@@ -236,10 +262,10 @@ class Model:
         Returns:
             Shape (samples, joints, columns), in N m or N.
         """
-        count = len(self.joints)
-        q, v, a = path.own, path.velocities, path.accelerations
+        count = len(self.coordinates)
+        q, v, a = path.configurations, path.velocities, path.accelerations
         found = np.empty((len(q), count, directions.shape[1]))
-        bodies = np.ascontiguousarray(directions[: 10 * count])
+        bodies = np.ascontiguousarray(directions[10 * self._empty : 10 * count])
         if bodies.any():
             regress, model, data = pinocchio.computeJointTorqueRegressor, self._pin, self._data
             for place, (q_k, v_k, a_k) in enumerate(zip(q, v, a, strict=True)):
@@ -258,7 +284,7 @@ class Model:
 
     def friction(self, path: Path, numbers: Vector) -> Vector:
         """Return the dry friction of each joint, shape (samples, joints), in N m or N."""
-        count = len(self.joints)
+        count = len(self.coordinates)
         found: Vector = np.sign(path.ends) * numbers[11 * count : 12 * count]
         return found
 
@@ -277,7 +303,7 @@ class Model:
         Returns:
             Shape (samples, joints, joints).
         """
-        count = len(self.joints)
+        count = len(self.coordinates)
         damping = path.period * np.diag(numbers[10 * count : 11 * count])
         damped = path.period**2 * stencil[2]
         return np.linalg.solve(damped - damping, damped).swapaxes(1, 2)
@@ -288,17 +314,17 @@ class Model:
         Returns:
             By the position before, its own and after, shape (3, samples, joints, joints).
         """
-        count, h = len(self.joints), path.period
+        count, h = len(self.coordinates), path.period
         model = self._pin.copy()
-        for joint in range(count):
-            model.inertias[joint + 1] = pinocchio.Inertia.FromDynamicParameters(
-                numbers[10 * joint : 10 * joint + 10]
-            )
+        for joint, ten in enumerate(numbers[10 * self._empty : 10 * count].reshape(-1, 10), 1):
+            inertia = pinocchio.Inertia
+            empty = not ten[0]  # as the part of a floating base that only translates
+            model.inertias[joint] = inertia.Zero() if empty else inertia.FromDynamicParameters(ten)
         damping, armature = (np.diag(numbers[(10 + row) * count :][:count]) for row in (0, 3))
         data = model.createData()
         by_q, by_v, mass = (np.empty((len(path.own), count, count)) for _ in range(3))
         derive = pinocchio.computeRNEADerivatives
-        moving = zip(path.own, path.velocities, path.accelerations, strict=True)
+        moving = zip(path.configurations, path.velocities, path.accelerations, strict=True)
         for place, state in enumerate(moving):
             by_q[place], by_v[place], mass[place] = derive(model, data, *state)
         mass = np.triu(mass) + np.triu(mass, 1).swapaxes(1, 2)

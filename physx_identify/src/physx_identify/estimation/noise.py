@@ -81,7 +81,7 @@ class Whitener:
 
     Args:
         blocks: Derivatives of the torques by the positions of the sample before, its own and the
-            next one, shape (3, samples, joints, joints).
+            next one, shape (3, samples, joints, positions), in deviations of the encoders.
         used: Which torques count, shape (samples, joints).
     """
 
@@ -164,27 +164,27 @@ class Whitener:
             noise: Noise of the log.
 
         Returns:
-            Shape (samples + 2, joints), in rad or m.
+            Shape (samples + 2, positions), in what the blocks are derivatives by.
         """
         factor = self.factor(noise)
         white = self.whitened(residual, noise, factor)
         solved, _ = lapack.dtbtrs(factor, white[:, None], uplo="L", trans="T")
-        solved, (count, joints) = solved.reshape(residual.shape), residual.shape
+        solved, count = solved.reshape(residual.shape), len(residual)
         back = solved.copy()
         for lag, weights in enumerate(noise.regression.T, 1):
             back[:-lag] -= weights * solved[lag:]
-        found = np.zeros((count + 2, joints))
+        found = np.zeros((count + 2, self._blocks.shape[-1]))
         for place, blocks in enumerate(self._blocks):
             found[place : place + count] += np.einsum("kij,ki->kj", blocks, back)
         return noise.encoder**2 * found
 
     def draw(self, noise: Noise) -> tuple[Vector, Vector]:
-        """Return errors of the encoders, shape (samples + 2, joints), and the residual they leave.
+        """Return errors of the positions, as of `corrections`, and the residual that they leave.
 
         The latter has errors of the torques too. It is the same draw every time.
         """
         random, (count, joints) = np.random.default_rng(0), self._used.shape
-        errors = noise.encoder * random.standard_normal((count + 2, joints))
+        errors = noise.encoder * random.standard_normal((count + 2, self._blocks.shape[-1]))
         residual = noise.torque * random.standard_normal((count, joints))
         for row in range(noise.order, count):
             for lag, weights in enumerate(noise.regression.T, 1):

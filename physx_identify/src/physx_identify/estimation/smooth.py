@@ -17,6 +17,9 @@ class Smoother:
 
     The strength is that with the least expected error of accelerations (Stein's unbiased estimate),
     chosen once: what it makes of other positions is then linear in them.
+
+    Attributes:
+        noise: Standard deviation of white noise of each joint, as the highest frequencies show it.
     """
 
     def __init__(self, positions: Vector) -> None:
@@ -28,6 +31,7 @@ class Smoother:
         second = (2 * np.sin(0.5 * np.pi * np.arange(count) / count)) ** 2
         waves = dct(positions - self._trend(positions), axis=0, norm="ortho")
         self._kept = np.empty(positions.shape)
+        self.noise = np.sqrt(np.median(waves[-count // 4 :] ** 2, axis=0) / _MEDIAN)
         for joint, own in enumerate(waves.T):
             power = own**2
             noise = np.median(power[-count // 4 :]) / _MEDIAN

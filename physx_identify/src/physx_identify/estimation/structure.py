@@ -56,18 +56,21 @@ def structure_tests(found: Fit, joints: Sequence[str]) -> list[ResidualTest]:
 
 
 def _tests(found: Fit, joints: Sequence[str]) -> Iterator[tuple[str, str, float]]:
-    path = found.path
-    speed, place = path.ends, path.own - path.own.mean(axis=0)
+    rows = slice(found.path.own.shape[1] - len(joints), None)
+    speed, place, accelerations = (
+        each[:, rows] for each in (found.path.ends, found.path.own, found.path.accelerations)
+    )
+    place = place - place.mean(axis=0)
     sign = np.sign(speed)
     stribeck = sign * np.exp(-np.abs(speed) / STRIBECK)
-    stops = speed * path.accelerations < 0
+    stops = speed * accelerations < 0
     columns = {
         "friction that falls with speed (Stribeck)": stribeck,
         "dry friction that fades as a joint stops, as MuJoCo's (see slowest)": stops * stribeck,
         "a resistance that grows with the square of speed": speed * np.abs(speed),
         "a resistance in proportion to speed (damping)": speed,
         "dry friction": sign,
-        "an inertia (armature)": path.accelerations,
+        "an inertia (armature)": accelerations,
         "a constant torque, or friction that depends on the direction": np.ones_like(speed),
         "a torque that depends on the position": place,
         "friction that grows with the load": sign * np.abs(found.torques),

@@ -25,6 +25,8 @@ _RATIO = 1.5
 _WELL = 0.5
 """Correlation above which velocities are those of a joint."""
 _TOO_LARGE = 20.0
+_TURN, _LEAP = 0.2, 0.02
+"""Turn of the base from sample to sample in rad, and change of its movement in m, of a jump."""
 _CLEAR, _UNLIKE = 0.2, 0.02
 """Share of what is unlike the model, and least of it, that shows that torques are exchanged."""
 _SHOWN_SIGN = -0.5
@@ -43,8 +45,10 @@ def check_log(log: Log, model: Model, parameters: int = 1) -> None:
         IdentificationError: If joints are missing, unknown or in another order; it is too short; a
             joint does not move; positions are beyond the joint's limits, repeat or have jumps;
             velocities are not those of the positions; or torques are cut off, constant, in another
-            unit, order or sign than the robot's.
+            unit, order or sign than the robot's; or there is no pose of a floating base, one of a
+            fixed base, or one that jumps.
     """
+    _check_base(log, model)
     _check_joints(log, model)
     _check_length(log, parameters)
     _check_positions(log, model)
@@ -68,6 +72,32 @@ def _check_joints(log: Log, model: Model) -> None:
         f"{log.source} {what}, which the robot has {'' if missing else 'not'}: "
         f"{listed(model.joints)}. Name joints that did not move: held (--held)."
     )
+
+
+def _check_base(log: Log, model: Model) -> None:
+    if model.floating is not (log.base is not None):
+        what = (
+            f'robot "{model.robot.name}" floats, but there is no pose of its base (base_x ... '
+            "base_qw). If it hangs or stands, pass Robot(..., fixed_base=True)"
+            if model.floating
+            else "there is a pose of the base, but the robot's is fixed. If it moves, pass "
+            "Robot(..., fixed_base=False) (--floating)"
+        )
+        raise IdentificationError(f"{log.source}: {what}.")
+    if log.base is None:
+        return
+    for what, values, most in (
+        ("turns by", np.diff(log.base.angles, axis=0), _TURN),
+        ("moves by", np.diff(log.coordinates[:, :3], 2, axis=0), _LEAP),
+    ):
+        sizes = np.linalg.norm(values, axis=1)
+        worst = int(np.argmax(sizes))
+        usual = float(np.sort(sizes)[-max(5, len(sizes) // 50)])
+        if sizes[worst] > most and sizes[worst] > 10 * usual:
+            raise IdentificationError(
+                f"{log.source}: the base {what} {sizes[worst]:.3g} at {worst * log.period:.4g} s: "
+                "a sample is wrong or missing. Cut the log there."
+            )
 
 
 def _check_length(log: Log, parameters: int) -> None:
@@ -159,9 +189,10 @@ def _check_torques(log: Log, model: Model) -> None:
                     f"{where} are {end:.4g} in {100 * share:.0f} % of the samples: cut off by a "
                     "limit, so the true ones are unknown. Cut the log there, or move less."
                 )
-    path = Smoother(log.positions)(log.positions)
-    motion = Path(path, log.period)
+    path = Smoother(log.coordinates)(log.coordinates)
+    motion = Path(path, log.period, base=log.base)
     expected = model.columns(motion, model.numbers[:, None], motion.ends)[..., 0][5:-5]
+    expected = expected[:, -len(log.joints) :]
     torques = Smoother(log.torques)(log.torques)[1:-1][5:-5]
     alike = _correlations(torques, expected)
     _check_order(log, alike)

@@ -11,8 +11,13 @@ import numpy as np
 from physx_core.errors import listed, nearest
 from physx_core.typing import Vector
 from physx_identify.errors import IdentificationError
+from physx_identify.estimation.base import Base
 from physx_identify.logs.tables import read_table
 
+_BASE = {"base_positions": ("x", "y", "z"), "base_orientations": ("qx", "qy", "qz", "qw")}
+"""Components of a floating base's pose."""
+_MORE = {"positions": 7, "velocities": 6, "torques": 6}
+"""Numbers of a floating base that may come before those of the joints."""
 NAMES: Mapping[str, Sequence[str]] = {
     "time": ("time", "t", "timestamp", "stamp"),
     "positions": (
@@ -27,6 +32,10 @@ NAMES: Mapping[str, Sequence[str]] = {
         *("torques", "torque", "tau", "effort", "efforts", "joint_torques", "joint_torque"),
         *("motor.torque", "commands", "command", "u", "action"),
     ),
+    "base_positions": ("base_positions", "base_position", "base_pos", "base"),
+    "base_orientations": (
+        *("base_orientations", "base_orientation", "base_quaternion", "base_quat", "base"),
+    ),
 }
 """Names that columns have, by what they are."""
 _NEEDED = ("positions", "torques")
@@ -35,16 +44,18 @@ _FACTORS = {
     "m": 1.0, "mm": 1e-3, "cm": 1e-2, "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9,
     "N m": 1.0, "Nm": 1.0, "N*m": 1.0, "mN m": 1e-3, "N mm": 1e-3, "kN m": 1e3, "N": 1.0, "kN": 1e3,
     "rad/s": 1.0, "deg/s": np.pi / 180, "°/s": np.pi / 180, "m/s": 1.0, "mm/s": 1e-3,
-    "rpm": np.pi / 30,
+    "rpm": np.pi / 30, "1": 1.0,
 }  # fmt: skip
 """Units by their names, in rad, m, s, N m, N."""
+_UNIT = 0.01
+"""Largest deviation of a quaternion's length from 1."""
 _EVEN = 0.01
 """Largest deviation of a time step, in steps, of a log that is not resampled."""
 
 
 @dataclass(frozen=True)
 class Log:
-    """What was measured of a robot's joints at equal intervals.
+    """What was measured of a robot at equal intervals.
 
     Attributes:
         joints: Names of the joints; columns are in this order.
@@ -55,9 +66,13 @@ class Log:
             with the positions, to notice wrong units, signs and orders, and not fitted.
         source: Where it comes from.
         left_out: Columns of the source that are none of these.
+        base_positions: Of a floating base's frame in the world, shape (samples, 3), in m; None: the
+            base is fixed.
+        base_orientations: Its quaternions x, y, z, w, shape (samples, 4), of either sign.
 
     Raises:
-        IdentificationError: If shapes differ, a number is not finite, or the period not positive.
+        IdentificationError: If shapes differ, a number is not finite, the period not positive, or a
+            quaternion not of length 1.
     """
 
     joints: tuple[str, ...]
@@ -67,33 +82,70 @@ class Log:
     velocities: Vector | None = None
     source: str = "log"
     left_out: tuple[str, ...] = ()
+    base_positions: Vector | None = None
+    base_orientations: Vector | None = None
 
     def __post_init__(self) -> None:
         if not self.period > 0 or not np.isfinite(self.period):
             raise IdentificationError(f"{self.source}: the period is {self.period:g} s.")
         object.__setattr__(self, "joints", tuple(self.joints))
-        for name in ("positions", "torques", "velocities"):
+        if (self.base_positions is None) is not (self.base_orientations is None):
+            raise IdentificationError(f"{self.source}: a base has a position and an orientation.")
+        parts = dict.fromkeys(("positions", "torques", "velocities"), self.joints) | _BASE
+        for name, columns in parts.items():
             given = getattr(self, name)
             if given is None:
                 continue
             values = np.array(given, np.float64)
-            if values.ndim != 2 or values.shape != (len(self.positions), len(self.joints)):
+            if values.ndim != 2 or values.shape != (len(self.positions), len(columns)):
                 raise IdentificationError(
                     f"{self.source}: {name} have the shape {values.shape} instead of "
-                    f"({len(self.positions)}, {len(self.joints)}): samples, joints."
+                    f"({len(self.positions)}, {len(columns)}): samples, {', '.join(columns)}."
                 )
             wrong = np.argwhere(~np.isfinite(values))
             if len(wrong):
-                row, joint = wrong[0]
+                row, column = wrong[0]
                 raise IdentificationError(
-                    f"{self.source}: {name} of {self.joints[joint]} are {values[row, joint]} in "
+                    f"{self.source}: {name} of {columns[column]} are {values[row, column]} in "
                     f"row {row}; {len(wrong)} numbers are not finite. Cut the log there."
                 )
+            if name == "base_orientations":
+                values = _continued(self.source, values)
             values.flags.writeable = False
             object.__setattr__(self, name, values)
 
     def __len__(self) -> int:
         return len(self.positions)
+
+    @property
+    def base(self) -> Base | None:
+        """Motion of a floating base; None: it is fixed."""
+        return None if self.base_orientations is None else Base.of(self.base_orientations)
+
+    @property
+    def coordinates(self) -> Vector:
+        """Positions of base and joints, as of `Model.coordinates`, in rad or m."""
+        base = self.base
+        if base is None or self.base_positions is None:
+            return self.positions
+        found: Vector = np.concatenate([self.base_positions, base.angles, self.positions], axis=1)
+        return found
+
+
+def _continued(source: str, quaternions: Vector) -> Vector:
+    """Return unit quaternions of a sign that does not change from one to the next."""
+    lengths = np.linalg.norm(quaternions, axis=1)
+    wrong = np.flatnonzero(np.abs(lengths - 1) > _UNIT)
+    if len(wrong):
+        raise IdentificationError(
+            f"{source}: the base's quaternion has the length {lengths[wrong[0]]:.4g} in row "
+            f"{wrong[0]} instead of 1 (x, y, z, w)."
+        )
+    unit = quaternions / lengths[:, None]
+    turned = np.sum(unit[1:] * unit[:-1], axis=1) < 0
+    unit[1:] *= np.where(np.cumsum(turned) % 2, -1.0, 1.0)[:, None]
+    found: Vector = unit
+    return found
 
 
 def read_log(
@@ -104,6 +156,7 @@ def read_log(
     columns: Mapping[str, str] | None = None,
     episode: int | None = None,
     topic: str | None = None,
+    floating: bool = False,
 ) -> Log:
     """Read a log.
 
@@ -123,6 +176,8 @@ def read_log(
             the only one.
         topic: Topic of an MCAP file, or group of an HDF5 file, that has the columns; None: the only
             one of all joints.
+        floating: Whether the base floats, so that its pose is needed: ``base_x`` to ``base_z`` and
+            ``base_qx`` to ``base_qw``, arrays of them, or seven numbers before the positions.
 
     Raises:
         IdentificationError: If columns are missing, not of these joints or in an unknown unit; if
@@ -137,28 +192,45 @@ def read_log(
         raise IdentificationError(f'There is no column "{wrong[0]}" to choose: {listed(NAMES)}.')
     table, units = read_table(path, joints, episode, topic, given.values())
     used: set[str] = set()
-    found = {name: _find(path, table, units, name, given.get(name), joints, used) for name in NAMES}
-    for name in _NEEDED:
-        if found[name] is None:
+    names = [name for name in NAMES if floating or name not in _BASE]
+    found = {
+        name: values
+        for name in names
+        if (values := _find(path, table, units, name, given.get(name), joints, used, floating))
+        is not None
+    }
+    if floating:
+        _split(found, len(joints))
+    for name in names if floating else _NEEDED:
+        if name not in found and name not in ("time", "velocities"):
+            parts = _BASE.get(name, joints)
             raise IdentificationError(
-                f"{path} has no column of {name} of all joints ({listed(joints)}). It has: "
-                f"{listed(table)}. Name it with columns (--columns {name}=NAME)."
+                f"{path} has no column of {name} ({listed(parts)}). It has: {listed(table)}. Name "
+                f"it with columns (--columns {name}=NAME)."
             )
+    if floating:
+        found["base_orientations"] = _continued(str(path), found["base_orientations"])
     left_out = tuple(name for name in table if name not in used)
-    assert found["positions"] is not None
-    assert found["torques"] is not None
-    series = [found["positions"], found["torques"]]
-    if found["velocities"] is not None:
-        series.append(found["velocities"])
-    time = found["time"]
+    time = found.pop("time", None)
     if period is None:
         if time is None:
             raise IdentificationError(
                 f"{path} has no column of times. Give the time between samples: period (--period)."
             )
-        period, series = _even(path, time[:, 0], series)
-    velocities = series[2] if len(series) > 2 else None
-    return Log(tuple(joints), period, series[0], series[1], velocities, str(path), left_out)
+        period, series = _even(path, time[:, 0], list(found.values()))
+        found = dict(zip(found, series, strict=True))
+    return Log(tuple(joints), period, source=str(path), left_out=left_out, **found)
+
+
+def _split(found: dict[str, Vector], joints: int) -> None:
+    """Take the numbers of a floating base out of those before the joints'."""
+    positions = found.get("positions")
+    if positions is not None and positions.shape[1] > joints:
+        found.setdefault("base_positions", positions[:, :3])
+        found.setdefault("base_orientations", positions[:, 3:7])
+    for name in _MORE:
+        if name in found:
+            found[name] = found[name][:, -joints:]
 
 
 def _find(
@@ -169,22 +241,25 @@ def _find(
     given: str | None,
     joints: Sequence[str],
     used: set[str],
+    floating: bool,
 ) -> Vector | None:
     """Return what is of a kind, shape (rows, joints), in the units of `Log`."""
+    joints = _BASE.get(kind, joints)
     width = 1 if kind == "time" else len(joints)
+    wide = width + (_MORE.get(kind, 0) if floating else 0)
     names = NAMES[kind] if given is None else (given,)
     for name in names:
         if name in table:
             values = table[name]
-            if values.shape[1] != width:
+            if values.shape[1] not in (width, wide):
                 if given is None and kind == "time":
                     continue
                 raise IdentificationError(
-                    f'{path}: "{name}" has {values.shape[1]} numbers a row, but there are {width} '
-                    f"joints: {listed(joints)}."
+                    f'{path}: "{name}" has {values.shape[1]} numbers a row, but there are {width}: '
+                    f"{listed(joints)}."
                 )
             used.add(name)
-            return values * _factors(path, name, units.get(name, ""), width)
+            return values * _factors(path, name, units.get(name, ""), values.shape[1])
         if kind != "time":
             columns = [_of_joint(table, name, joint) for joint in joints]
             if all(columns):
