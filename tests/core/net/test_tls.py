@@ -56,6 +56,31 @@ def shake_hands(near, far):
     return client, server
 
 
+def test_a_server_that_sends_early_waits_for_the_end_of_the_handshake():
+    (near, away), (back, far) = pair(), pair()
+    server, made = SecureSocket.of_server(far, IDENTITY, set()), []
+    server.setblocking(False)
+    thread = threading.Thread(target=lambda: made.append(encrypt(near, always=True)))
+    thread.start()
+    back.sendall(away.recv(100_000))  # its hello
+    with pytest.raises(BlockingIOError):
+        server.recv_into(bytearray(1))
+    with pytest.raises(BlockingIOError):
+        server.send(b"welcome")
+    away.sendall(back.recv(100_000))
+    back.sendall(away.recv(100_000))  # its last message
+    assert server.send(b"welcome") == 7
+    thread.join()
+    (client,) = made
+    away.sendall(back.recv(100_000))
+    assert client.recv(10) == b"welcome"
+    client.sendall(b"thanks")
+    back.sendall(away.recv(100_000))
+    assert server.recv(10) == b"thanks"
+    for each in (client, server, away, back):
+        each.close()
+
+
 def receive_all(end):
     """Return what arrives until the end, as the system or `hidden` tell, and the error."""
     received = bytearray()

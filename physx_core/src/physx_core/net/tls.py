@@ -206,7 +206,12 @@ class SecureSocket(socket.socket):
             while done < len(view):
                 end = min(done + _SEND_SIZE, len(view))
                 while done + self._unreported < end:
-                    self._unreported += tls.write(view[done + self._unreported : end])
+                    try:
+                        self._unreported += tls.write(view[done + self._unreported : end])
+                    except ssl.SSLWantReadError:  # the handshake has not ended
+                        self._answer()
+                        self._fetch()
+                        self.buffered.add(self)
                 self._push()
                 done, self._unreported = end, 0
         except BlockingIOError:
