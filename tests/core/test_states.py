@@ -463,18 +463,18 @@ def test_scripts_are_known_by_their_files(tmp_path):
     """In clients, their modules have other names than in the process that was started."""
     text = """
 from physx_core import Environment
-class Part: ...
 class Whole(Environment):
     def create(self):
         self.part = Part()
 """
+    part = "class Part: ...\n"
     found = []
-    for folder in ("one", "other"):
+    for folder, content in (("before", text), ("one", text + part), ("other", text + part)):
         file = tmp_path / folder / "script.py"
         file.parent.mkdir()
-        file.write_text(text)
+        file.write_text(content)
         found.append(resolve("environment", f"{file}:Whole"))
-    one, other = (kind(seed=1) for kind in found)
+    one, other = (kind(seed=1) for kind in found[1:])
     for each in (one, other):
         each.create()
     assert type(one).__module__ != type(other).__module__
@@ -482,6 +482,7 @@ class Whole(Environment):
     one.part, one.more = 3, type(one.part)()
     target.restore(decode(encode(source.capture(), "state")))
     assert other.part == 3
+    assert type(other.more).__module__ == type(other).__module__
     assert type(other.more).__name__ == "Part"
 
 

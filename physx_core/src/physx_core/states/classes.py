@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import enum
 import functools
 import sys
+from collections.abc import Iterator
 from pathlib import PurePath
 from types import FunctionType, MemberDescriptorType
 from typing import Any
@@ -40,34 +42,44 @@ def recipe_of(kind: Any, base: Any) -> str | None:
     if kind is base:
         return None
     name = name_of(kind)
-    try:
-        if class_named(name, base) is kind and (
-            base is enum.Enum or new_of(name, base) is not None
-        ):
+    with contextlib.suppress(TypeError):
+        is_found = any(each is kind for each in _classes_named(name, base))
+        if is_found and (base is enum.Enum or _made(kind, base) is not None):
             return name
-    except (StateError, TypeError):
-        pass
     raise RefusedError("is of a class that cannot be found and made by its name, or has __del__")
 
 
 def class_named(name: str, base: type[Any]) -> Any:
-    """Return a class that is imported, and whose objects run no code when they are made or end."""
+    """Return a class that is imported, and whose objects run no code when they are made or end.
+
+    Of scripts whose files have the same name, it is that of the last one.
+
+    Raises:
+        StateError: If there is none.
+    """
+    for found in _classes_named(name, base):
+        return found
+    raise StateError(
+        f"The state has an object of {name.replace(':', '.')}, which is not a class of an "
+        "imported module, or defines __del__: import it where the environment is defined."
+    )
+
+
+def _classes_named(name: str, base: type[Any]) -> Iterator[Any]:
     module, _, qualified = name.partition(":")
-    found = _module_named(module)
-    for each in qualified.split("."):
-        found = vars(found).get(each) if hasattr(found, "__dict__") else None
-    is_class = isinstance(found, type) and issubclass(found, base)
-    if not is_class or hasattr(found, "__del__"):
-        raise StateError(
-            f"The state has an object of {name.replace(':', '.')}, which is not a class of an "
-            "imported module, or defines __del__: import it where the environment is defined."
-        )
-    return found
+    for found in _modules_named(module):
+        for each in qualified.split("."):
+            found = vars(found).get(each) if hasattr(found, "__dict__") else None
+        if isinstance(found, type) and issubclass(found, base) and not hasattr(found, "__del__"):
+            yield found
 
 
 def new_of(name: str | None, base: Any, *items: Any) -> Any:
     """Return an object of a class by its name, made without any method of that class."""
-    kind = base if name is None else class_named(name, base)
+    return _made(base if name is None else class_named(name, base), base, *items)
+
+
+def _made(kind: Any, base: Any, *items: Any) -> Any:
     make = base.__new__ if isinstance(kind.__new__, FunctionType) else kind.__new__
     return make(kind, *items)
 
@@ -89,8 +101,9 @@ def _file_or_module(module: str) -> str:
     return PurePath(file).name if is_script and file else module
 
 
-def _module_named(name: str) -> Any:
+def _modules_named(name: str) -> list[Any]:
+    """Return the modules of a name; of scripts of the same name, the last ones first."""
     if name in sys.modules or not name.endswith(".py"):
-        return sys.modules.get(name)
-    names = (each for each in list(sys.modules) if _file_or_module(each) == name)
-    return sys.modules.get(next(names, ""))
+        return [sys.modules.get(name)]
+    names = [each for each in list(sys.modules) if _file_or_module(each) == name]
+    return [sys.modules.get(each) for each in reversed(names)]
