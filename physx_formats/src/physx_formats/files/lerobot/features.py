@@ -91,7 +91,8 @@ class Feature:
         if self.name.startswith(_PICTURES) and not self.is_video:
             raise ExchangeError(
                 f'"{self.name}" must be one field of pictures, of type uint8 and shape (height, '
-                f"width, 3), but {names} is of type {self.dtype} and shape {self.shape}."
+                f"width, 3), but {names} is of type {self.dtype} and shape {self.shape}. Define "
+                f'the field as Field({names}, (height, width, 3), "uint8").'
             )
 
 
