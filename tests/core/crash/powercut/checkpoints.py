@@ -98,13 +98,14 @@ class Promise:
 
     Attributes:
         there: Name to what it may hold.
-        new: What may also be there: the checkpoint that is being written.
+        new: What may also be there: the checkpoint that is being written, and those that were
+            when the process was killed.
         made: Whether there is a folder for certain.
         call: The call at work.
     """
 
     there: Mapping[str, tuple[int, ...]]
-    new: Mapping[str, int]
+    new: Mapping[str, tuple[int, ...]]
     made: bool
     call: str
 
@@ -114,7 +115,7 @@ class Promise:
             if seen.found.get(name) not in values:
                 return f"{name} holds {seen.found.get(name)!r}, not one of {values}"
         for name in seen.found.keys() - self.there.keys():
-            if seen.found[name] != self.new.get(name):
+            if seen.found[name] not in self.new.get(name, ()):
                 return f"{name} is {seen.found[name]!r}"
         numbered = [v for n, v in seen.found.items() if not n.endswith(BEST)]
         last = max(numbered, default=None)
@@ -141,7 +142,7 @@ class CheckpointHistory:
         self._chance, self._stage, self._longest = chance, stage, longest
         self._folder = folder / "session" / "network"
         self._there: dict[str, tuple[int, ...]] = {}
-        self._perhaps: dict[str, int] = {}
+        self._perhaps: dict[str, tuple[int, ...]] = {}
         self._number = self._fuse = -1
         self._made = False
 
@@ -195,14 +196,14 @@ class CheckpointHistory:
         numbers = [int(n.rpartition("_")[2]) for n in taken if not n.endswith(BEST)]
         name = f"{NAME}_{BEST if best else max(numbers, default=-1) + 1}"
         self.calls.append(f"save {self._number} as {name}, {nbytes} bytes")
-        self._mark(self.calls[-1], {name: self._number})
+        self._mark(self.calls[-1], {name: (*self._perhaps.get(name, ()), self._number)})
         if self._chance.random() < 0.15:
             self._fuse = self._chance.randint(0, 30)
         try:
             saved = save(self._folder, self._number, nbytes, best=best)
             if saved.name != name:
                 self.problems.append(f"{saved.name} was saved, not {name}")
-            self._there |= {found: (n,) for found, n in self._perhaps.items()}
+            self._there |= self._perhaps
             self._perhaps.clear()
             self._there[name] = (self._number,)
         except Killed:
@@ -215,17 +216,17 @@ class CheckpointHistory:
             elif name in self._there:
                 self._there[name] = (*self._there[name], self._number)
             elif name in seen.found:  # the disk may not have it yet
-                self._perhaps[name] = self._number
+                self._perhaps[name] = (*self._perhaps.get(name, ()), self._number)
         except Exception as error:
             self.problems.append(f"{self.calls[-1]}: {type(error).__name__}: {error}")
         self._fuse = -1
         self._mark(f"after {self.calls[-1]}")
 
-    def _mark(self, call: str, new: Mapping[str, int] | None = None) -> None:
+    def _mark(self, call: str, new: Mapping[str, tuple[int, ...]] | None = None) -> None:
         there = dict(self._there)
         new = self._perhaps | dict(new or {})
         for name in there.keys() & new.keys():
-            there[name] = (*there[name], new.pop(name))
+            there[name] = (*there[name], *new.pop(name))
         promise = Promise(there, new, self._made, call)
         self._promises.append((len(self._recorder.journal), promise))
 
