@@ -18,6 +18,7 @@ import numpy as np
 from physx_core.fields import TEXT, Field
 from physx_core.typing import Array
 from physx_formats.errors import ExchangeError
+from physx_formats.files.sequential_rows import SequentialRows
 from physx_formats.format import Columns, Format
 from physx_formats.table import (
     BLOCK,
@@ -93,49 +94,32 @@ def _array(arrow: Any, kind: Any, values: Array) -> Any:
     return array.cast(kind)
 
 
-class _Column:
-    """A column of a file, read sequentially; see `Column`."""
-
-    unit = ""
+class _Column(SequentialRows):
+    """A column of a file."""
 
     def __init__(self, path: Path, file: Any, field: Any) -> None:
         kind, shape = field.type, []
         while hasattr(kind, "list_size"):
             shape.append(kind.list_size)
             kind = kind.value_type
+        known, dtype = field.metadata or {}, np.dtype(np.uint8)
         self._path, self._file, self._name = path, file, field.name
-        self._batches: Iterator[Any] | None = None
-        self.shape, self.problem = (file.metadata.num_rows, *shape), ""
-        known = field.metadata or {}
-        self.dtype = np.dtype(np.uint8)
         try:
-            self.dtype = np.dtype(kind.to_pandas_dtype())
+            dtype = np.dtype(kind.to_pandas_dtype())
         except NotImplementedError:
             self.problem = f'"{field.name}" of {path} holds {kind}.'
         if str(kind) in ("string", "large_string"):
             noted = _TEXT.fullmatch(known.get(b"dtype", b""))
-            self.dtype = np.dtype(f"S{max(1, int(noted[1]) if noted else 0, self._longest())}")
+            dtype = np.dtype(f"S{max(1, int(noted[1]) if noted else 0, self._longest())}")
         elif "list" in str(kind):
             self.problem = f'"{field.name}" of {path} holds lists of different lengths.'
-        elif self.dtype.kind not in "biuf":
+        elif dtype.kind not in "biuf":
             self.problem = self.problem or f'"{field.name}" of {path} holds {kind}.'
         self._is_complex = known.get(b"dtype", b"").startswith(b"complex") and shape[-1:] == [2]
         if self._is_complex:
-            self.shape = self.shape[:-1]
-            self.dtype = np.result_type(self.dtype, np.complex64)
+            shape, dtype = shape[:-1], np.result_type(dtype, np.complex64)
         self.unit = known.get(b"unit", b"").decode(errors="replace")
-        self._left = np.empty((0, *self.shape[1:]), self.dtype)
-
-    def read(self, start: int, count: int) -> Array:
-        """Return the next rows."""
-        if self._batches is None:
-            self._batches = self._file.iter_batches(columns=[self._name])
-        parts = [self._left]
-        while sum(map(len, parts)) < count:
-            parts.append(self._values(next(self._batches).column(0)))
-        rows = np.concatenate(parts)
-        found, self._left = rows[:count], rows[count:]
-        return found
+        super().__init__([file], field.name, dtype, shape)
 
     def _longest(self) -> int:
         """Return the largest number of bytes of a text."""

@@ -1,4 +1,4 @@
-"""Where LeRobot's files are: numbered files of limited size in numbered folders."""
+"""Paths of the files of a LeRobot dataset, numbered in numbered folders, and their sizes."""
 
 from __future__ import annotations
 

@@ -24,6 +24,7 @@ from physx_formats.errors import ExchangeError
 from physx_formats.files.lerobot.features import VERSION
 from physx_formats.files.lerobot.layout import video_file
 from physx_formats.files.lerobot.video import Clip, Pictures, read_image
+from physx_formats.files.sequential_rows import SequentialRows
 from physx_formats.format import Columns
 from physx_formats.table import Column, Notes, check_size, import_library
 
@@ -184,42 +185,7 @@ def _size_of(described: Mapping[str, Any], shape: _Shape) -> _Shape:
     return shape[1:] if "channel" in str((described.get("names") or [""])[0]) else shape[:2]
 
 
-class _Sequential:
-    """A field of the frames, read in sequence; see `Column`."""
-
-    unit = problem = ""
-
-    def __init__(
-        self, files: Sequence[Any], name: str, dtype: np.dtype[Any], shape: _Shape
-    ) -> None:
-        """Keep where it is.
-
-        Args:
-            files: The Parquet files in order.
-            name: Name of the feature.
-            dtype: Type of the values.
-            shape: Shape of the field.
-        """
-        self.dtype, self.shape = dtype, (sum(file.metadata.num_rows for file in files), *shape)
-        self._name = name
-        self._batches = (b for file in files for b in file.iter_batches(columns=[name]))
-        self._left = np.empty((0, *shape), dtype)
-
-    def read(self, start: int, count: int) -> Array:
-        """Return the next rows."""
-        parts = [self._left]
-        while sum(map(len, parts)) < count:
-            parts.append(self._values(next(self._batches).column(0)))
-        rows = np.concatenate(parts)
-        found, self._left = rows[:count], rows[count:]
-        return found
-
-    def _values(self, array: Any) -> Array:
-        """Return the rows of an Arrow array."""
-        raise NotImplementedError
-
-
-class _Numbers(_Sequential):
+class _Numbers(SequentialRows):
     """Components of a feature."""
 
     def __init__(
@@ -251,7 +217,7 @@ class _Numbers(_Sequential):
         return found.reshape(rows, *self.shape[1:])
 
 
-class _Images(_Sequential):
+class _Images(SequentialRows):
     """Pictures that are files in the rows, such as PNG."""
 
     def __init__(self, files: Sequence[Any], name: str, shape: _Shape) -> None:
