@@ -207,7 +207,7 @@ BUGS = (
         _instead(partition_format.Inspection, "certain", property(lambda self: True)),
     ),
     Bug("no marks are made", _instead(PartitionFile, "mark", _no_mark), first=17),
-    Bug("there is only one mark", _instead(PartitionFile, "mark", _mark_one_place), first=184),
+    Bug("there is only one mark", _instead(PartitionFile, "mark", _mark_one_place), first=226),
     Bug(
         "rows that follow lost ones are given out",
         _instead(recovery, "_discard_behind_gaps", lambda mode: None),
