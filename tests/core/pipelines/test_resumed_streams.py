@@ -60,6 +60,10 @@ def stored(name):
         }
 
 
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
 def interrupted(pipeline, after):
     """Run a pipeline that is interrupted after some batches."""
 
@@ -85,6 +89,18 @@ def test_a_resumed_generation_has_the_same_rows(run, every, places, nothing_stay
     interrupted(run.generation("stopped", first), 4)
     interrupted(run.generation("stopped", second, resume=True), 8)
     run.generation("stopped", first, resume=True).execute()
+    assert stored("stopped") == stored("whole")
+
+
+def test_parameters_saved_by_a_run_without_rows_do_not_count(run, monkeypatch):
+    """The environment counts its runs with `save_parameters`, before its first row."""
+    environment = run.streams(LOCAL)
+    run.generation("whole", environment).execute()
+    for _ in range(2):
+        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+            patch.setattr(resolve("environment", RIVER), "step", interrupt)
+            run.generation("stopped", environment).execute()
+    run.generation("stopped", environment, resume=True).execute()
     assert stored("stopped") == stored("whole")
 
 

@@ -30,6 +30,8 @@ from physx_core.views.dataset_config import DatasetConfig
 PARAMETERS = "parameters_{}.bin"
 """Name of the file in a dataset's folder that contains an instance's saved parameters."""
 _FORMER = ".former"
+_BEGINS = "parameters.begins"
+"""Name of the file that exists while a generation has begun, but has no rows yet."""
 _IF_SET = ("independent_episodes", "episode_steps", "sampler", "sampler_kwargs", "state_every")
 LARGEST_PARAMETERS = 2**32
 """Maximum size of such a file in bytes."""
@@ -124,7 +126,7 @@ def _is_unused(session: Session, path: Path, opened: bool) -> bool:
         case ("dataset", name):
             is_data = name == FILE or path.suffix == ".h5"
             return (
-                not opened or name in (LOCK, PROOF) or (is_data and not _has_samples(path.parent))
+                not opened or name in (LOCK, PROOF, _BEGINS) or (is_data and not _has_samples(path.parent))
             )
         case ("stats", *_):
             numbers = session.stats_dir / "scalars.csv"
@@ -246,13 +248,26 @@ def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:
 
 
 def keep_parameters(directory: Path) -> None:
-    """Back up the instances' parameters in a dataset's folder when a training begins."""
+    """Back up the instances' parameters in a dataset's folder when a generation begins.
+
+    If a run was killed before it had rows, nothing goes on with what it saved: the parameters that
+    it began with are restored first.
+    """
+    if (directory / _BEGINS).exists():
+        restore_parameters(directory)
     with files.storing(f"{directory}"):
         for path in directory.glob(PARAMETERS.format("*") + _FORMER):
             files.remove(path)
         for path in directory.glob(PARAMETERS.format("*")):
             content = files.read_content(path, LARGEST_PARAMETERS)
             files.replace(path.with_name(path.name + _FORMER), content)
+        files.replace(directory / _BEGINS, b"")
+
+
+def accept_parameters(directory: Path) -> None:
+    """Let the parameters that are saved stay: a later run can go on with the generation."""
+    with files.storing(f"{directory}"):
+        files.remove(directory / _BEGINS)
 
 
 def restore_parameters(directory: Path) -> None:
@@ -264,6 +279,7 @@ def restore_parameters(directory: Path) -> None:
                 files.replace(path, files.read_content(former, LARGEST_PARAMETERS))
             else:
                 files.remove(path)
+        files.remove(directory / _BEGINS)
 
 
 def is_copy(directory: Path) -> bool:

@@ -15,6 +15,7 @@ from physx_core.pipelines.generation import Generation
 from physx_core.pipelines.services import Touch
 from physx_core.pipelines.storage import (
     STREAMS,
+    accept_parameters,
     describe_environment,
     keep_parameters,
     last_steps,
@@ -106,6 +107,7 @@ class StoredStreams(Closeable):
         if new is not None:
             self._files.clear()
             new.start(self._dataset)
+            accept_parameters(self._dataset.directory)
 
     def touched(self, touch: Touch) -> Touch:
         """Return what a person did before rows that are repeated, and does before others.

@@ -33,6 +33,7 @@ from physx_core.pipelines.pipeline import derive_seed
 from physx_core.pipelines.services import Predict, Show
 from physx_core.pipelines.storage import (
     GENERATION,
+    accept_parameters,
     copy_existing,
     describe_environment,
     keep_parameters,
@@ -314,6 +315,7 @@ class DataOpening:
         if former is None:
             keep_parameters(dataset.directory)
             now.start(dataset)
+            accept_parameters(dataset.directory)
             return now, NOTHING
         advice = advise(self.session.path)
         skip = former.resume(dataset, environment, now, self.buffer.total, advice)
