@@ -104,6 +104,27 @@ def test_parameters_saved_by_a_run_without_rows_do_not_count(run, monkeypatch):
     assert stored("stopped") == stored("whole")
 
 
+def test_parameters_saved_by_another_run_without_rows_do_not_count(run, monkeypatch):
+    environment = run.streams(LOCAL)
+    run.generation("whole", environment).execute()
+    interrupted(run.generation("stopped", environment), 4)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(resolve("environment", RIVER), "step", interrupt)
+        run.generation("stopped", environment, mode="validation").execute()
+    run.generation("stopped", environment, resume=True).execute()
+    assert stored("stopped") == stored("whole")
+
+
+def test_parameters_are_restored_if_a_kill_comes_just_after_the_run_is_recorded(run, monkeypatch):
+    environment = run.streams(LOCAL)
+    run.generation("whole", environment).execute()
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("physx_core.pipelines.stored_streams.accept_parameters", interrupt)
+        run.generation("stopped", environment).execute()
+    run.generation("stopped", environment, resume=True).execute()
+    assert stored("stopped") == stored("whole")
+
+
 @pytest.mark.parametrize("batches", [1, 3])
 def test_rejected_samples_keep_their_order_if_a_kill_comes_between_them_and_their_rows(
     run, batches, monkeypatch

@@ -59,6 +59,11 @@ class Generation:
     campaign: int | None = None
     ended: Sequence[int] | None = None
 
+    @property
+    def name(self) -> str:
+        """Its name among those of a dataset."""
+        return f"{self.mode} {self.first} {self.seed}"
+
     @classmethod
     def begin(
         cls,

@@ -12,15 +12,13 @@ from physx_core.components.hand import HAND
 from physx_core.config import EnvironmentConfig
 from physx_core.dataset import Dataset
 from physx_core.pipelines.generation import Generation
-from physx_core.pipelines.services import Touch
-from physx_core.pipelines.storage import (
-    STREAMS,
+from physx_core.pipelines.saved_parameters import (
     accept_parameters,
-    describe_environment,
     keep_parameters,
-    last_steps,
     restore_parameters,
 )
+from physx_core.pipelines.services import Touch
+from physx_core.pipelines.storage import STREAMS, describe_environment, last_steps
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.workers.pasts import NOTHING, PastFiles
@@ -30,7 +28,7 @@ _ADVICE = "Start another run for more of them."
 
 def states_of(streams: Generation, session: Path) -> PastFiles:
     """Return the last states of streams, which are in the folder of their session."""
-    return PastFiles(session / "states", f"{streams.mode} {streams.first} {streams.seed}")
+    return PastFiles(session / "states", streams.name)
 
 
 class StoredStreams(Closeable):
@@ -76,11 +74,11 @@ class StoredStreams(Closeable):
         self._first, self._count = known.first, config.num_clients
         self._new = now if former is None else None
         if former is None:
-            keep_parameters(dataset.directory)
+            keep_parameters(dataset.directory, now.name)
             return
         count = self._count
         self.skip = skip = former.resume(dataset, config, now, needed, _ADVICE)
-        restore_parameters(dataset.directory)
+        restore_parameters(dataset.directory, former.name)
         stop = former.first + skip.rows
         self.earlier = last_steps(dataset, mode, former.first, stop, count)
         if config.state_every:
