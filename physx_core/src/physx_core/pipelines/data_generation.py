@@ -23,6 +23,7 @@ from physx_core.pipelines.run_description import (
     describe_environment_config,
     describe_samples,
 )
+from physx_core.pipelines.saved_parameters import forget_parameters
 from physx_core.pipelines.storage import (
     GENERATION,
     STREAMS,
@@ -372,6 +373,7 @@ class DataGeneration(NewSessionPipeline):
         """Simulate episodes by number, instead of streams."""
         self.source.check_independent()
         parameters, self._streams = self.source.sets.parameters, None
+        forget_parameters(self.dataset.directory)
         self.dataset.update_info(**{STREAMS: None})
         campaign = Campaign.begin(self.dataset, self._mode, config, self._seed, seed, parameters)
         self._writer = self._make_writer(campaign)

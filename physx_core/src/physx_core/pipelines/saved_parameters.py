@@ -1,4 +1,4 @@
-"""Files of the parameters that instances save, restored when a run goes on from its beginning."""
+"""Files of what instances saved with `save_parameters`, as streams begin with them."""
 
 from __future__ import annotations
 
@@ -10,63 +10,82 @@ PARAMETERS = "parameters_{}.bin"
 """Name of the file in a dataset's folder that contains an instance's saved parameters."""
 LARGEST_PARAMETERS = 2**32
 """Maximum size of such a file in bytes."""
-BEGINS = "parameters.begins"
-"""Name of the file that holds the name of a generation that has begun, but has no rows yet."""
-_NOW, _BEFORE, _BEFORE_LAST = "", ".begins", ".former"  # suffixes: now, and before generations
+BEGUN = "parameters.begun"
+"""Name of the file that says which streams have begun, but are not described in the dataset."""
+_BEGUN = ".begun"
+_ALL, _OF_STREAMS = PARAMETERS.format("*"), PARAMETERS.format("[1-9]*")
 
 
-def copy_parameters(source: Path, target: Path) -> None:
-    """Copy the saved parameters from the folder of one dataset into that of another."""
-    for path in source.glob(PARAMETERS.format("*")):
-        with files.storing(f"{path}, copied into the session,"):
-            files.replace(target / path.name, files.read_content(path, LARGEST_PARAMETERS))
-
-
-def keep_parameters(directory: Path, generation: str) -> None:
-    """Back up the parameters in a dataset's folder when a generation begins.
-
-    If another one was killed before it had rows, nothing goes on with what it saved: the parameters
-    that it began with are restored first.
+def copy_parameters(directory: Path, to: Path) -> None:
+    """Replace the files in a dataset's folder by copies of those in another one.
 
     Args:
-        directory: The folder.
-        generation: Name of the generation.
+        directory: The other one.
+        to: The folder.
     """
-    with files.storing(f"{directory}"):
-        if (directory / BEGINS).exists():
-            _copy(directory, _BEFORE, _NOW)
-        _copy(directory, _NOW, _BEFORE)
-        files.replace(directory / BEGINS, generation.encode())
+    _copy(directory, to, _ALL)
 
 
-def accept_parameters(directory: Path) -> None:
-    """Note that the generation has been recorded, so that a later run can go on with it."""
-    with files.storing(f"{directory}"):
-        _copy(directory, _BEFORE, _BEFORE_LAST)
-        files.remove(directory / BEGINS)
+def _copy(directory: Path, to: Path, which: str, of: str = "", become: str = "") -> None:
+    """Replace files by copies of others, whose names end differently."""
+    with files.storing(f"{to}"):
+        names = {path.name.removesuffix(of) for path in directory.glob(which + of)}
+        for path in to.glob(which + become):
+            if path.name.removesuffix(become) not in names:
+                files.remove(path)
+        for name in names:
+            content = files.read_content(directory / f"{name}{of}", LARGEST_PARAMETERS)
+            files.replace(to / f"{name}{become}", content)
 
 
-def restore_parameters(directory: Path, generation: str) -> None:
-    """Restore the parameters with which a recorded generation began.
+def keep_parameters(directory: Path, streams: str) -> None:
+    """Back up the parameters with which streams begin.
+
+    If those that began before were never described, nothing goes on with what they saved: the
+    parameters that they began with are restored first.
 
     Args:
         directory: The dataset's folder.
-        generation: Name of the generation.
+        streams: Name of the streams: `Generation.name`.
     """
+    if (directory / BEGUN).exists():
+        _copy(directory, directory, _OF_STREAMS, _BEGUN)
+    _copy(directory, directory, _OF_STREAMS, become=_BEGUN)
     with files.storing(f"{directory}"):
-        begins = directory / BEGINS
-        if begins.exists() and files.read_content(begins, 1 << 12) == generation.encode():
-            accept_parameters(directory)  # it was killed in between
-        _copy(directory, _BEFORE_LAST, _NOW)
-        files.remove(begins)
+        files.replace(directory / BEGUN, streams.encode())
 
 
-def _copy(directory: Path, source: str, target: str) -> None:
-    """Let files with one suffix be copies of those with another one."""
-    every = PARAMETERS.format("*")
-    copied = {path.name.removesuffix(source): path for path in directory.glob(every + source)}
-    for name, path in copied.items():
-        files.replace(directory / (name + target), files.read_content(path, LARGEST_PARAMETERS))
-    for path in directory.glob(every + target):
-        if path.name.removesuffix(target) not in copied:
+def accept_parameters(directory: Path, entry: str) -> None:
+    """Keep the backup for runs that go on with streams, now that the dataset describes them.
+
+    Args:
+        directory: The dataset's folder.
+        entry: Entry of the dataset's info that describes them.
+    """
+    _copy(directory, directory, _OF_STREAMS, _BEGUN, f".{entry}")
+    forget_parameters(directory)
+
+
+def restore_parameters(directory: Path, entry: str, streams: str) -> None:
+    """Restore the parameters with which streams began.
+
+    Args:
+        directory: The dataset's folder.
+        entry: Entry of the dataset's info that describes them.
+        streams: Name of the streams: `Generation.name`.
+    """
+    begun = directory / BEGUN
+    with files.storing(f"{directory}"):
+        is_accepted = not begun.exists() or files.read_content(begun, 2**16) != streams.encode()
+    if not is_accepted:  # the run was killed just before
+        accept_parameters(directory, entry)
+    _copy(directory, directory, _OF_STREAMS, f".{entry}")
+    forget_parameters(directory)
+
+
+def forget_parameters(directory: Path) -> None:
+    """Remove the backup of streams that the dataset does not describe."""
+    with files.storing(f"{directory}"):
+        files.remove(directory / BEGUN)
+        for path in directory.glob(_OF_STREAMS + _BEGUN):
             files.remove(path)

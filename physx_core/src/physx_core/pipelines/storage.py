@@ -22,7 +22,7 @@ from physx_core.errors import (
     listed,
 )
 from physx_core.observers import read_scalars
-from physx_core.pipelines.saved_parameters import BEGINS, copy_parameters
+from physx_core.pipelines.saved_parameters import BEGUN, copy_parameters
 from physx_core.plugins import reference_of
 from physx_core.session import NOTES, Session, installed_versions, related_sessions
 from physx_core.sources.source import Source
@@ -119,11 +119,8 @@ def _is_unused(session: Session, path: Path, opened: bool) -> bool:
             return NOTES in path.read_text(encoding="utf-8")
         case ("dataset", name):
             is_data = name == FILE or path.suffix == ".h5"
-            return (
-                not opened
-                or name in (LOCK, PROOF, BEGINS)
-                or (is_data and not _has_samples(path.parent))
-            )
+            is_empty = is_data and not _has_samples(path.parent)
+            return not opened or name in (LOCK, PROOF, BEGUN) or is_empty
         case ("stats", *_):
             numbers = session.stats_dir / "scalars.csv"
             return not numbers.exists() or not read_scalars(session.path)

@@ -12,11 +12,6 @@ from physx_core.components.hand import HAND
 from physx_core.config import EnvironmentConfig
 from physx_core.dataset import Dataset
 from physx_core.pipelines.generation import Generation
-from physx_core.pipelines.saved_parameters import (
-    accept_parameters,
-    keep_parameters,
-    restore_parameters,
-)
 from physx_core.pipelines.services import Touch
 from physx_core.pipelines.storage import STREAMS, describe_environment, last_steps
 from physx_core.session import Session
@@ -74,11 +69,12 @@ class StoredStreams(Closeable):
         self._first, self._count = known.first, config.num_clients
         self._new = now if former is None else None
         if former is None:
-            keep_parameters(dataset.directory, now.name)
+            now.keep_parameters(dataset)
             return
         count = self._count
         self.skip = skip = former.resume(dataset, config, now, needed, _ADVICE)
-        restore_parameters(dataset.directory, former.name)
+        if skip.rows < needed:
+            former.restore_parameters(dataset)
         stop = former.first + skip.rows
         self.earlier = last_steps(dataset, mode, former.first, stop, count)
         if config.state_every:
@@ -105,7 +101,6 @@ class StoredStreams(Closeable):
         if new is not None:
             self._files.clear()
             new.start(self._dataset)
-            accept_parameters(self._dataset.directory)
 
     def touched(self, touch: Touch) -> Touch:
         """Return what a person did before rows that are repeated, and does before others.

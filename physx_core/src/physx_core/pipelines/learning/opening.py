@@ -30,11 +30,6 @@ from physx_core.pipelines.learning.batches.stored import StoredBatches
 from physx_core.pipelines.learning.resuming import Start, advise
 from physx_core.pipelines.learning.training_data import TrainingData
 from physx_core.pipelines.pipeline import derive_seed
-from physx_core.pipelines.saved_parameters import (
-    accept_parameters,
-    keep_parameters,
-    restore_parameters,
-)
 from physx_core.pipelines.services import Predict, Show
 from physx_core.pipelines.storage import (
     GENERATION,
@@ -315,13 +310,12 @@ class DataOpening:
         former = self.start.generation
         self._generation = former or now
         if former is None:
-            keep_parameters(dataset.directory, now.name)
+            now.keep_parameters(dataset)
             now.start(dataset)
-            accept_parameters(dataset.directory)
             return now, NOTHING
         advice = advise(self.session.path)
         skip = former.resume(dataset, environment, now, self.buffer.total, advice)
-        restore_parameters(dataset.directory, former.name)
+        former.restore_parameters(dataset)
         return former, self._find_place(former, skip, environment.num_clients)
 
     def _find_place(self, former: Generation, skip: Skip, count: int) -> Skip:
