@@ -6,6 +6,7 @@ import pytest
 from wide_lines import wide_lines
 
 from physx_core.cli import main
+from physx_core.plugins import find_entries
 
 CLOTH = """
 from physx_core import Environment, Field, Parameter
@@ -67,3 +68,10 @@ def test_a_line_is_as_long_as_the_terminal_is_wide(capsys, monkeypatch, columns,
     Path("cloth.py").write_text(CLOTH)
     [_, command] = printed(capsys, GENERATE).split("\nnext: physx train ")
     assert len(command.splitlines()) == lines
+
+
+@pytest.mark.parametrize("command", sorted(find_entries("physx.commands")))
+def test_help_fits(capsys, monkeypatch, command):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    text = printed(capsys, f"{command} --help")
+    assert text.startswith(f"usage: physx {command}") and wide_lines(text) == []

@@ -60,10 +60,7 @@ def run(words: Sequence[str]) -> None:
         env_kwargs=options.env_kwargs,
         trust=options.trust,
     )
-    if options.json:
-        print(found.to_json())
-    else:
-        show(found)
+    show(found, as_json=options.json)
     if options.output is not None:
         store_agreement(options.output, found, time.monotonic() - begin)
         if not options.json:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Collection, Mapping, Sequence
+from typing import Any
 
 from physx_core.cells import in_notebook as in_notebook
 from physx_core.errors import printable
@@ -11,9 +12,14 @@ from physx_core.terminal import width as width
 from physx_core.terminal import wrapped
 
 
-def show(text: object = "") -> None:
-    """Print text, wrapped, whose names from files or packages must not control the terminal."""
-    print(wrapped(printable(text)))
+def show(found: Any = "", *, as_json: bool = False) -> None:
+    """Print what was found, or a text: wrapped, and no name in it controls the terminal.
+
+    Args:
+        found: What to print.
+        as_json: Whether to print what its ``to_json`` returns instead, for programs.
+    """
+    print(found.to_json() if as_json else wrapped(printable(found)))
 
 
 def show_values(values: Mapping[str, str]) -> None:

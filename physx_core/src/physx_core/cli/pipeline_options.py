@@ -72,7 +72,7 @@ def pipeline_from(
     if unknown:
         raise UnknownOptionError(f"The table [{make.kind}]", unknown, known)
     form = dataclasses.make_dataclass(verb, options, kw_only=True)
-    about = textwrap.dedent(make.__doc__ or "").split("\n\n")[0]
+    about = textwrap.dedent(make.__doc__ or "").split("\n\n")[0].replace("``", "")
     lines = "\n".join(f"  physx {verb} {example}" for example in examples)
     kwargs = "network.network-kwargs" if "network" in known else "environment.env-kwargs"
     about += f"\n\nexamples:\n{lines}\n\n{_ONE_ARGUMENT.format(option=kwargs)}"

@@ -104,10 +104,7 @@ def run(words: Sequence[str]) -> None:
         slowest=options.slowest,
         flight=options.flight,
     )
-    if options.json:
-        print(found.to_json())
-    else:
-        show(found)
+    show(found, as_json=options.json)
     notes = []
     if log.left_out:
         notes.append(f"columns not used: {', '.join(log.left_out)}")

@@ -58,10 +58,7 @@ def run(words: Sequence[str]) -> None:
         invariants=options.invariants,
         trust=options.trust,
     )
-    if options.json:
-        print(result.to_json())
-    else:
-        show(result)
+    show(result, as_json=options.json)
 
 
 def _other(session: Path) -> Evaluation | None:
