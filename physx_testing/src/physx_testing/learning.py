@@ -12,7 +12,8 @@ from physx_core.components import Network
 from physx_core.config import NetworkConfig
 from physx_core.errors import MissingLibraryError
 from physx_core.fields import Field
-from physx_core.pipelines import Learner, create_network
+from physx_core.pipelines import Learner
+from physx_core.plugins import create_network
 from physx_core.typing import Batch
 from physx_testing.report import NotApplicableError
 from physx_testing.subject import expect, expect_close

@@ -23,7 +23,7 @@ from physx_core.errors import UsageError
 from physx_core.observers import Observers, ProgressBar, ScalarsFile
 from physx_core.pipelines.services import Predict, RunServices, Show, Touch
 from physx_core.pipelines.storage import remove_unused
-from physx_core.plugins import resolve
+from physx_core.plugins import create
 from physx_core.processes import (
     Terminated,
     describe_ending,
@@ -295,8 +295,9 @@ class Pipeline(ABC):
         if environment is not None:
             instance_nb = environment.num_clients
             if environment.visualizer is not None:
-                make = resolve("visualizer", environment.visualizer)
-                observers.append(make(**environment.visualizer_kwargs))
+                observers.append(
+                    create("visualizer", environment.visualizer, environment.visualizer_kwargs)
+                )
         self.observers = Observers(observers)
         self.observers.open(self.session.name, self.session.path, instance_nb)
         resources.callback(self.observers.close)

@@ -21,7 +21,6 @@ from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, DivergedError, PhysxError
 from physx_core.observers import REPORT_SECONDS, statistics_observers
 from physx_core.pipelines.learning.bound_options import bound_options, check_bound
-from physx_core.pipelines.learning.components import create
 from physx_core.pipelines.learning.data_record import (
     describe_batch,
     record_data,
@@ -50,6 +49,7 @@ from physx_core.pipelines.storage import (
     reject_client_writers,
     reject_environments,
 )
+from physx_core.plugins import create
 from physx_core.processes import Interrupt, deferred_interrupt, is_from_signal
 from physx_core.results import Result
 from physx_core.results.errors import as_loss
@@ -710,7 +710,7 @@ class Training(NewSessionPipeline):
 
     def _create_buffer(self) -> Buffer:
         environment = self.environment_config
-        buffer: Buffer = create("buffer", self.online, self.online_kwargs, Buffer)
+        buffer: Buffer = create("buffer", self.online, self.online_kwargs)
         produces = environment is not None and not environment.load_samples
         if not produces and buffer.capacity and not self.resume:
             raise ConfigError(

@@ -1,5 +1,7 @@
 """Plugins: components of pip-installed packages, selected by the name of their entry point."""
 
+from .creation import create as create
+from .creation import create_network as create_network
 from .entries import CHECKS as CHECKS
 from .entries import find_entries as find_entries
 from .entries import official_package as official_package

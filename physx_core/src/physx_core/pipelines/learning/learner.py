@@ -32,8 +32,7 @@ from physx_core.errors import (
 from physx_core.fields import NUMBERS, PTR, Field, free_axes, is_finite
 from physx_core.normalization import Normalization
 from physx_core.packing import join, pack, packed_fields, split
-from physx_core.pipelines.learning.components import create, create_network
-from physx_core.plugins import import_component
+from physx_core.plugins import create, create_network, import_component
 from physx_core.rows import concatenate
 from physx_core.typing import Array, Batch, Index, Tensors
 
@@ -78,7 +77,7 @@ class Learner:
         self.network: Network = network or create_network(config)
         reference = config.transformation or self.network.default_transformation
         self.transformation: Transformation = create(
-            "transformation", reference, config.transformation_kwargs, Transformation
+            "transformation", reference, config.transformation_kwargs
         )
         self.config = dataclasses.replace(config, transformation=reference)
         self.network.set_data_type(config.data_type)
@@ -104,9 +103,7 @@ class Learner:
                 f"{type(self.network).__name__} names no default_optimization: choose what trains "
                 "it in NetworkConfig.optimization."
             )
-        optimization: Optimization = create(
-            "optimization", reference, config.optimization_kwargs, Optimization
-        )
+        optimization: Optimization = create("optimization", reference, config.optimization_kwargs)
         arguments = dict(config.optimizer_kwargs)
         if config.lr is not None:
             arguments["lr"] = config.lr
