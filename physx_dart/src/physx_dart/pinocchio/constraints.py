@@ -247,7 +247,7 @@ class _Group:
     def solve(self, v: Vector, solver: ImpulseSolver) -> Solved:
         """Return the impulses of all constraints, with the rows of joints that act."""
         pairs = zip(self._parts, self._of_rows, strict=True)
-        rows = joined([np.array(part.acts, np.intp) + span.start for part, span in pairs])
+        rows = np.array([span.start + row for part, span in pairs for row in part.acts], np.intp)
         least, most = self._least.take(rows), self._most.take(rows)
         if len(self._parts) > 1:  # the solver expects rows with one bound first
             order = np.argsort(np.isinf(least) == np.isinf(most), kind="stable")

@@ -449,14 +449,14 @@ def spins_of(first: Vector, second: Vector) -> Vector | None:
 
 def together(points: Sequence[ContactPoints]) -> Spins | None:
     """Return the friction against turning of points that are combined in this order."""
-    if all(each.spins is None for each in points):
-        return None
     first, numbers, found = 0, [], []
     for each in points:
         if each.spins is not None:
             numbers.append(first + each.spins.points)
             found.append(each.spins)
         first += len(each.gaps)
+    if not found:
+        return None
     names = ("bounds", "jacobian", "drift", "impulses")
     rest = (np.concatenate([getattr(spins, name) for spins in found]) for name in names)
     return Spins(np.concatenate(numbers), *rest)
