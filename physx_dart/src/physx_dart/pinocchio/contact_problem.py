@@ -76,8 +76,8 @@ class ContactProblem:
         # A non-finite entry of the response makes the diagonal non-finite, too.
         if not math.isfinite(sum(speeds) + sum(rates)):
             raise SimulationError("The state is no longer finite. Use a smaller period.")
-        largest = max(rates, default=0.0) or 1.0
-        if min(rates, default=1.0) <= (least_rate := _STUCK * largest):
+        largest = max(rates) or 1.0
+        if min(rates) <= (least_rate := _STUCK * largest):
             free = np.where(np.array(rates) <= least_rate, 0.0, free)
             speeds = free.tolist()
             rates = [largest if rate <= least_rate else rate for rate in rates]
@@ -96,10 +96,10 @@ class ContactProblem:
         self._rates = np.array(rates)
         # A step against the velocities, scaled per row.
         self._unit, scaled = unit(len(free)), self.matrix / self._rates[:, None]
-        self._back, self._start = self._unit - scaled, -free / self._rates
+        self._back, self._start = self._unit - scaled, free / self._rates
         self._choices = np.concatenate([scaled, self._unit])
         self._bounds = list(zip(least.tolist(), most.tolist(), strict=True))
-        self.accuracy = _ACCURACY * max(1.0, *map(abs, speeds))
+        self.accuracy = _ACCURACY * max(1.0, max(speeds), -min(speeds))
 
     @property
     def turning_rows(self) -> int:
@@ -153,9 +153,9 @@ class ContactProblem:
         Also return the arguments of `_slope`: for each row itself, or n rows further if the
         projection made it constant, and where the projection turned rows.
         """
-        values = (self._back.dot(impulses) + self._start).tolist()
-        n, place, turned = len(values), 0, []
-        chosen = list(range(n))
+        values = (self._back.dot(impulses) - self._start).tolist()
+        n, place = len(values), 0
+        chosen, turned = list(range(n)), list[_Turned]()
         for friction in self._coefficients:
             x, y, normal = values[place : place + 3]
             if normal <= 0:
