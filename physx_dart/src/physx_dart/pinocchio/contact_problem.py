@@ -10,6 +10,7 @@ import eigenpy
 import numpy as np
 
 from physx_core.typing import Index, Vector
+from physx_sim.errors import SimulationError
 
 _REGULARIZATION = 1e-9
 """Relative regularization of the diagonal, as in DART's solver."""
@@ -18,8 +19,7 @@ _STUCK = 1e-14
 _ACCURACY = 1e-9
 """Accuracy of velocities, in m/s, for free velocities of 1 m/s or less."""
 _Turned = tuple[slice, slice | list[int], Sequence[Sequence[float]]]
-"""Rows that a projection changes, the rows on which the result depends, and how; (): on none."""
-_NOWHERE = slice(0)
+"""Rows that a projection changes, the rows on which the result depends, and how."""
 
 
 class ContactProblem:
@@ -66,13 +66,20 @@ class ContactProblem:
             most: Likewise.
             turning: Points that resist turning, as indices, and their largest angular impulses per
                 normal impulse across and about the normal, in m, shape (s, 2).
+
+        Raises:
+            SimulationError: If a value is not finite.
         """
         self.matrix = regularized(response)
         # Lists, because operations on short arrays take longer.
-        rates = self.matrix.diagonal().tolist()
-        largest = max(rates, default=0.0) or 1.0
-        if min(rates, default=1.0) <= (least_rate := _STUCK * largest):
+        rates, speeds = self.matrix.diagonal().tolist(), free.tolist()
+        # A non-finite entry of the response makes the diagonal non-finite, too.
+        if not math.isfinite(sum(speeds) + sum(rates)):
+            raise SimulationError("The state is no longer finite. Use a smaller period.")
+        largest = max(rates) or 1.0
+        if min(rates) <= (least_rate := _STUCK * largest):
             free = np.where(np.array(rates) <= least_rate, 0.0, free)
+            speeds = free.tolist()
             rates = [largest if rate <= least_rate else rate for rate in rates]
             self.matrix.flat[:: len(free) + 1] = rates
         self.free = free
@@ -88,11 +95,11 @@ class ContactProblem:
                 rates[place : place + 2] = [max(rates[place : place + 2])] * 2
         self._rates = np.array(rates)
         # A step against the velocities, scaled per row.
-        self._unit, self._scaled = unit(len(free)), self.matrix / self._rates[:, None]
-        self._back = self._unit - self._scaled
-        self._start = -free / self._rates
+        self._unit, scaled = unit(len(free)), self.matrix / self._rates[:, None]
+        self._back, self._start = self._unit - scaled, free / self._rates
+        self._choices = np.concatenate([scaled, self._unit])
         self._bounds = list(zip(least.tolist(), most.tolist(), strict=True))
-        self.accuracy = _ACCURACY * max(1.0, *map(abs, free.tolist()))
+        self.accuracy = _ACCURACY * max(1.0, max(speeds), -min(speeds))
 
     @property
     def turning_rows(self) -> int:
@@ -107,7 +114,7 @@ class ContactProblem:
         """Return the best impulses within `most` steps from given ones, and their error."""
         best, least_error = impulses, math.inf
         for _ in range(most):
-            projected, turned = self._project(impulses)
+            projected, chosen, turned = self._project(impulses)
             change = projected - impulses
             error = self._error(change)
             if error < least_error:
@@ -116,7 +123,7 @@ class ContactProblem:
                     break
             elif not error < math.inf:
                 break
-            slope = self._slope(turned, self._scaled, self._back)
+            slope = self._slope(chosen, turned, self._choices, self._back)
             impulses = impulses + eigenpy.PartialPivLU(slope).solve(change)
         return best, least_error
 
@@ -128,10 +135,11 @@ class ContactProblem:
         Args:
             impulses: The solution.
         """
-        _, turned = self._project(impulses)
-        slope = self._slope(turned, self._scaled, self._back)
+        _, chosen, turned = self._project(impulses)
+        slope = self._slope(chosen, turned, self._choices, self._back)
         # The projection alone, as if impulses had no response.
-        rest = self._slope(turned, np.zeros(slope.shape), self._unit)
+        alone = np.concatenate([np.zeros(slope.shape), self._unit])
+        rest = self._slope(chosen, turned, alone, self._unit)
         found: Vector = eigenpy.PartialPivLU(slope).solve((rest - self._unit) / self._rates)
         return found
 
@@ -139,19 +147,20 @@ class ContactProblem:
         velocities = change * self._rates
         return math.sqrt(velocities.dot(velocities))
 
-    def _project(self, impulses: Vector) -> tuple[Vector, list[_Turned]]:
+    def _project(self, impulses: Vector) -> tuple[Vector, list[int], list[_Turned]]:
         """Return impulses (n,) after a step and a projection onto the cones and bounds.
 
-        Also return where the projection changed them.
+        Also return the arguments of `_slope`: for each row itself, or n rows further if the
+        projection made it constant, and where the projection turned rows.
         """
-        values = (self._back.dot(impulses) + self._start).tolist()
-        turned: list[_Turned] = []
-        place = 0
+        values = (self._back.dot(impulses) - self._start).tolist()
+        n, place = len(values), 0
+        chosen, turned = list(range(n)), list[_Turned]()
         for friction in self._coefficients:
             x, y, normal = values[place : place + 3]
             if normal <= 0:
                 values[place : place + 3] = 0.0, 0.0, 0.0
-                turned.append((slice(place, place + 3), _NOWHERE, ()))
+                chosen[place : place + 3] = n + place, n + place + 1, n + place + 2
             elif (across := math.hypot(x, y)) > (bound := friction * normal):
                 share, x, y = bound / across, x / across, y / across
                 values[place], values[place + 1] = bound * x, bound * y
@@ -164,40 +173,44 @@ class ContactProblem:
         for least, most in self._bounds:
             if not least < values[place] < most:
                 values[place] = least if values[place] <= least else most
-                turned.append((slice(place, place + 1), _NOWHERE, ()))
+                chosen[place] += n
             place += 1
         for normal, across, about in self._turning:
-            turned += _limit_turning(values, place, normal, (across, about))
+            turned += _limit_turning(values, chosen, place, normal, (across, about))
             place += 3
-        return np.array(values), turned
+        return np.array(values), chosen, turned
 
-    def _slope(self, turned: Sequence[_Turned], scaled: Vector, back: Vector) -> Vector:
+    def _slope(
+        self, chosen: list[int], turned: Sequence[_Turned], choices: Vector, back: Vector
+    ) -> Vector:
         """Return the derivative of impulses minus their projection, shape (n, n).
 
         Args:
-            turned: Where the projection changed them.
-            scaled: The derivative of the impulses minus those after the step, shape (n, n).
-            back: The derivative of the impulses after the step, in the same form.
+            chosen: Which of the choices its rows are.
+            turned: Where the projection turned rows, which are none of these.
+            choices: The derivative of the impulses minus those after the step, then that of the
+                impulses, shape (2 n, n).
+            back: The derivative of the impulses after the step, shape (n, n).
         """
-        slope, unit = scaled.copy(), self._unit
+        slope: Vector = choices.take(chosen, 0)
         for rows, sources, turn in turned:
-            slope[rows] = unit[rows] - np.array(turn).dot(back[sources]) if turn else unit[rows]
+            slope[rows] = self._unit[rows] - np.array(turn).dot(back[sources])
         return slope
 
 
 def _limit_turning(
-    values: list[float], place: int, normal: int, bounds: Sequence[float]
+    values: list[float], chosen: list[int], place: int, normal: int, bounds: Sequence[float]
 ) -> list[_Turned]:
     """Project the angular impulses of a point, from a row on, given its normal's row.
 
-    Return where that changed them.
+    Return where that turned them; where it made them constant, change `chosen`.
     """
     across, about = (bound * values[normal] for bound in bounds)
     turned: list[_Turned] = []
     x, y, z = values[place : place + 3]
     if not across:
         values[place : place + 2] = 0.0, 0.0
-        turned.append((slice(place, place + 2), _NOWHERE, ()))
+        chosen[place : place + 2] = chosen[place] + len(values), chosen[place + 1] + len(values)
     elif (size := math.hypot(x, y)) > across:
         share, x, y = across / size, x / size, y / size
         values[place], values[place + 1] = across * x, across * y
@@ -208,8 +221,11 @@ def _limit_turning(
         turned.append((slice(place, place + 2), [place, place + 1, normal], turn))
     if abs(z) >= about:
         values[place + 2] = math.copysign(about, z)
-        slope = ((math.copysign(bounds[1], z),),) if about else ()
-        turned.append((slice(place + 2, place + 3), [normal], slope))
+        if about:
+            slope = ((math.copysign(bounds[1], z),),)
+            turned.append((slice(place + 2, place + 3), [normal], slope))
+        else:
+            chosen[place + 2] += len(values)
     return turned
 
 

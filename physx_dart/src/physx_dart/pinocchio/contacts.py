@@ -35,6 +35,9 @@ _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z i
 _THIRDS = np.array([[1.0, 0.0], [-0.5, 0.75**0.5], [-0.5, -(0.75**0.5)]])
 """Cosines and sines of three directions around a rim."""
 
+# Arrays, because NumPy takes twice as long with numbers.
+_ZERO, _HALF, _NEAR = np.array(0.0), np.array(0.5), np.array(MARGIN)
+
 Indices = NDArray[np.intp]
 
 
@@ -253,7 +256,7 @@ class ContactFinder:
         self._radii = np.array([row[2] for row in points] + [0.0] * (around * len(rims)))
         self._joint_of = joints[spread]
         self._moved = moved[joints[spread]]
-        self._frames = np.zeros((len(spread), 6))
+        self._moved_along_axes = np.tile(self._moved, 3)
 
     def __bool__(self) -> bool:
         """Return whether anything can ever touch."""
@@ -283,16 +286,14 @@ class ContactFinder:
             rows = self._near(surface, points, axes, gaps, motions, v, period)
             if not len(rows):
                 continue
-            gaps = gaps.take(rows)
-            normals = axes.take(rows, 0) if len(axes) > 1 else axes.repeat(len(rows), 0)
-            depths = self._radii.take(rows) + 0.5 * np.minimum(gaps, 0.0)
+            gaps, normals = gaps.take(rows), axes.take(rows, 0)
+            depths = self._radii.take(rows) + _HALF * np.minimum(gaps, _ZERO)
             touched = points.take(rows, 0) - depths[:, None] * normals[:, 2]
-            frames = np.concatenate([normals, surface.moments(touched, normals)], 2)
-            moved = self._moved.take(rows, 0)
-            jacobian = frames.reshape(-1, 6).dot(motions).reshape(len(rows), 3, -1)
-            jacobian *= moved[:, None]
+            jacobian = surface.twist_rows(touched, normals).reshape(-1, 6).dot(motions)
+            jacobian *= self._moved_along_axes.take(rows, 0).reshape(jacobian.shape)
             numbers, spins = place * len(points) + rows, None
             if self._spins is not None:
+                moved = self._moved.take(rows, 0)
                 spins = Spins.of(self._spins[numbers], normals, motions, moved)
             found.append(
                 ContactPoints(
@@ -302,7 +303,7 @@ class ContactFinder:
                     gaps,
                     self._friction.take(numbers),
                     self._restitution.take(numbers),
-                    jacobian.reshape(3 * len(rows), -1),
+                    jacobian,
                     self._drift(place, normals, rows, rolling),
                     spins,
                 )
@@ -320,14 +321,12 @@ class ContactFinder:
         period: float,
     ) -> Indices:
         """Return the points (n, 3) that touch a surface or may touch it within the next step."""
-        frames = self._frames
-        frames[:, :3], frames[:, 3:] = axes[:, 2], surface.levers(points, axes)
-        speeds = frames.dot(motions)
+        speeds = surface.normal_rows(points, axes).dot(motions)
         speeds *= self._moved
         ahead = speeds.dot(v)
         ahead *= period
         ahead += gaps
-        near: Indices = (np.minimum(gaps, ahead, out=ahead) < MARGIN).nonzero()[0]
+        near: Indices = (np.minimum(gaps, ahead, out=ahead) < _NEAR).nonzero()[0]
         return near
 
     def _drift(
@@ -453,14 +452,14 @@ def spins_of(first: Vector, second: Vector) -> Vector | None:
 
 def together(points: Sequence[ContactPoints]) -> Spins | None:
     """Return the friction against turning of points that are combined in this order."""
-    if all(each.spins is None for each in points):
-        return None
     first, numbers, found = 0, [], []
     for each in points:
         if each.spins is not None:
             numbers.append(first + each.spins.points)
             found.append(each.spins)
         first += len(each.gaps)
+    if not found:
+        return None
     names = ("bounds", "jacobian", "drift", "impulses")
     rest = (np.concatenate([getattr(spins, name) for spins in found]) for name in names)
     return Spins(np.concatenate(numbers), *rest)

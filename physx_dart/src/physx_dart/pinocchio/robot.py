@@ -182,7 +182,8 @@ class PinocchioRobot(RobotEngine):
         q, v = self._positions, self._velocities
         torques = self._net_torques(q, v) if self._smooth else self._torques
         a = pinocchio.aba(self.model_in_motion, self.data, q, v, torques, *self._more)
-        self._free = v + self._period * a
+        multiply(a, self._periods, a)
+        self._free = add(a, v, a)
         return self._free
 
     def free_derivatives(self) -> tuple[Vector, Vector, Vector]:
@@ -230,7 +231,7 @@ class PinocchioRobot(RobotEngine):
             if self.gyrates:
                 velocities = velocities + change
         self._earlier, self._before = self._positions, self._velocities
-        motion = self._period * velocities
+        motion = multiply(velocities, self._periods, self._motion)
         self._positions = pinocchio.integrate(self.model_in_motion, self._positions, motion)
         self._velocities = velocities
 
