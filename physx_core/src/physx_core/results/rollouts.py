@@ -384,7 +384,7 @@ class _Runs:
         return found
 
     def _check_follows(self, before: Batch, after: Batch, alive: Index, kept: Index) -> None:
-        """Check that a row goes on with the mesh and the values that the one before it ended with."""
+        """Check that a row goes on with the mesh and values that the one before it ended with."""
         some = np.isin(alive, kept)
         for name in self._loop.feeds if len(kept) else ():
             axis = self._batches.fields[name].free_axis
