@@ -265,10 +265,11 @@ class Problem:
             rubbing = self._model.friction(path, numbers)
             doubt = np.einsum("kij,kj->ki", dry, rubbing) - rubbing
         torques = self._torques(values, whole)
-        instruments, known = self._columns(path, path, stencil, dry, torques)
+        along, change = self._columns(path, raw, dry)
+        instruments, known = self._split(along, stencil, torques)
         own = known + instruments[..., self._plain] @ values[self._plain]
         instruments = self._endogenous(instruments, own)
-        columns, known = self._columns(path, raw, stencil, dry, torques)
+        columns, known = self._split(along + change, stencil, torques)
         target = torques - known
         for place, each in self._special:
             if each.kind == "gain":
@@ -287,32 +288,38 @@ class Problem:
             doubt[:, rows],
         )
 
-    def _columns(
-        self, path: Path, raw: Path, stencil: Vector, dry: Vector | None, torques: Vector
-    ) -> tuple[Vector, Vector]:
-        """Return columns along a motion near a path, to first order in what it differs by.
+    def _columns(self, path: Path, raw: Path, dry: Vector | None) -> tuple[Vector, Vector]:
+        """Return columns along a path, with what is known beside them as the last one.
 
         Returns:
-            Shape (samples, joints, parameters); and what is known beside them.
+            Shape (samples, joints, parameters + 1); and to first order what they differ by along a
+            motion near the path.
         """
         given = np.column_stack([self._directions, self._known])
-        found = self._model.columns(path, given, path.ends, dry)
-        if raw is not path:
-            change = _NEAR * (raw.positions - path.positions)
-            for sign in (1, -1):
-                near = dataclasses.replace(path, positions=path.positions + sign * change)
-                found += sign / (2 * _NEAR) * self._model.columns(near, given, path.ends, dry)
-        columns, known = found[..., :-1], found[..., -1]
+        difference = _NEAR * (raw.positions - path.positions)
+        along, ahead, behind = (
+            self._model.columns(each, given, path.ends, dry)
+            for each in (
+                path,
+                dataclasses.replace(path, positions=path.positions + difference),
+                dataclasses.replace(path, positions=path.positions - difference),
+            )
+        )
+        return along, (ahead - behind) / (2 * _NEAR)
+
+    def _split(self, columns: Vector, stencil: Vector, torques: Vector) -> tuple[Vector, Vector]:
+        """Return the parameters' columns, those of logged quantities too; and what is known."""
+        found, known = columns[..., :-1].copy(), columns[..., -1]
         for place, each in self._special:
             if each.kind == "delay":
-                columns[..., place] = self._slopes(torques)
+                found[..., place] = self._slopes(torques)
                 continue
             joint = self._model.coordinates.index(each.of)
             if each.kind == "encoder":
-                columns[..., place] = -stencil.sum(axis=0)[:, :, joint]
+                found[..., place] = -stencil.sum(axis=0)[:, :, joint]
             else:
-                columns[:, joint, place] = -torques[:, joint] if each.kind == "gain" else 1.0
-        return columns, known
+                found[:, joint, place] = -torques[:, joint] if each.kind == "gain" else 1.0
+        return found, known
 
     def solve(self, start: Vector | None, noise: Noise | None) -> Fit:
         """Repeat: noise of the residual, values, path."""

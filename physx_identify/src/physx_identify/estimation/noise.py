@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.linalg import cholesky_banded, lapack
 from scipy.optimize import minimize
+from scipy.signal import lfilter
 
 from physx_core.typing import Array, Vector
 
@@ -186,9 +187,8 @@ class Whitener:
         random, (count, joints) = np.random.default_rng(0), self._used.shape
         errors = noise.encoder * random.standard_normal((count + 2, self._blocks.shape[-1]))
         residual = noise.torque * random.standard_normal((count, joints))
-        for row in range(noise.order, count):
-            for lag, weights in enumerate(noise.regression.T, 1):
-                residual[row] += weights * residual[row - lag]
+        for joint, weights in enumerate(noise.regression):
+            residual[:, joint] = lfilter([1.0], [1.0, *-weights], residual[:, joint])
         for place, blocks in enumerate(self._blocks):
             residual -= np.einsum("kij,kj->ki", blocks, errors[place : place + count])
         return errors, residual

@@ -7,50 +7,62 @@ from scipy.fft import dct, idct
 
 from physx_core.typing import Vector
 
-_TREND = 5  # degree
+_ORDER = 3
+"""Of the differences that are penalized."""
 _WEAKEST, _STRONGEST, _STRENGTHS = -4.0, 14.0, 73  # powers of ten
-_MEDIAN = 0.455  # of a squared normal variable
 
 
 class Smoother:
     """A linear smoother that penalizes third differences, each joint by its own strength.
 
-    The strength is that with the least expected error of accelerations (Stein's unbiased estimate),
-    chosen once: what it makes of other positions is then linear in them.
+    The strength is that with the least error of accelerations by generalized cross-validation
+    (Craven and Wahba, Numerische Mathematik 31, 1979), chosen once: what it makes of other
+    positions is then linear in them.
+
+    In cosine waves, the third differences of a signal that is continued by its mirror image are
+    penalized; the two of them that a mirror image breaks, at the ends, are taken out by Woodbury's
+    identity, so that a log may begin and end in the middle of a motion.
 
     Attributes:
-        noise: Standard deviation of white noise of each joint, as the highest frequencies show it.
+        noise: Standard deviation of white noise of each joint, as what is smoothed away shows it.
     """
 
     def __init__(self, positions: Vector) -> None:
         """Choose the strengths for positions, shape (samples, joints)."""
         count = len(positions)
-        # The cosine transform continues a signal by its mirror image; without trend, smoothly.
-        basis = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, count), _TREND)
-        self._basis = np.linalg.qr(basis)[0]
-        second = (2 * np.sin(0.5 * np.pi * np.arange(count) / count)) ** 2
-        waves = dct(positions - self._trend(positions), axis=0, norm="ortho")
-        self._kept = np.empty(positions.shape)
-        self.noise = np.sqrt(np.median(waves[-count // 4 :] ** 2, axis=0) / _MEDIAN)
-        for joint, own in enumerate(waves.T):
-            power = own**2
-            noise = np.median(power[-count // 4 :]) / _MEDIAN
+        half = 0.5 * np.pi * np.arange(count) / count
+        self._second = second = (2 * np.sin(half)) ** 2
+        mirrored = np.stack([np.ones(count), np.cos(2 * half * count)], axis=1)  # at both ends
+        scale = np.sqrt(2 / count)
+        self._breaks = scale * np.sin(2 * half)[:, None] * mirrored * [1, -1]
+        outside = scale * (second * np.cos(half))[:, None] * mirrored
+        waves = dct(positions, axis=0, norm="ortho")
+        strengths = np.logspace(_WEAKEST, _STRONGEST, _STRENGTHS)
+        fits, shares = np.empty((_STRENGTHS, positions.shape[1])), np.empty((_STRENGTHS, 1))
+        for row, strength in enumerate(strengths):
+            kept, ends, inside = self._parts(strength)
+            left = waves - kept[:, None] * waves - ends @ (inside @ (ends.T @ waves))
+            fits[row] = second**2 @ left**2 - np.sum((outside.T @ left) ** 2, axis=0)
+            mixed, accelerated = outside.T @ ends, second[:, None] * ends
+            shares[row] = second**2 @ (1 - kept) - np.sum(outside.T**2 @ (1 - kept))
+            shares[row] -= np.sum(inside * (accelerated.T @ accelerated - mixed.T @ mixed))
+        best = np.argmin(fits / shares**2, axis=0)
+        self._chosen = strengths[best]
+        self.noise = np.sqrt(fits[best, np.arange(len(best))] / shares[best, 0])
 
-            def error(strength: float, power: Vector = power, noise: float = noise) -> float:
-                kept = 1 / (1 + 10**strength * second**3)
-                return float(np.sum(second**2 * ((1 - kept) ** 2 * power + 2 * kept * noise)))
-
-            grid = np.linspace(_WEAKEST, _STRONGEST, _STRENGTHS)
-            best = min(grid, key=error)
-            self._kept[:, joint] = 1 / (1 + 10**best * second**3)
+    def _parts(self, strength: float) -> tuple[Vector, Vector, Vector]:
+        """Return what is kept of waves: diagonal + ends @ inside @ ends.T."""
+        kept = 1 / (1 + strength * self._second**_ORDER)
+        ends = (kept * self._second ** (0.5 * _ORDER))[:, None] * self._breaks
+        inside = strength * np.linalg.inv(self._breaks.T @ (kept[:, None] * self._breaks))
+        return kept, ends, inside
 
     def __call__(self, positions: Vector) -> Vector:
         """Return positions, shape (samples, joints), with less noise."""
-        trend = self._trend(positions)
-        waves = dct(positions - trend, axis=0, norm="ortho")
-        found: Vector = trend + idct(self._kept * waves, axis=0, norm="ortho")
-        return found
-
-    def _trend(self, positions: Vector) -> Vector:
-        found: Vector = self._basis @ (self._basis.T @ positions)
+        waves = dct(positions, axis=0, norm="ortho")
+        for joint, strength in enumerate(self._chosen):
+            kept, ends, inside = self._parts(strength)
+            own = waves[:, joint]
+            waves[:, joint] = kept * own + ends @ (inside @ (ends.T @ own))
+        found: Vector = idct(waves, axis=0, norm="ortho")
         return found
