@@ -72,14 +72,19 @@ class ContactRows:
         if not self.active:
             mujoco.mj_step(model, data)
             return
-        mujoco.mj_step1(model, data)
+        self.begin()
+        mujoco.mj_step2(model, data)
+
+    def begin(self) -> None:
+        """Begin a physics step, up to the forces, which `mujoco.mj_step2` solves for."""
+        data = self._data
+        mujoco.mj_step1(self._world.model, data)
         if self._mixed and data.ncon:
             self._resist_turning()
         if self._deep:
             self._limit_depth()
         if self._moving:
             self._push()
-        mujoco.mj_step2(model, data)
 
     def _resist_turning(self) -> None:
         """Give each contact the larger torsional and rolling friction of its two shapes."""
