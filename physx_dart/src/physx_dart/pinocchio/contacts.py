@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio
 from numpy.typing import NDArray
 
+from physx_core.rotations import cross_rows
 from physx_core.typing import Records, Vector
 from physx_dart.pinocchio.models import twists_of
 from physx_dart.pinocchio.surfaces import Heights, Plane, Surface, surface_of
@@ -406,15 +407,15 @@ class ContactFinder:
         upright = lengths <= 1e-9
         divisors = np.where(upright, 1.0, lengths)
         beside = np.where(upright, axes[:, :, 0], downward / divisors)
-        around = _THIRDS @ np.stack([beside, np.cross(along, beside)], axis=1)
+        around = _THIRDS @ np.stack([beside, cross_rows(along, beside)], axis=1)
         found = (points[first:, None] + self._rim_radii[:, None, None] * around).reshape(-1, 3)
-        tilting = np.cross(turns, along)
+        tilting = cross_rows(turns, along)
         pace = (tilting @ up)[:, None] * along + (along @ up)[:, None] * tilting
         pace -= np.einsum("ij,ij->i", beside, pace)[:, None] * beside
-        run = period * (pace / divisors - np.cross(turns, beside))
+        run = period * (pace / divisors - cross_rows(turns, beside))
         run[upright[:, 0] | (np.einsum("ij,ij->i", run, run) > _FARTHEST_RUN**2)] = 0.0
         rolling = np.zeros((first + len(found), 3))
-        rolling[first :: len(_THIRDS)] = -0.5 * self._rim_radii[:, None] * np.cross(turns, run)
+        rolling[first :: len(_THIRDS)] = -0.5 * self._rim_radii[:, None] * cross_rows(turns, run)
         return found, rolling
 
 
