@@ -65,17 +65,18 @@ class Drives:
         """Simulate a physics step; for driven joints, the applied force is the desired velocity."""
         running, at = self._running, self._places
         model, data = running.model, running.data
-        q, v = running.positions, running.velocities
-        q[:], v[:], warm = data.qpos, data.qvel, data.qacc_warmstart.copy()
-        wanted, response = data.qfrc_applied[at], np.zeros(0)
+        q, v, warmth, forces = data.qpos, data.qvel, data.qacc_warmstart, data.qfrc_applied
+        start = running.positions, running.velocities, warmth.copy()
+        start[0][:], start[1][:] = q, v
+        wanted, response = forces.take(at), np.zeros(0)
         applied, targets = np.where(self._driven, 0.0, wanted), wanted.tolist()
         torques = tried = before = np.zeros(len(at))
         self._begin()
         for count in range(_MOST):
-            data.qfrc_applied[at] = applied + torques
-            data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = q, v, warm
+            forces[at] = applied + torques
+            q[:], v[:], warmth[:] = start
             mujoco.mj_step2(model, data)
-            now = data.qvel[at]
+            now = v.take(at)
             free, errors, least, most = self._off(now.tolist(), torques.tolist(), targets)
             if not free:
                 break
@@ -87,7 +88,7 @@ class Drives:
             more = np.linalg.solve(response.take(free, 0).take(free, 1), errors)
             tried, before, torques = torques, now, torques.copy()
             torques[free] = np.minimum(np.maximum(torques[free] + more, least), most)
-        data.qfrc_applied[at] = wanted
+        forces[at] = wanted
 
     def _off(
         self, speeds: Sequence[float], torques: Sequence[float], targets: Sequence[float]
