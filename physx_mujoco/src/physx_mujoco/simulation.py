@@ -98,7 +98,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
             for movable, part in zip(parts.movables, layout.parts.values(), strict=True)
         ]
         self._contact_rows = ContactRows(self._world, data)
-        self._drives = Drives(parts, layout, self._running, self._contact_rows.step)
+        self._drives = Drives(parts, layout, self._running, self._contact_rows.begin)
         self._touches = model.geom_contype.copy(), model.geom_conaffinity.copy()
         super().__init__(parts, robots, () if world.integrator == "euler" else RK4_LACKS)
 

@@ -188,7 +188,7 @@ class PairFinder:
                 center, velocity, surface = self._moved[body]
                 along = axes[place] @ surface
                 along[2] = 0.0
-                arm = np.cross(velocity[3:], point - center)
+                arm = cross_rows(velocity[3:], point - center)
                 found[place] = along + axes[place] @ (velocity[:3] + arm)
         return found.ravel()
 

@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio
 from numpy import add, multiply
 
-from physx_core.rotations import rotate_back, to_matrix
+from physx_core.rotations import cross_rows, rotate_back, to_matrix
 from physx_core.typing import Records, Vector
 from physx_dart.pinocchio.constraints import Constraints, Warmth, constrained, limited
 from physx_dart.pinocchio.contacts import ContactFinder, Indices, supports_of
@@ -354,7 +354,7 @@ class PinocchioRobot(RobotEngine):
             pinocchio.forwardKinematics(self._model, self._data, self._positions)
             turn = (self._data.oMi[joint].rotation @ place.rotation).T
             force, torque = turn @ force, turn @ torque
-        wrench = pinocchio.Force(force, torque + np.cross(point, force))
+        wrench = pinocchio.Force(force, torque + cross_rows(point, force))
         self._pushes[joint] = self._pushes[joint] + place.act(wrench)
         self._more = (self._pushes,)
 

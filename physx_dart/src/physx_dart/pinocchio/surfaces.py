@@ -142,7 +142,7 @@ def axes_of(normals: Vector) -> Vector:
     steep, nothing = np.abs(z) > 0.5, np.zeros(len(x))
     first = np.where(steep, [z, nothing, -x], [y, -x, nothing]).T
     first /= np.sqrt(np.einsum("ij,ij->i", first, first))[:, None]
-    return np.stack([first, np.cross(normals, first), normals], axis=1)
+    return np.stack([first, cross_rows(normals, first), normals], axis=1)
 
 
 def twist_rows(points: Vector, axes: Vector) -> Vector:
