@@ -159,13 +159,18 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         if self.parts.world.ground is not before.world.ground:
             self._world.write_heights(self.parts)
             self._forget_pictures()
-        self._world.derive()
+        self._derive()
 
     def hide(self, bodies: Sequence[int]) -> None:
         """Let only bodies that are not among these touch."""
         model, shown = self._running.model, ~np.isin(self._world.owners, bodies)
         model.geom_contype[:], model.geom_conaffinity[:] = (mask * shown for mask in self._touches)
+        self._derive()
+
+    def _derive(self) -> None:
+        """Let MuJoCo derive what depends on changes; it then connects bodies as they began."""
         self._world.derive()
+        self._write_bonds()
 
     def place_static(self, static: int, pose: Vector, velocity: Vector, surface: Vector) -> None:
         """Place a static body for the next step."""

@@ -172,6 +172,20 @@ def test_a_snapshot_holds_bodies_where_its_static_bodies_are(engine):
         np.testing.assert_array_equal(simulation.positions(), other.positions())
 
 
+@pytest.mark.parametrize("change", [{"mass": 2.0}, {"friction": 0.3}, {"hidden": True}], ids=str)
+def test_changes_leave_attachments_where_they_are(engine, change):
+    objects = [crate(name=n, position=(x, 0, 1)) for x, n in enumerate("abc")]
+    world = World(objects=objects, gravity=(0, 0, 0))
+    with engine.build(world) as simulation:
+        q = simulation.positions()
+        q[8] = 0.5
+        simulation.set_state(q, np.zeros(18))
+        simulation.attach(Connect("a", "b", (0.5, 0, 0)))
+        simulation.set_body("c", BodySettings(**change))
+        simulation.step(100)
+        np.testing.assert_allclose(simulation.positions(), q, atol=1e-9)
+
+
 def test_attached_bodies_touch_the_ground(engine):
     objects = [crate(position=(0, 0, 0.05)), hand(position=(0, 0, 0.11), orientation=(0, 0, 0, 1))]
     world = World(objects=objects, ground=Ground(), attachments=[Weld("hand", "crate")])
