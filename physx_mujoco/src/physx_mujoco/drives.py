@@ -80,7 +80,7 @@ class Drives:
             elif (change := torques - tried).any():  # contacts resist, too: Broyden's method
                 missed = now - before - response @ change
                 response += np.outer(missed, change / change.dot(change))
-            more = np.linalg.solve(response[np.ix_(free, free)], error[free])
+            more = _solved(response[np.ix_(free, free)], error[free])
             tried, before = torques.copy(), now
             torques[free] = np.clip(torques[free] + more, low[free], high[free])
         data.qfrc_applied[at] = wanted
@@ -95,3 +95,12 @@ class Drives:
         mujoco.mj_fullM(model, self._running.data, plain)
         found: Vector = np.linalg.inv(plain + mass)[np.ix_(self._places, self._places)]
         return found
+
+
+def _solved(response: Vector, error: Vector) -> Vector:
+    """Return the torques of joints that correct their velocities, the least if some cannot."""
+    try:
+        found: Vector = np.linalg.solve(response, error)
+    except np.linalg.LinAlgError:  # something holds joints, whatever their torques are
+        found = np.linalg.lstsq(response, error, rcond=None)[0]
+    return found
