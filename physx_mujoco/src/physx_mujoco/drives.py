@@ -85,7 +85,7 @@ class Drives:
             elif (change := torques - tried).any():  # contacts resist, too: Broyden's method
                 missed = now - before - response @ change
                 response += missed[:, None] * (change / change.dot(change))
-            more = np.linalg.solve(response.take(free, 0).take(free, 1), errors)
+            more = _solved(response.take(free, 0).take(free, 1), errors)
             tried, before, torques = torques, now, torques.copy()
             torques[free] = np.minimum(np.maximum(torques[free] + more, least), most)
         forces[at] = wanted
@@ -129,3 +129,12 @@ class Drives:
         mujoco.mj_fullM(self._running.model, self._running.data, mass)
         found: Vector = np.linalg.inv(mass + self._resistance)[np.ix_(self._places, self._places)]
         return found
+
+
+def _solved(response: Vector, error: Sequence[float]) -> Vector:
+    """Return the torques of joints that correct their velocities, the least if some cannot."""
+    try:
+        found: Vector = np.linalg.solve(response, error)
+    except np.linalg.LinAlgError:  # something holds joints, whatever their torques are
+        found = np.linalg.lstsq(response, error, rcond=None)[0]
+    return found

@@ -129,7 +129,7 @@ class Robot:
             (condim 6).
         joints: Settings of joints, by their name in the file.
         couplings: Which joints move together, besides those that follow others; None: those of an
-            MJCF file, otherwise none. It starts at positions that couplings allow.
+            MJCF file, otherwise none. It starts at positions that couplings and limits allow.
         wheels: Links that roll on the ground without slip.
         mass_factors: Scale factors for the mass and moments of inertia of links, by their name in
             the file; 1 for all others.
