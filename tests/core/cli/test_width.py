@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 from wide_lines import wide_lines
 
-from physx_core.cli import main
+from physx_core.cli import main, show_table
 from physx_core.plugins import find_entries
 
 CLOTH = """
@@ -75,3 +75,13 @@ def test_help_fits(capsys, monkeypatch, command):
     monkeypatch.delenv("COLUMNS", raising=False)
     text = printed(capsys, f"{command} --help")
     assert text.startswith(f"usage: physx {command}") and wide_lines(text) == []
+
+
+def test_a_table_that_is_too_wide_breaks_between_words(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "58")
+    head = ["pipeline", "lr", "layers", "state", "loss/validation", ""]
+    row = ["linear", "0.002288", "[5, 256, 256, 256, 576]", "complete", "0.32577", "█▆▃"]
+    show_table(head, [row], numbers=("lr", "loss/validation"), curve="")
+    text = capsys.readouterr().out
+    assert {"linear", "0.002288", "576]", "complete", "0.32577"} <= set(text.split())
+    assert max(map(len, text.splitlines())) <= 58

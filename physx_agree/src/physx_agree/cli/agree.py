@@ -1,4 +1,4 @@
-"""``physx agree``: how far engines agree on a task, and why they part."""
+"""``physx agree``: compare engines on a task: how far they agree, and why they differ."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from physx_core.errors import ConfigError
 
 @dataclass
 class Agree:
-    """Run a task with the same seeds and policies on several engines, and say why they part."""
+    """Run a task with the same seeds and policies on several engines, and say why they differ."""
 
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
     """Id of the environment, "module:id", "module:Class", or "script.py:function"."""

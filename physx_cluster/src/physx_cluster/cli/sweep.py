@@ -13,6 +13,7 @@ import tyro
 
 from physx_core.cli import show
 from physx_core.errors import UsageError, printable
+from physx_core.terminal import wrapped
 
 
 @dataclass
@@ -96,7 +97,8 @@ def _report(study: Any, folder: Path) -> None:
         _say(line)
     _say(f"table: {folder / TABLE}")
     place = shlex.quote(str(folder))
-    _say(f"next: physx sweep {place} --status, physx report {place}")
+    _say(f"next: physx sweep {place} --status")
+    _say(f"next: physx report {place}")
     if study.best() is None:
         raise StudyError(
             f"No trial of {folder} is complete with all seeds. The end of each trial's output.txt "
@@ -105,4 +107,4 @@ def _report(study: Any, folder: Path) -> None:
 
 
 def _say(line: str) -> None:
-    print(printable(line), file=sys.stderr, flush=True)
+    print(wrapped(printable(line)), file=sys.stderr, flush=True)

@@ -1,4 +1,4 @@
-"""``physx robots``: list the robots that a world may name, and their collision shapes."""
+"""``physx robots``: list the robots that are available by name."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``physx edit``: write a dataset with other rows or fields than another one."""
+"""``physx edit``: write a copy of a dataset with other rows or fields."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``physx log``: show recorded episodes as a table, a plot, or a replay."""
+"""``physx log``: show logs of robots' episodes as a table, a plot, or a replay."""
 
 from __future__ import annotations
 

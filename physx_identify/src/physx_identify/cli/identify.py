@@ -1,4 +1,4 @@
-"""``physx identify``: parameters of a robot from a log, with intervals."""
+"""``physx identify``: identify a robot's parameters from a log, with confidence intervals."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from physx_sim import Robot
 
 @dataclass
 class Identify:
-    """Find parameters of a robot in a log, with intervals that hold."""
+    """Identify a robot's parameters from a log, with confidence intervals."""
 
     log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")]
     """File or folder with positions and torques of the joints: CSV, Parquet, npz, HDF5, MCAP (of

@@ -1,4 +1,4 @@
-"""``physx branch``: go back to a stored row, and on from there with a change."""
+"""``physx branch``: simulate on from a stored row, as it was and with a change."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``physx compact``: free the disk space of rows that no episode of a campaign has."""
+"""``physx compact``: free the disk space of failed, lost and unfinished episodes."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""``physx evaluate``: how good a session's network is; plugins evaluate other kinds of networks."""
+"""``physx evaluate``: evaluate a session's network against baselines, or a policy on episodes."""
 
 from __future__ import annotations
 
