@@ -32,6 +32,8 @@ from physx_core import (
     Training,
     Transformation,
     Visualizer,
+    evaluate,
+    read_scalars,
 )
 from physx_core import errors as e
 from physx_core.pipelines import Replay
@@ -786,6 +788,16 @@ def predicts_with_a_session_that_trained_nothing():
 @mistake(e.CheckpointError, '"network_7"', "Available: network_0")
 def wants_a_checkpoint_that_does_not_exist():
     predict(network=NetworkConfig(which_network=7))
+
+
+@mistake(e.CheckpointError, 'traind does not exist. Did you mean "trained"')
+def evaluates_a_session_that_does_not_exist():
+    evaluate("sessions/traind")
+
+
+@mistake(e.SessionError, 'traind does not exist. Did you mean "trained"')
+def reads_losses_of_a_session_that_does_not_exist():
+    read_scalars("sessions/traind")
 
 
 @mistake(e.SessionError, "traind")
