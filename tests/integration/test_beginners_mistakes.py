@@ -212,6 +212,22 @@ def has_no_create():
     with_data(None, create=Environment.create)
 
 
+@mistake(e.EnvironmentFailedError, "no attribute 'place'. reset_parameters() is called later")
+def draws_what_only_an_episode_sets():
+    class Placed(Good):
+        independent_episodes = True
+        create = Environment.create
+
+        def init_visualization(self):
+            self.factory.add_sphere("ball", position=self.place)
+
+        def reset_parameters(self):
+            self.place = np.zeros(3)
+
+    config = EnvironmentConfig(Placed, as_tcp_ip_client=False, visualizer=Visualizer)
+    DataGeneration(config, episodes=2, session_name="new").execute()
+
+
 @mistake(e.UsageError, "Changed does not implement init_database()", 'Did you mean "init_databse"')
 def misspells_init_database():
     with_data(None, init_database=Environment.init_database, init_databse=Good.init_database)

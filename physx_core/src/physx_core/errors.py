@@ -272,11 +272,11 @@ class FailedEpisodesError(PhysxError):
     def __init__(self, failed: int, episode: int, reason: str) -> None:
         self.failed, self.episode = failed, episode
         first, _, self.remote_traceback = reason.partition("\n")
-        count = "An episode" if failed == 1 else f"{failed} episodes"
+        others = f", after {failed - 1} others," if failed > 1 else ""
         super().__init__(
-            f"{count} failed, the last one number {episode}: {first.rstrip('.')}. What has been "
-            "simulated is stored. To go on with the others: --resume, and --max-failed for more "
-            "failures; physx generate --retry-failed simulates those that failed again."
+            f"Episode {episode}{others} failed: {first.rstrip('.')}. What has been simulated is "
+            "stored. To go on with the others: --resume, and --max-failed for more failures; "
+            "physx generate --retry-failed simulates those that failed again."
         )
 
 

@@ -126,7 +126,9 @@ def _is_unused(session: Session, path: Path, opened: bool) -> bool:
         case ("dataset", name):
             is_data = name == FILE or path.suffix == ".h5"
             return (
-                not opened or name in (LOCK, PROOF, _BEGINS) or (is_data and not _has_samples(path.parent))
+                not opened
+                or name in (LOCK, PROOF, _BEGINS)
+                or (is_data and not _has_samples(path.parent))
             )
         case ("stats", *_):
             numbers = session.stats_dir / "scalars.csv"

@@ -463,11 +463,17 @@ class Training(NewSessionPipeline):
         return " and ".join(decided)
 
     @property
+    def _decisive(self) -> str:
+        """What decides which network is the best."""
+        known = "training" if math.isnan(self.validation_loss) else "validation"
+        return self.monitor or f"{known} loss"
+
+    @property
     def stopped(self) -> str:
         """Why the training ends before its last epoch; empty if it does not."""
         if self.patience is None or self.epoch_id >= self.epoch_nb:
             return ""
-        return self.best.reason_to_stop(self.patience, self.monitor)
+        return self.best.reason_to_stop(self.patience, self._decisive)
 
     def validate(self) -> dict[str, float]:
         """Return the mean loss and other statistics over the validation samples."""
@@ -792,7 +798,7 @@ class Training(NewSessionPipeline):
         elif self.epoch_id >= self.epoch_nb:
             yield "nothing left to train: epoch_nb (--epoch-nb) is the total number of epochs"
         if not math.isinf(self.best.loss):
-            yield self.best.describe(self.monitor)
+            yield self.best.describe(self._decisive)
         if self.environment_config is not None:
             yield describe_samples(self.data.dataset.directory)
         if self.data.online is not None:
