@@ -6,6 +6,7 @@ Plugins raise these errors too. The command line reports them without a tracebac
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
 from physx_core.origin import install_hint
 
@@ -32,6 +33,22 @@ def _listed_near(name: str, known: Sequence[str]) -> str:
         return listed(known)
     near = difflib.get_close_matches(name, known, n=8, cutoff=0.0)
     return f"{listed(near)} and {len(known) - len(near)} others (physx plugins)"
+
+
+def found_at(place: Path) -> str:
+    """Return what is at a path at which something is missing, as the end of a message."""
+    if place.is_file():
+        return "It is a file: give the folder of a session or dataset."
+    if place.is_dir():
+        return f"The folder contains: {listed(path.name for path in place.iterdir())}."
+    missing = place.absolute()
+    while not missing.parent.is_dir():
+        missing = missing.parent
+    around = [path.name for path in missing.parent.iterdir()]
+    return (
+        f"The folder {missing} does not exist.{nearest(missing.name, around)} {missing.parent} "
+        f"contains: {listed(around)}."
+    )
 
 
 def printable(text: object) -> str:
@@ -255,11 +272,11 @@ class FailedEpisodesError(PhysxError):
     def __init__(self, failed: int, episode: int, reason: str) -> None:
         self.failed, self.episode = failed, episode
         first, _, self.remote_traceback = reason.partition("\n")
-        count = "An episode" if failed == 1 else f"{failed} episodes"
+        others = f", after {failed - 1} others," if failed > 1 else ""
         super().__init__(
-            f"{count} failed, the last one number {episode}: {first.rstrip('.')}. What has been "
-            "simulated is stored. To go on with the others: --resume, and --max-failed for more "
-            "failures; physx generate --retry-failed simulates those that failed again."
+            f"Episode {episode}{others} failed: {first.rstrip('.')}. What has been simulated is "
+            "stored. To go on with the others: --resume, and --max-failed for more failures; "
+            "physx generate --retry-failed simulates those that failed again."
         )
 
 

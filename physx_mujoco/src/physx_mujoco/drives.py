@@ -133,8 +133,9 @@ class Drives:
 
 def _solved(response: Vector, error: Sequence[float]) -> Vector:
     """Return the torques of joints that correct their velocities, the least if some cannot."""
+    wanted = np.array(error)
     try:
-        found: Vector = np.linalg.solve(response, error)
+        found: Vector = np.linalg.solve(response, wanted)
     except np.linalg.LinAlgError:  # something holds joints, whatever their torques are
-        found = np.linalg.lstsq(response, error, rcond=None)[0]
+        found = np.linalg.lstsq(response, wanted, rcond=None)[0]
     return found

@@ -13,7 +13,7 @@ from PIL import Image
 
 from physx_core import Closeable, Visualizer, plugins
 from physx_core.components import Event
-from physx_core.errors import PhysxError, VisualizerError
+from physx_core.errors import PhysxError, UntrustedReferenceError, VisualizerError
 from physx_core.pipelines import Redrawing
 from physx_core.typing import Array, Batch, Sample
 from physx_report.blocks import Block, Text
@@ -176,6 +176,11 @@ def or_why_not(blocks: Iterable[Block]) -> list[Block]:
     try:
         with warnings.catch_warnings(action="ignore"):  # of environments that draw nothing
             return list(blocks)
+    except UntrustedReferenceError:
+        told = (
+            "its environment is not of an installed plugin; if you trust the code that its files "
+        )
+        return [Text([f"There is no film: {told}name, make the page with --trust (trust=True)."])]
     except PhysxError as error:
         return [Text([f"There is no film: {str(error).rstrip('.')}."])]
 

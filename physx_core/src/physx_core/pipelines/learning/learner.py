@@ -418,7 +418,8 @@ class Learner:
         except KeyError as error:
             raise MissingFieldError(
                 f'The network reads the field "{error.args[0]}", which is missing. '
-                f"Given: {', '.join(batch) or 'none'}.",
+                f"Given: {', '.join(batch) or 'none'}. An environment gives more than it trains "
+                "with, such as windows, by define_additional_fields() and set_additional_data().",
                 field=str(error.args[0]),
             ) from None
         try:
