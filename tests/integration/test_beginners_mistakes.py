@@ -681,6 +681,36 @@ def gives_a_transformation_too_few_arguments():
     train(of("toy/linear", transformation=Needy))
 
 
+@mistake(e.ConfigError, "The network Changed has predict() where physx calls predict(data)")
+def defines_predict_without_its_argument():
+    own(predict=lambda self: {})
+
+
+@mistake(e.UsageError, "Changed.predict() must return a dictionary with prediction, not ndarray")
+def predicts_an_array():
+    own(predict=lambda self, data: data["state"])
+
+
+@mistake(e.UsageError, "Changed.predict() must return a dictionary with prediction, not other")
+def predicts_another_field():
+    own(predict=lambda self, data: {"other": data["state"]})
+
+
+@mistake(e.UsageError, "Changed.predict() must return a dictionary with prediction, not NoneType")
+def forgets_to_return_the_prediction():
+    own(predict=lambda self, data: None)
+
+
+@mistake(e.FieldsMismatchError, 'prediction: shape (4, 1), but "next_state" has (4, 2)')
+def predicts_one_column_that_would_be_broadcast():
+    own(predict=lambda self, data: {"prediction": data["state"][:, :1]})
+
+
+@mistake(e.FieldsMismatchError, 'prediction: a list, but "next_state" has the shape (4, 2)')
+def predicts_a_list():
+    own(predict=lambda self, data: {"prediction": data["state"].tolist()})
+
+
 @mistake(e.UsageError, 'transform_loss() must return a dictionary with "loss", not float')
 def returns_a_number_from_transform_loss():
     class Own(LeastSquares):

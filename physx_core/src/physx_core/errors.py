@@ -174,12 +174,13 @@ class PluginNotFoundError(PhysxError):
         installed: Entry-point names of the installed plugins.
     """
 
-    def __init__(self, name: str, installed: Sequence[str], hint: str) -> None:
+    def __init__(
+        self, name: str, installed: Sequence[str], hint: str, meant: Sequence[str] = ()
+    ) -> None:
         self.name, self.installed = name, list(installed)
-        super().__init__(
-            f'No plugin "{name}" is installed.{nearest(name, installed)} '
-            f"Installed: {listed(installed)}. {hint}"
-        )
+        guess = f" Did you mean {' or '.join(meant)}?" if meant else nearest(name, installed)
+        text = f'No plugin "{name}" is installed.{guess} Installed: {listed(installed)}. {hint}'
+        super().__init__(text.rstrip())
 
 
 class ComponentNotFoundError(PhysxError):
@@ -196,7 +197,10 @@ class ComponentNotFoundError(PhysxError):
     ) -> None:
         self.kind, self.name, self.known = kind, name, sorted(known)
         hint = hint or f"It has: {_listed_near(name, self.known)}."
-        super().__init__(f'{place} has no {kind} "{name}".{nearest(name, self.known)} {hint}')
+        what = f'has no {kind} "{name}".{nearest(name, self.known)}'
+        if not name:
+            what = f"has several of kind {kind}: name one." if self.known else f"has no {kind}."
+        super().__init__(f"{place} {what} {hint}")
 
 
 class ContractError(PhysxError):

@@ -431,13 +431,8 @@ def _no_plugin(kind: str, plugin_name: str) -> PluginNotFoundError:
             components = load(name).components.get(kind, {})
             having += [name] if components else []
             meant += [f'"{name}/{plugin_name}"'] if plugin_name in components else []
-    hint = (
-        f"Did you mean {' or '.join(meant)}?"
-        if meant
-        else f"Plugins with a component of kind {kind}: {listed(having)}. "
-        f"{plugin_hint(plugin_name)}"
-    )
-    return PluginNotFoundError(plugin_name, list(available()), hint)
+    hint = f"Plugins with a component of kind {kind}: {listed(having)}. {plugin_hint(plugin_name)}"
+    return PluginNotFoundError(plugin_name, list(available()), "" if meant else hint, meant)
 
 
 def import_module(kind: str, place: str) -> ModuleType:

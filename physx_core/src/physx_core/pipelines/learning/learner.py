@@ -88,6 +88,7 @@ class Learner:
         self.group = Group()
         self.row_losses: Array = np.zeros(0)
         self._is_between_steps = False
+        self._is_checked = False
         self._predict_training = self._predict_batch
         self._read = self.network.numpy_to_tensor
         if trains:
@@ -247,7 +248,8 @@ class Learner:
         Raises:
             DivergedError: If the loss or a gradient is not finite, unless
                 `Optimization.stops_at_nan` is off.
-            UsageError: If there is no optimization.
+            UsageError: If there is no optimization, or the prediction lacks a field.
+            FieldsMismatchError: If a prediction has not the shape of its target.
         """
         if self._is_between_steps:
             self._is_between_steps = False
@@ -257,6 +259,8 @@ class Learner:
         if weight is None:
             share, weight = (batch, 1.0) if group.size == 1 else group.share_of(batch)
         step = self._predict_training(share)
+        if not self._is_checked:
+            self._check(step)
         loss, stops = optimization.compute_loss(step), optimization.stops_at_nan
         if stops and isinstance(loss, (float, np.floating)) and not math.isfinite(loss):
             raise DivergedError(self._explain(f"the loss is {loss}", step))
@@ -273,6 +277,30 @@ class Learner:
         if stops and not math.isfinite(losses["loss"]):
             raise DivergedError(self._explain(f"the loss is {losses['loss']}", step))
         return losses
+
+    def _check(self, step: PredictedBatch) -> None:
+        """Check the first prediction: a wrong shape might be broadcast, and trained on."""
+        self._is_checked = True
+        network, found = self.network, step.prediction
+        names = list(network.pred_fields)
+        if not isinstance(found, Mapping) or not found.keys() >= set(names):
+            given = listed(map(str, found)) if isinstance(found, Mapping) else type(found).__name__
+            raise UsageError(
+                f"{type(network).__name__}.predict() must return a dictionary with "
+                f"{listed(names)}, not {given}."
+            )
+        differences = {}
+        for name, target in zip(names, network.opt_fields, strict=False):
+            if self.fields[target].numpy_dtype.kind in "iub":  # labels, of which a loss knows more
+                continue
+            wanted, values = tuple(step.targets[target].shape), found[name]
+            if not hasattr(values, "shape"):
+                kind = type(values).__name__
+                differences[name] = f'a {kind}, but "{target}" has the shape {wanted}'
+            elif tuple(values.shape) != wanted:
+                differences[name] = f'shape {tuple(values.shape)}, but "{target}" has {wanted}'
+        if differences:
+            raise FieldsMismatchError("Prediction and target differ", differences)
 
     def _compute_row_losses(self, optimization: Optimization, step: PredictedBatch) -> Array:
         found = optimization.compute_row_losses(step)
