@@ -6,85 +6,22 @@ import dataclasses
 import json
 
 import logged_arm as arm
+import logged_flyer as flyer
 import numpy as np
 import pytest
 
 from physx_core.cli import main
-from physx_core.rotations import from_rotation_vector_rows, multiply_rows
 from physx_dart import DartBackend, PinocchioBackend
 from physx_identify import Log, Model, check_log, identify, read_log
 from physx_identify.errors import IdentificationError
 from physx_identify.estimation.model import Path
-from physx_sim import JointSettings, Robot, World
-
-FLYER = """
-<mujoco><compiler angle="radian"/><worldbody><body name="trunk" pos="0 0 1"><freejoint/>
-  <geom type="box" size="0.2 0.1 0.05" mass="2"/>
-  <body name="upper" pos="0.1 0 -0.05"><joint name="shoulder" axis="0 1 0"/>
-    <geom type="capsule" size="0.03" fromto="0 0 0 0.05 0.02 -0.3" mass="0.6"/>
-    <body name="lower" pos="0.05 0.02 -0.3"><joint name="elbow" axis="1 0 0"/>
-      <geom type="capsule" size="0.03" fromto="0 0 0 0 0.1 -0.25" mass="0.4"/></body></body>
-</body></worldbody></mujoco>
-"""
-HIDDEN = {"mass lower": 0.5, "damping shoulder": 0.05, "damping elbow": 0.03,
-          "friction shoulder": 0.1, "friction elbow": 0.05}  # fmt: skip
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    found = tmp_path_factory.mktemp("flyer") / "flyer.xml"
-    found.write_text(FLYER)
-    return found
-
-
-def flyer(place, **more):
-    return Robot(str(place), fixed_base=False, **more)
-
-
-def hidden(place, friction=True):
-    joints = {
-        name: JointSettings(
-            damping=HIDDEN[f"damping {name}"], friction=friction * HIDDEN[f"friction {name}"]
-        )
-        for name in arm.JOINTS
-    }
-    return flyer(place, mass_factors={"lower": 1.25}, joints=joints)
-
-
-def flown(robot, samples, engine=PinocchioBackend):
-    """Return positions and torques of a robot that tumbles while its joints track a motion."""
-    simulation = engine().build(World([robot], period=arm.PERIOD))
-    begin = np.array([0, 0, 1.0, 0.7, -0.5, 0.9, 0, 0])
-    simulation.set_state(simulation.positions(), begin)
-    targets, speeds = arm.motion(samples)
-    q, torques = np.empty((samples, 9)), np.empty((samples, 2))
-    for row in range(samples):
-        q[row] = simulation.positions()
-        torques[row] = [12, 4] * (targets[row] - q[row, 7:])
-        torques[row] += [1, 0.2] * (speeds[row] - simulation.velocities()[6:])
-        simulation.set_commands(torques[row])
-        simulation.step(1)
-    return q, torques
-
-
-def noisy(q, torques, base=1e-3, encoder=1e-4, torque=0.02):
-    random, count = np.random.default_rng(0), len(q)
-    turns = from_rotation_vector_rows(base * random.normal(size=(count, 3)))
-    signs = np.where(np.arange(count) % 7 < 3, -1, 1)[:, None]  # a quaternion has two
-    return Log(
-        arm.JOINTS,
-        arm.PERIOD,
-        q[:, 7:] + encoder * random.normal(size=(count, 2)),
-        torques + torque * torques.std(axis=0) * random.normal(size=(count, 2)),
-        base_positions=q[:, :3] + base * random.normal(size=(count, 3)),
-        base_orientations=signs * multiply_rows(q[:, 3:7], turns),
-    )
+from physx_sim import Robot
 
 
 @pytest.mark.parametrize("engine", [PinocchioBackend, DartBackend])
-def test_the_model_of_a_floating_base_takes_the_steps_of_engines(place, engine):
-    robot = hidden(place, friction=False)
-    q, torques = flown(robot, 80, engine)
+def test_the_model_of_a_floating_base_takes_the_steps_of_engines(engine):
+    robot = flyer.hidden(friction=False)
+    q, torques = flyer.flown(robot, 80, engine)
     log = Log(arm.JOINTS, arm.PERIOD, q[:, 7:], torques,
               base_positions=q[:, :3], base_orientations=q[:, 3:7])  # fmt: skip
     model = Model(robot)
@@ -95,31 +32,38 @@ def test_the_model_of_a_floating_base_takes_the_steps_of_engines(place, engine):
 
 
 @pytest.mark.slow
-def test_the_command_finds_what_a_tumbling_robot_hides(place, tmp_path, capsys):
-    log = noisy(*flown(hidden(place), 600))
+def test_the_command_finds_what_a_tumbling_robot_hides(tmp_path, capsys):
+    log = flyer.noisy(flyer.flown(flyer.hidden(), 600))
     arrays = {"q": log.positions, "tau": log.torques, "time": arm.PERIOD * np.arange(600)}
     arrays |= {"base_position": log.base_positions, "base_quat": log.base_orientations}
     np.savez(tmp_path / "log.npz", **arrays)
-    words = ["identify", str(tmp_path / "log.npz"), str(place), "--floating", "--level", "0.999"]
+    words = [
+        "identify",
+        str(tmp_path / "log.npz"),
+        str(flyer.FILE),
+        "--floating",
+        "--level",
+        "0.999",
+    ]
     assert main([*words, "--free", "mass:lower", "damping", "friction", "--json"]) == 0
     found = {each["name"]: each for each in json.loads(capsys.readouterr().out)["estimates"]}
-    for name, true in HIDDEN.items():
+    for name, true in flyer.HIDDEN.items():
         assert found[name]["low"] <= true <= found[name]["high"]
         assert found[name]["error"] < 0.1 * true
 
 
 @pytest.mark.slow
-def test_in_flight_the_base_tells_masses_from_poor_torques(place):
-    robot = hidden(place, friction=False)
-    log = noisy(*flown(robot, 120), base=1e-4, torque=0.2)
+def test_in_flight_the_base_tells_masses_from_poor_torques():
+    robot = flyer.hidden(friction=False)
+    log = flyer.noisy(flyer.flown(robot, 120), base=1e-4, torque=0.2)
     known = dataclasses.replace(robot, mass_factors={})
     found = identify(log, known, "mass:lower", level=0.999, flight=True)["mass lower"]
-    assert found.low <= HIDDEN["mass lower"] <= found.high
+    assert found.low <= flyer.HIDDEN["mass lower"] <= found.high
     assert found.error < 0.02 * found.value
 
 
-def test_a_pose_is_the_same_from_any_columns(place, tmp_path):
-    log = noisy(*flown(hidden(place), 80))
+def test_a_pose_is_the_same_from_any_columns(tmp_path):
+    log = flyer.noisy(flyer.flown(flyer.hidden(), 80))
     time = arm.PERIOD * np.arange(80)
     whole = np.concatenate([log.base_positions, log.base_orientations, log.positions], axis=1)
     np.savez(tmp_path / "q.npz", q=whole, tau=np.pad(log.torques, ((0, 0), (6, 0))), time=time)
@@ -138,9 +82,9 @@ def test_a_pose_is_the_same_from_any_columns(place, tmp_path):
     assert fixed.base is None and "base_qw" in fixed.left_out
 
 
-def test_a_wrong_pose_is_named(place, tmp_path):
-    robot, known = flyer(place), Model(flyer(place))
-    log = noisy(*flown(hidden(place), 80), base=1e-5)
+def test_a_wrong_pose_is_named(tmp_path):
+    robot, known = flyer.KNOWN, Model(flyer.KNOWN)
+    log = flyer.noisy(flyer.flown(flyer.hidden(), 80), base=1e-5)
     own = vars(log)
     turned = np.array(log.base_orientations)
     turned[40:] = turned[40:, [1, 0, 3, 2]]
@@ -158,7 +102,7 @@ def test_a_wrong_pose_is_named(place, tmp_path):
             check_log(Log(**{**own, **changed}), known)
     check_log(log, known)
     with pytest.raises(IdentificationError, match="but the robot's is fixed"):
-        identify(log, Robot(str(place)), "friction")
+        identify(log, Robot(str(flyer.FILE)), "friction")
     np.savez(tmp_path / "q.npz", q=log.positions, tau=log.torques, time=arm.PERIOD * np.arange(80))
     with pytest.raises(IdentificationError, match="no column of base_positions"):
         read_log(tmp_path / "q.npz", arm.JOINTS, floating=True)
