@@ -162,7 +162,7 @@ class ChangeableSimulation(ReadableSimulation[Engine]):
         """
         self._check_has("attachments")
         self._check_attachment(attachment)
-        velocities = self._scenery.velocities.any(axis=1)
+        velocities = self._scenery.velocities.any(axis=1).tolist()
         moving = [n for n, moves in zip(self.layout.statics, velocities, strict=True) if moves]
         for name in (attachment.body_a, attachment.body_b):
             if self._changes.of(name).hidden:
