@@ -162,8 +162,8 @@ class ChangeableSimulation(ReadableSimulation[Engine]):
         """
         self._check_has("attachments")
         self._check_attachment(attachment)
-        velocities = self._scenery.velocities.any(axis=1).tolist()
-        moving = [n for n, moves in zip(self.layout.statics, velocities, strict=True) if moves]
+        velocities = zip(self.layout.statics, self._scenery.velocities, strict=True)
+        moving = [name for name, velocity in velocities if velocity.any()]
         for name in (attachment.body_a, attachment.body_b):
             if self._changes.of(name).hidden:
                 raise SimulationError(f'"{name}" is hidden, so nothing can be attached to it.')
