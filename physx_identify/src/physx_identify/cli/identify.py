@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from physx_core.cli import show
+from physx_core.cli import options_from, show
 from physx_identify import (
     Model,
     identify,
@@ -79,7 +79,7 @@ class Identify:
 
 def run(words: Sequence[str]) -> None:
     """Print what the log says, and store it if requested."""
-    options = tyro.cli(Identify, args=words, prog="physx identify")
+    options = options_from(Identify, words, "identify")
     robot = Robot(options.robot, fixed_base=not options.floating)
     begin = time.monotonic()
     model = Model(robot, options.gravity, options.held)
