@@ -85,3 +85,9 @@ def test_a_table_that_is_too_wide_breaks_between_words(capsys, monkeypatch):
     text = capsys.readouterr().out
     assert {"linear", "0.002288", "576]", "complete", "0.32577"} <= set(text.split())
     assert max(map(len, text.splitlines())) <= 58
+
+
+def test_a_description_breaks_only_where_the_terminal_ends(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "400")
+    text = printed(capsys, "verify --help")
+    assert 'left open, and move unreadable partitions to the folder "damaged".' in text

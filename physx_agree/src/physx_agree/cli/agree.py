@@ -10,7 +10,7 @@ from typing import Annotated, Any
 import tyro
 
 from physx_agree import agree, store_agreement
-from physx_core.cli import argument_registry, show
+from physx_core.cli import options_from, show
 from physx_core.errors import ConfigError
 
 
@@ -45,8 +45,7 @@ class Agree:
 
 def run(words: Sequence[str]) -> None:
     """Print the agreement, and store it if requested."""
-    with argument_registry():
-        options = tyro.cli(Agree, args=words, prog="physx agree")
+    options = options_from(Agree, words, "agree")
     if options.episodes < 1:
         raise ConfigError(f"--episodes is {options.episodes} but must be at least 1.")
     begin = time.monotonic()

@@ -11,7 +11,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from physx_core.cli import show
+from physx_core.cli import options_from, show
 from physx_core.errors import UsageError, printable
 from physx_core.terminal import wrapped
 
@@ -53,7 +53,7 @@ def run(words: Sequence[str]) -> None:
     from physx_cluster.sweep.runner import run_study
     from physx_cluster.sweep.study import STUDY, Study, is_study
 
-    options = tyro.cli(Sweep, args=words, prog="physx sweep")
+    options = options_from(Sweep, words, "sweep")
     folder = options.study or Path("studies") / options.place.stem
     file = options.place
     if file.is_dir() or is_study(file):

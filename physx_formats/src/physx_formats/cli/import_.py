@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from physx_core.cli import count, show
+from physx_core.cli import count, options_from, show
 from physx_core.observers import ProgressBar
 from physx_formats import import_file
 
@@ -38,7 +38,7 @@ class Import:
 
 def run(words: Sequence[str]) -> None:
     """Import a file and print the number of stored samples."""
-    options = tyro.cli(Import, args=words, prog="physx import")
+    options = options_from(Import, words, "import")
     bar = ProgressBar()
     bar.begin("import", None, "B")
     try:

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from physx_core.cli import show
+from physx_core.cli import options_from, show
 from physx_identify import (
     Model,
     identify,
@@ -45,7 +45,7 @@ class Identify:
     session: str | None = None
     """Folder that keeps the result, for physx report."""
     propose: str | None = None
-    """CSV file for a motion of the same length that would tell more."""
+    """CSV file for an excitation trajectory of the same length that would narrow the intervals."""
     period: float | None = None
     """Time between samples, in s; by default from the log's column of times."""
     columns: dict[str, str] = field(default_factory=dict)
@@ -60,10 +60,10 @@ class Identify:
     held: tuple[str, ...] = ()
     """Joints that did not move and are not in the log, such as a gripper's: they are at 0."""
     floating: bool = False
-    """The base of the robot moves, and the log has its pose: base_x, base_y, base_z, and base_qx,
+    """The robot has a floating base, and the log has its pose: base_x, base_y, base_z, and base_qx,
     base_qy, base_qz, base_qw."""
     flight: bool = False
-    """Nothing but gravity acts on a base that moves, so that its equations count, too. Slow."""
+    """Nothing but gravity acts on the floating base, so that its equations count, too. Slow."""
     instant: bool = False
     """Torques are those at the instants of the samples, instead of held from each to the next."""
     engines: tuple[str, ...] = ()
@@ -79,7 +79,7 @@ class Identify:
 
 def run(words: Sequence[str]) -> None:
     """Print what the log says, and store it if requested."""
-    options = tyro.cli(Identify, args=words, prog="physx identify")
+    options = options_from(Identify, words, "identify")
     robot = Robot(options.robot, fixed_base=not options.floating)
     begin = time.monotonic()
     model = Model(robot, options.gravity, options.held)

@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 import tyro
 
 from physx_core import plugins
-from physx_core.cli import show
+from physx_core.cli import options_from, show
 from physx_core.errors import ConfigError
 from physx_core.files import create_folder, make_folder, remove_folder, rename
 
@@ -97,7 +97,7 @@ class New:
 
 def run(words: Sequence[str]) -> None:
     """Write the files and print what to do next."""
-    options = tyro.cli(New, args=words, prog="physx new")
+    options = options_from(New, words, "new")
     name = options.name
     _check_name(name)
     target = options.folder / f"physx-{name}"

@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from physx_core import checkpoint, plugins
+from physx_core.cli.options import options_from
 from physx_core.cli.output import show
 from physx_core.components import Evaluation
 from physx_core.pipelines import evaluate
@@ -49,7 +50,7 @@ def run(words: Sequence[str]) -> None:
     if other is not None:
         other.run(words)
         return
-    options = tyro.cli(Evaluate, args=words, prog="physx evaluate")
+    options = options_from(Evaluate, words, "evaluate")
     result = evaluate(
         options.session,
         options.data,
