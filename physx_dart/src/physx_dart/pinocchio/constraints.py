@@ -141,7 +141,7 @@ class Constraints:
         self.warmth.points.fill(0.0)
         if self.touching is not None:
             self.warmth.points[self.touching.numbers] = self.impulses
-        self.warmth.rows[:] = rows
+        self.warmth.rows = rows
 
 
 def limited(part: Constraints, v: Vector) -> Vector:
