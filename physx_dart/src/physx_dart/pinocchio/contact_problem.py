@@ -151,7 +151,9 @@ class ContactProblem:
         Also return the rows that the projection made constant, and where it turned others.
         """
         values = (self._back.dot(impulses) - self._start).tolist()
-        place, held, turned = 0, list[int](), list[_Turned]()
+        place = 0
+        held: list[int] = []
+        turned: list[_Turned] = []
         for friction in self._coefficients:
             x, y, normal = values[place : place + 3]
             if normal <= 0:
