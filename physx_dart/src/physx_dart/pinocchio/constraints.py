@@ -141,7 +141,7 @@ class Constraints:
         self.warmth.points.fill(0.0)
         if self.touching is not None:
             self.warmth.points[self.touching.numbers] = self.impulses
-        self.warmth.rows[:] = rows
+        self.warmth.rows = rows
 
 
 def limited(part: Constraints, v: Vector) -> Vector:
@@ -218,8 +218,8 @@ class _Group:
                 guess.append(part.warmth.points.take(part.touching.numbers, 0).ravel())
         self._of_pairs = 0 if pairs is None else 3 * len(pairs.gaps)
         self._inverse = _diagonal([part.inverse() for part in parts], self._spans)
-        self._points, self._more = np.zeros((2, 0, width))
-        self._bias = self._friction = self._guess = self._targets = self._pace = nothing
+        self._points = np.zeros((0, width))
+        self._bias = self._friction = self._guess = self._pace = nothing
         if touching:
             self._points = joined([each.jacobian for each in touching])
             self._bias = joined([each.bias(before, period) for each in touching])
@@ -231,38 +231,42 @@ class _Group:
         self._last = joined([part.warmth.rows for part in parts])
         self._joints = joined([widened(part.joints.jacobian, span, width) for part, span in wide])
         self._turning = None
+        self._more: list[Vector] = []  # Jacobians of further rows
+        self._targets: list[Vector] = []
         if ties is not None:
-            self._more, self._pace = ties
-            self._targets = -self._pace
+            self._pace = ties[1]
+            self._more, self._targets = [ties[0]], [-self._pace]
         if (spins := together(touching)) is not None:
             self._turning = spins.points, spins.bounds
-            self._more = np.concatenate([self._more, spins.jacobian])
-            self._targets = np.concatenate([self._targets, -spins.drift])
+            self._more.append(spins.jacobian)
+            self._targets.append(-spins.drift)
 
     def solve(self, v: Vector, solver: ImpulseSolver) -> Solved:
         """Return the impulses of all constraints, with the rows of joints that act."""
         pairs = zip(self._parts, self._of_rows, strict=True)
         rows = np.array([span.start + row for part, span in pairs for row in part.acts], np.intp)
-        least, most, turning = self._least.take(rows), self._most.take(rows), self._turning
+        least, most = self._least.take(rows), self._most.take(rows)
         if len(self._parts) > 1:  # the solver expects rows with one bound first
             order = np.argsort(np.isinf(least) == np.isinf(most), kind="stable")
             rows, least, most = rows[order], least[order], most[order]
-        along = np.concatenate([self._points, self._joints.take(rows, 0), self._more])
-        targets = np.concatenate([self._bias, -self._aims.take(rows), self._targets])
+        along = np.concatenate([self._points, self._joints.take(rows, 0), *self._more])
+        targets = np.concatenate([self._bias, -self._aims.take(rows), *self._targets])
         if len(self._pace):
             endless = np.full(len(self._pace), np.inf)
             least, most = np.concatenate([least, -endless]), np.concatenate([most, endless])
         spread = self._inverse.dot(along.T)
         response, free = along.dot(spread), along.dot(v) + targets
         if len(self._bias):
-            none, friction = np.zeros(len(self._targets)), self._friction
-            guess = np.concatenate([self._guess, self._last.take(rows), none])
-            impulses = solver.solve(response, free, friction, least, most, guess, turning)
+            none = (np.zeros(len(each)) for each in self._targets)
+            guess = np.concatenate([self._guess, self._last.take(rows), *none])
+            impulses = solver.solve(
+                response, free, self._friction, least, most, guess, self._turning
+            )
         else:
             impulses = solve(response, -free, least, most)
         return Solved(
             *(self._inverse, along, spread, response, free, self._friction),
-            *(least, most, impulses, rows, self._pace, turning),
+            *(least, most, impulses, rows, self._pace, self._turning),
         )
 
     def add_missed(self, velocities: Vector) -> bool:

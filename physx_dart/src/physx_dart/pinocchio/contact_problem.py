@@ -95,9 +95,8 @@ class ContactProblem:
                 rates[place : place + 2] = [max(rates[place : place + 2])] * 2
         self._rates = np.array(rates)
         # A step against the velocities, scaled per row.
-        self._unit, scaled = unit(len(free)), self.matrix / self._rates[:, None]
-        self._back, self._start = self._unit - scaled, free / self._rates
-        self._choices = np.concatenate([scaled, self._unit])
+        self._unit, self._scaled = unit(len(free)), self.matrix / self._rates[:, None]
+        self._back, self._start = self._unit - self._scaled, free / self._rates
         self._bounds = list(zip(least.tolist(), most.tolist(), strict=True))
         self.accuracy = _ACCURACY * max(1.0, max(speeds), -min(speeds))
 
@@ -114,7 +113,7 @@ class ContactProblem:
         """Return the best impulses within `most` steps from given ones, and their error."""
         best, least_error = impulses, math.inf
         for _ in range(most):
-            projected, chosen, turned = self._project(impulses)
+            projected, held, turned = self._project(impulses)
             change = projected - impulses
             error = self._error(change)
             if error < least_error:
@@ -123,7 +122,7 @@ class ContactProblem:
                     break
             elif not error < math.inf:
                 break
-            slope = self._slope(chosen, turned, self._choices, self._back)
+            slope = self._slope(held, turned, self._scaled, self._back)
             impulses = impulses + eigenpy.PartialPivLU(slope).solve(change)
         return best, least_error
 
@@ -135,11 +134,10 @@ class ContactProblem:
         Args:
             impulses: The solution.
         """
-        _, chosen, turned = self._project(impulses)
-        slope = self._slope(chosen, turned, self._choices, self._back)
+        _, held, turned = self._project(impulses)
+        slope = self._slope(held, turned, self._scaled, self._back)
         # The projection alone, as if impulses had no response.
-        alone = np.concatenate([np.zeros(slope.shape), self._unit])
-        rest = self._slope(chosen, turned, alone, self._unit)
+        rest = self._slope(held, turned, np.zeros(slope.shape), self._unit)
         found: Vector = eigenpy.PartialPivLU(slope).solve((rest - self._unit) / self._rates)
         return found
 
@@ -150,17 +148,17 @@ class ContactProblem:
     def _project(self, impulses: Vector) -> tuple[Vector, list[int], list[_Turned]]:
         """Return impulses (n,) after a step and a projection onto the cones and bounds.
 
-        Also return the arguments of `_slope`: for each row itself, or n rows further if the
-        projection made it constant, and where the projection turned rows.
+        Also return the rows that the projection made constant, and where it turned others.
         """
         values = (self._back.dot(impulses) - self._start).tolist()
-        n, place = len(values), 0
-        chosen, turned = list(range(n)), list[_Turned]()
+        place = 0
+        held: list[int] = []
+        turned: list[_Turned] = []
         for friction in self._coefficients:
             x, y, normal = values[place : place + 3]
             if normal <= 0:
                 values[place : place + 3] = 0.0, 0.0, 0.0
-                chosen[place : place + 3] = n + place, n + place + 1, n + place + 2
+                held += (place, place + 1, place + 2)
             elif (across := math.hypot(x, y)) > (bound := friction * normal):
                 share, x, y = bound / across, x / across, y / across
                 values[place], values[place + 1] = bound * x, bound * y
@@ -173,44 +171,45 @@ class ContactProblem:
         for least, most in self._bounds:
             if not least < values[place] < most:
                 values[place] = least if values[place] <= least else most
-                chosen[place] += n
+                held.append(place)
             place += 1
         for normal, across, about in self._turning:
-            turned += _limit_turning(values, chosen, place, normal, (across, about))
+            turned += _limit_turning(values, held, place, normal, (across, about))
             place += 3
-        return np.array(values), chosen, turned
+        return np.array(values), held, turned
 
     def _slope(
-        self, chosen: list[int], turned: Sequence[_Turned], choices: Vector, back: Vector
+        self, held: Sequence[int], turned: Sequence[_Turned], scaled: Vector, back: Vector
     ) -> Vector:
         """Return the derivative of impulses minus their projection, shape (n, n).
 
         Args:
-            chosen: Which of the choices its rows are.
-            turned: Where the projection turned rows, which are none of these.
-            choices: The derivative of the impulses minus those after the step, then that of the
-                impulses, shape (2 n, n).
-            back: The derivative of the impulses after the step, shape (n, n).
+            held: Rows that the projection made constant.
+            turned: Where it turned others.
+            scaled: The derivative of the impulses minus those after the step, shape (n, n).
+            back: The derivative of the impulses after the step, in the same form.
         """
-        slope: Vector = choices.take(chosen, 0)
+        slope, unit = scaled.copy(), self._unit
+        for row in held:
+            slope[row] = unit[row]
         for rows, sources, turn in turned:
-            slope[rows] = self._unit[rows] - np.array(turn).dot(back[sources])
+            slope[rows] = unit[rows] - np.array(turn).dot(back[sources])
         return slope
 
 
 def _limit_turning(
-    values: list[float], chosen: list[int], place: int, normal: int, bounds: Sequence[float]
+    values: list[float], held: list[int], place: int, normal: int, bounds: Sequence[float]
 ) -> list[_Turned]:
     """Project the angular impulses of a point, from a row on, given its normal's row.
 
-    Return where that turned them; where it made them constant, change `chosen`.
+    Return where that turned them; add those that it made constant to `held`.
     """
     across, about = (bound * values[normal] for bound in bounds)
     turned: list[_Turned] = []
     x, y, z = values[place : place + 3]
     if not across:
         values[place : place + 2] = 0.0, 0.0
-        chosen[place : place + 2] = chosen[place] + len(values), chosen[place + 1] + len(values)
+        held += (place, place + 1)
     elif (size := math.hypot(x, y)) > across:
         share, x, y = across / size, x / size, y / size
         values[place], values[place + 1] = across * x, across * y
@@ -225,7 +224,7 @@ def _limit_turning(
             slope = ((math.copysign(bounds[1], z),),)
             turned.append((slice(place + 2, place + 3), [normal], slope))
         else:
-            chosen[place + 2] += len(values)
+            held.append(place + 2)
     return turned
 
 

@@ -309,7 +309,7 @@ class ContactFinder:
                     self._friction.take(numbers),
                     self._restitution.take(numbers),
                     jacobian,
-                    self._drift(place, normals, rows, motions[3:] * v, period),
+                    self._drift(place, normals, rows, motions, v, period),
                     spins,
                 )
             )
@@ -335,7 +335,13 @@ class ContactFinder:
         return near
 
     def _drift(
-        self, static: int, axes: Vector, points: Indices, turns: Vector, period: float
+        self,
+        static: int,
+        axes: Vector,
+        points: Indices,
+        motions: Vector,
+        v: Vector,
+        period: float,
     ) -> Vector | None:
         """Return the velocities along the axes (k, 3, 3) that points stick to, shape (3 k,).
 
@@ -343,7 +349,8 @@ class ContactFinder:
             static: The surface, whose velocity it is.
             axes: Two tangents and the normal of each point.
             points: The points.
-            turns: What each velocity adds to the angular velocities, in rad/s, shape (3, nv).
+            motions: Twists for unit velocities, shape (6, nv).
+            v: Velocities without contacts, shape (nv,).
             period: Length of the step, in s.
         """
         if not len(self._rim_radii) and not self._drifts:
@@ -352,7 +359,7 @@ class ContactFinder:
         rims = self._rim_of.take(points)
         rolling = (rims >= 0).nonzero()[0]
         if len(rolling):
-            speeds = self._rolling(rims.take(rolling), turns, period)
+            speeds = self._rolling(rims.take(rolling), motions[3:] * v, period)
             found[rolling] += np.einsum("kij,kj->ki", axes.take(rolling, 0), speeds)
         found[:, 2] = 0.0
         return found.ravel()
@@ -428,7 +435,7 @@ class ContactFinder:
 
         Args:
             rims: The rims.
-            turns: As in `_drift`.
+            turns: What each velocity adds to angular velocities, in rad/s, shape (3, nv).
             period: Length of the step, in s.
 
         Returns:
