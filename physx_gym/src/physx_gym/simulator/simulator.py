@@ -34,6 +34,7 @@ from physx_sim import (
     Wrench,
     with_rotors,
 )
+from physx_sim.engines import RobotModel, read_robot
 from physx_sim.errors import SimulationError
 
 _CHANGES = {"changes", "gravity"}
@@ -51,6 +52,7 @@ class Engine:
         part: The controlled robot's part of the state.
         first: The state right after building, with the masses, friction and gravity of now.
         masses: Masses of the robots' links as built, by the names of bodies, once needed.
+        models: The controlled robot's model, once needed.
     """
 
     simulation: Simulation
@@ -58,6 +60,7 @@ class Engine:
     part: Part
     first: State
     masses: dict[str, float] = field(default_factory=dict)
+    models: list[RobotModel] = field(default_factory=list)
 
 
 class Simulator(SharedArrays, Closeable):
@@ -309,8 +312,8 @@ class Simulator(SharedArrays, Closeable):
     def neutral(self) -> Vector:
         """Return the robot's neutral positions, shape (nq,).
 
-        Joints are at 0, or in the middle of their limits if 0 is outside them; a floating base is
-        where the world puts it.
+        Joints are at 0, or in the middle of their limits if 0 is outside them, or the nearest
+        position that leaders and couplings allow; a floating base is where the world puts it.
         """
         engine = self._built()
         found: Vector = engine.first.positions[engine.part.positions].copy()
@@ -320,6 +323,10 @@ class Simulator(SharedArrays, Closeable):
         joint_positions.fill(0.0)
         outside = (lower > 0.0) | (upper < 0.0)
         joint_positions[outside] = 0.5 * (lower + upper)[outside] if outside.any() else 0.0
+        if not engine.models:
+            (robot,) = (each for each in self.world.robots if each.name == self._robot_name)
+            engine.models.append(read_robot(robot))
+        joint_positions[:] = engine.models[0].allowed(joint_positions)
         return found
 
     def place_on_ground(self, positions: Vector) -> Vector:
