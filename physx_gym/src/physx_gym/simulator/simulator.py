@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -123,8 +123,8 @@ class Simulator(SharedArrays, Closeable):
         self.world = self._built_world = world
         self.backend = backend
         self._robot_name = names[0] if robot is None else robot
-        self._given_motors = _check_list("motors", Motor, motors)
-        self._given_sensors = _check_list("sensors", Sensor, sensors)
+        self._given_motors = None if motors is None else checks.things("motors", motors, Motor)
+        self._given_sensors = None if sensors is None else checks.things("sensors", sensors, Sensor)
         self._motors: tuple[Motor, ...] = self._given_motors or ()
         self._sensors: tuple[Sensor, ...] = self._given_sensors or ()
         self.control_period = _positive_or_none("control_period", control_period)
@@ -629,21 +629,6 @@ def simulator_options(thing: Any) -> set[str]:
     takers: list[Any] = [Simulator, *(() if isinstance(thing, World) else (Simulator.build,))]
     known = {name for taker in takers for name in inspect.signature(taker).parameters}
     return known - {"world", "urdf", "options"}
-
-
-def _check_list(option: str, kind: type[Any], given: Any) -> tuple[Any, ...] | None:
-    """Return a list of motors or sensors as a tuple; None stays None."""
-    if given is None:
-        return None
-    name = kind.__name__
-    wanted = f"{option} must be a list of {name}s, as in [{name}(...)]"
-    if isinstance(given, (str, Mapping)) or not isinstance(given, Iterable):
-        raise ConfigError(f"{wanted}, not {given!r}.")
-    found = tuple(given)
-    for each in found:
-        if not isinstance(each, kind):
-            raise ConfigError(f"{wanted}; {each!r} is not a {name}.")
-    return found
 
 
 def _positive_or_none(option: str, value: float | None) -> float | None:
