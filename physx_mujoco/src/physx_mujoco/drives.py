@@ -6,6 +6,7 @@ A step is repeated with adjusted torques until it ends with the desired velociti
 from __future__ import annotations
 
 from collections.abc import Callable
+from typing import Any
 
 import mujoco
 import numpy as np
@@ -99,8 +100,9 @@ class Drives:
 
 def _solved(response: Vector, error: Vector) -> Vector:
     """Return the torques of joints that correct their velocities, the least if some cannot."""
+    found: Any
     try:
-        found: Vector = np.linalg.solve(response, error)
+        found = np.linalg.solve(response, error)
     except np.linalg.LinAlgError:  # something holds joints, whatever their torques are
         found = np.linalg.lstsq(response, error, rcond=None)[0]
-    return found
+    return np.asarray(found, np.float64)

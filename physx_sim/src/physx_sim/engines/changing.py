@@ -162,8 +162,8 @@ class ChangeableSimulation(ReadableSimulation[Engine]):
         """
         self._check_has("attachments")
         self._check_attachment(attachment)
-        velocities = self._scenery.velocities.any(axis=1)
-        moving = [n for n, moves in zip(self.layout.statics, velocities, strict=True) if moves]
+        velocities = self._scenery.velocities
+        moving = [n for n, v in zip(self.layout.statics, velocities, strict=True) if v.any()]
         for name in (attachment.body_a, attachment.body_b):
             if self._changes.of(name).hidden:
                 raise SimulationError(f'"{name}" is hidden, so nothing can be attached to it.')
