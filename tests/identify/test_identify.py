@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import re
 
@@ -379,22 +380,31 @@ def test_a_robot_gets_the_values(found):
     robot = found.applied_to(arm.KNOWN)
     assert robot.mass_factors["lower"] == pytest.approx(found["mass lower"].value)
     assert robot.joints["elbow"].damping == found["damping elbow"].value
+    again = found.applied_to(robot)
+    assert again.mass_factors == pytest.approx(robot.mass_factors)
 
 
 def test_episodes_draw_from_the_posterior(found, tmp_path):
     write_identification(tmp_path / "arm.toml", found)
-    env = RobotEnv("double_pendulum", 0.01, period=0.005)
+    heavy = Robot("double_pendulum", mass_factors={"lower": 3.0})
+    env = RobotEnv(World([heavy], period=0.005), 0.01)
     env = RandomizedEnv(env, randomizations=Identified(tmp_path / "arm.toml"))
     drawn = []
     for seed in range(3):
         env.reset(seed=seed)
         drawn.append(env.drawn["Identified"])
         robot = env.simulator.world.robots[0]
-        assert robot.mass_factors["lower"] == drawn[-1]["mass lower"]
+        assert robot.mass_factors["lower"] == pytest.approx(drawn[-1]["mass lower"])  # 1 kg
         assert robot.joints["elbow"].friction == drawn[-1]["friction elbow"]
     assert len({each["mass lower"] for each in drawn}) == 3
     env.reset(seed=0)
     assert env.drawn["Identified"] == drawn[0]
+
+
+@pytest.mark.parametrize("draws", [[], [[1.0]]])
+def test_an_identification_without_draws_is_named(found, draws):
+    with pytest.raises(IdentificationError, match="no draws of its 6 parameters"):
+        Identified(dataclasses.replace(found, draws=draws))
 
 
 @pytest.mark.parametrize("where", ["in the file", "in the call", "in code"])

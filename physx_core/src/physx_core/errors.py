@@ -108,7 +108,7 @@ class UnknownOptionError(ConfigError):
     """
 
     def __init__(self, owner: str, unknown: Iterable[str], known: Iterable[str]) -> None:
-        self.owner, self.unknown, self.known = owner, sorted(unknown), sorted(known)
+        self.owner, self.unknown, self.known = owner, sorted(map(str, unknown)), sorted(known)
         name = self.unknown[0]
         super().__init__(
             f'{owner} has no option "{name}".{nearest(name, self.known)} '
@@ -132,7 +132,7 @@ class UnknownArgumentError(UnknownOptionError, TypeError):
             unknown: Names of the unknown arguments.
             known: Names of the arguments that the class accepts.
         """
-        self.owner, self.unknown, self.known = owner, sorted(unknown), sorted(known)
+        self.owner, self.unknown, self.known = owner, sorted(map(str, unknown)), sorted(known)
         message = owner
         if self.unknown:
             name = self.unknown[0]

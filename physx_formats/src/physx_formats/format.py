@@ -16,7 +16,10 @@ KIND = "format"
 Columns: TypeAlias = dict[str, Column]
 
 LOSSES = {
-    "types": "keeps no types: numbers are int64, float64 or bool again, with the same values",
+    "types": (
+        "keeps no types: numbers are int64, float64 or bool again, with the same values, and so is "
+        "text that looks like them"
+    ),
     "notes": "keeps no roles and axes of fields, nor which are the same quantity",
     "colors": "keeps pictures that are observations as videos, whose colors are only close",
     "records": "keeps no records of episodes, with their parameters",

@@ -23,7 +23,7 @@ from physx_core.pipelines.run_description import (
     describe_environment_config,
     describe_samples,
 )
-from physx_core.pipelines.saved_parameters import forget_parameters
+from physx_core.pipelines.saved_parameters import forget_parameters, remove_unused_parameters
 from physx_core.pipelines.storage import (
     GENERATION,
     STREAMS,
@@ -340,6 +340,8 @@ class DataGeneration(NewSessionPipeline):
             skip = self._streams.skip
             if former is not None and skip.rows >= (total or 0):
                 return
+        elif campaign is None:
+            remove_unused_parameters(self.dataset)
         known = self._streams
         self.source = self._open_source(
             *(resources, config, seed),

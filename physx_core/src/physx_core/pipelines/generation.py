@@ -16,6 +16,7 @@ from physx_core.errors import ConfigError
 from physx_core.pipelines.saved_parameters import (
     accept_parameters,
     keep_parameters,
+    remove_unused_parameters,
     restore_parameters,
 )
 from physx_core.pipelines.storage import EPISODE_OPTIONS, GENERATIONS, end_generation
@@ -99,6 +100,7 @@ class Generation:
 
         What earlier streams saved that have no rows does not count.
         """
+        remove_unused_parameters(dataset)
         for entry in GENERATIONS:
             last = self.find(dataset.info, entry)
             if last is None or last.ended is not None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from physx_core import files
+from physx_core.dataset import Dataset
 
 PARAMETERS = "parameters_{}.bin"
 """Name of the file in a dataset's folder that contains an instance's saved parameters."""
@@ -36,6 +37,15 @@ def _copy(directory: Path, to: Path, which: str, of: str = "", become: str = "")
         for name in names:
             content = files.read_content(directory / f"{name}{of}", LARGEST_PARAMETERS)
             files.replace(to / f"{name}{become}", content)
+
+
+def remove_unused_parameters(dataset: Dataset) -> None:
+    """Remove what instances saved of a dataset that has no samples, as nothing goes on with it."""
+    if any(dataset.num_samples(mode) for mode in dataset.modes):
+        return
+    with files.storing(f"{dataset.directory}"):
+        for path in dataset.directory.glob(_ALL):
+            files.remove(path)
 
 
 def keep_parameters(directory: Path, streams: str) -> None:

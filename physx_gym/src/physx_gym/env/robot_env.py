@@ -253,8 +253,9 @@ class RobotEnv(PipelineEnv):
     def _neutral(self) -> Vector:
         """Return the neutral positions of the robot, shape (nq,).
 
-        By default, each joint is at 0, or in the middle of its limits if 0 is outside them, and a
-        floating base is where the world puts it. Called by `_sample_state`.
+        By default, each joint is at 0, or in the middle of its limits if 0 is outside them, or the
+        nearest position that leaders and couplings allow, and a floating base is where the world
+        puts it. Called by `_sample_state`.
         """
         return self.simulator.neutral()
 

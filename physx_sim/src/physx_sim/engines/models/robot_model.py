@@ -86,16 +86,27 @@ class RobotModel:
 
     @functools.cached_property
     def start(self) -> Vector:
-        """Positions of the joints at the start, shape (joints,).
+        """Positions of the joints at the start, shape (joints,): 0 or the nearest limit.
 
-        They are 0 or the nearest limit; with couplings, the nearest that these and limits allow.
+        Joints that follow others or are coupled are where these let them be.
         """
-        lower, upper = np.array([(j.lower, j.upper) for j in self.joints]).reshape(-1, 2).T
-        found = np.clip(np.zeros(len(lower)), lower, upper)
+        return self.allowed(np.array([max(j.lower, min(0.0, j.upper)) for j in self.joints]))
+
+    def allowed(self, positions: Vector) -> Vector:
+        """Return positions of joints, shape (joints,), where couplings and leaders let them be.
+
+        Followers are moved to where their leaders are; if there are couplings, all joints to the
+        nearest positions within their limits.
+
+        Args:
+            positions: Within the joints' limits, shape (joints,), in rad or m.
+        """
+        found = np.array(positions, np.float64)
         for follower, leader, mimic in self.followers:
             found[follower] = mimic.multiplier * found[leader] + mimic.offset
         if not self.couplings:
             return found
+        lower, upper = np.array([(joint.lower, joint.upper) for joint in self.joints]).T
         rows, sums = self.coupling_rows
         inverse, beyond = np.linalg.pinv(rows), np.zeros(len(found))
         for _ in range(_MOST):  # Dykstra's projections, one after the other
