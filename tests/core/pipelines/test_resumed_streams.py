@@ -246,6 +246,8 @@ def test_streams_without_states_repeat_their_rows_and_say_so(run, made, capfd):
     assert "42 samples are stored, and simulated again first; with state_every" in (
         capfd.readouterr().err
     )
+    run.generation("stopped", environment, resume=True, quiet=False).execute()
+    assert ", 0 samples/s" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("where", [LOCAL, CLIENTS])

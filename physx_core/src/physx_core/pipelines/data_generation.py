@@ -132,14 +132,16 @@ class DataGeneration(NewSessionPipeline):
             before = self.dataset.num_samples(self._mode)
             self.observers.begin("generation", *self._amount())
             self.data_generation_begin()
-            if self.episodes is None:
-                self._generate_batches()
-            else:
-                self._simulate_episodes()
-            if self._writer is not None and self.prove_independence:
-                self._writer.prove_independence()
-            self.data_generation_end()
-            self._rows = self.dataset.num_samples(self._mode) - before
+            try:
+                if self.episodes is None:
+                    self._generate_batches()
+                else:
+                    self._simulate_episodes()
+                if self._writer is not None and self.prove_independence:
+                    self._writer.prove_independence()
+                self.data_generation_end()
+            finally:
+                self._rows = self.dataset.num_samples(self._mode) - before
         return self.result
 
     def _amount(self) -> tuple[int, str]:
@@ -447,7 +449,7 @@ class DataGeneration(NewSessionPipeline):
             yield describe_samples(self.dataset.directory)
             return
         count = self.batch_id
-        rate = count * (self.batch_size or 0) / duration
+        rate = max(self._rows, 0) / duration
         yield f"{count} of {self.batch_nb} batches in {duration:.2f} s, {rate:.0f} samples/s"
         yield describe_samples(self.dataset.directory)
         if self._writer is not None and self._writer.failed:

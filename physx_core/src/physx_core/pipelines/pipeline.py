@@ -378,8 +378,10 @@ class Pipeline(ABC):
         """Say that a run repeats rows of an earlier one, if it does not go on from states."""
         repeated = skip.repeated(config.num_clients)
         if repeated and not skip.pasts:
-            hint = "" if config.state_every else "; with state_every it would go on from states"
-            self._say(f"{repeated:,} samples are stored, and simulated again first{hint}")
+            said = f"{repeated:,} samples are stored, and simulated again first"
+            if not config.state_every:
+                said += "; with state_every (--environment.state-every) it would go on from states"
+            self._say(said)
 
     def _record_config(self, seed: int, **others: object) -> None:
         """Write the options, some of them changed, and the actual seed to the session."""

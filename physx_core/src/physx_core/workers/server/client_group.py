@@ -36,6 +36,7 @@ from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.server import Server
 from physx_core.workers.server.stream_pool import StreamPool
 from physx_core.workers.server.written_rows import WrittenRows
+from physx_core.workers.warned import repeat_warnings
 
 _ALL = ("", "0.0.0.0", "::")  # all addresses of this machine
 _TICK = 0.1
@@ -220,6 +221,7 @@ class ClientGroup:
         finally:
             try:
                 stop(self._handles.values(), patience)
+                repeat_warnings(self._handles.values())
             finally:
                 self._handles = {}
                 self.server.close()
