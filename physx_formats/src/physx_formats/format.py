@@ -16,6 +16,7 @@ KIND = "format"
 Columns: TypeAlias = dict[str, Column]
 
 LOSSES = {
+    "units": "keeps no units",
     "types": "keeps no types: numbers are int64, float64 or bool again, with the same values",
     "notes": "keeps no roles and axes of fields, nor which are the same quantity",
     "colors": "keeps pictures that are observations as videos, whose colors are only close",
@@ -46,7 +47,8 @@ class Format:
         recognizes: Returns whether a path is a file or folder of this format, from its first 8
             bytes; those of a folder are empty. File names do not matter.
         open: Opens a file that holds at most this number of bytes, and yields its arrays by name,
-            and the notes in it. None: nothing can be imported from it.
+            and the notes in it; raises ExchangeError for a damaged file. None: nothing can be
+            imported from it.
     """
 
     write: Callable[[Sequence[Table], Path, ExportOptions], int] | None = None
