@@ -96,6 +96,13 @@ def test_a_file_that_several_formats_recognize_needs_the_name_of_one(add, stored
         import_file(file, copy, form="minari")
 
 
+def test_a_broken_format_breaks_no_other(add, stored, tmp_path):
+    add("broken", '{"gone": "nowhere:GONE"}')
+    export(stored, "npz", tmp_path / "file")
+    with pytest.warns(UserWarning, match="The format broken/gone is left out"):
+        assert import_file(tmp_path / "file", tmp_path / "copy") == {"training": 3}
+
+
 @pytest.mark.processes
 def test_the_kit_finds_nothing_in_a_right_format(add):
     add("right", '{"own": OWN}')

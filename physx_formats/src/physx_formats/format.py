@@ -75,5 +75,8 @@ def find_format(name: str) -> Format:
 
 
 def all_formats() -> dict[str, Format]:
-    """Return the formats of all plugins by name."""
-    return {name: find_format(places[0]) for name, places in plugins.references_of(KIND).items()}
+    """Return the formats of all plugins by name; broken ones are left out."""
+    found: dict[str, Format] = {}
+    for reference, each in plugins.resolve_all(KIND).items():
+        found.setdefault(reference.partition("/")[2], each)
+    return found
