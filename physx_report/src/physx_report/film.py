@@ -74,8 +74,9 @@ class Camera(Closeable):
         self.show([Event("remove", kind, (name,), {}) for name, kind in known.items()])
 
     def close(self) -> None:
-        """Close the visualizer."""
-        self._viewer.close()
+        """Close the visualizer; if it has failed, the page says why."""
+        with warnings.catch_warnings(action="ignore"):
+            self._viewer.close()
 
 
 @dataclass(frozen=True)
@@ -135,8 +136,7 @@ class Film:
 
 
 def _visualizers() -> Iterator[type[Visualizer]]:
-    known = plugins.references_of("visualizer")
-    found = (plugins.resolve("visualizer", each) for some in known.values() for each in some)
+    found = plugins.resolve_all("visualizer").values()
     yield from (each for each in found if isinstance(each, type) and issubclass(each, Visualizer))
 
 

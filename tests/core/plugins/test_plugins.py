@@ -167,6 +167,15 @@ def test_components_that_end_the_process_break_only_themselves(tmp_path, monkeyp
         plugins.resolve("environment", "lazy/spring")
 
 
+def test_a_broken_component_is_left_out_where_all_of_a_kind_are_used(tmp_path, monkeypatch):
+    code = GOOD.replace("Spring}", '"nowhere:Spring", "good": Spring}')
+    add_plugin(tmp_path, "partly", code)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.warns(UserWarning, match="The environment partly/spring is left out. Plugin"):
+        found = plugins.resolve_all("environment")
+    assert "partly/good" in found and "toy/spring" in found and "partly/spring" not in found
+
+
 HANG = "import time\ntime.sleep(600)\n"
 STUBBORN = HANG.replace("time.sleep(600)", "try: time.sleep(600)\nexcept BaseException: pass")
 

@@ -20,6 +20,7 @@ from .references import import_module as import_module
 from .references import reference_of as reference_of
 from .references import references_of as references_of
 from .references import resolve as resolve
+from .references import resolve_all as resolve_all
 from .registry import Plugin as Plugin
 from .registry import PluginInfo as PluginInfo
 from .registry import available as available

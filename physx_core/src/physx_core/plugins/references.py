@@ -13,6 +13,7 @@ import hashlib
 import importlib
 import importlib.util
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
@@ -22,6 +23,7 @@ from physx_core.config import SCRIPT_PREFIX
 from physx_core.config import reference_of as reference_of
 from physx_core.errors import (
     ComponentNotFoundError,
+    MissingLibraryError,
     PhysxError,
     PluginError,
     PluginNotFoundError,
@@ -106,6 +108,23 @@ def references_of(kind: str) -> dict[str, list[str]]:
         with contextlib.suppress(PluginError):
             for name in load(plugin).components.get(kind, ()):
                 found.setdefault(name, []).append(f"{plugin}/{name}")
+    return found
+
+
+def resolve_all(kind: str) -> dict[str, Any]:
+    """Return all components of a kind by reference; a broken one is left out, with a warning.
+
+    Args:
+        kind: See `resolve`.
+    """
+    found = {}
+    for reference in sorted(each for places in references_of(kind).values() for each in places):
+        try:
+            found[reference] = resolve(kind, reference)
+        except MissingLibraryError:  # it would say so if it were asked for
+            continue
+        except PhysxError as error:
+            warnings.warn(f"The {kind} {reference} is left out. {error}", stacklevel=2)
     return found
 
 

@@ -112,7 +112,7 @@ def _load(entry: EntryPoint) -> Plugin:
         manager.add_hookspecs(hookspecs_of(hook))
     hooks = {kind: hook_of(kind) for kind in CORE_KINDS} | {kind_of(hook): hook for hook in added}
     manager.register(module, entry.name)
-    components: dict[str, dict[str, Any]] = {}
+    components: dict[str, Components] = {}
     for kind, hook in hooks.items():
         with loading(entry.name, who, f"fails in {hook}()"):
             returned = getattr(manager.hook, hook)()

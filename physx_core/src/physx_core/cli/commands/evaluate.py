@@ -69,6 +69,5 @@ def _other(session: Path) -> Evaluation | None:
         CheckpointError: If there is no network, or it is damaged.
     """
     fields = list(checkpoint.find(session, None, _LAST).fields)
-    known = plugins.references_of("evaluation")
-    found = (plugins.resolve("evaluation", each) for places in known.values() for each in places)
+    found = plugins.resolve_all("evaluation").values()
     return next((each for each in found if each.applies(fields)), None)
