@@ -1,4 +1,4 @@
-"""Logs of a pendulum that swings about its rest, pushed by a torque that does not look at it."""
+"""Logs of a pendulum, pushed near its own frequency by a torque that does not look at it."""
 
 import numpy as np
 from logged_arm import PERIOD

@@ -13,12 +13,11 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.interpolate import CubicSpline
 from scipy.linalg import qr, solve_triangular
 
 from physx_core.typing import Array, Vector
 from physx_identify.errors import IdentificationError
-from physx_identify.estimation.base import COORDINATES, Base
+from physx_identify.estimation.equations import Data, Equation, Equations
 from physx_identify.estimation.model import Model, Path
 from physx_identify.estimation.noise import ORDERS, LikelyNoise, Noise, Whitener
 from physx_identify.estimation.smooth import Smoother
@@ -36,50 +35,12 @@ _AROUND = 2
 """Steps of the other parameters around a value that one is given."""
 _CLOSE = 0.1
 """Change of a value between two steps, in standard errors, that ends them."""
-_LOWEST = 0.2
-"""Share of a nominal value below which the path is not corrected with a value."""
 _EDGE = 4
 """Samples left out at both ends, where the smoothed path is uncertain."""
 _SEPARABLE = 1e-6
 """Relative length of what is left of a column without the others, below which it is one of them."""
-_NEAR = 0.01
-"""Share of the encoders' errors in differences that derivatives are made of."""
-_FAINT = 1e-9
-"""Least noise of positions that counts."""
-SLOWEST, _UNSURE = 0.02, 2.0
-"""Velocity below which dry friction is unknown: in rad/s or m/s, and in standard errors."""
-
-
-@dataclass(frozen=True)
-class Data:
-    """Measured motion and torques.
-
-    Attributes:
-        positions: Shape (samples, joints), in rad or m.
-        torques: Shape (samples, joints), in N m or N.
-        period: In s.
-        instant: As in `Path`.
-        slowest: Velocity below which dry friction is unknown, in rad/s or m/s.
-        base: Measured orientations of a floating base, whose coordinates come first.
-        flight: Whether nothing but gravity acts on a floating base, so that its forces are known.
-    """
-
-    positions: Vector
-    torques: Vector
-    period: float
-    instant: bool = False
-    slowest: float = SLOWEST
-    base: Base | None = None
-    flight: bool = False
-
-    @property
-    def rows(self) -> slice:
-        """Which coordinates have known torques."""
-        return slice(0 if self.flight or self.base is None else len(COORDINATES), None)
-
-    def path(self, positions: Vector) -> Path:
-        """Return a motion at its times."""
-        return Path(positions, self.period, self.instant, self.base)
+_UNSURE = 2.0
+"""Velocity below which dry friction is unknown, in standard errors."""
 
 
 @dataclass(frozen=True)
@@ -135,48 +96,6 @@ class Fit:
     likely: LikelyNoise | None = None
 
 
-def fit(
-    model: Model,
-    parameters: Sequence[Parameter],
-    data: Data,
-    start: Vector | None = None,
-    noise: Noise | None = None,
-) -> Fit:
-    """Fit parameters.
-
-    Args:
-        model: The robot.
-        parameters: What is unknown.
-        data: The log.
-        start: Values to start at; None: those of least squares along the smoothed path.
-        noise: Noise of the log to start with; None: found from the first residual.
-    """
-    return Problem(model, parameters, data).solve(start, noise)
-
-
-@dataclass(frozen=True)
-class _Equation:
-    """Torques that are linear in parameters: target = columns @ values + residual.
-
-    Attributes:
-        instruments: Columns along a path that the noise does not reach, shape (samples, joints,
-            parameters).
-        columns: Columns of what was measured, of the same shape.
-        target: Shape (samples, joints).
-        stencil: As in `Model.stencil`, along the same path as the instruments, by positions in
-            deviations of the encoders, shape (3, samples, joints, positions).
-        torques: Of the model along that path, of the same shape as the target.
-        doubt: By what dry friction differs if it is applied another way, shape (samples, joints).
-    """
-
-    instruments: Vector
-    columns: Vector
-    target: Vector
-    stencil: Vector
-    torques: Vector
-    doubt: Vector
-
-
 class Problem:
     """Parameters of a robot in a log.
 
@@ -187,159 +106,34 @@ class Problem:
     """
 
     def __init__(self, model: Model, parameters: Sequence[Parameter], data: Data) -> None:
-        self._model, self._parameters, self._data = model, parameters, data
-        self._nominal = np.array([each.nominal for each in parameters])
-        self._directions = np.stack([model.direction(each) for each in parameters], axis=1)
-        self._known = model.numbers - self._directions @ self._nominal
-        self._lowest = np.array([
-            -np.inf if each.lowest is None else _LOWEST * each.nominal for each in parameters
-        ])  # fmt: skip
-        self._special = [
-            (place, each) for place, each in enumerate(parameters)
-            if each.kind in ("gain", "bias", "encoder", "delay")
-        ]  # fmt: skip
-        self._plain = [each.kind not in ("gain", "delay", "encoder") for each in parameters]
-        self._rows, self._scale = data.rows, _noises(data)
-        delayed = any(each.kind == "delay" for _, each in self._special)
-        self._smooth = Smoother(data.torques) if delayed else None
-        joints = model.coordinates
-        dry = np.zeros(len(joints), bool)
-        rubbing = model.numbers[11 * len(joints) : 13 * len(joints)].reshape(2, -1)
-        dry |= rubbing.any(axis=0)
-        for each in parameters:
-            if each.kind in ("friction", "stribeck"):
-                dry[joints.index(each.of)] = True
-        self._dry = dry
+        self.parameters = parameters
+        self._equations = Equations(model, parameters, data)
 
-    def _positions(self, values: Vector) -> Vector:
-        """Return measured positions without the encoders' offsets."""
-        found = self._data.positions
-        for place, each in self._special:
-            if each.kind == "encoder":
-                offset = values[place] * (np.array(self._model.coordinates) == each.of)
-                found = found - offset
-        return found
-
-    def _late(self, values: Vector) -> float:
-        """Return by how many samples the torques are late."""
-        delays = (values[place] for place, each in self._special if each.kind == "delay")
-        return float(sum(delays)) / self._data.period
-
-    def _torques(self, values: Vector, whole: int) -> Vector:
-        """Return measured torques at the times of the positions, shape (samples - 2, joints).
-
-        They are moved by whole samples, or their noise would be smoothed, too; without it, what is
-        left of the delay moves them.
-        """
-        torques = self._data.torques
-        time = np.arange(len(torques))
-        rows = np.clip(time[1:-1] + whole, 0, time[-1])
-        rest = self._late(values) - whole
-        if not rest or self._smooth is None:
-            return torques[rows]
-        smooth = self._smooth(torques)
-        late: Vector = torques[rows] + CubicSpline(time, smooth)(rows + rest) - smooth[rows]
-        return late
-
-    def _slopes(self, torques: Vector) -> Vector:
-        """Return how torques change with a delay, without noise, shape (samples - 2, joints)."""
-        assert self._smooth is not None
-        found = np.gradient(self._smooth(np.pad(torques, ((1, 1), (0, 0)), mode="edge")), axis=0)
-        slopes: Vector = -found[1:-1] / self._data.period
-        return slopes
-
-    def _equation(self, path: Path, raw: Path, values: Vector, whole: int) -> _Equation:
-        """Return what is linear in the parameters, near values of them.
+    def solve(self, start: Vector | None = None, noise: Noise | None = None) -> Fit:
+        """Repeat: noise of the residual, values, path.
 
         Args:
-            path: That of the instruments.
-            raw: As measured.
-            values: Values of the parameters.
-            whole: Whole samples of the delay.
+            start: Values to start at; None: those of least squares along the smoothed path.
+            noise: Noise of the log; None: that of the residual.
         """
-        numbers = self._known + self._directions @ np.maximum(values, self._lowest)
-        stencil = self._model.stencil(path, numbers)
-        dry, doubt = None, np.zeros(path.own.shape)
-        if self._dry.any() and not path.instant:  # halfway between the two ways of engines
-            dry = 0.5 * (self._model.dry(path, stencil, numbers) + np.eye(path.own.shape[1]))
-            rubbing = self._model.friction(path, numbers)
-            doubt = np.einsum("kij,kj->ki", dry, rubbing) - rubbing
-        torques = self._torques(values, whole)
-        along, change = self._columns(path, raw, dry)
-        instruments, known = self._split(along, stencil, torques)
-        own = known + instruments[..., self._plain] @ values[self._plain]
-        instruments = self._endogenous(instruments, own)
-        columns, known = self._split(along + change, stencil, torques)
-        target = torques - known
-        for place, each in self._special:
-            if each.kind == "gain":
-                target = target + columns[..., place]
-            elif each.kind in ("delay", "encoder"):
-                if each.kind == "encoder":
-                    columns[..., place] = instruments[..., place]
-                target = target + columns[..., place] * values[place]
-        rows = self._rows
-        return _Equation(
-            instruments[:, rows],
-            columns[:, rows],
-            target[:, rows],
-            self._scale * stencil[:, :, rows],
-            own[:, rows],
-            doubt[:, rows],
-        )
-
-    def _columns(self, path: Path, raw: Path, dry: Vector | None) -> tuple[Vector, Vector]:
-        """Return columns along a path, with what is known beside them as the last one.
-
-        Returns:
-            Shape (samples, joints, parameters + 1); and to first order what they differ by along a
-            motion near the path.
-        """
-        given = np.column_stack([self._directions, self._known])
-        difference = _NEAR * (raw.positions - path.positions)
-        along, ahead, behind = (
-            self._model.columns(each, given, path.ends, dry)
-            for each in (
-                path,
-                dataclasses.replace(path, positions=path.positions + difference),
-                dataclasses.replace(path, positions=path.positions - difference),
-            )
-        )
-        return along, (ahead - behind) / (2 * _NEAR)
-
-    def _split(self, columns: Vector, stencil: Vector, torques: Vector) -> tuple[Vector, Vector]:
-        """Return the parameters' columns, those of logged quantities too; and what is known."""
-        found, known = columns[..., :-1].copy(), columns[..., -1]
-        for place, each in self._special:
-            if each.kind == "delay":
-                found[..., place] = self._slopes(torques)
-                continue
-            joint = self._model.coordinates.index(each.of)
-            if each.kind == "encoder":
-                found[..., place] = -stencil.sum(axis=0)[:, :, joint]
-            else:
-                found[:, joint, place] = -torques[:, joint] if each.kind == "gain" else 1.0
-        return found, known
-
-    def solve(self, start: Vector | None, noise: Noise | None) -> Fit:
-        """Repeat: noise of the residual, values, path."""
-        values = self._nominal if start is None else start
-        smoother, fixed = Smoother(self._positions(values)), noise is not None
+        equations = self._equations
+        values = equations.nominal if start is None else start
+        smoother, fixed = equations.smoother, noise is not None
         corrections: Vector | float = 0.0
         whole, settled = 0, False
-        slow = np.full(len(self._model.coordinates), self._data.slowest)
+        slow = np.full(len(equations.model.coordinates), equations.data.slowest)
         found: Fit | None = None
         likely: LikelyNoise | None = None
         for step in range(1, _STEPS + 1):
-            measured = self._positions(values)
-            raw = self._data.path(measured)
+            measured = equations.positions(values)
+            raw = equations.data.path(measured)
             moving = step <= _PATH_STEPS or (not settled and step <= _LONGEST)
             if moving:  # then it stays, or the sign of slow motions may never settle
                 path = dataclasses.replace(raw, positions=smoother(measured + corrections))
-                used = ~(self._dry & _unsure(path.ends, slow))[:, self._rows]
-                whole = round(self._late(values))
+                used = ~(equations.dry & _unsure(path.ends, slow))[:, equations.data.rows]
+                whole = round(equations.late(values))
                 used[: max(_EDGE, -whole)] = used[-max(_EDGE, whole) :] = False
-            equation = self._equation(path, raw, values, whole)
+            equation = equations.at(path, raw, values, whole)
             if start is None and step == 1:
                 values = self._first(path, smoother, used)
             whitener = Whitener(equation.stencil, used)
@@ -361,13 +155,13 @@ class Problem:
             if not moving and (moved < _CLOSE).all():
                 found = dataclasses.replace(found, converged=True)
                 break
-            corrections = self._scale * whitener.corrections(found.residual, noise)
-            if self._dry.any() and moving:
+            corrections = equations.scale * whitener.corrections(found.residual, noise)
+            if equations.dry.any() and moving:
                 errors, left = whitener.draw(noise)
-                errors = self._scale * (errors + whitener.corrections(left, noise))
+                errors = equations.scale * (errors + whitener.corrections(left, noise))
                 unsure = np.diff(smoother(errors), axis=0)
                 slow = np.maximum(
-                    self._data.slowest, _UNSURE * unsure.std(axis=0) / self._data.period
+                    equations.data.slowest, _UNSURE * unsure.std(axis=0) / equations.data.period
                 )
         assert found is not None
         if likely is None:
@@ -393,17 +187,17 @@ class Problem:
             place: Place of the parameter, an independent one.
             value: Its value.
         """
-        others = found.independent != place
+        equations, others = self._equations, found.independent != place
         row, free = int(np.argmin(others)), found.independent[others]
-        values, prior = found.values.copy(), self._priors()
+        values, prior = found.values.copy(), equations.priors()
         near = found.covariance[:, row] / found.covariance[row, row]
         values[found.independent] += near * (value - found.values[place])
-        moved = self._positions(values) - self._positions(found.values)
+        moved = equations.positions(values) - equations.positions(found.values)
         path = dataclasses.replace(found.path, positions=found.path.positions + moved)
-        raw = dataclasses.replace(path, positions=self._positions(values))
-        whole = round(self._late(found.values))
+        raw = dataclasses.replace(path, positions=equations.positions(values))
+        whole = round(equations.late(found.values))
         for _ in range(_AROUND):
-            equation = self._equation(path, raw, values, whole)
+            equation = equations.at(path, raw, values, whole)
             whitener = Whitener(equation.stencil, found.used)
             z, a, y = _whitened(whitener, equation, found.noise, *prior)
             basis = np.linalg.qr(z[:, found.independent])[0]
@@ -415,58 +209,39 @@ class Problem:
 
     def _known_of(self, fitted: Array, values: Vector) -> Vector:
         """Return what is known beforehand as rows: of the fitted values, and what is left."""
-        prior, mean = self._priors()
+        prior, mean = self._equations.priors()
         return np.column_stack([prior[:, fitted], mean - prior @ values])
-
-    def _endogenous(self, columns: Vector, own: Vector) -> Vector:
-        """Return columns whose torques are the model's own instead of measured ones."""
-        found = columns.copy()
-        for place, each in self._special:
-            if each.kind == "delay":
-                found[..., place] = self._slopes(own)
-            elif each.kind == "gain":
-                joint = self._model.coordinates.index(each.of)
-                found[:, joint, place] = -own[:, joint]
-        return found
 
     def _first(self, path: Path, smoother: Smoother, used: Array) -> Vector:
         """Return the values of least squares along a smoothed path, for torques smoothed alike."""
-        smooth = dataclasses.replace(self._data, torques=smoother(self._data.torques))
-        equation = Problem(self._model, self._parameters, smooth)._equation(
-            path, path, self._nominal, 0
-        )
+        equations = self._equations
+        smooth = dataclasses.replace(equations.data, torques=smoother(equations.data.torques))
+        smoothed = Equations(equations.model, equations.parameters, smooth)
+        equation = smoothed.at(path, path, equations.nominal, 0)
         target, flat = equation.target, equation.columns[used]
         weights = 1 / np.sqrt(np.mean(np.where(used, target, 0.0) ** 2, axis=0) + 1e-12)
         weights = np.broadcast_to(weights, used.shape)[used]
         rows, goal = flat * weights[:, None], target[used] * weights
-        prior, mean = self._priors()
+        prior, mean = equations.priors()
         rows, goal = np.concatenate([rows, prior]), np.concatenate([goal, mean])
         scale = np.linalg.norm(rows, axis=0)
         scale[scale == 0] = 1.0
-        change = np.linalg.lstsq(rows / scale, goal - rows @ self._nominal, rcond=1e-6)[0]
-        found: Vector = self._nominal + change / scale
+        change = np.linalg.lstsq(rows / scale, goal - rows @ equations.nominal, rcond=1e-6)[0]
+        found: Vector = equations.nominal + change / scale
         return found
-
-    def _priors(self) -> tuple[Vector, Vector]:
-        given = [(n, each) for n, each in enumerate(self._parameters) if each.deviation is not None]
-        rows, mean = np.zeros((len(given), len(self._parameters))), np.zeros(len(given))
-        for row, (place, each) in enumerate(given):
-            assert each.deviation is not None
-            rows[row, place], mean[row] = 1 / each.deviation, each.mean / each.deviation
-        return rows, mean
 
     def _step(
         self,
         whitener: Whitener,
-        equation: _Equation,
+        equation: Equation,
         before: Vector,
         noise: Noise,
         step: int,
         path: Path,
         used: Array,
     ) -> Fit:
-        target, columns = equation.target, equation.columns
-        z, a, y = _whitened(whitener, equation, noise, *self._priors())
+        equations, target, columns = self._equations, equation.target, equation.columns
+        z, a, y = _whitened(whitener, equation, noise, *equations.priors())
         scale = np.linalg.norm(z, axis=0)
         scale[scale == 0] = 1.0
         _, triangle, order = qr(z / scale, mode="economic", pivoting=True)
@@ -479,7 +254,7 @@ class Problem:
         free, held = order[:rank], order[rank:]
         mixing = solve_triangular(triangle[:rank, :rank], triangle[:rank, rank:])
         mixing *= scale[held] / scale[free][:, None]
-        values = self._nominal.copy()
+        values = equations.nominal.copy()
         values[free] = before[free] + mixing @ (before[held] - values[held])
         # As in Fisher's scoring: unlike z.T @ a, this is positive definite whatever the noise.
         square = z[:, free].T @ z[:, free]
@@ -487,7 +262,7 @@ class Problem:
         inner = np.linalg.inv(z[:, free].T @ a[:, free])
         covariance = inner @ square @ inner.T
         sort = np.argsort(free)
-        own = equation.instruments[..., self._plain] @ (values - before)[self._plain]
+        own = equation.instruments[..., equations.plain] @ (values - before)[equations.plain]
         return Fit(
             values, free[sort], held, mixing[sort], covariance[np.ix_(sort, sort)], noise, step,
             False, y - a @ values, z, a, equation.torques + own,
@@ -496,23 +271,8 @@ class Problem:
         )  # fmt: skip
 
 
-def _noises(data: Data) -> Vector:
-    """Return the noise of each position, shape (coordinates,), relative to the encoders'."""
-    scale = np.ones(data.positions.shape[1])
-    if data.base is not None:
-        noise = Smoother(data.positions).noise
-        encoder = max(_size(noise[6:]), _FAINT)
-        for part in (slice(0, 3), slice(3, 6)):
-            scale[part] = max(_size(noise[part]), _FAINT) / encoder
-    return scale
-
-
-def _size(values: Vector) -> float:
-    return float(np.sqrt(np.mean(values**2)))
-
-
 def _whitened(
-    whitener: Whitener, equation: _Equation, noise: Noise, prior: Vector, mean: Vector
+    whitener: Whitener, equation: Equation, noise: Noise, prior: Vector, mean: Vector
 ) -> tuple[Vector, Vector, Vector]:
     """Return whitened instruments, columns and target, with what is known beforehand as rows."""
     factor = whitener.factor(noise)

@@ -15,9 +15,8 @@ _WEAKEST, _STRONGEST, _STRENGTHS = -4.0, 14.0, 73  # powers of ten
 class Smoother:
     """A linear smoother that penalizes third differences, each joint by its own strength.
 
-    The strength is that with the least error of accelerations by generalized cross-validation
-    (Craven and Wahba, Numerische Mathematik 31, 1979), chosen once: what it makes of other
-    positions is then linear in them.
+    The strength is that of generalized cross-validation (Craven and Wahba, Numerische Mathematik
+    31, 1979), chosen once: what it makes of other positions is then linear in them.
 
     In cosine waves, the third differences of a signal that is continued by its mirror image are
     penalized; the two of them that a mirror image breaks, at the ends, are taken out by Woodbury's
@@ -31,24 +30,20 @@ class Smoother:
         """Choose the strengths for positions, shape (samples, joints)."""
         count = len(positions)
         half = 0.5 * np.pi * np.arange(count) / count
-        self._second = second = (2 * np.sin(half)) ** 2
+        self._second = (2 * np.sin(half)) ** 2
         mirrored = np.stack([np.ones(count), np.cos(2 * half * count)], axis=1)  # at both ends
-        scale = np.sqrt(2 / count)
-        self._breaks = scale * np.sin(2 * half)[:, None] * mirrored * [1, -1]
-        outside = scale * (second * np.cos(half))[:, None] * mirrored
+        self._breaks = np.sqrt(2 / count) * np.sin(2 * half)[:, None] * mirrored * [1, -1]
         waves = dct(positions, axis=0, norm="ortho")
         strengths = np.logspace(_WEAKEST, _STRONGEST, _STRENGTHS)
-        fits, shares = np.empty((_STRENGTHS, positions.shape[1])), np.empty((_STRENGTHS, 1))
+        lefts, shares = np.empty((_STRENGTHS, positions.shape[1])), np.empty((_STRENGTHS, 1))
         for row, strength in enumerate(strengths):
             kept, ends, inside = self._parts(strength)
             left = waves - kept[:, None] * waves - ends @ (inside @ (ends.T @ waves))
-            fits[row] = second**2 @ left**2 - np.sum((outside.T @ left) ** 2, axis=0)
-            mixed, accelerated = outside.T @ ends, second[:, None] * ends
-            shares[row] = second**2 @ (1 - kept) - np.sum(outside.T**2 @ (1 - kept))
-            shares[row] -= np.sum(inside * (accelerated.T @ accelerated - mixed.T @ mixed))
-        best = np.argmin(fits / shares**2, axis=0)
+            lefts[row] = np.sum(left**2, axis=0)
+            shares[row] = count - kept.sum() - np.sum(inside * (ends.T @ ends))
+        best = np.argmin(lefts / shares**2, axis=0)
         self._chosen = strengths[best]
-        self.noise = np.sqrt(fits[best, np.arange(len(best))] / shares[best, 0])
+        self.noise = np.sqrt(lefts[best, np.arange(len(best))] / shares[best, 0])
 
     def _parts(self, strength: float) -> tuple[Vector, Vector, Vector]:
         """Return what is kept of waves: diagonal + ends @ inside @ ends.T."""
