@@ -156,7 +156,7 @@ def test_an_interval_is_a_profile_where_the_likelihood_is_not_quadratic(clean):
     known = identify(arm.noisy(clean), arm.hidden(), "delay")["delay"]
     assert known.method == "quadratic"
     assert known.low < 0.0 < known.high
-    log = arm.noisy(clean, torque=20.0)
+    log = arm.noisy(clean, torque=10.0)
     found = identify(log, arm.hidden(), "delay")
     assert "by profile" in str(found)
     hardly = found["delay"]

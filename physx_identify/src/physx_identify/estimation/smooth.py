@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
-from scipy.fft import dct, idct
+from scipy.linalg import cho_solve_banded, cholesky_banded
 
-from physx_core.typing import Vector
+from physx_core.typing import Array, Vector
 
-_TREND = 5  # degree
-_WEAKEST, _STRONGEST, _STRENGTHS = -4.0, 14.0, 73  # powers of ten
+_WEAKEST, _STRONGEST, _STRENGTHS = -4.0, 13.0, 69  # powers of ten
 _MEDIAN = 0.455  # of a squared normal variable
+_DIFFERENCE, _GROWTH = 5, 252.0
+"""Order of the differences that show the noise, and by how much its variance is more in them."""
 
 
 class Smoother:
@@ -22,35 +25,50 @@ class Smoother:
         noise: Standard deviation of white noise of each joint, as the highest frequencies show it.
     """
 
-    def __init__(self, positions: Vector) -> None:
-        """Choose the strengths for positions, shape (samples, joints)."""
+    def __init__(
+        self, positions: Vector, kinks: Array | None = None, orders: Sequence[int] = ()
+    ) -> None:
+        """Choose the strengths.
+
+        Args:
+            positions: Shape (samples, joints).
+            kinks: Samples at which the velocity may jump, shape (samples,); None: none.
+            orders: Derivative that each of the first columns is instead of a position.
+        """
         count = len(positions)
-        # The cosine transform continues a signal by its mirror image; without trend, smoothly.
-        basis = np.polynomial.legendre.legvander(np.linspace(-1.0, 1.0, count), _TREND)
-        self._basis = np.linalg.qr(basis)[0]
+        self._free = np.zeros(count - 3, bool)
+        if kinks is not None:
+            self._free = kinks[1:-2] | kinks[2:-1]
+        rough = np.diff(positions, _DIFFERENCE, axis=0)
+        self.noise = np.sqrt(np.median(rough**2, axis=0) / _MEDIAN / _GROWTH)
         second = (2 * np.sin(0.5 * np.pi * np.arange(count) / count)) ** 2
-        waves = dct(positions - self._trend(positions), axis=0, norm="ortho")
-        self._kept = np.empty(positions.shape)
-        self.noise = np.sqrt(np.median(waves[-count // 4 :] ** 2, axis=0) / _MEDIAN)
-        for joint, own in enumerate(waves.T):
-            power = own**2
-            noise = np.median(power[-count // 4 :]) / _MEDIAN
-
-            def error(strength: float, power: Vector = power, noise: float = noise) -> float:
-                kept = 1 / (1 + 10**strength * second**3)
-                return float(np.sum(second**2 * ((1 - kept) ** 2 * power + 2 * kept * noise)))
-
-            grid = np.linspace(_WEAKEST, _STRONGEST, _STRENGTHS)
-            best = min(grid, key=error)
-            self._kept[:, joint] = 1 / (1 + 10**best * second**3)
+        grid = 10 ** np.linspace(_WEAKEST, _STRONGEST, _STRENGTHS)
+        factors = [self._factor(strength) for strength in grid]
+        kept = 1 / (1 + grid[:, None] * second**3)
+        self._factors = []
+        for place, (own, noise) in enumerate(zip(positions.T, self.noise, strict=True)):
+            more = 2 - (orders[place] if place < len(orders) else 0)
+            removed = [np.diff(own - self._smooth(own, each), more) for each in factors]
+            errors = np.sum(np.square(removed), axis=1) + 2 * noise**2 * (kept @ second**more)
+            self._factors.append(factors[int(np.argmin(errors))])
 
     def __call__(self, positions: Vector) -> Vector:
         """Return positions, shape (samples, joints), with less noise."""
-        trend = self._trend(positions)
-        waves = dct(positions - trend, axis=0, norm="ortho")
-        found: Vector = trend + idct(self._kept * waves, axis=0, norm="ortho")
-        return found
+        found = (self._smooth(*each) for each in zip(positions.T, self._factors, strict=True))
+        return np.stack(list(found), axis=1)
 
-    def _trend(self, positions: Vector) -> Vector:
-        found: Vector = self._basis @ (self._basis.T @ positions)
+    def _factor(self, strength: float) -> Vector:
+        """Return the factor of 1 / strength and the product of third differences, banded."""
+        band = np.zeros((4, len(self._free)))
+        for row, weight in enumerate((20.0, -15.0, 6.0, -1.0)):
+            kept = ~(self._free | np.roll(self._free, -row))
+            band[row] = weight * kept
+        band[0] += 1 / strength
+        factor: Vector = cholesky_banded(band, lower=True, check_finite=False)
+        return factor
+
+    def _smooth(self, positions: Vector, factor: Vector) -> Vector:
+        thirds = np.where(self._free, 0.0, np.diff(positions, 3))
+        pulls = np.pad(cho_solve_banded((factor, True), thirds, check_finite=False), 3)
+        found: Vector = positions + np.diff(pulls, 3)
         return found
