@@ -9,8 +9,8 @@ uncorrelated with the residual, so no controller and no commanded motion have to
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 from scipy.interpolate import CubicSpline
@@ -18,7 +18,7 @@ from scipy.linalg import qr, solve_triangular
 
 from physx_core.typing import Array, Vector
 from physx_identify.errors import IdentificationError
-from physx_identify.estimation.base import COORDINATES, Base
+from physx_identify.estimation.base import COORDINATES, Base, Imu
 from physx_identify.estimation.model import Model, Path
 from physx_identify.estimation.noise import ORDERS, LikelyNoise, Noise, Whitener
 from physx_identify.estimation.smooth import Smoother
@@ -40,6 +40,8 @@ _LOWEST = 0.2
 """Share of a nominal value below which the path is not corrected with a value."""
 _EDGE = 4
 """Samples left out at both ends, where the smoothed path is uncertain."""
+_KINK = 3.0 * np.sqrt(20.0)
+"""Third difference of positions with contacts, in deviations of their noise, that is a kink."""
 _SEPARABLE = 1e-6
 """Relative length of what is left of a column without the others, below which it is one of them."""
 _NEAR = 0.01
@@ -55,13 +57,16 @@ class Data:
     """Measured motion and torques.
 
     Attributes:
-        positions: Shape (samples, joints), in rad or m.
-        torques: Shape (samples, joints), in N m or N.
+        positions: As in `Path`, shape (samples, coordinates).
+        torques: Shape (samples, coordinates), in N m or N.
         period: In s.
         instant: As in `Path`.
         slowest: Velocity below which dry friction is unknown, in rad/s or m/s.
-        base: Measured orientations of a floating base, whose coordinates come first.
-        flight: Whether nothing but gravity acts on a floating base, so that its forces are known.
+        base: What is known of a floating base, whose coordinates come first.
+        flight: Whether all that acts on a floating base is known, so that its forces are.
+        wrenches: What acts on links, shape (samples, 6), each of the period before a sample.
+        axes: Along which axes, as in `Model.acting`.
+        contacts: Whether anything else does, shape (samples,), in the period before a sample.
     """
 
     positions: Vector
@@ -69,8 +74,11 @@ class Data:
     period: float
     instant: bool = False
     slowest: float = SLOWEST
-    base: Base | None = None
+    base: Base | Imu | None = None
     flight: bool = False
+    wrenches: Mapping[str, Vector] = field(default_factory=dict)
+    axes: str = "link"
+    contacts: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def rows(self) -> slice:
@@ -80,6 +88,23 @@ class Data:
     def path(self, positions: Vector) -> Path:
         """Return a motion at its times."""
         return Path(positions, self.period, self.instant, self.base)
+
+    def smoother(self, kinks: Array | None = None) -> Smoother:
+        """Return what smooths its positions, but not over kinks, shape (samples,)."""
+        orders = self.base.orders if isinstance(self.base, Imu) else ()
+        return Smoother(self.positions, kinks, orders)
+
+    def of_steps(self, readings: Vector) -> Vector:
+        """Return those of readings that belong to the samples of a path."""
+        return readings[1:-1] if self.instant else readings[2:]
+
+    def with_readings(self, stencil: Vector, felt: Sequence[Vector]) -> Vector:
+        """Return a stencil with derivatives by wrenches, each (samples, joints, 6), at its end."""
+        if not felt:
+            return stencil
+        more = np.zeros((*stencil.shape[:3], 6 * len(felt)))
+        more[1 if self.instant else 2] = np.concatenate(felt, axis=2)
+        return np.concatenate([stencil, more], axis=3)
 
 
 @dataclass(frozen=True)
@@ -163,8 +188,8 @@ class _Equation:
             parameters).
         columns: Columns of what was measured, of the same shape.
         target: Shape (samples, joints).
-        stencil: As in `Model.stencil`, along the same path as the instruments, by positions in
-            deviations of the encoders, shape (3, samples, joints, positions).
+        stencil: As in `Model.stencil`, along the same path as the instruments, by positions and
+            wrenches in deviations of the encoders, shape (3, samples, joints, readings).
         torques: Of the model along that path, of the same shape as the target.
         doubt: By what dry friction differs if it is applied another way, shape (samples, joints).
     """
@@ -210,6 +235,23 @@ class Problem:
             if each.kind in ("friction", "stribeck"):
                 dry[joints.index(each.of)] = True
         self._dry = dry
+        self._kinks, self._struck = self._contacts()
+
+    def _contacts(self) -> tuple[Array | None, Array]:
+        """Return where velocities may jump, and which torques contacts enter, by coordinates."""
+        data, model = self._data, self._model
+        struck = np.zeros((len(data.positions), len(model.coordinates)), bool)
+        for link, on in data.contacts.items():
+            struck |= on[:, None] & model.moved(link)
+        if not data.wrenches and not data.contacts:
+            return None, struck[1:-1]
+        kinks = _around(
+            np.any(struck, axis=1), 2, 1
+        )  # the step before a flag, and the samples around
+        noise = data.smoother().noise
+        kinks[2:-1] |= (np.abs(np.diff(data.positions, 3, axis=0)) > _KINK * noise).any(axis=1)
+        kinks[:-1] |= kinks[1:]
+        return kinks, _around(struck, _EDGE + 1, _EDGE)[1:-1]
 
     def _positions(self, values: Vector) -> Vector:
         """Return measured positions without the encoders' offsets."""
@@ -259,17 +301,30 @@ class Problem:
         """
         numbers = self._known + self._directions @ np.maximum(values, self._lowest)
         stencil = self._model.stencil(path, numbers)
-        dry, doubt = None, np.zeros(path.own.shape)
-        if self._dry.any() and not path.instant:  # halfway between the two ways of engines
+        dry, doubt, acting = None, np.zeros(path.own.shape), np.zeros((2, *path.own.shape))
+        if (self._dry.any() or self._data.wrenches) and not path.instant:
+            # halfway between the two ways of engines
             dry = 0.5 * (self._model.dry(path, stencil, numbers) + np.eye(path.own.shape[1]))
-            rubbing = self._model.friction(path, numbers)
-            doubt = np.einsum("kij,kj->ki", dry, rubbing) - rubbing
+        felt = []
+        for link, wrenches in self._data.wrenches.items():
+            readings = self._data.of_steps(wrenches)
+            by_reading, slopes = self._model.wrenches(path, link, readings, self._data.axes)
+            acting += np.einsum("kij,kj->ki", by_reading, readings)
+            acting[1] += np.einsum("kij,kj->ki", slopes, raw.own - path.own)
+            stencil[1] -= slopes
+            felt.append(-by_reading)
+        if dry is not None:
+            impulses = self._model.friction(path, numbers) - acting[0]
+            doubt = np.einsum("kij,kj->ki", dry, impulses) - impulses
+            acting = np.einsum("kij,akj->aki", dry, acting)
+            felt = [dry @ each for each in felt]
         torques = self._torques(values, whole)
         instruments, known = self._columns(path, path, stencil, dry, torques)
+        known -= acting[0]
         own = known + instruments[..., self._plain] @ values[self._plain]
         instruments = self._endogenous(instruments, own)
         columns, known = self._columns(path, raw, stencil, dry, torques)
-        target = torques - known
+        target = torques - known + acting[1]
         for place, each in self._special:
             if each.kind == "gain":
                 target = target + columns[..., place]
@@ -282,7 +337,7 @@ class Problem:
             instruments[:, rows],
             columns[:, rows],
             target[:, rows],
-            self._scale * stencil[:, :, rows],
+            self._scale * self._data.with_readings(stencil, felt)[:, :, rows],
             own[:, rows],
             doubt[:, rows],
         )
@@ -317,7 +372,7 @@ class Problem:
     def solve(self, start: Vector | None, noise: Noise | None) -> Fit:
         """Repeat: noise of the residual, values, path."""
         values = self._nominal if start is None else start
-        smoother, fixed = Smoother(self._positions(values)), noise is not None
+        smoother, fixed = self._data.smoother(self._kinks), noise is not None
         corrections: Vector | float = 0.0
         whole, settled = 0, False
         slow = np.full(len(self._model.coordinates), self._data.slowest)
@@ -331,6 +386,7 @@ class Problem:
                 path = dataclasses.replace(raw, positions=smoother(measured + corrections))
                 used = ~(self._dry & _unsure(path.ends, slow))[:, self._rows]
                 whole = round(self._late(values))
+                used &= ~self._struck[:, self._rows]
                 used[: max(_EDGE, -whole)] = used[-max(_EDGE, whole) :] = False
             equation = self._equation(path, raw, values, whole)
             if start is None and step == 1:
@@ -354,10 +410,10 @@ class Problem:
             if not moving and (moved < _CLOSE).all():
                 found = dataclasses.replace(found, converged=True)
                 break
-            corrections = self._scale * whitener.corrections(found.residual, noise)
+            corrections = self._scaled(whitener.corrections(found.residual, noise))
             if self._dry.any() and moving:
                 errors, left = whitener.draw(noise)
-                errors = self._scale * (errors + whitener.corrections(left, noise))
+                errors = self._scaled(errors + whitener.corrections(left, noise))
                 unsure = np.diff(smoother(errors), axis=0)
                 slow = np.maximum(
                     self._data.slowest, _UNSURE * unsure.std(axis=0) / self._data.period
@@ -374,6 +430,11 @@ class Problem:
         return dataclasses.replace(
             found, covariance=covariance, freedom=sure.freedom, likely=likely
         )
+
+    def _scaled(self, errors: Vector) -> Vector:
+        """Return errors of the positions, from those of all readings in deviations."""
+        found: Vector = (self._scale * errors)[:, : len(self._model.coordinates)]
+        return found
 
     def distance(self, found: Fit, place: int, value: float) -> float:
         """Return half the squared distance of the torques if one parameter had another value.
@@ -490,14 +551,16 @@ class Problem:
 
 
 def _noises(data: Data) -> Vector:
-    """Return the noise of each position, shape (coordinates,), relative to the encoders'."""
-    scale = np.ones(data.positions.shape[1])
-    if data.base is not None:
-        noise = Smoother(data.positions).noise
-        encoder = max(_size(noise[6:]), _FAINT)
-        for part in (slice(0, 3), slice(3, 6)):
+    """Return the noise of each position, and each wrench, relative to the encoders'."""
+    noise = data.smoother().noise
+    base = 0 if data.base is None else len(COORDINATES)
+    encoder = max(_size(noise[base:]), _FAINT)
+    scale = np.ones(len(noise))
+    for part in (slice(0, base // 2), slice(base // 2, base)):
+        if data.base is not None:
             scale[part] = max(_size(noise[part]), _FAINT) / encoder
-    return scale
+    felt = [Smoother(each).noise / encoder for each in data.wrenches.values()]
+    return np.concatenate([scale, *felt])
 
 
 def _size(values: Vector) -> float:
@@ -526,4 +589,14 @@ def _unsure(velocities: Vector, slow: Vector) -> Array:
     turned = np.diff(np.sign(velocities), axis=0) != 0
     found[1:] |= turned
     found[:-1] |= turned
+    return found
+
+
+def _around(on: Array, before: int, after: int) -> Array:
+    """Return where something is on, with so many samples before and after."""
+    found = on.copy()
+    for _ in range(before):
+        found[:-1] |= found[1:]
+    for _ in range(after):
+        found[1:] |= found[:-1]
     return found
