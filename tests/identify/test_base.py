@@ -8,26 +8,14 @@ import json
 import logged_arm as arm
 import numpy as np
 import pytest
+from logged_flyer import FLYER, HIDDEN, flown, flyer, hidden, noisy
 
 from physx_core.cli import main
-from physx_core.rotations import from_rotation_vector_rows, multiply_rows
 from physx_dart import DartBackend, PinocchioBackend
 from physx_identify import Log, Model, check_log, identify, read_log
 from physx_identify.errors import IdentificationError
 from physx_identify.estimation.model import Path
-from physx_sim import JointSettings, Robot, World
-
-FLYER = """
-<mujoco><compiler angle="radian"/><worldbody><body name="trunk" pos="0 0 1"><freejoint/>
-  <geom type="box" size="0.2 0.1 0.05" mass="2"/>
-  <body name="upper" pos="0.1 0 -0.05"><joint name="shoulder" axis="0 1 0"/>
-    <geom type="capsule" size="0.03" fromto="0 0 0 0.05 0.02 -0.3" mass="0.6"/>
-    <body name="lower" pos="0.05 0.02 -0.3"><joint name="elbow" axis="1 0 0"/>
-      <geom type="capsule" size="0.03" fromto="0 0 0 0 0.1 -0.25" mass="0.4"/></body></body>
-</body></worldbody></mujoco>
-"""
-HIDDEN = {"mass lower": 0.5, "damping shoulder": 0.05, "damping elbow": 0.03,
-          "friction shoulder": 0.1, "friction elbow": 0.05}  # fmt: skip
+from physx_sim import Robot
 
 
 @pytest.fixture(scope="module")
@@ -37,66 +25,21 @@ def place(tmp_path_factory):
     return found
 
 
-def flyer(place, **more):
-    return Robot(str(place), fixed_base=False, **more)
-
-
-def hidden(place, friction=True):
-    joints = {
-        name: JointSettings(
-            damping=HIDDEN[f"damping {name}"], friction=friction * HIDDEN[f"friction {name}"]
-        )
-        for name in arm.JOINTS
-    }
-    return flyer(place, mass_factors={"lower": 1.25}, joints=joints)
-
-
-def flown(robot, samples, engine=PinocchioBackend):
-    """Return positions and torques of a robot that tumbles while its joints track a motion."""
-    simulation = engine().build(World([robot], period=arm.PERIOD))
-    begin = np.array([0, 0, 1.0, 0.7, -0.5, 0.9, 0, 0])
-    simulation.set_state(simulation.positions(), begin)
-    targets, speeds = arm.motion(samples)
-    q, torques = np.empty((samples, 9)), np.empty((samples, 2))
-    for row in range(samples):
-        q[row] = simulation.positions()
-        torques[row] = [12, 4] * (targets[row] - q[row, 7:])
-        torques[row] += [1, 0.2] * (speeds[row] - simulation.velocities()[6:])
-        simulation.set_commands(torques[row])
-        simulation.step(1)
-    return q, torques
-
-
-def noisy(q, torques, base=1e-3, encoder=1e-4, torque=0.02):
-    random, count = np.random.default_rng(0), len(q)
-    turns = from_rotation_vector_rows(base * random.normal(size=(count, 3)))
-    signs = np.where(np.arange(count) % 7 < 3, -1, 1)[:, None]  # a quaternion has two
-    return Log(
-        arm.JOINTS,
-        arm.PERIOD,
-        q[:, 7:] + encoder * random.normal(size=(count, 2)),
-        torques + torque * torques.std(axis=0) * random.normal(size=(count, 2)),
-        base_positions=q[:, :3] + base * random.normal(size=(count, 3)),
-        base_orientations=signs * multiply_rows(q[:, 3:7], turns),
-    )
-
-
 @pytest.mark.parametrize("engine", [PinocchioBackend, DartBackend])
 def test_the_model_of_a_floating_base_takes_the_steps_of_engines(place, engine):
     robot = hidden(place, friction=False)
-    q, torques = flown(robot, 80, engine)
-    log = Log(arm.JOINTS, arm.PERIOD, q[:, 7:], torques,
-              base_positions=q[:, :3], base_orientations=q[:, 3:7])  # fmt: skip
+    flight = flown(robot, 80, engine)
+    log = noisy(flight, 0.0, 0.0, 0.0)
     model = Model(robot)
     path = Path(log.coordinates, log.period, base=log.base)
     found = model.columns(path, model.numbers[:, None], path.ends)[..., 0]
     assert np.abs(found[:, :6]).max() < 1e-7  # nothing but gravity acts on the base
-    assert found[:, 6:] == pytest.approx(torques[1:-1], abs=1e-7)
+    assert found[:, 6:] == pytest.approx(flight.torques[1:-1], abs=1e-7)
 
 
 @pytest.mark.slow
 def test_the_command_finds_what_a_tumbling_robot_hides(place, tmp_path, capsys):
-    log = noisy(*flown(hidden(place), 600))
+    log = noisy(flown(hidden(place), 600))
     arrays = {"q": log.positions, "tau": log.torques, "time": arm.PERIOD * np.arange(600)}
     arrays |= {"base_position": log.base_positions, "base_quat": log.base_orientations}
     np.savez(tmp_path / "log.npz", **arrays)
@@ -111,7 +54,7 @@ def test_the_command_finds_what_a_tumbling_robot_hides(place, tmp_path, capsys):
 @pytest.mark.slow
 def test_in_flight_the_base_tells_masses_from_poor_torques(place):
     robot = hidden(place, friction=False)
-    log = noisy(*flown(robot, 120), base=1e-4, torque=0.2)
+    log = noisy(flown(robot, 120), base=1e-4, torque=0.2)
     known = dataclasses.replace(robot, mass_factors={})
     found = identify(log, known, "mass:lower", level=0.999, flight=True)["mass lower"]
     assert found.low <= HIDDEN["mass lower"] <= found.high
@@ -119,7 +62,7 @@ def test_in_flight_the_base_tells_masses_from_poor_torques(place):
 
 
 def test_a_pose_is_the_same_from_any_columns(place, tmp_path):
-    log = noisy(*flown(hidden(place), 80))
+    log = noisy(flown(hidden(place), 80))
     time = arm.PERIOD * np.arange(80)
     whole = np.concatenate([log.base_positions, log.base_orientations, log.positions], axis=1)
     np.savez(tmp_path / "q.npz", q=whole, tau=np.pad(log.torques, ((0, 0), (6, 0))), time=time)
@@ -140,7 +83,7 @@ def test_a_pose_is_the_same_from_any_columns(place, tmp_path):
 
 def test_a_wrong_pose_is_named(place, tmp_path):
     robot, known = flyer(place), Model(flyer(place))
-    log = noisy(*flown(hidden(place), 80), base=1e-5)
+    log = noisy(flown(hidden(place), 80), base=1e-5)
     own = vars(log)
     turned = np.array(log.base_orientations)
     turned[40:] = turned[40:, [1, 0, 3, 2]]
@@ -152,7 +95,12 @@ def test_a_wrong_pose_is_named(place, tmp_path):
         ({"base_orientations": log.base_orientations[:, :3]}, "samples, qx, qy, qz, qw"),
         ({"base_orientations": turned}, "the base turns by"),
         ({"base_positions": leapt}, "the base moves by 1.0"),
-        ({"base_positions": None, "base_orientations": None}, "floats, but there is no pose"),
+        (
+            dict.fromkeys(
+                ("base_positions", "base_orientations", "gyroscope", "accelerometer"), None
+            ),
+            "floats, but there is no pose",
+        ),
     ):
         with pytest.raises(IdentificationError, match=message):
             check_log(Log(**{**own, **changed}), known)
