@@ -21,7 +21,7 @@ from physx_identify.errors import IdentificationError
 from physx_identify.estimation.base import COORDINATES, Base, Imu
 from physx_identify.estimation.model import Model, Path
 from physx_identify.estimation.noise import ORDERS, LikelyNoise, Noise, Whitener
-from physx_identify.estimation.smooth import Smoother
+from physx_identify.estimation.smooth import Smoother, white_noise
 from physx_identify.estimation.uncertainty import values_of
 from physx_identify.unknowns import Parameter
 
@@ -248,7 +248,7 @@ class Problem:
         kinks = _around(
             np.any(struck, axis=1), 2, 1
         )  # the step before a flag, and the samples around
-        noise = data.smoother().noise
+        noise = white_noise(data.positions)
         kinks[2:-1] |= (np.abs(np.diff(data.positions, 3, axis=0)) > _KINK * noise).any(axis=1)
         kinks[:-1] |= kinks[1:]
         return kinks, _around(struck, _EDGE + 1, _EDGE)[1:-1]
@@ -552,14 +552,14 @@ class Problem:
 
 def _noises(data: Data) -> Vector:
     """Return the noise of each position, and each wrench, relative to the encoders'."""
-    noise = data.smoother().noise
+    noise = white_noise(data.positions)
     base = 0 if data.base is None else len(COORDINATES)
     encoder = max(_size(noise[base:]), _FAINT)
     scale = np.ones(len(noise))
     for part in (slice(0, base // 2), slice(base // 2, base)):
         if data.base is not None:
             scale[part] = max(_size(noise[part]), _FAINT) / encoder
-    felt = [Smoother(each).noise / encoder for each in data.wrenches.values()]
+    felt = [white_noise(each) / encoder for each in data.wrenches.values()]
     return np.concatenate([scale, *felt])
 
 

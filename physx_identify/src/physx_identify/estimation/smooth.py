@@ -15,14 +15,22 @@ _DIFFERENCE, _GROWTH = 5, 252.0
 """Order of the differences that show the noise, and by how much its variance is more in them."""
 
 
+def white_noise(positions: Vector) -> Vector:
+    """Return the standard deviation of white noise, as high differences show it, shape (joints,).
+
+    Args:
+        positions: Shape (samples, joints).
+    """
+    squares = np.diff(positions, _DIFFERENCE, axis=0) ** 2
+    found: Vector = np.sqrt(np.median(squares, axis=0) / _MEDIAN / _GROWTH)
+    return found
+
+
 class Smoother:
     """A linear smoother that penalizes third differences, each joint by its own strength.
 
     The strength is that with the least expected error of accelerations (Stein's unbiased estimate),
     chosen once: what it makes of other positions is then linear in them.
-
-    Attributes:
-        noise: Standard deviation of white noise of each joint, as the highest frequencies show it.
     """
 
     def __init__(
@@ -39,18 +47,19 @@ class Smoother:
         self._free = np.zeros(count - 3, bool)
         if kinks is not None:
             self._free = kinks[1:-2] | kinks[2:-1]
-        rough = np.diff(positions, _DIFFERENCE, axis=0)
-        self.noise = np.sqrt(np.median(rough**2, axis=0) / _MEDIAN / _GROWTH)
         second = (2 * np.sin(0.5 * np.pi * np.arange(count) / count)) ** 2
         grid = 10 ** np.linspace(_WEAKEST, _STRONGEST, _STRENGTHS)
-        factors = [self._factor(strength) for strength in grid]
-        kept = 1 / (1 + grid[:, None] * second**3)
-        self._factors = []
-        for place, (own, noise) in enumerate(zip(positions.T, self.noise, strict=True)):
-            more = 2 - (orders[place] if place < len(orders) else 0)
-            removed = [np.diff(own - self._smooth(own, each), more) for each in factors]
-            errors = np.sum(np.square(removed), axis=1) + 2 * noise**2 * (kept @ second**more)
-            self._factors.append(factors[int(np.argmin(errors))])
+        more = [2 - order for order in (*orders, *[0] * (positions.shape[1] - len(orders)))]
+        columns = list(zip(positions.T, white_noise(positions), more, strict=True))
+        errors = []
+        for strength in grid:
+            factor, kept = self._factor(strength), 1 / (1 + strength * second**3)
+            errors.append([
+                np.sum(np.diff(own - self._smooth(own, factor), order) ** 2)
+                + 2 * noise**2 * np.sum(kept * second**order)
+                for own, noise, order in columns
+            ])  # fmt: skip
+        self._factors = [self._factor(grid[best]) for best in np.argmin(errors, axis=0)]
 
     def __call__(self, positions: Vector) -> Vector:
         """Return positions, shape (samples, joints), with less noise."""
