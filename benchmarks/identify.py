@@ -1,12 +1,15 @@
 """Intervals of `physx identify`: do they hold, and does it say when they do not?
 
-    python benchmarks/identify.py [--check] [--draws 100] [coverage] [contact] [panda] [engines]
+    python benchmarks/identify.py [--check] [--draws 200] [coverage] [contact] [panda] [engines]
                                   [structure] [excitation]
 
-Coverage: the share of nominal 95 % intervals that hold the true value: an arm of two links that
-tracks a motion for 4 s at 200 Hz, six parameters, noise of torques (5 % of their deviation) with a
-correlation from sample to sample, of encoders, of both. The peer's own function, of MuJoCo's sysid,
-gets the least-squares residual and Jacobian along the true path, where only torques are noisy.
+Coverage: the share of nominal 95 % intervals that hold the true value, of logs of 4 s at 200 Hz: a
+pendulum that swings about its rest, three parameters; an arm of two links that tracks a motion,
+six. Noise of torques (5 % of their deviation) with a correlation from sample to sample, of
+encoders, of both. A cell of half as many logs each: the arm with late torques and an encoder that
+is off; a robot that floats, 3 s, its base measured to 1 mm and 1 mrad; the same, 1 s, of which only
+gravity acts on the base. The peer's own function, of MuJoCo's sysid, gets the least-squares
+residual and Jacobian along the true path, where only torques are noisy.
 Contact: logs of 2 s of a leg whose foot strikes the ground, with the noisy force of the ground,
 with flags where it touches, and without, so that the model knows nothing of it.
 Panda: seven joints, 20 s at 100 Hz, 5 % noise. Engines: logs of each engine, all fitted on
@@ -24,8 +27,10 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")  # the processes share the cores
 import importlib
 import sys
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
 from concurrent.futures import ProcessPoolExecutor
+from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 from unittest.mock import MagicMock
@@ -36,7 +41,9 @@ from scipy.stats import norm
 
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "shared"))
 import logged_arm as arm
+import logged_flyer as flyer
 import logged_leg as leg
+import logged_oscillator as oscillator
 
 from physx_core.typing import Vector
 from physx_dart import PinocchioBackend
@@ -59,30 +66,102 @@ CELLS = {
     "both": (1e-4, 0.05),
 }
 """Noise of encoders in rad, and of torques relative to their deviation."""
-_CLEAN: dict[str, tuple[Vector, Vector]] = {}
 
 
+@cache
 def clean(engine: type = PinocchioBackend) -> tuple[Vector, Vector]:
-    """Return the arm's motion and torques without noise, simulated once."""
-    name = engine.__name__
-    if name not in _CLEAN:
-        _CLEAN[name] = arm.simulated(samples=SAMPLES, engine=engine)
-    return _CLEAN[name]
+    """Return the arm's motion and torques without noise."""
+    motion: tuple[Vector, Vector] = arm.simulated(samples=SAMPLES, engine=engine)
+    return motion
 
 
-def found(cell: str, correlation: float, seed: int) -> Identification:
-    """Return what a log with a draw of noise says."""
-    encoder, torque = CELLS[cell]
-    log = arm.noisy(clean(), encoder, torque, correlation, seed)
-    return identify(log, arm.KNOWN, UNKNOWN)
+@cache
+def late() -> tuple[Vector, Vector]:
+    """Return the arm's, with torques that are late and an encoder that is off."""
+    positions, torques = arm.simulated(samples=SAMPLES + LATE)
+    return positions[LATE:] + np.array([OFF, 0.0]), torques[:-LATE]
 
 
-def draw(job: tuple[str, float, int]) -> tuple[list[bool], bool] | None:
+@cache
+def swung() -> tuple[Vector, Vector]:
+    """Return those of the pendulum."""
+    motion: tuple[Vector, Vector] = oscillator.simulated(SAMPLES)
+    return motion
+
+
+@cache
+def flown(samples: int, friction: bool) -> tuple[Vector, Vector]:
+    """Return those of the robot that floats, with or without dry friction."""
+    motion: tuple[Vector, Vector] = flyer.flown(flyer.hidden(friction), samples)
+    return motion
+
+
+LATE, OFF = 2, 0.02
+"""Delay of torques in samples; offset of the shoulder's encoder in rad."""
+
+
+@dataclass(frozen=True)
+class Case:
+    """Logs with hidden parameters.
+
+    Attributes:
+        robot: As it is known.
+        unknowns: What is to be found.
+        hidden: True values by name.
+        log: Makes a log, from noise of encoders in rad, noise of torques relative to their
+            deviation, its correlation from sample to sample, and a seed.
+        flight: Whether only gravity acts on the base.
+    """
+
+    robot: Robot
+    unknowns: Sequence[str]
+    hidden: Mapping[str, float]
+    log: Callable[[float, float, float, int], Log]
+    flight: bool = False
+
+    def found(self, cell: str, correlation: float, seed: int) -> Identification:
+        """Return what a log with a draw of noise says."""
+        log = self.log(*CELLS[cell], correlation, seed)
+        return identify(log, self.robot, self.unknowns, flight=self.flight)
+
+
+CASES = {
+    "arm": Case(arm.KNOWN, UNKNOWN, arm.HIDDEN, lambda *noise: arm.noisy(clean(), *noise)),
+    "pendulum": Case(
+        oscillator.KNOWN,
+        UNKNOWN,
+        oscillator.HIDDEN,
+        lambda *noise: arm.noisy(swung(), *noise, oscillator.JOINTS),
+    ),
+    "late arm": Case(
+        arm.KNOWN,
+        [*UNKNOWN, "delay", "encoder:shoulder"],
+        arm.HIDDEN | {"delay": LATE * arm.PERIOD, "encoder shoulder": OFF},
+        lambda *noise: arm.noisy(late(), *noise),
+    ),
+    "floating": Case(
+        flyer.KNOWN,
+        ["mass:lower", "damping", "friction"],
+        flyer.HIDDEN,
+        lambda *noise: flyer.noisy(flown(600, True), 1e-3, *noise),
+    ),
+    "flight": Case(
+        flyer.KNOWN,
+        ["mass:lower", "damping"],
+        {name: value for name, value in flyer.HIDDEN.items() if "friction" not in name},
+        lambda *noise: flyer.noisy(flown(200, False), 1e-3, *noise),
+        flight=True,
+    ),
+}
+
+
+def draw(job: tuple[str, str, float, int]) -> tuple[list[bool], bool] | None:
     """Return which intervals of a draw hold, and whether a test failed; None: no intervals."""
-    result = found(*job)
+    case = CASES[job[0]]
+    result = case.found(*job[1:])
     if not result.converged:
         return None
-    held = [result[n].low <= true <= result[n].high for n, true in arm.HIDDEN.items()]
+    held = [result[n].low <= true <= result[n].high for n, true in case.hidden.items()]
     return held, bool(result.lacks)
 
 
@@ -116,36 +195,53 @@ def peer(correlation: float, seed: int) -> list[bool]:
     return inside
 
 
+def covered(
+    pool: ProcessPoolExecutor, case: str, cell: str, correlation: float, first: int, draws: int
+) -> tuple[bool, int]:
+    """Print the share of intervals that hold in a cell.
+
+    Returns:
+        Whether it is as claimed; how many logs were called model error.
+    """
+    jobs = [(case, cell, correlation, first + seed) for seed in range(draws)]
+    results = [each for each in pool.map(draw, jobs, chunksize=4) if each is not None]
+    held = np.array([each for each, _ in results])
+    false = sum(failed for _, failed in results)
+    print(
+        f"  {case:9}noise of {cell:8}correlation {correlation:4}: {held.mean():.3f}, worst "
+        f"parameter {held.mean(axis=0).min():.2f}, without an interval {draws - len(held)}, "
+        f"called model error {false}, {draws} draws",
+        flush=True,
+    )
+    name = f"{case}, {cell}, {correlation}"
+    good = claim(f"{name}: pooled", held.mean(), at_least=0.90)
+    good &= claim(f"{name}: too wide", held.mean(), at_most=0.98)
+    good &= claim(f"{name}: worst parameter", held.mean(axis=0).min(), at_least=0.85)
+    return good, false
+
+
 def coverage(draws: int) -> bool:
     """Print the share of intervals that hold in each cell."""
-    print(f"Intervals that hold the true value, {draws} draws of 6 parameters")
-    good, flagged = True, dict.fromkeys(CORRELATIONS, 0)
+    print("Intervals that hold the true value")
+    good, first = True, 0  # draws of their own
     with ProcessPoolExecutor() as pool:
         for correlation in CORRELATIONS:
             shares = pool.map(peer, [correlation] * draws, range(draws), chunksize=4)
             share = float(np.mean(list(shares)))
             print(f"  MuJoCo sysid      noise of torques, correlation {correlation:4}: {share:.3f}")
-        for row, cell in enumerate(CELLS):
-            for column, correlation in enumerate(CORRELATIONS):
-                first = 1000 * (len(CORRELATIONS) * row + column)  # draws of their own
-                jobs = [(cell, correlation, first + seed) for seed in range(draws)]
-                results = [x for x in pool.map(draw, jobs, chunksize=4) if x is not None]
-                held = np.array([each for each, _ in results])
-                false = sum(failed for _, failed in results)
-                print(
-                    f"  physx identify    noise of {cell:8}correlation {correlation:4}: "
-                    f"{held.mean():.3f}, worst parameter {held.mean(axis=0).min():.2f}, without an "
-                    f"interval {draws - len(held)}, called model error {false}",
-                    flush=True,
-                )
-                flagged[correlation] += false
-                name = f"{cell}, {correlation}"
-                good &= claim(f"{name}: pooled", held.mean(), at_least=0.90)
-                good &= claim(f"{name}: too wide", held.mean(), at_most=0.98)
-                good &= claim(f"{name}: worst parameter", held.mean(axis=0).min(), at_least=0.85)
-    for correlation, false in flagged.items():
-        name = f"clean logs called model error, correlation {correlation}"
-        good &= claim(name, false / (draws * len(CELLS)), at_most=0.05)
+        for case in ("arm", "pendulum"):
+            flagged = dict.fromkeys(CORRELATIONS, 0)
+            for cell in CELLS:
+                for correlation in CORRELATIONS:
+                    met, false = covered(pool, case, cell, correlation, first, draws)
+                    good, first = good and met, first + 1000
+                    flagged[correlation] += false
+            for correlation, false in flagged.items():
+                name = f"{case}: clean logs called model error, correlation {correlation}"
+                good &= claim(name, false / (draws * len(CELLS)), at_most=0.05)
+        for case in ("late arm", "floating", "flight"):
+            met, _ = covered(pool, case, "both", 0.9, first, draws // 2)
+            good, first = good and met, first + 1000
     return good
 
 
@@ -309,7 +405,7 @@ def contact(draws: int) -> bool:
 
 def excitation() -> bool:
     """Print how much the proposed motion tells relative to a sweep."""
-    result = found("both", 0.9, 0)
+    result = CASES["arm"].found("both", 0.9, 0)
     motion = propose(result, arm.KNOWN)
     moments = result.period * np.arange(len(motion.positions))
     sweep = np.sin(2 * np.pi * (0.2 + 0.15 * moments) * moments)[:, None] * result.farthest
@@ -324,7 +420,7 @@ def excitation() -> bool:
 
 def main(words: list[str]) -> None:
     """Run the parts that are named, or all."""
-    draws = int(words[words.index("--draws") + 1]) if "--draws" in words else 100
+    draws = int(words[words.index("--draws") + 1]) if "--draws" in words else 200
     parts: dict[str, Callable[[], bool]] = {
         "coverage": lambda: coverage(draws),
         "contact": lambda: contact(min(draws, 40)),

@@ -1,3 +1,5 @@
+import warnings
+
 import numpy as np
 import pytest
 from hypothesis import given
@@ -79,6 +81,19 @@ def test_a_row_that_is_checked_at_once_leaves_the_buffer_as_it_was():
         "x": [[1, 2], [3, 4]],
         "n": [1, 3],
     }
+
+
+def test_fields_that_are_one_array_are_warned_of():
+    state = np.zeros(2)
+    buffer = RowBuffer([Field("before", (2,)), Field("after", (2,))])
+    with pytest.warns(UserWarning, match=r'"before" and "after" are the same array.*copy\(\)'):
+        buffer.put({"before": state[:], "after": state})
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        buffer.take()
+        buffer.put({"before": state.copy(), "after": state})
+        buffer.take()
+        buffer.put({"before": np.zeros((4, 2))[:2].T[0], "after": np.zeros(2)})
 
 
 def test_a_buffer_holds_one_mebibyte_at_most():

@@ -58,11 +58,31 @@ def test_a_table_of_somebody_else_is_imported(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("texts", "wanted"),
+    [
+        (["2020-01-31", "2021-01-31"], [b"2020-01-31", b"2021-01-31"]),
+        (["10:00:00", "11:30:00"], [b"10:00:00", b"11:30:00"]),
+        (["2020-01-31T10:00:00Z", "2021-01-31T10:00:00Z"], [b"2020-01-31T10:00:00Z", ...]),
+        (["18446744073709551615", "9007199254740993"], [2**64 - 1, 2**53 + 1]),
+        (["1e20", "2.5"], [1e20, 2.5]),
+    ],
+)
+def test_what_is_no_common_number_is_imported_as_it_is(texts, wanted, tmp_path):
+    (tmp_path / "log.csv").write_text("\n".join(["x,y", *(f"{text},1e19" for text in texts)]))
+    import_file(tmp_path / "log.csv", tmp_path / "set")
+    with Dataset.open(tmp_path / "set") as dataset:
+        found = dataset["training"]["x"][:].tolist()
+        assert dataset["training"]["y"][:].tolist() == [1e19, 1e19]
+    assert [one for one, other in zip(found, wanted, strict=True) if other not in (one, ...)] == []
+
+
+@pytest.mark.parametrize(
     ("text", "reason"),
     [
         ("a,b\n1,2\n3\n", "not a valid CSV file"),
         ("a\n1\n\n3\n", None),
         ("a,b\n1,\n2,3\n", '"b" of .* has no number in row 0'),
+        ("a,b\n1,\n2,\n", '"b" of .* has no number in row 0'),
         ("a,a\n1,2\n", "several columns for the same place"),
         ("a,a[0]\n1,2\n", "several columns for the same place"),
         ("a[0],a[2]\n1,2\n", r"leave out places of \(3,\)"),

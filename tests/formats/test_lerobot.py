@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from physx_core import Dataset
-from physx_core.errors import MissingLibraryError, UsageError
+from physx_core.errors import ConfigError, MissingLibraryError, UsageError
 from physx_formats import ExchangeError, ExportOptions, export, import_file
 from physx_formats.cli.export import run
 
@@ -140,6 +140,15 @@ def test_the_command_says_that_colors_are_lost_if_there_are_pictures(rows, tmp_p
     assert info["features"]["observation.state"]["fields"] == ["q", "v"]
     with pytest.raises(UsageError, match="--as q names no value"):
         run([*words, "--as", "q"])
+
+
+def test_a_feature_is_no_path(rows, tmp_path):
+    options = ExportOptions(features={"observation.images.a/../b": ["camera"]}, fps=30)
+    with (
+        Dataset.open(tmp_path / "data") as dataset,
+        pytest.raises(ConfigError, match='a/../b" needs a name without "/"'),
+    ):
+        export(dataset, "lerobot", tmp_path / "out", options=options)
 
 
 @pytest.mark.parametrize("of", [["mask", "camera"], ["q"]])

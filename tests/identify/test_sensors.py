@@ -9,7 +9,7 @@ import logged_arm as arm
 import logged_leg as leg
 import numpy as np
 import pytest
-from logged_flyer import FLYER, HIDDEN, flown, flyer, hidden, noisy
+from logged_flyer import FILE, HIDDEN, KNOWN, hidden, pushed, sensed
 
 from physx_core.cli import main
 from physx_core.errors import ComponentNotFoundError, UnknownOptionError
@@ -19,20 +19,12 @@ from physx_identify import Log, Model, check_log, identify, read_log
 from physx_identify.errors import IdentificationError
 from physx_identify.estimation.base import Base, Imu
 from physx_identify.estimation.model import Path
-from physx_identify.estimation.smooth import Smoother, white_noise
 from physx_sim import World
 
 UNKNOWN = ("mass", "damping", "friction")
 TABLE = """time,q.shoulder,q.elbow,tau.shoulder,tau.elbow,force.foot_x,force.foot_y,force.foot_z,\
 moment.foot_x,moment.foot_y,moment.foot_z,contact.lower,gyroscope_x [deg/s],gyroscope_y [deg/s],\
 gyroscope_z [deg/s],accelerometer_x [g],accelerometer_y [g],accelerometer_z [g]"""
-
-
-@pytest.fixture(scope="module")
-def place(tmp_path_factory):
-    found = tmp_path_factory.mktemp("flyer") / "flyer.xml"
-    found.write_text(FLYER)
-    return found
 
 
 @pytest.fixture(scope="module")
@@ -48,8 +40,8 @@ def push(time):
 
 
 @pytest.fixture(scope="module")
-def flight(place):
-    return flown(hidden(place), 300, lift=29.0)
+def flight():
+    return pushed(hidden(), 300, lift=29.0)
 
 
 # The model ---------------------------------------------------------------------------------------
@@ -71,9 +63,9 @@ def test_the_model_takes_the_steps_of_engines_in_contact(engine):
 
 @pytest.mark.parametrize("known", ["pose", "sensor"])
 @pytest.mark.parametrize("axes", ["world", "link"])
-def test_forces_and_an_inertial_sensor_tell_what_the_pose_does(place, known, axes):
-    robot = flyer(place)
-    flight, model = flown(robot, 60, push=push), Model(robot)
+def test_forces_and_an_inertial_sensor_tell_what_the_pose_does(known, axes):
+    robot = KNOWN
+    flight, model = pushed(robot, 60, push=push), Model(robot)
     wrench, base, orientations = flight.wrench, flight.q[:, :3], flight.q[:, 3:7]
     pose = Base.of(orientations)
     positions = np.hstack([base, pose.angles, flight.q[:, 7:]])
@@ -100,8 +92,8 @@ def test_forces_and_an_inertial_sensor_tell_what_the_pose_does(place, known, axe
 
 @pytest.mark.parametrize("instant", [False, True])
 @pytest.mark.parametrize("sensor", [False, True])
-def test_derivatives_are_those_of_the_torques(place, sensor, instant):
-    random, model = np.random.default_rng(0), Model(flyer(place))
+def test_derivatives_are_those_of_the_torques(sensor, instant):
+    random, model = np.random.default_rng(0), Model(KNOWN)
     quaternions = random.normal(size=4) + 0.05 * random.normal(size=(7, 4))
     pose = Base.of(quaternions / np.linalg.norm(quaternions, axis=1)[:, None])
     base = Imu(np.array([0.1, -0.2, 0.3])) if sensor else pose
@@ -132,20 +124,6 @@ def test_derivatives_are_those_of_the_torques(place, sensor, instant):
             assert (ends[0] - ends[1]) / 2e-6 == pytest.approx(slopes[:, :, number], abs=1e-7)
 
 
-def test_smoothing_does_not_reach_over_kinks():
-    time = np.arange(200) * arm.PERIOD
-    positions = np.stack([np.abs(time - 0.5), np.sin(5 * time + 1.0)], axis=1)
-    noise = 1e-4 * np.random.default_rng(0).normal(size=positions.shape)
-    kinks = np.arange(200) == 100
-    through, around = (Smoother(positions + noise, each) for each in (None, kinks))
-    assert white_noise(positions + noise) == pytest.approx(1e-4, rel=0.2)
-    left = around(positions + noise) - positions
-    assert np.abs(left).max() < 4e-4
-    assert np.diff(left, 2, axis=0).std() < 0.1 * np.diff(noise, 2, axis=0).std()
-    kept, moved = (np.abs(each(positions) - positions)[:, 0].max() for each in (around, through))
-    assert kept < 1e-9 and moved > 1e-4
-
-
 # What is found -----------------------------------------------------------------------------------
 
 
@@ -167,11 +145,11 @@ def test_the_noise_of_forces_is_that_of_the_torques(clean):
     assert loud["mass upper"].low < leg.HIDDEN["mass upper"] < loud["mass upper"].high
 
 
-def test_an_inertial_sensor_tells_what_the_pose_tells_whatever_its_drift(place, flight):
-    unknown, known = ["mass:lower", "damping", "friction"], flyer(place)
-    pose = identify(noisy(flight, base=1e-6), known, unknown)
+def test_an_inertial_sensor_tells_what_the_pose_tells_whatever_its_drift(flight):
+    unknown, known = ["mass:lower", "damping", "friction"], KNOWN
+    pose = identify(sensed(flight, base=1e-6), known, unknown)
     for drift in (0.0, 0.005):
-        log = noisy(flight, inertial=(0.05, 0.005), drift=drift)
+        log = sensed(flight, inertial=(0.05, 0.005), drift=drift)
         found = identify(log, known, unknown, imu="imu", level=0.999)
         assert found.holds, found
         for name, true in HIDDEN.items():
@@ -180,9 +158,9 @@ def test_an_inertial_sensor_tells_what_the_pose_tells_whatever_its_drift(place, 
 
 
 @pytest.mark.slow
-def test_in_flight_the_base_tells_masses_beside_known_forces(place):
-    robot = hidden(place, friction=False)
-    log = noisy(flown(robot, 120, push=push), base=1e-4, torque=0.2, force=0.01)
+def test_in_flight_the_base_tells_masses_beside_known_forces():
+    robot = hidden(friction=False)
+    log = sensed(pushed(robot, 120, push=push), base=1e-4, torque=0.2, force=0.01)
     known = dataclasses.replace(robot, mass_factors={})
     found = identify(log, known, "mass:lower", level=0.999, flight=True)["mass lower"]
     assert found.low <= HIDDEN["mass lower"] <= found.high
@@ -204,10 +182,10 @@ def write(path, log, head=TABLE, change=lambda table: table):
 
 
 @pytest.fixture(scope="module")
-def whole(place):
-    flight = flown(hidden(place), 80, push=push)
+def whole():
+    flight = pushed(hidden(), 80, push=push)
     on = np.arange(80) < 10
-    log = noisy(flight, 1e-5, inertial=(0.05, 0.005))
+    log = sensed(flight, base=1e-5, inertial=(0.05, 0.005))
     return dataclasses.replace(log, axes="link", contacts={"lower": on})
 
 
@@ -244,12 +222,12 @@ def test_a_file_has_forces_contacts_and_an_inertial_sensor(whole, tmp_path):
 
 
 @pytest.mark.slow
-def test_the_command_takes_an_inertial_sensor_by_its_frame(place, tmp_path, capsys):
-    log = noisy(flown(hidden(place), 300, lift=29.0), inertial=(0.05, 0.005))
+def test_the_command_takes_an_inertial_sensor_by_its_frame(tmp_path, capsys):
+    log = sensed(pushed(hidden(), 300, lift=29.0), inertial=(0.05, 0.005))
     arrays = {"q": log.positions, "tau": log.torques, "time": arm.PERIOD * np.arange(300)}
     arrays |= {"gyro": log.gyroscope, "accel": log.accelerometer}
     np.savez(tmp_path / "log.npz", **arrays)
-    words = ["identify", str(tmp_path / "log.npz"), str(place), "--floating", "--imu", "imu"]
+    words = ["identify", str(tmp_path / "log.npz"), str(FILE), "--floating", "--imu", "imu"]
     words += ["--level", "0.999", "--free", "mass:lower", "damping", "friction", "--json"]
     assert main(words) == 0
     found = {each["name"]: each for each in json.loads(capsys.readouterr().out)["estimates"]}
@@ -330,18 +308,18 @@ BAD_SENSORS = {
 
 
 @pytest.mark.parametrize("what", BAD_SENSORS)
-def test_bad_inertial_sensors_are_named(place, flight, what):
+def test_bad_inertial_sensors_are_named(flight, what):
     spoil, message = BAD_SENSORS[what]
-    model = Model(flyer(place))
-    log = noisy(flight, inertial=(0.05, 0.005)).with_sensor_at(model.sensor_pose("imu"))
+    model = Model(KNOWN)
+    log = sensed(flight, inertial=(0.05, 0.005)).with_sensor_at(model.sensor_pose("imu"))
     check_log(log, model)
     with pytest.raises(IdentificationError, match=message):
         check_log(spoil(log), model)
 
 
-def test_a_sensor_must_be_there(place, flight):
-    log = noisy(flight)
+def test_a_sensor_must_be_there(flight):
+    log = sensed(flight)
     with pytest.raises(ComponentNotFoundError, match="foot"):
-        identify(log, flyer(place), "mass", imu="foot")
+        identify(log, KNOWN, "mass", imu="foot")
     with pytest.raises(IdentificationError, match="no readings of an inertial sensor"):
-        identify(spoiled(log, gyroscope=None, accelerometer=None), flyer(place), "mass", imu="imu")
+        identify(spoiled(log, gyroscope=None, accelerometer=None), KNOWN, "mass", imu="imu")

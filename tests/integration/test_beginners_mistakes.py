@@ -32,6 +32,8 @@ from physx_core import (
     Training,
     Transformation,
     Visualizer,
+    evaluate,
+    read_scalars,
 )
 from physx_core import errors as e
 from physx_core.pipelines import Replay
@@ -208,6 +210,22 @@ def defines_additional_data_and_never_sets_them():
 @mistake(e.UsageError, "Changed does not implement create()")
 def has_no_create():
     with_data(None, create=Environment.create)
+
+
+@mistake(e.EnvironmentFailedError, "no attribute 'place'. reset_parameters() is called later")
+def draws_what_only_an_episode_sets():
+    class Placed(Good):
+        independent_episodes = True
+        create = Environment.create
+
+        def init_visualization(self):
+            self.factory.add_sphere("ball", position=self.place)
+
+        def reset_parameters(self):
+            self.place = np.zeros(3)
+
+    config = EnvironmentConfig(Placed, as_tcp_ip_client=False, visualizer=Visualizer)
+    DataGeneration(config, episodes=2, session_name="new").execute()
 
 
 @mistake(e.UsageError, "Changed does not implement init_database()", 'Did you mean "init_databse"')
@@ -663,6 +681,36 @@ def gives_a_transformation_too_few_arguments():
     train(of("toy/linear", transformation=Needy))
 
 
+@mistake(e.ConfigError, "The network Changed has predict() where physx calls predict(data)")
+def defines_predict_without_its_argument():
+    own(predict=lambda self: {})
+
+
+@mistake(e.UsageError, "Changed.predict() must return a dictionary with prediction, not ndarray")
+def predicts_an_array():
+    own(predict=lambda self, data: data["state"])
+
+
+@mistake(e.UsageError, "Changed.predict() must return a dictionary with prediction, not other")
+def predicts_another_field():
+    own(predict=lambda self, data: {"other": data["state"]})
+
+
+@mistake(e.UsageError, "Changed.predict() must return a dictionary with prediction, not NoneType")
+def forgets_to_return_the_prediction():
+    own(predict=lambda self, data: None)
+
+
+@mistake(e.FieldsMismatchError, 'prediction: shape (4, 1), but "next_state" has (4, 2)')
+def predicts_one_column_that_would_be_broadcast():
+    own(predict=lambda self, data: {"prediction": data["state"][:, :1]})
+
+
+@mistake(e.FieldsMismatchError, 'prediction: a list, but "next_state" has the shape (4, 2)')
+def predicts_a_list():
+    own(predict=lambda self, data: {"prediction": data["state"].tolist()})
+
+
 @mistake(e.UsageError, 'transform_loss() must return a dictionary with "loss", not float')
 def returns_a_number_from_transform_loss():
     class Own(LeastSquares):
@@ -786,6 +834,16 @@ def predicts_with_a_session_that_trained_nothing():
 @mistake(e.CheckpointError, '"network_7"', "Available: network_0")
 def wants_a_checkpoint_that_does_not_exist():
     predict(network=NetworkConfig(which_network=7))
+
+
+@mistake(e.CheckpointError, 'traind does not exist. Did you mean "trained"')
+def evaluates_a_session_that_does_not_exist():
+    evaluate("sessions/traind")
+
+
+@mistake(e.SessionError, 'traind does not exist. Did you mean "trained"')
+def reads_losses_of_a_session_that_does_not_exist():
+    read_scalars("sessions/traind")
 
 
 @mistake(e.SessionError, "traind")

@@ -47,6 +47,8 @@ def call(python, tmp_path):
     [
         "environment",
         pytest.param("visualizer", marks=pytest.mark.faults),
+        pytest.param("launcher", marks=pytest.mark.faults),
+        "format",
         pytest.param("plugin", marks=pytest.mark.faults),  # with an environment and a network
         pytest.param("network", marks=pytest.mark.faults),
         pytest.param("backend", marks=pytest.mark.faults),
@@ -74,7 +76,7 @@ def test_a_new_plugin_works_until_it_is_removed(call, tmp_path, kind):
 def use(call, kind, name, folder):
     """What the README of the plugin says, at a small size."""
     source = name if kind in ("environment", "plugin") else "toy/spring"
-    shown = ("--environment.visualizer", name) if kind == "visualizer" else ()
+    shown = (f"--environment.{kind}", name) if kind in ("visualizer", "launcher") else ()
     if kind == "backend":
         readme = (folder / f"physx-{name}/README.md").read_text()
         code = readme.partition('python -c "\n')[2].partition('\n"\n')[0]
@@ -86,15 +88,19 @@ def use(call, kind, name, folder):
     if kind == "visualizer":
         lines = (folder / "sessions/data_generation/data_generation.txt").read_text()
         assert "1 0 add mass" in lines
+    if kind == "format":
+        call("physx_core", "export", "sessions/data_generation", "file", "--to", name)
+        assert "100 training samples" in call("physx_core", "import", "file", "copy")
+        assert "m, m/s" in call("physx_core", "info", "copy")
     if kind in ("network", "plugin"):
         assert "training loss" in call("physx_core", *TRAIN, name)
 
 
 def test_new_plugins_import_faces_only(call, tmp_path):
-    for kind in ("plugin", "visualizer", "backend"):
+    for kind in ("plugin", "visualizer", "launcher", "format", "backend"):
         call("physx_core", "new", kind, f"a-{kind}", "--folder", "made")
     files = list((tmp_path / "made").rglob("*.py"))
-    assert len(files) == 13
+    assert len(files) == 21
     for file in files:
         for node in ast.walk(ast.parse(file.read_text())):
             if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("physx_"):

@@ -21,6 +21,7 @@ from physx_core import (
     Field,
     NetworkConfig,
     Parameter,
+    Prediction,
     Result,
     Training,
     View,
@@ -153,6 +154,18 @@ def test_report_of_a_training_says_how_good_its_network_is_beside_its_rivals():
     assert "physx train --config sessions/net/config.toml --session-name again" in told
 
 
+def test_the_commands_on_a_page_repeat_its_runs():
+    spring = EnvironmentConfig("toy/spring", as_tcp_ip_client=False, seed=1)
+    DataGeneration(spring, batch_nb=2, batch_size=20, session_name="data", quiet=True).execute()
+    train(view=View(), reads=["state", "force"], learns="next_state")
+    Prediction(NetworkConfig(), spring, session_name="net", step_nb=3, quiet=True).execute()
+    told = text_of(written("sessions/data")) + text_of(written("sessions/net"))
+    commands = re.findall(r"physx (\w+ --config \S+(?: --session-name again)?)", told)
+    assert [each.partition(" ")[0] for each in commands] == ["generate", "train", "predict"]
+    for command in commands:
+        assert main(command.split()) == 0
+
+
 def films(written):
     """Return the sizes and numbers of pictures of the films and pictures of a page."""
     found = re.findall(r"data:image/webp;base64,([^\"]+)", written)
@@ -172,7 +185,7 @@ def test_a_film_shows_predictions_beside_the_truth(monkeypatch):
     assert known[0].startswith("Film of the median episode") and "11 rows" in known[0]
     assert known[1].startswith("Best episode") and known[2].startswith("Worst episode")
     assert written("sessions/net", path="other.html", trust=True) == first
-    assert "There is no film: " in text_of(written("sessions/net"))  # its code is not trusted
+    assert "make the page with --trust" in text_of(written("sessions/net"))
 
 
 def test_a_page_says_why_there_is_no_film(monkeypatch):
@@ -412,9 +425,11 @@ def test_a_failing_section_is_named(monkeypatch, blocks, message):
 
 
 def test_mistakes_are_named(capsys):
-    with pytest.raises(SessionError, match="has no result"):
-        write_report("sessions/none")
     generate(4)
+    with pytest.raises(SessionError, match='does not exist. Did you mean "data"'):
+        write_report("sessions/dta")
+    with pytest.raises(SessionError, match="has no result: .* The folder contains: data"):
+        write_report("sessions")
     with pytest.raises(SessionError, match="cannot be written"):
         write_report("sessions/data", "nowhere/else/page.html")
     assert main(["report", "sessions/data", "--output", "page.html"]) == 0

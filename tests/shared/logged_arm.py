@@ -68,14 +68,15 @@ def simulated(robot=None, samples=600, engine=PinocchioBackend):
     return positions, torques
 
 
-def noisy(clean, encoder=1e-4, torque=0.05, correlation=0.0, seed=0):
+def noisy(clean, encoder=1e-4, torque=0.05, correlation=0.0, seed=0, joints=JOINTS):
     """Return a log with noise: of encoders in rad, of torques relative to their deviation."""
     positions, torques = clean
     random = np.random.default_rng(seed)
-    white = random.normal(size=(len(torques) + 400, 2)) * np.sqrt(1 - correlation**2)
+    white = random.normal(size=(len(torques) + 400, len(joints)))
+    white *= np.sqrt(1 - correlation**2)
     colored = lfilter([1.0], [1.0, -correlation], white, axis=0)[400:]
     return Log(
-        JOINTS,
+        joints,
         PERIOD,
         positions + encoder * random.normal(size=positions.shape),
         torques + torque * torques.std(axis=0) * colored,

@@ -1,44 +1,42 @@
-"""Logs of a robot that floats: a trunk with an arm of two links, in the air."""
-
-from __future__ import annotations
+"""Logs of a robot that tumbles through the air while its two joints track a motion."""
 
 import dataclasses
+from pathlib import Path
 
 import logged_arm as arm
 import numpy as np
 
 from physx_core.rotations import from_rotation_vector_rows, multiply_rows
 from physx_dart import PinocchioBackend
-from physx_identify import Log
 from physx_sim import Imu, JointSettings, Robot, Sensors, World, Wrench
 
-FLYER = """
-<mujoco><compiler angle="radian"/><worldbody><body name="trunk" pos="0 0 1"><freejoint/>
-  <geom type="box" size="0.2 0.1 0.05" mass="2"/>
-  <body name="imu" pos="0.1 -0.05 0.03" quat="0.8 0.36 0 0.48"/>
-  <body name="upper" pos="0.1 0 -0.05"><joint name="shoulder" axis="0 1 0"/>
-    <geom type="capsule" size="0.03" fromto="0 0 0 0.05 0.02 -0.3" mass="0.6"/>
-    <body name="lower" pos="0.05 0.02 -0.3"><joint name="elbow" axis="1 0 0"/>
-      <geom type="capsule" size="0.03" fromto="0 0 0 0 0.1 -0.25" mass="0.4"/>
-      <body name="foot" pos="0 0.1 -0.25" quat="0.6 0 0.8 0"/></body></body>
-</body></worldbody></mujoco>
-"""
-HIDDEN = {"mass lower": 0.5, "damping shoulder": 0.05, "damping elbow": 0.03,
-          "friction shoulder": 0.1, "friction elbow": 0.05}  # fmt: skip
+FILE = Path(__file__).with_name("flyer.xml")
+HIDDEN = {
+    "mass lower": 0.5,
+    "damping shoulder": 0.05,
+    "damping elbow": 0.03,
+    "friction shoulder": 0.1,
+    "friction elbow": 0.05,
+}
+"""Parameters of the robot that makes the logs; the known one has 0.4 kg and no resistance."""
+KNOWN = Robot(str(FILE), fixed_base=False)
 
 
-def flyer(place, **more):
-    return Robot(str(place), fixed_base=False, **more)
-
-
-def hidden(place, friction=True):
+def hidden(friction=True):
+    """Return the robot with the hidden parameters, or without dry friction."""
     joints = {
         name: JointSettings(
             damping=HIDDEN[f"damping {name}"], friction=friction * HIDDEN[f"friction {name}"]
         )
         for name in arm.JOINTS
     }
-    return flyer(place, mass_factors={"lower": 1.25}, joints=joints)
+    return dataclasses.replace(KNOWN, mass_factors={"lower": 1.25}, joints=joints)
+
+
+def flown(robot, samples, engine=PinocchioBackend):
+    """Return positions, shape (samples, 9), and torques, shape (samples, 2)."""
+    flight = pushed(robot, samples, engine)
+    return flight.q, flight.torques
 
 
 @dataclasses.dataclass
@@ -58,8 +56,8 @@ class Flight:
     wrench: np.ndarray
 
 
-def flown(robot, samples, engine=PinocchioBackend, lift=0.0, push=None):
-    """Return what a robot does that tumbles while its joints track a motion.
+def pushed(robot, samples, engine=PinocchioBackend, lift=0.0, push=None):
+    """Return the flight of a robot on which forces act.
 
     Args:
         robot: The robot.
@@ -96,37 +94,38 @@ def flown(robot, samples, engine=PinocchioBackend, lift=0.0, push=None):
     return Flight(q, torques, inertial, wrench[:-1])
 
 
-def noisy(flight, base=1e-3, encoder=1e-4, torque=0.02, inertial=(0.0, 0.0), drift=0.0, force=0.0):
-    """Return a log with noise: of poses, encoders, torques, and of the sensors.
+def noisy(clean, base=1e-3, encoder=1e-4, torque=0.02, correlation=0.0, seed=0):
+    """Return a log with noise: of the base in m and rad, else as of `logged_arm.noisy`."""
+    q, torques = clean
+    log = arm.noisy((q[:, 7:], torques), encoder, torque, correlation, seed)
+    random, count = np.random.default_rng([seed, 1]), len(q)
+    turns = from_rotation_vector_rows(base * random.normal(size=(count, 3)))
+    signs = np.where(np.arange(count) % 7 < 3, -1, 1)[:, None]  # a quaternion has two
+    return dataclasses.replace(
+        log,
+        base_positions=q[:, :3] + base * random.normal(size=(count, 3)),
+        base_orientations=signs * multiply_rows(q[:, 3:7], turns),
+    )
+
+
+def sensed(flight, inertial=(0.0, 0.0), drift=0.0, force=0.0, **more):
+    """Return a log with the pose, an inertial sensor, and forces if there are any.
 
     Args:
         flight: The motion.
-        base: Noise of the pose, in m and rad.
-        encoder: Of encoders, in rad.
-        torque: Of torques, relative to their deviation.
-        inertial: Of specific forces, in m/s², and angular velocities, in rad/s.
+        inertial: Noise of specific forces, in m/s², and angular velocities, in rad/s.
         drift: Constant error of the latter, in rad/s.
-        force: Of forces, in N, ten times that of moments.
+        force: Noise of forces, in N, ten times that of moments.
+        **more: As of `noisy`.
     """
-    q, torques = flight.q, flight.torques
-    random, count = np.random.default_rng(0), len(q)
-    turns = from_rotation_vector_rows(base * random.normal(size=(count, 3)))
-    signs = np.where(np.arange(count) % 7 < 3, -1, 1)[:, None]  # a quaternion has two
-    positions = q[:, 7:] + encoder * random.normal(size=(count, 2))
-    torques = torques + torque * torques.std(axis=0) * random.normal(size=(count, 2))
-    places = q[:, :3] + base * random.normal(size=(count, 3))
+    random, count = np.random.default_rng(0), len(flight.q)
     read = flight.inertial + np.repeat(inertial, 3) * random.normal(size=(count, 6))
     felt = flight.wrench + force * np.repeat([1, 0.1], 3) * random.normal(size=(count, 6))
-    pushed = flight.wrench.any()
-    return Log(
-        arm.JOINTS,
-        arm.PERIOD,
-        positions,
-        torques,
-        base_positions=places,
-        base_orientations=signs * multiply_rows(q[:, 3:7], turns),
+    touched = flight.wrench.any()
+    return dataclasses.replace(
+        noisy((flight.q, flight.torques), **more),
         gyroscope=read[:, 3:] + drift,
         accelerometer=read[:, :3],
-        wrenches={"foot": felt} if pushed else {},
-        axes="world" if pushed else "link",
+        wrenches={"foot": felt} if touched else {},
+        axes="world" if touched else "link",
     )

@@ -7,9 +7,11 @@ import pickle
 
 import numpy as np
 import pytest
+import safetensors.numpy
 
 from physx_core.errors import ComponentNotFoundError, ConfigError
 from physx_sim import (
+    ActuatorNetwork,
     JointSettings,
     Layout,
     Motor,
@@ -18,7 +20,9 @@ from physx_sim import (
     Simulation,
     State,
     World,
+    read_actuators,
     with_rotors,
+    write_actuators,
 )
 from physx_sim.errors import FeatureNotSupportedError, SimulationError
 
@@ -193,3 +197,14 @@ def test_motors_can_be_pickled_and_reject_states_of_others():
     motors.restore(state)
     motors(simulation)
     np.testing.assert_allclose(motors.torques, 10 * 0.15)
+
+
+def test_files_of_actuator_networks_hold_joints_of_any_name(tmp_path):
+    layers = [(np.ones((1, 2)), np.zeros(1))]
+    names = ("arm", "arm:0", "arm:elbow", "größe 1")
+    networks = {name: ActuatorNetwork(0.01, layers, 1.0) for name in names}
+    write_actuators(tmp_path / "all", networks)
+    assert tuple(read_actuators(tmp_path / "all")) == names
+    safetensors.numpy.save_file({"weights": np.ones(3)}, tmp_path / "other")
+    with pytest.raises(ConfigError, match="it holds other arrays"):
+        read_actuators(tmp_path / "other")

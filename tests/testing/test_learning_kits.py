@@ -56,6 +56,18 @@ def test_wrong_networks(name, check, text, place, expect_named):
     expect_named(network(place, name), check, text)
 
 
+def test_a_network_that_no_fields_are_at_fault_for_is_not_skipped(place):
+    report = check_network(place("wrong_networks", "ReturnsNothing"))
+    assert not report.ok and report.counts()["failed"] == 12, str(report)
+    assert "TypeError: 'NoneType' object is not" in str(report)
+
+
+def test_a_class_that_is_not_complete_fails_once(place):
+    report = check_network(place("wrong_networks", "TakesNothing"))
+    (check,) = report.checks
+    assert check.status == "failed" and "predict() where physx calls predict(data)" in check.reason
+
+
 @pytest.mark.parametrize(("name", "check", "text"), OPTIMIZATIONS)
 def test_wrong_optimizations(name, check, text, place, expect_named):
     expect_named(optimization(place, name), check, text)

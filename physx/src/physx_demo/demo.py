@@ -7,10 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-import tyro
-
 from physx_core import plugins
-from physx_core.cli import show
+from physx_core.cli import options_from, show
 
 
 @dataclass
@@ -28,7 +26,7 @@ class Demo:
 
 def run(words: Sequence[str]) -> None:
     """Run the demo, and say what it shows and where it is."""
-    options = tyro.cli(Demo, args=words, prog="physx demo")
+    options = options_from(Demo, words, "demo")
     from physx_demo import arm
 
     options.out.mkdir(parents=True, exist_ok=True)

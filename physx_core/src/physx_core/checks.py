@@ -14,13 +14,14 @@ import operator
 import types
 import typing
 from collections.abc import Callable, Mapping, Sequence
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, TypeVar
 
 from physx_core.errors import ConfigError
 
 if TYPE_CHECKING:
     from physx_core.typing import Vector
 
+T = TypeVar("T")
 Convert = Callable[[str, Any], Any]
 """Returns a value as the declared type, given the option's name and the value."""
 
@@ -278,6 +279,35 @@ def vector(option: str, values: Any, length: int) -> tuple[float, ...]:
     if len(numbers) != length:
         raise ConfigError(f"{option} has {len(numbers)} numbers but needs {length}.")
     return tuple(finite(option, number) for number in numbers)
+
+
+def things(option: str, values: Any, kind: type[T]) -> tuple[T, ...]:
+    """Return a sequence of objects of a class as a tuple.
+
+    Raises:
+        ConfigError: If it is no sequence, or one of the objects is of another class.
+    """
+    name = kind.__name__
+    wanted = f"{option} must be a list of {name}s, as in [{name}(...)]"
+    if not _is_sequence(values):
+        raise ConfigError(f"{wanted}, not {values!r}.")
+    found = tuple(values)
+    for each in found:
+        if not isinstance(each, kind):
+            raise ConfigError(f"{wanted}; {each!r} is not a {name}.")
+    return found
+
+
+def names(option: str, values: Any) -> tuple[str, ...]:
+    """Return a sequence of names as a tuple.
+
+    Raises:
+        ConfigError: If it is no sequence of strings.
+    """
+    found = tuple(values) if _is_sequence(values) else (None,)
+    if not all(isinstance(each, str) for each in found):
+        raise ConfigError(f"{option} is {values!r}, not a list of names.")
+    return found
 
 
 def scaled(values: tuple[float, ...], length: float) -> tuple[float, ...]:

@@ -6,6 +6,7 @@ Plugins raise these errors too. The command line reports them without a tracebac
 from __future__ import annotations
 
 from collections.abc import Iterable, Mapping, Sequence
+from pathlib import Path
 
 from physx_core.origin import install_hint
 
@@ -32,6 +33,22 @@ def _listed_near(name: str, known: Sequence[str]) -> str:
         return listed(known)
     near = difflib.get_close_matches(name, known, n=8, cutoff=0.0)
     return f"{listed(near)} and {len(known) - len(near)} others (physx plugins)"
+
+
+def found_at(place: Path) -> str:
+    """Return what is at a path at which something is missing, as the end of a message."""
+    if place.is_file():
+        return "It is a file: give the folder of a session or dataset."
+    if place.is_dir():
+        return f"The folder contains: {listed(path.name for path in place.iterdir())}."
+    missing = place.absolute()
+    while not missing.parent.is_dir():
+        missing = missing.parent
+    around = [path.name for path in missing.parent.iterdir()]
+    return (
+        f"The folder {missing} does not exist.{nearest(missing.name, around)} {missing.parent} "
+        f"contains: {listed(around)}."
+    )
 
 
 def printable(text: object) -> str:
@@ -91,7 +108,7 @@ class UnknownOptionError(ConfigError):
     """
 
     def __init__(self, owner: str, unknown: Iterable[str], known: Iterable[str]) -> None:
-        self.owner, self.unknown, self.known = owner, sorted(unknown), sorted(known)
+        self.owner, self.unknown, self.known = owner, sorted(map(str, unknown)), sorted(known)
         name = self.unknown[0]
         super().__init__(
             f'{owner} has no option "{name}".{nearest(name, self.known)} '
@@ -115,7 +132,7 @@ class UnknownArgumentError(UnknownOptionError, TypeError):
             unknown: Names of the unknown arguments.
             known: Names of the arguments that the class accepts.
         """
-        self.owner, self.unknown, self.known = owner, sorted(unknown), sorted(known)
+        self.owner, self.unknown, self.known = owner, sorted(map(str, unknown)), sorted(known)
         message = owner
         if self.unknown:
             name = self.unknown[0]
@@ -157,12 +174,13 @@ class PluginNotFoundError(PhysxError):
         installed: Entry-point names of the installed plugins.
     """
 
-    def __init__(self, name: str, installed: Sequence[str], hint: str) -> None:
+    def __init__(
+        self, name: str, installed: Sequence[str], hint: str, meant: Sequence[str] = ()
+    ) -> None:
         self.name, self.installed = name, list(installed)
-        super().__init__(
-            f'No plugin "{name}" is installed.{nearest(name, installed)} '
-            f"Installed: {listed(installed)}. {hint}"
-        )
+        guess = f" Did you mean {' or '.join(meant)}?" if meant else nearest(name, installed)
+        text = f'No plugin "{name}" is installed.{guess} Installed: {listed(installed)}. {hint}'
+        super().__init__(text.rstrip())
 
 
 class ComponentNotFoundError(PhysxError):
@@ -179,7 +197,10 @@ class ComponentNotFoundError(PhysxError):
     ) -> None:
         self.kind, self.name, self.known = kind, name, sorted(known)
         hint = hint or f"It has: {_listed_near(name, self.known)}."
-        super().__init__(f'{place} has no {kind} "{name}".{nearest(name, self.known)} {hint}')
+        what = f'has no {kind} "{name}".{nearest(name, self.known)}'
+        if not name:
+            what = f"has several of kind {kind}: name one." if self.known else f"has no {kind}."
+        super().__init__(f"{place} {what} {hint}")
 
 
 class ContractError(PhysxError):
@@ -255,11 +276,11 @@ class FailedEpisodesError(PhysxError):
     def __init__(self, failed: int, episode: int, reason: str) -> None:
         self.failed, self.episode = failed, episode
         first, _, self.remote_traceback = reason.partition("\n")
-        count = "An episode" if failed == 1 else f"{failed} episodes"
+        others = f", after {failed - 1} others," if failed > 1 else ""
         super().__init__(
-            f"{count} failed, the last one number {episode}: {first.rstrip('.')}. What has been "
-            "simulated is stored. To go on with the others: --resume, and --max-failed for more "
-            "failures; physx generate --retry-failed simulates those that failed again."
+            f"Episode {episode}{others} failed: {first.rstrip('.')}. What has been simulated is "
+            "stored. To go on with the others: --resume, and --max-failed for more failures; "
+            "physx generate --retry-failed simulates those that failed again."
         )
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import warnings
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import replace
 from typing import Any
@@ -139,6 +140,8 @@ class RowBuffer:
             steps[row] = step
         if finite and self._finite == row:
             self._finite = row + 1
+        if not row:
+            _warn_of_equal(sample)
         self.count = row + 1
 
     def number_rows(self, first: int, episode: int) -> None:
@@ -283,6 +286,22 @@ class RejectedSamples:
             with contextlib.suppress(SampleError):
                 buffer.put(sample, instance_id, episode, step, finite=True)
         return buffer.take()
+
+
+def _warn_of_equal(sample: Mapping[str, Any]) -> None:
+    """Warn of fields that are one array, such as a state before and after a step in place."""
+    found: dict[tuple[Any, ...], str] = {}
+    for name, value in sample.items():
+        if type(value) is np.ndarray and value.size:
+            key = value.ctypes.data, value.shape, value.strides
+            other = found.setdefault(key, name)
+            if other != name:
+                warnings.warn(
+                    f'The fields "{other}" and "{name}" are the same array, so their values are '
+                    "equal. If one is from before a step that changes the array in place, give a "
+                    "copy: array.copy().",
+                    stacklevel=2,
+                )
 
 
 def check_names(

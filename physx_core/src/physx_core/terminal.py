@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import re
 import shutil
 import textwrap
 
+_COMMAND = re.compile(r"next: | +physx [a-z]")
 _LEAST = 30  # columns that a last column needs to be wrapped within itself
 
 
@@ -17,7 +19,8 @@ def wrapped(text: str) -> str:
     r"""Return a text whose lines are no wider than the terminal, except for words that are.
 
     What is continued stands below the last column of its line (columns are two blanks apart), or
-    is indented further than the line. A command after ``next: `` is continued with a backslash.
+    is indented further than the line. A command, after ``next: `` or indented, is continued with a
+    backslash.
     """
     return "\n".join(piece for line in text.split("\n") for piece in _pieces(line))
 
@@ -27,7 +30,7 @@ def _pieces(line: str) -> list[str]:
     if len(line) <= columns:
         return [line]
     text = line.lstrip()
-    ending = " \\" if text.startswith("next: ") else ""
+    ending = " \\" if _COMMAND.match(line) else ""
     begin = " " * (len(line) - len(text))
     indent = len(begin) + 4
     columns_before, gap, last = text.rstrip().rpartition("  ")

@@ -145,6 +145,7 @@ class Linear(Network):
     def bind(self, fields: dict[str, Field]) -> None:  # type: ignore[override]
         """Set the sizes from the fields; existing weights are kept."""
         super().bind(fields)
+        self.reject_free_axes(fields)
         none = {name: np.zeros((0, *(fields[name].shape or ()))) for name in self.net_fields}
         self._shape = fields[self.opt_fields[0]].shape or ()
         size = (self.rows(none).shape[1], int(np.prod(self._shape)))

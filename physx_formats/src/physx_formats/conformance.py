@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from physx_core import Dataset
+from physx_core import Dataset, Field
 from physx_core.errors import PhysxError
 from physx_formats.format import Format
 from physx_formats.table import ExportOptions
@@ -19,21 +19,30 @@ from physx_testing.report import NotApplicableError
 from physx_testing.subject import Check, Subject, expect
 
 _ROWS = 12
+_FIELDS = (
+    Field("state", (2,), unit="m"),
+    Field("next_state", (2,), unit="m", role="additional", like="state"),
+    Field("points", (3, 2), unit="m"),
+    Field("episode", (), "int64", role="additional"),
+    Field("step", (), "int64", role="additional"),
+)
 _VALUES: dict[str, Any] = {"fps": 30, "task": "a task", "points": "points"}
 
 
 @contextlib.contextmanager
 def _rows(folder: Path) -> Iterator[Dataset]:
-    """Yield a dataset with one trajectory of 12 rows: a state, and a mesh that moves."""
+    """Yield a dataset with one trajectory of 12 rows: states, and a mesh that moves."""
     step = np.arange(_ROWS)
     state = np.stack([np.cos(step / 3), np.sin(step / 3)], axis=1)
     rows = {
         "state": state,
+        "next_state": np.roll(state, -1, axis=0),
         "points": state[:, None, :] * np.arange(1, 4)[:, None],
         "episode": np.zeros(_ROWS, int),
         "step": step,
     }
     with Dataset.create(folder) as dataset:
+        dataset.define_fields("training", _FIELDS)
         dataset.append("training", rows)
         yield dataset
 
@@ -67,7 +76,8 @@ def _writes(subject: Subject) -> None:
 
 def _reads_again(subject: Subject) -> None:
     place, copy = _written(subject), subject.folder / "copy"
-    if subject.make().open is None:
+    form: Format = subject.make()
+    if form.open is None:
         raise NotApplicableError("nothing is imported from it")
     import_file(place, copy)
     with Dataset.open(copy) as found, Dataset.open(subject.folder / "session") as wanted:
@@ -75,6 +85,19 @@ def _reads_again(subject: Subject) -> None:
             expect(name in found.fields("training"), f'it loses the field "{name}"')
             one, other = (each["training"][name][:].reshape(_ROWS, -1) for each in (found, wanted))
             expect(np.array_equal(one, other), f'it changes the values of "{name}" ({field.dtype})')
+            _compare(form, field, found.fields("training")[name])
+
+
+def _compare(form: Format, wanted: Field, found: Field) -> None:
+    """Compare what is known of a field, but for what the format says that it loses."""
+    for loss, names in (("units", ["unit"]), ("types", ["dtype"]), ("notes", ["role", "like"])):
+        for name in names if loss not in form.loses else ():
+            one, other = getattr(wanted, name), getattr(found, name)
+            expect(
+                one == other,
+                f'the {name} of "{wanted.name}" is {other!r} instead of {one!r}: keep it, for '
+                f'example with Notes, or say that the format loses "{loss}"',
+            )
 
 
 def _recognizes_its_own(subject: Subject) -> None:
@@ -98,6 +121,11 @@ def _refuses_damage(subject: Subject) -> None:
         import_file(place, subject.folder / "copy")
     except PhysxError:
         return
+    except Exception as error:
+        raise AssertionError(
+            f"it raises {type(error).__name__}: {error}; it must raise ExchangeError, which says "
+            "what is wrong with the file"
+        ) from error
     raise AssertionError("it imports a file of which half is missing")
 
 

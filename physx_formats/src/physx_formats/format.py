@@ -16,7 +16,11 @@ KIND = "format"
 Columns: TypeAlias = dict[str, Column]
 
 LOSSES = {
-    "types": "keeps no types: numbers are int64, float64 or bool again, with the same values",
+    "units": "keeps no units",
+    "types": (
+        "keeps no types: numbers are int64, float64 or bool again, with the same values, and so is "
+        "text that looks like them"
+    ),
     "notes": "keeps no roles and axes of fields, nor which are the same quantity",
     "colors": "keeps pictures that are observations as videos, whose colors are only close",
     "records": "keeps no records of episodes, with their parameters",
@@ -46,7 +50,8 @@ class Format:
         recognizes: Returns whether a path is a file or folder of this format, from its first 8
             bytes; those of a folder are empty. File names do not matter.
         open: Opens a file that holds at most this number of bytes, and yields its arrays by name,
-            and the notes in it. None: nothing can be imported from it.
+            and the notes in it; raises ExchangeError for a damaged file. None: nothing can be
+            imported from it.
     """
 
     write: Callable[[Sequence[Table], Path, ExportOptions], int] | None = None
@@ -73,5 +78,8 @@ def find_format(name: str) -> Format:
 
 
 def all_formats() -> dict[str, Format]:
-    """Return the formats of all plugins by name."""
-    return {name: find_format(places[0]) for name, places in plugins.references_of(KIND).items()}
+    """Return the formats of all plugins by name; broken ones are left out."""
+    found: dict[str, Format] = {}
+    for reference, each in plugins.resolve_all(KIND).items():
+        found.setdefault(reference.partition("/")[2], each)
+    return found

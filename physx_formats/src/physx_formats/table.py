@@ -148,6 +148,25 @@ class Column(Protocol):
         ...
 
 
+class ArrayColumn:
+    """A column whose rows are in memory; see `Column`.
+
+    Args:
+        values: Shape (rows, *field shape).
+        unit: Their unit, if the file says so.
+    """
+
+    problem = ""
+
+    def __init__(self, values: Array, unit: str = "") -> None:
+        self._values, self.unit = values, unit
+        self.shape, self.dtype = values.shape, values.dtype
+
+    def read(self, start: int, count: int) -> Array:
+        """Return the next `count` rows, which begin at `start`."""
+        return self._values[start : start + count]
+
+
 def is_picture(field: Field) -> bool:
     """Return whether a field has the colors of pictures, uint8 of shape (height, width, 3)."""
     shape = field.shape or ()

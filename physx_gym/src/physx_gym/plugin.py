@@ -15,14 +15,15 @@ from physx_gym.bridge.gym_environment import GymEnvironment
 def physx_environments() -> Components:
     """Return all environments registered with Gymnasium, and what adapts others.
 
-    Those are named by where they are: ``"gym/module:id"``, ``"gym/script.py:function"``.
+    Those are named by where they are: ``"gym/module:id"``, ``"gym/script.py:function"``. The
+    environment ``"gym/log"`` is that of a log, and repeats its episode.
     """
     registered = {
         id: functools.partial(GymEnvironment, id=id)
         for id in gymnasium.registry
         if is_component_name(id)
     }
-    return {**registered, "module": _named}
+    return {**registered, "module": _named, "log": _logged}
 
 
 @hookimpl
@@ -33,3 +34,9 @@ def physx_evaluations() -> Components:
 
 def _named(*, module: str, **kwargs: Any) -> GymEnvironment:
     return GymEnvironment(id=module, **kwargs)
+
+
+def _logged(*, path: str, **kwargs: Any) -> GymEnvironment:
+    from physx_gym.telemetry.logged_actions import logged_environment
+
+    return GymEnvironment(**{**logged_environment(path), "policy": path, **kwargs})

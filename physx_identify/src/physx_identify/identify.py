@@ -13,7 +13,8 @@ from physx_core import checks
 from physx_core.errors import ConfigError
 from physx_core.typing import Array, Vector
 from physx_identify.engines import find_engines, refits, world_of
-from physx_identify.estimation.fit import SLOWEST, Data, Fit, fit
+from physx_identify.estimation.equations import SLOWEST
+from physx_identify.estimation.fit import Fit, Problem
 from physx_identify.estimation.inertia import cholesky_of, from_cholesky, is_physical
 from physx_identify.estimation.model import GRAVITY, Model
 from physx_identify.estimation.profile import profile_interval
@@ -103,32 +104,26 @@ def identify(
     world = world_of(robot, log.period, gravity, held)
     others = find_engines(engines, world, parameters)
     data = data_of(log, instant, slowest, flight)
-    found = fit(model, parameters, data)
-    again = fit(model, parameters, data, np.array([p.nominal for p in parameters]), found.noise)
+    problem = Problem(model, parameters, data)
+    found = problem.solve()
+    again = problem.solve(np.array([each.nominal for each in parameters]), found.noise)
     names = model.coordinates[data.rows]
     summary = _summary(log, robot, parameters, found, again, level, seed, names)
     refitted = refits(others, world, model, parameters, found, summary)
     estimates = summary.estimates
     if summary.converged:
-        estimates = [_profiled(each, model, parameters, data, found, level) for each in estimates]
+        estimates = [_profiled(each, problem, found, level) for each in estimates]
     return dataclasses.replace(summary, estimates=estimates, engines=refitted)
 
 
-def _profiled(
-    estimate: Estimate,
-    model: Model,
-    parameters: Sequence[Parameter],
-    data: Data,
-    found: Fit,
-    level: float,
-) -> Estimate:
+def _profiled(estimate: Estimate, problem: Problem, found: Fit, level: float) -> Estimate:
     """Return an estimate with the interval of its profile, where that is another one."""
-    place = [each.name for each in parameters].index(estimate.name)
+    place = [each.name for each in problem.parameters].index(estimate.name)
     if estimate.error is None:
         return estimate
     freedom = found.freedom[int(np.flatnonzero(found.independent == place)[0])]
     width = float(student.ppf(0.5 + 0.5 * level, freedom))
-    ends = profile_interval(model, parameters, data, found, place, width)
+    ends = profile_interval(problem, found, place, width)
     if ends is None:
         return estimate
     return dataclasses.replace(estimate, low=ends[0], high=ends[1], method="profile")

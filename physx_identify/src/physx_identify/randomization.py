@@ -11,7 +11,7 @@ from numpy.random import Generator
 from physx_core.errors import ComponentNotFoundError
 from physx_gym.tasks.randomizations import Randomization
 from physx_identify.errors import IdentificationError
-from physx_identify.result.identification import SETTINGS, Identification
+from physx_identify.result.identification import SETTINGS, Identification, masses_of
 from physx_identify.result.stored import read_identification
 
 
@@ -31,15 +31,21 @@ class Identified(Randomization):
             name: Name in the log; None: that of the class.
 
         Raises:
-            IdentificationError: If the file is missing or damaged, or the log told of nothing that
-                an environment can change.
+            IdentificationError: If the file is missing or damaged, has no draws, or the log told of
+                nothing that an environment can change.
         """
         super().__init__(name)
         self.found = path if isinstance(path, Identification) else read_identification(path)
+        count = len(self.found.estimates)
+        if {len(draw) for draw in self.found.draws} != {count}:
+            raise IdentificationError(
+                f"The identification has no draws of its {count} parameters: make it again."
+            )
         self._places = [
             (place, each) for place, each in enumerate(self.found.estimates)
             if each.kind in ("mass", *SETTINGS)
         ]  # fmt: skip
+        self._masses: dict[str | Path, dict[str, float]] = {}
         if not self._places:
             raise IdentificationError(
                 "The identification has no mass, damping, friction or armature to draw."
@@ -67,11 +73,15 @@ class Identified(Randomization):
         """Return factors of the masses, and settings of the joints."""
         robot = nominal.env.robot.name
         factors = dict(nominal.options["world"]["robots"][robot]["mass_factors"])
+        (described,) = (each for each in nominal.env.simulator.world.robots if each.name == robot)
+        if described.urdf not in self._masses:
+            self._masses[described.urdf] = masses_of(described)
+        masses = self._masses[described.urdf]
         joints: dict[str, dict[str, float]] = {}
         for _, each in self._places:
             value = drawn[each.name]
             if each.kind == "mass":
-                factors[each.of] = factors.get(each.of, 1.0) * value / each.nominal
+                factors[each.of] = value / masses[each.of]
             else:
                 joints.setdefault(each.of, {})[each.kind] = value
         return {"world": {"robots": {robot: {"mass_factors": factors, "joints": joints}}}}

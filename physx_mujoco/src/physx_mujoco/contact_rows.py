@@ -10,7 +10,7 @@ from __future__ import annotations
 import mujoco
 import numpy as np
 
-from physx_core.rotations import to_matrix
+from physx_core.rotations import cross_rows, to_matrix
 from physx_core.typing import Vector
 from physx_mujoco.model import LAG, WorldModel
 
@@ -59,7 +59,7 @@ class ContactRows:
             own = np.zeros(9)
             mujoco.mju_quat2Mat(own, model.geom_quat[shape])
             whole, arm = turn @ own.reshape(3, 3), turn @ model.geom_pos[shape]
-            linear = velocity[:3] + np.cross(velocity[3:], arm) + turn @ surface
+            linear = velocity[:3] + cross_rows(velocity[3:], arm) + turn @ surface
             model.geom_surfacevel[shape] = *(linear @ whole), *(velocity[3:] @ whole)
         model.flg_surfacevel = bool(model.geom_surfacevel.any())
         self._moving.pop(int(body), None)
@@ -72,14 +72,19 @@ class ContactRows:
         if not self.active:
             mujoco.mj_step(model, data)
             return
-        mujoco.mj_step1(model, data)
+        self.begin()
+        mujoco.mj_step2(model, data)
+
+    def begin(self) -> None:
+        """Begin a physics step, up to the forces, which `mujoco.mj_step2` solves for."""
+        data = self._data
+        mujoco.mj_step1(self._world.model, data)
         if self._mixed and data.ncon:
             self._resist_turning()
         if self._deep:
             self._limit_depth()
         if self._moving:
             self._push()
-        mujoco.mj_step2(model, data)
 
     def _resist_turning(self) -> None:
         """Give each contact the larger torsional and rolling friction of its two shapes."""
@@ -115,6 +120,6 @@ class ContactRows:
                 if row < 0 or body not in self._moving:
                     continue
                 center, linear, angular = np.split(self._moving[body], 3)
-                moved = linear + np.cross(angular, contact.pos[number] - center)
+                moved = linear + cross_rows(angular, contact.pos[number] - center)
                 speed = float(moved @ contact.frame[number, :3]) * (1.0 if side else -1.0)
                 data.efc_pos[row] += speed * LAG * model.opt.timestep

@@ -1,11 +1,13 @@
 """Servos, imposed velocities, and velocity limits, which MuJoCo does not have.
 
-A step is repeated with adjusted torques until it ends with the desired velocities.
+The forces of a step are solved for again, with adjusted torques, until it ends with the desired
+velocities.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import math
+from collections.abc import Callable, Sequence
 
 import mujoco
 import numpy as np
@@ -28,13 +30,13 @@ class Drives:
         parts: The world; the velocity limit of a joint that follows another limits its leader.
         layout: Its joints.
         running: The world.
-        step: Simulates a physics step.
+        begin: Begins a physics step, which `mujoco.mj_step2` ends.
     """
 
     def __init__(
-        self, parts: Parts, layout: Layout, running: Running, step: Callable[[], None]
+        self, parts: Parts, layout: Layout, running: Running, begin: Callable[[], None]
     ) -> None:
-        self._running, self._step, modes = running, step, np.array(layout.modes)
+        self._running, self._begin, modes = running, begin, np.array(layout.modes)
         self._driven = modes != "force"
         self._places = np.array(list(layout.velocity_index.values()), np.intp)
         fastest = layout.max_velocity.copy()
@@ -47,51 +49,93 @@ class Drives:
             coupled = movable.model.coupling_rows[0]
             rows.append(np.zeros((len(coupled), len(fastest))))
             rows[-1][:, part.joints] = coupled
-        self._rows = np.concatenate(rows)
-        self._fastest = np.where(self._driven, np.inf, fastest)
-        self._strongest = np.where(modes == "velocity", np.inf, layout.max_torque)
-        self.idle = not (self._driven.any() or np.isfinite(self._fastest).any())
+        fastest[self._driven] = np.inf
+        strongest = np.where(modes == "velocity", np.inf, layout.max_torque)
+        self.idle = not (self._driven.any() or np.isfinite(fastest).any())
+        # Lists, because operations on short arrays take longer.
+        bounds = self._driven.tolist(), fastest.tolist(), strongest.tolist()
+        self._joints = list(zip(*bounds, strict=True))
+        model, joined, period = running.model, np.concatenate(rows), running.model.opt.timestep
+        self._resistance = np.diag(
+            period * model.dof_damping + period**2 * model.jnt_stiffness[model.dof_jntid]
+        )
+        self._resistance[np.ix_(self._places, self._places)] += _STIFF * joined.T @ joined
 
     def step(self) -> None:
         """Simulate a physics step; for driven joints, the applied force is the desired velocity."""
-        running, at, driven = self._running, self._places, self._driven
+        running, at = self._running, self._places
         model, data = running.model, running.data
-        q, v = running.positions, running.velocities
-        q[:], v[:], warm = data.qpos, data.qvel, data.qacc_warmstart.copy()
-        wanted, torques = data.qfrc_applied[at].copy(), np.zeros(len(at))
-        response, tried, before = None, torques, v[at]
-        for _ in range(_MOST):
-            data.qfrc_applied[at] = np.where(driven, 0.0, wanted) + torques
-            data.qpos[:], data.qvel[:], data.qacc_warmstart[:] = q, v, warm
-            self._step()
-            now = data.qvel[at]
-            side = -np.copysign(1.0, np.where(torques, torques, -now))  # of a limit
-            active = driven | (side * now > self._fastest) | (torques != 0)
-            goal = np.where(driven, wanted, np.where(active, side * self._fastest, now))
-            low = np.where(driven, -self._strongest, np.where(side > 0, -np.inf, 0.0))
-            high = np.where(driven, self._strongest, np.where(side > 0, 0.0, np.inf))
-            error = goal - now
-            stuck = ((torques <= low) & (error < 0)) | ((torques >= high) & (error > 0))
-            free = np.flatnonzero(active & ~stuck)
-            if not (np.abs(error[free]) > _EXACT * (1 + np.abs(now[free]))).any():
+        q, v, warmth, forces = data.qpos, data.qvel, data.qacc_warmstart, data.qfrc_applied
+        start = running.positions, running.velocities, warmth.copy()
+        start[0][:], start[1][:] = q, v
+        wanted, response = forces.take(at), np.zeros(0)
+        applied, targets = np.where(self._driven, 0.0, wanted), wanted.tolist()
+        torques = tried = before = np.zeros(len(at))
+        self._begin()
+        for count in range(_MOST):
+            forces[at] = applied + torques
+            q[:], v[:], warmth[:] = start
+            mujoco.mj_step2(model, data)
+            now = v.take(at)
+            free, errors, least, most = self._off(now.tolist(), torques.tolist(), targets)
+            if not free:
                 break
-            if response is None:
+            if not count:
                 response = model.opt.timestep * self._inverse()
             elif (change := torques - tried).any():  # contacts resist, too: Broyden's method
                 missed = now - before - response @ change
-                response += np.outer(missed, change / change.dot(change))
-            more = np.linalg.solve(response[np.ix_(free, free)], error[free])
-            tried, before = torques.copy(), now
-            torques[free] = np.clip(torques[free] + more, low[free], high[free])
-        data.qfrc_applied[at] = wanted
+                response += missed[:, None] * (change / change.dot(change))
+            more = _solved(response.take(free, 0).take(free, 1), errors)
+            tried, before, torques = torques, now, torques.copy()
+            torques[free] = np.minimum(np.maximum(torques[free] + more, least), most)
+        forces[at] = wanted
+
+    def _off(
+        self, speeds: Sequence[float], torques: Sequence[float], targets: Sequence[float]
+    ) -> tuple[list[int], list[float], list[float], list[float]]:
+        """Return the joints whose velocities can be improved; none if all are exact.
+
+        Args:
+            speeds: Velocities of all joints after the step.
+            torques: What was added to the torques.
+            targets: Desired velocities of driven joints.
+
+        Returns:
+            The joints, their errors, and the smallest and largest torques that may be added.
+        """
+        free, exact = [], True
+        for joint, (driven, fastest, strongest) in enumerate(self._joints):
+            speed, torque = speeds[joint], torques[joint]
+            if driven:
+                goal, least, most = targets[joint], -strongest, strongest
+            elif torque > 0 or (not torque and speed < -fastest):
+                goal, least, most = -fastest, 0.0, math.inf
+            elif torque < 0 or speed > fastest:
+                goal, least, most = fastest, -math.inf, 0.0
+            else:
+                continue
+            error = goal - speed
+            if not ((torque <= least and error < 0) or (torque >= most and error > 0)):
+                free.append((joint, error, least, most))
+                exact = exact and not abs(error) > _EXACT * (1 + abs(speed))
+        if exact:
+            return [], [], [], []
+        joints, errors, least, most = map(list, zip(*free, strict=True))
+        return joints, errors, least, most
 
     def _inverse(self) -> Vector:
         """Return the inverse of the mass matrix with implicit damping, shape (joints, joints)."""
-        model, period = self._running.model, self._running.model.opt.timestep
-        mass = np.diag(period * model.dof_damping)
-        mass += np.diag(period**2 * model.jnt_stiffness[model.dof_jntid])
-        mass[np.ix_(self._places, self._places)] += _STIFF * self._rows.T @ self._rows
-        plain = np.zeros_like(mass)
-        mujoco.mj_fullM(model, self._running.data, plain)
-        found: Vector = np.linalg.inv(plain + mass)[np.ix_(self._places, self._places)]
+        mass = np.zeros_like(self._resistance)
+        mujoco.mj_fullM(self._running.model, self._running.data, mass)
+        found: Vector = np.linalg.inv(mass + self._resistance)[np.ix_(self._places, self._places)]
         return found
+
+
+def _solved(response: Vector, error: Sequence[float]) -> Vector:
+    """Return the torques of joints that correct their velocities, the least if some cannot."""
+    wanted = np.array(error)
+    try:
+        found: Vector = np.linalg.solve(response, wanted)
+    except np.linalg.LinAlgError:  # something holds joints, whatever their torques are
+        found = np.linalg.lstsq(response, wanted, rcond=None)[0]
+    return found

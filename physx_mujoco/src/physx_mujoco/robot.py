@@ -8,7 +8,7 @@ from typing import Any
 import mujoco
 import numpy as np
 
-from physx_core.rotations import rotate, rotate_back
+from physx_core.rotations import cross_rows, rotate, rotate_back
 from physx_core.typing import Index, Vector
 from physx_sim import Part
 from physx_sim.engines import MovableBody, RobotEngine, twist_change
@@ -105,7 +105,7 @@ class MujocoRobot(RobotEngine):
         if local:
             force, torque = turn @ force, turn @ torque
         arm = data.xpos[body] + turn @ point - data.xipos[body]
-        data.xfrc_applied[body] += np.concatenate([force, torque + np.cross(arm, force)])
+        data.xfrc_applied[body] += np.concatenate([force, torque + cross_rows(arm, force)])
 
     def release(self) -> None:
         """Remove all wrenches."""

@@ -6,7 +6,7 @@ Steps are semi-implicit Euler, with implicit damping and springs (MuJoCo's integ
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from typing import ClassVar
+from typing import Any, ClassVar
 
 import mujoco
 import numpy as np
@@ -90,7 +90,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         _set_options(model, world)
         data = mujoco.MjData(model)
         self._running = Running(model, data, data.qpos.copy(), data.qvel.copy())
-        self._bound: dict[int, int] = {}
+        self._bound: dict[int, tuple[Any, list[int], Vector]] = {}
         self._pictures: Pictures | None = None
         layout = layout_of(parts)
         robots = [
@@ -98,7 +98,7 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
             for movable, part in zip(parts.movables, layout.parts.values(), strict=True)
         ]
         self._contact_rows = ContactRows(self._world, data)
-        self._drives = Drives(parts, layout, self._running, self._contact_rows.step)
+        self._drives = Drives(parts, layout, self._running, self._contact_rows.begin)
         self._touches = model.geom_contype.copy(), model.geom_conaffinity.copy()
         super().__init__(parts, robots, () if world.integrator == "euler" else RK4_LACKS)
 
@@ -159,13 +159,18 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         if self.parts.world.ground is not before.world.ground:
             self._world.write_heights(self.parts)
             self._forget_pictures()
-        self._world.derive()
+        self._derive()
 
     def hide(self, bodies: Sequence[int]) -> None:
         """Let only bodies that are not among these touch."""
         model, shown = self._running.model, ~np.isin(self._world.owners, bodies)
         model.geom_contype[:], model.geom_conaffinity[:] = (mask * shown for mask in self._touches)
+        self._derive()
+
+    def _derive(self) -> None:
+        """Let MuJoCo derive what depends on changes; it then connects bodies as they began."""
         self._world.derive()
+        self._write_bonds()
 
     def place_static(self, static: int, pose: Vector, velocity: Vector, surface: Vector) -> None:
         """Place a static body for the next step."""
@@ -178,30 +183,38 @@ class MujocoSimulation(RobotSimulation[MujocoRobot]):
         Raises:
             SimulationError: If too many bodies are attached while it runs.
         """
-        model, data = self._running.model, self._running.data
-        free = [spare for spare in self._world.spare if spare not in self._bound.values()]
-        if not free:
+        if len(self._bound) == len(self._world.spare):
             raise SimulationError(
                 f"MuJoCo holds at most {len(self._world.spare)} attachments in this world; detach "
                 "some, or build it with more of them."
             )
-        self._bound[number] = place = free[0]
-        first, second = (self._world.bodies[body] if body >= 0 else 0 for body in bond.bodies)
-        model.eq_obj1id[place], model.eq_obj2id[place] = first, second
-        frames, found = bond.frames, np.zeros(model.eq_data.shape[1])
+        kinds, frames = mujoco.mjtEq, bond.frames
+        found = np.zeros(self._running.model.eq_data.shape[1])
         if bond.rigid:
             turn = frames[0][:3, :3] @ frames[1][:3, :3].T
             found[:3], found[3:6] = frames[1][:3, 3], frames[0][:3, 3]
             found[6:10], found[10] = quaternion_of(turn), 1.0
         else:
             found[:3], found[3:6] = frames[0][:3, 3], frames[1][:3, 3]
-        kinds = mujoco.mjtEq
-        model.eq_type[place] = kinds.mjEQ_WELD if bond.rigid else kinds.mjEQ_CONNECT
-        model.eq_data[place], data.eq_active[place] = found, True
+        bodies = [self._world.bodies[body] if body >= 0 else 0 for body in bond.bodies]
+        kind = kinds.mjEQ_WELD if bond.rigid else kinds.mjEQ_CONNECT
+        self._bound[number] = kind, bodies, found
+        self._write_bonds()
 
     def unbind(self, number: int) -> None:
         """Stop holding two bodies together."""
-        self._running.data.eq_active[self._bound.pop(number)] = False
+        del self._bound[number]
+        self._write_bonds()
+
+    def _write_bonds(self) -> None:
+        """Write what is held in the order of its numbers, which decides on the last digits."""
+        model, data = self._running.model, self._running.data
+        data.eq_active[self._world.spare] = False
+        for place, each in zip(self._world.spare, self._bound.values(), strict=False):
+            kind, bodies, found = each
+            model.eq_obj1id[place], model.eq_obj2id[place] = bodies
+            model.eq_type[place], model.eq_data[place] = kind, found
+            data.eq_active[place] = True
 
     def clear_warm_start(self) -> None:
         """Make the state alone determine what follows."""

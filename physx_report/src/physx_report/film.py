@@ -13,7 +13,7 @@ from PIL import Image
 
 from physx_core import Closeable, Visualizer, plugins
 from physx_core.components import Event
-from physx_core.errors import PhysxError, VisualizerError
+from physx_core.errors import PhysxError, UntrustedReferenceError, VisualizerError
 from physx_core.pipelines import Redrawing
 from physx_core.typing import Array, Batch, Sample
 from physx_report.blocks import Block, Text
@@ -74,8 +74,9 @@ class Camera(Closeable):
         self.show([Event("remove", kind, (name,), {}) for name, kind in known.items()])
 
     def close(self) -> None:
-        """Close the visualizer."""
-        self._viewer.close()
+        """Close the visualizer; if it has failed, the page says why."""
+        with warnings.catch_warnings(action="ignore"):
+            self._viewer.close()
 
 
 @dataclass(frozen=True)
@@ -135,8 +136,7 @@ class Film:
 
 
 def _visualizers() -> Iterator[type[Visualizer]]:
-    known = plugins.references_of("visualizer")
-    found = (plugins.resolve("visualizer", each) for some in known.values() for each in some)
+    found = plugins.resolve_all("visualizer").values()
     yield from (each for each in found if isinstance(each, type) and issubclass(each, Visualizer))
 
 
@@ -176,6 +176,11 @@ def or_why_not(blocks: Iterable[Block]) -> list[Block]:
     try:
         with warnings.catch_warnings(action="ignore"):  # of environments that draw nothing
             return list(blocks)
+    except UntrustedReferenceError:
+        told = (
+            "its environment is not of an installed plugin; if you trust the code that its files "
+        )
+        return [Text([f"There is no film: {told}name, make the page with --trust (trust=True)."])]
     except PhysxError as error:
         return [Text([f"There is no film: {str(error).rstrip('.')}."])]
 

@@ -9,7 +9,7 @@ from typing import Any
 
 from physx_core import Closeable, Dataset, Result, read_scalars
 from physx_core.config import read_toml
-from physx_core.errors import DatasetError, SessionError
+from physx_core.errors import DatasetError, SessionError, found_at
 from physx_core.pipelines import Unseen, open_unseen
 from physx_core.results import read_results
 from physx_report.film import Camera
@@ -38,7 +38,8 @@ class Run(Closeable):
         self.results: dict[str, Result] = read_results(self.path)
         if not self.results:
             raise SessionError(
-                f"{self.path} has no result: run physx generate, train or predict in it first."
+                f"{self.path} has no result: name a session in which physx generate, train or "
+                f"predict has run. {found_at(self.path)}"
             )
         self._opened = contextlib.ExitStack()
 

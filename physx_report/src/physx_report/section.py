@@ -30,11 +30,7 @@ class Section:
 
 
 def all_sections() -> list[Section]:
-    """Return the sections of all plugins, in their order.
-
-    Raises:
-        PluginError: If a plugin is broken.
-    """
-    known = plugins.references_of(KIND)
-    found = [plugins.resolve(KIND, place) for places in known.values() for place in places]
-    return sorted(found, key=lambda section: (section.rank, section.title))
+    """Return the sections of all plugins, in their order; broken ones are left out."""
+    return sorted(
+        plugins.resolve_all(KIND).values(), key=lambda section: (section.rank, section.title)
+    )

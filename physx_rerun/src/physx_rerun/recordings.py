@@ -8,7 +8,7 @@ from pathlib import Path
 
 import rerun as rr
 
-from physx_core.errors import VisualizerError
+from physx_core.errors import VisualizerError, found_at
 from physx_core.processes import TemporaryFolder
 from physx_rerun.dataset import write_dataset
 from physx_rerun.importer import find_dataset
@@ -26,7 +26,7 @@ def find(place: str | Path) -> Path:
     """
     path = Path(place)
     if not path.exists():
-        raise VisualizerError(f"There is no recording, session or dataset {path}.")
+        raise VisualizerError(f"There is no recording, session or dataset {path}. {found_at(path)}")
     if path.suffix == ".rrd" and path.is_file():
         return path
     recordings = sorted(path.glob("*.rrd"), key=lambda file: file.stat().st_mtime)

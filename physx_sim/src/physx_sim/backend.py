@@ -221,7 +221,8 @@ class Simulation(Closeable):
             settings: What to change; the rest stays.
 
         Raises:
-            SimulationError: If there is no body with that name, or it does not have what changes.
+            SimulationError: If there is no body with that name, it does not have what changes, or
+                it is attached and would be hidden or moved.
         """
         raise self._lacks("changes")
 
@@ -248,7 +249,8 @@ class Simulation(Closeable):
         it says are pulled there within some steps.
 
         Raises:
-            SimulationError: If there is no body with one of the names, or neither can move.
+            SimulationError: If there is no body with one of the names, neither can move, or one is
+                hidden or a static body that moves.
         """
         raise self._lacks("attachments")
 

@@ -12,7 +12,8 @@ from physx_core.components import Network
 from physx_core.config import NetworkConfig
 from physx_core.errors import MissingLibraryError
 from physx_core.fields import Field
-from physx_core.pipelines import Learner, create_network
+from physx_core.pipelines import Learner
+from physx_core.plugins import create_network
 from physx_core.typing import Batch
 from physx_testing.report import NotApplicableError
 from physx_testing.subject import expect, expect_close
@@ -31,6 +32,8 @@ SHAPES: Sequence[tuple[tuple[int, ...], tuple[int, ...]]] = (
 """Shapes of inputs and targets to try in turn if no fields are given."""
 SEED = 3
 ROWS = 8
+_OF_CODE = (TypeError, AttributeError, NameError)
+"""Errors that are mistakes in code if they are the same for all fields."""
 TOLERANCE = 1e-4
 """For float32, where sums may round differently with a different number of rows."""
 
@@ -126,6 +129,7 @@ def find_case(config: NetworkConfig, fields: Sequence[Field]) -> Case:
 
     Raises:
         NotApplicableError: If it accepts none of those that are tried.
+        TypeError: If it raises this, or another error of mistakes in code, for all of them.
     """
     config = dataclasses.replace(config, device="cpu")
     if fields:
@@ -141,6 +145,8 @@ def find_case(config: NetworkConfig, fields: Sequence[Field]) -> Case:
             reasons.append(error)
             continue
         return case
+    if isinstance(reasons[0], _OF_CODE) and len(set(map(repr, reasons))) == 1:
+        raise reasons[0]
     raise NotApplicableError(
         "it accepts none of the fields that were tried: specify the fields it is made for (the "
         f"first error: {reasons[0]})"

@@ -90,6 +90,41 @@ def check_rows(name, total, troubles=None, **options):
     assert found == list(itertools.chain(*(rows for rows in expected if rows is not None)))
 
 
+SCALED = """
+from physx_core import Environment, Field
+
+class Scaled(Environment):
+    episode_steps = 1
+
+    def __init__(self, *, scale, fails=False, **kwargs):
+        super().__init__(**kwargs)
+        self.scale, self.fails = scale, fails
+
+    def create(self):
+        self.save_parameters(scale=self.scale)
+
+    def init_database(self):
+        self.define_training_fields([Field("x", ())])
+
+    def step(self):
+        if self.fails:
+            raise KeyboardInterrupt
+        self.set_training_data(x=self.load_parameters()["scale"])
+"""
+
+
+def test_what_a_run_without_episodes_saved_does_not_count():
+    Path("scaled.py").write_text(SCALED)
+    config = EnvironmentConfig("scaled.py:Scaled", as_tcp_ip_client=False, seed=SEED)
+    with pytest.raises(KeyboardInterrupt):
+        generate("s", 2, config, env_kwargs={"scale": 1.0, "fails": True})
+    generate("s", 2, config, env_kwargs={"scale": 2.0}, new_session=False)
+    with Dataset.open("sessions/s") as dataset:
+        assert dataset["training"]["x"][:].tolist() == [2.0, 2.0]
+    with pytest.raises(UsageError, match="another value"):  # rows are there that depend on it
+        generate("s", 2, config, env_kwargs={"scale": 3.0}, new_session=False)
+
+
 # Who simulates -----------------------------------------------------------------------------------
 
 

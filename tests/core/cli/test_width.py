@@ -5,7 +5,8 @@ from pathlib import Path
 import pytest
 from wide_lines import wide_lines
 
-from physx_core.cli import main
+from physx_core.cli import main, show_table
+from physx_core.plugins import find_entries
 
 CLOTH = """
 from physx_core import Environment, Field, Parameter
@@ -67,3 +68,26 @@ def test_a_line_is_as_long_as_the_terminal_is_wide(capsys, monkeypatch, columns,
     Path("cloth.py").write_text(CLOTH)
     [_, command] = printed(capsys, GENERATE).split("\nnext: physx train ")
     assert len(command.splitlines()) == lines
+
+
+@pytest.mark.parametrize("command", sorted(find_entries("physx.commands")))
+def test_help_fits(capsys, monkeypatch, command):
+    monkeypatch.delenv("COLUMNS", raising=False)
+    text = printed(capsys, f"{command} --help")
+    assert text.startswith(f"usage: physx {command}") and wide_lines(text) == []
+
+
+def test_a_table_that_is_too_wide_breaks_between_words(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "58")
+    head = ["pipeline", "lr", "layers", "state", "loss/validation", ""]
+    row = ["linear", "0.002288", "[5, 256, 256, 256, 576]", "complete", "0.32577", "█▆▃"]
+    show_table(head, [row], numbers=("lr", "loss/validation"), curve="")
+    text = capsys.readouterr().out
+    assert {"linear", "0.002288", "576]", "complete", "0.32577"} <= set(text.split())
+    assert max(map(len, text.splitlines())) <= 58
+
+
+def test_a_description_breaks_only_where_the_terminal_ends(capsys, monkeypatch):
+    monkeypatch.setenv("COLUMNS", "400")
+    text = printed(capsys, "verify --help")
+    assert 'left open, and move unreadable partitions to the folder "damaged".' in text

@@ -361,6 +361,25 @@ def test_leftovers_of_killed_writer_are_removed(folder):
     assert files_of(folder) == sorted([kept.name, *own])
 
 
+def test_it_stays_as_long_as_the_manifest_refers_to_it(folder, tmp_path):
+    """Removed rows leave no statistics, so a list of further partitions cannot name a new file."""
+    with Dataset.create(folder, max_file_size=1e-5) as dataset:
+        dataset.define_fields("other", [Field("k", (200,), "i8")])
+        dataset.append("training", rows_of(3, (100,)))
+        dataset.flush()
+        dataset.remove_partition("training", 1, "run")
+        dataset.update_info(notes="long" * 2000)  # it is not written anew for few partitions
+        for number in range(4):
+            dataset.append("other", {"k": np.ones((1, 200), "i8")})
+            dataset.flush()
+            copy = shutil.copytree(folder, tmp_path / f"copy_{number}")
+            with Dataset.open(copy) as killed:
+                assert killed.verify() == []
+        assert len(files_of(folder)) == 1
+    with Dataset.open(folder) as dataset:
+        assert_right(dataset.normalization, rows_of(3, (100,))["x"][[0, 2]])
+
+
 def test_read_only_folder_permissions(folder):
     rows = rows_of(50)
     write(folder, rows)

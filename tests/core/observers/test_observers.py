@@ -153,6 +153,17 @@ def test_one_that_fails_is_left_out_and_the_others_go_on(method):
     assert seen == [method, method]
 
 
+@pytest.mark.parametrize("returned", [None, "a text", 3, {"a": "set"}.keys()])
+@pytest.mark.parametrize("method", ["announcements", "outputs", "touch"])
+def test_one_that_returns_no_list_fails(method, returned):
+    bad = type("Bad", (Observer,), {method: lambda self, *arguments: returned})
+    good = type("Good", (Observer,), {method: lambda self, *arguments: ["said"]})
+    observers = Observers([bad(), good()])
+    arguments = [1] if method == "touch" else []
+    with pytest.warns(UserWarning, match=rf"Bad failed.*{method}\(\) returned .*, not a list"):
+        assert list(getattr(observers, method)(*arguments)) == ["said"]
+
+
 def test_a_training_goes_on_without_those_that_fail():
     DataGeneration(SPRING, batch_nb=1, batch_size=20, session_name="run").execute()
     data = DatasetConfig(existing_dir="sessions/run")

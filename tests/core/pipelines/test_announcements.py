@@ -122,7 +122,7 @@ def test_a_training_names_its_samples_its_losses_and_its_files(said):
         "samples: 20 training in sessions/spring/dataset",
         "2 of 2 epochs in T",
         f"training loss {training.training_loss:.6g}",
-        f"smallest loss {training.best.loss:.6g}, after epoch {training.best.epoch}",
+        f"smallest training loss {training.best.loss:.6g}, after epoch {training.best.epoch}",
         "checkpoint: sessions/training/network/network_0",
         'not judged: no samples were held back: generate some of the mode "validation", or hold '
         "back a part of stored ones (View.hold_back)",

@@ -92,16 +92,52 @@ def test_a_resumed_generation_has_the_same_rows(run, every, places, nothing_stay
     assert stored("stopped") == stored("whole")
 
 
-def test_parameters_saved_by_a_run_without_rows_do_not_count(run, monkeypatch):
+@pytest.mark.parametrize("what", ["generation", "training"])
+@pytest.mark.parametrize("resume", [True, False])
+def test_parameters_saved_by_a_run_without_rows_do_not_count(run, what, resume, monkeypatch):
     """The environment counts its runs with `save_parameters`, before its first row."""
-    environment = run.streams(LOCAL)
-    run.generation("whole", environment).execute()
-    for _ in range(2):
+    environment, make = run.streams(LOCAL), getattr(run, what)
+    make("whole", environment).execute()
+    for resumed in (False, resume, False):
         with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
             patch.setattr(resolve("environment", RIVER), "step", interrupt)
-            run.generation("stopped", environment).execute()
+            make("stopped", environment, resume=resumed).execute()
+    make("stopped", environment, resume=resume).execute()
+    assert stored("stopped") == stored("whole")
+
+
+@pytest.mark.parametrize("between", ["generation", "training"])
+@pytest.mark.parametrize("every", [0, 5])
+def test_a_run_without_rows_between_others_changes_nothing(run, every, between, monkeypatch):
+    environment = run.streams(LOCAL, state_every=every)
+    run.generation("whole", environment).execute()
+    interrupted(run.generation("stopped", environment), 4)
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(resolve("environment", RIVER), "step", interrupt)
+        getattr(run, between)("stopped", environment).execute()
     run.generation("stopped", environment, resume=True).execute()
     assert stored("stopped") == stored("whole")
+
+
+def test_parameters_are_restored_if_a_kill_comes_just_after_the_run_is_recorded(run, monkeypatch):
+    environment = run.streams(LOCAL)
+    run.generation("whole", environment).execute()
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr("physx_core.pipelines.generation.accept_parameters", interrupt)
+        run.generation("stopped", environment).execute()
+    run.generation("stopped", environment, resume=True).execute()
+    assert stored("stopped") == stored("whole")
+
+
+@pytest.mark.parametrize("where", [LOCAL, CLIENTS])
+def test_a_resumed_generation_that_is_complete_changes_nothing(run, where):
+    environment = run.streams(where)
+    run.generation("once", environment).execute()
+    run.generation("again", environment).execute()
+    run.generation("again", environment, resume=True).execute()
+    for name in ("once", "again"):  # the environment counts its runs
+        run.generation(name, environment).execute()
+    assert stored("again") == stored("once")
 
 
 @pytest.mark.parametrize("batches", [1, 3])
@@ -210,6 +246,8 @@ def test_streams_without_states_repeat_their_rows_and_say_so(run, made, capfd):
     assert "42 samples are stored, and simulated again first; with state_every" in (
         capfd.readouterr().err
     )
+    run.generation("stopped", environment, resume=True, quiet=False).execute()
+    assert ", 0 samples/s" in capfd.readouterr().err
 
 
 @pytest.mark.parametrize("where", [LOCAL, CLIENTS])

@@ -292,7 +292,7 @@ def test_a_training_stops_when_nothing_improves_and_says_why(validated, capfd):
     pipeline.execute()
     assert pipeline.epoch_id == 6
     assert "did not improve 3 times in a row" in pipeline.stopped
-    assert "smallest loss 3, after epoch 3" in pipeline.stopped
+    assert "smallest validation loss 3, after epoch 3" in pipeline.stopped
     assert pipeline.stopped in Path("sessions/training/info.txt").read_text()
     assert pipeline.stopped in capfd.readouterr().err
 

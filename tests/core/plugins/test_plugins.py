@@ -8,6 +8,7 @@ from importlib import metadata
 
 import pytest
 
+import physx_core
 from physx_core import Environment, plugins
 from physx_core.cli import main
 from physx_core.errors import (
@@ -85,6 +86,9 @@ def test_broken_plugins_are_reported_and_the_rest_works(tmp_path):
     add_plugin(tmp_path, "misspelt", GOOD.replace("physx_environments", "physx_enviroments"))
     add_plugin(tmp_path, "arguments", GOOD.replace("environments()", "environments(what)"))
     add_plugin(tmp_path, "nothing", GOOD.replace('return {"spring": Spring}', "return 5"))
+    add_plugin(tmp_path, "fails", GOOD.replace('return {"spring": Spring}', "return {}[5]"))
+    add_plugin(tmp_path, "empty", "")
+    add_plugin(tmp_path, "unmarked", GOOD.replace("@hookimpl", ""))
     add_plugin(tmp_path, "twice", GOOD, "first-dist")
     add_plugin(tmp_path, "twice", GOOD, "second-dist")
     listing = physx(tmp_path, "plugins")
@@ -92,15 +96,33 @@ def test_broken_plugins_are_reported_and_the_rest_works(tmp_path):
     text = listing.stdout
     assert "environment: good/spring" in text
     assert "environment: toy/spring" in text
-    assert 'Plugin "raises" (raises-dist 1.0) fails to import' in text and "on purpose" in text
-    assert "physx_enviroments" in text and "physx_environments" in text
-    assert 'Plugin "arguments" (arguments-dist 1.0) has an unknown hook' in text
-    assert "physx_environments() returned int, not a dictionary" in text
+    text = " ".join(text.split())
+    assert 'Plugin "raises" (raises-dist 1.0) fails to import' in text
+    assert "RuntimeError: on purpose (plugin_of_raises_dist.py, line 1)" in text
+    assert 'hook physx_enviroments. Did you mean "physx_environments"?' in text
+    assert "(arguments-dist 1.0) has physx_environments(what): hooks take no arguments" in text
+    assert '"nothing" (nothing-dist 1.0): physx_environments() returned int, not a dict' in text
+    assert '"fails" (fails-dist 1.0) fails in physx_environments(): KeyError: 5 (plu' in text
+    assert '"empty" (empty-dist 1.0) has no hooks: nothing in plugin_of_empty_dist is' in text
+    assert "physx_environments() in plugin_of_unmarked_dist is not marked with hookimpl" in text
     assert 'The plugin name "twice" is claimed by first-dist 1.0 and second-dist 1.0' in text
     run = physx(tmp_path, "generate", "good/spring", "--batch-nb", "1", "--batch-size", "2")
     assert run.returncode == 0, run.stderr
     run = physx(tmp_path, "generate", "twice/spring", "--batch-nb", "1", "--batch-size", "2")
     assert run.returncode == 1 and "claimed by" in run.stderr and "Traceback" not in run.stderr
+
+
+def test_what_a_broken_plugin_requires_in_another_version_is_named(tmp_path):
+    add_plugin(tmp_path, "older", "from physx_core.plugins import register_network")
+    needs = ["physx-core<0.1", "no-such-package>=2", "numpy", "another ; extra == 'test'", "??"]
+    with (tmp_path / "older_dist-1.0.dist-info/METADATA").open("a") as metadata_file:
+        metadata_file.writelines(f"Requires-Dist: {each}\n" for each in needs)
+    said = [" ".join(physx(tmp_path, command).stdout.split()) for command in ("plugins", "doctor")]
+    for text in said:
+        assert f"older-dist requires physx-core<0.1, but {physx_core.__version__} is" in text
+        assert "older-dist requires no-such-package>=2, which is not installed." in text
+        assert "requires numpy" not in text and "another" not in text
+    assert "cannot import name 'register_network'" in said[0]
 
 
 ENDS = {
@@ -115,7 +137,7 @@ ENDS = {
     "generator": ("raise GeneratorExit", "fails to import plugin_of_generator_dist: GeneratorExit"),
     "hook-exits": (
         GOOD.replace("return", "raise SystemExit #"),
-        "fails in a hook: it calls sys.exit",
+        "fails in physx_environments(): it calls sys.exit",
     ),
 }
 
@@ -143,6 +165,15 @@ def test_components_that_end_the_process_break_only_themselves(tmp_path, monkeyp
         PluginError, match='"lazy" fails to import its environment "spring": it calls'
     ):
         plugins.resolve("environment", "lazy/spring")
+
+
+def test_a_broken_component_is_left_out_where_all_of_a_kind_are_used(tmp_path, monkeypatch):
+    code = GOOD.replace("Spring}", '"nowhere:Spring", "good": Spring}')
+    add_plugin(tmp_path, "partly", code)
+    monkeypatch.syspath_prepend(tmp_path)
+    with pytest.warns(UserWarning, match="The environment partly/spring is left out. Plugin"):
+        found = plugins.resolve_all("environment")
+    assert "partly/good" in found and "toy/spring" in found and "partly/spring" not in found
 
 
 HANG = "import time\ntime.sleep(600)\n"
@@ -233,7 +264,7 @@ def test_a_component_with_an_impossible_name_breaks_its_plugin(tmp_path):
     assert listing.returncode == 0 and "\x1b" not in listing.stdout
     for number in range(len(IMPOSSIBLE)):
         who = f'Plugin "strange{number}" (strange{number}-dist 1.0)'
-        assert f"{who} fails in a hook: physx_environments() names a component" in listing.stdout
+        assert f"{who}: physx_environments() names a component" in listing.stdout
     assert "environment: toy/spring" in listing.stdout
 
 
@@ -270,7 +301,7 @@ def test_commands_of_other_packages(tmp_path):
     others = list(lines)[len(core) :]
     assert others == sorted(others) and {"broken", "twice", "wave", "wrong"} <= {*others}
     assert lines["wave"].endswith("wave at the user") and "broken" in lines["wrong"]
-    assert "claimed by first-dist 1.0 and second-dist 1.0; uninstall one" in lines["twice"]
+    assert "claimed by first-dist 1.0 and second-dist 1.0; uninstall or re" in lines["twice"]
     assert physx(tmp_path, "wave", "you").stdout == "hello you\n"
     for name, message in {
         "broken": "physx broken (broken-dist 1.0) fails to import plugin_of_broken_dist: No module",
@@ -304,6 +335,22 @@ def test_a_missing_plugin_of_the_project_names_its_package(monkeypatch):
         plugins.resolve("environment", "dart/arm")
     with pytest.raises(PluginNotFoundError, match="physx_gym$"):
         plugins.resolve("environment", "gym/env")
+
+
+def test_a_plugin_alone_stands_for_its_only_component():
+    assert plugins.resolve("environment", "toy") is plugins.resolve("environment", "toy/spring")
+    with pytest.raises(ComponentNotFoundError, match='"physx" has several of kind launcher: name'):
+        plugins.resolve("launcher", "physx")
+    with pytest.raises(ComponentNotFoundError, match='"toy" has no launcher. It has: none.'):
+        plugins.resolve("launcher", "toy")
+
+
+def test_a_component_without_its_plugin_is_found_for_the_message():
+    with pytest.raises(PluginNotFoundError) as caught:
+        plugins.resolve("environment", "spring")
+    said = str(caught.value)
+    assert said.startswith('No plugin "spring" is installed. Did you mean "toy/spring"? Installed')
+    assert said.count("Did you mean") == 1
 
 
 @pytest.mark.parametrize(

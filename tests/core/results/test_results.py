@@ -201,6 +201,22 @@ def test_nothing_changes_is_a_rival_of_a_field_that_is_like_an_input():
     assert rival.errors["rmse"] == pytest.approx(0.1, rel=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("off", "normalize", "advised"),
+    [(0.5, False, True), (0.5, True, True), (0.1, False, False), (0.5, {"y": "increment"}, False)],
+)
+def test_a_network_worse_than_nothing_changing_may_learn_changes(off, normalize, advised, capfd):
+    rng = np.random.default_rng(0)
+    x = rng.normal(size=(1000, 2))
+    step = [Field(name, (), "int64", role="additional") for name in ("episode", "step")]
+    moved = x + rng.uniform(0.1, 0.2, x.shape)
+    store(x, moved, fields=[Field("x", (2,)), Field("y", (2,), like="x"), *step])
+    data = DatasetConfig(existing_dir="data", normalize=normalize)
+    judged(planted(lambda x: x + off), data=data, quiet=False, session_name="net")
+    advice = "next: physx train --config sessions/net --dataset.normalize.y increment"
+    assert (advice in capfd.readouterr().err.splitlines()) is advised
+
+
 # Errors -----------------------------------------------------------------------------------------
 
 

@@ -15,8 +15,8 @@ from physx_core import ClientHandle, Environment, Launcher, plugins
 from physx_core.errors import (
     ClientError,
     ComponentNotFoundError,
-    ConfigError,
     ReferenceFormError,
+    UnknownOptionError,
 )
 from physx_core.workers.launchers import (
     ClientProcess,
@@ -125,6 +125,16 @@ class ForgetfulLauncher(Launcher):
         return []
 
 
+class ForeignLauncher(Launcher):
+    """Returns what is no handle, or fails."""
+
+    def __init__(self, returns=None):
+        self.returns = returns
+
+    def launch(self, instances, address, token):
+        return {"none": None, "numbers": [4 for _ in instances]}[self.returns]
+
+
 class NoLauncher:
     """A class of another kind."""
 
@@ -206,10 +216,24 @@ def test_launcher_without_handles_is_an_error(clients):
 
 
 @pytest.mark.parametrize(
+    ("returns", "said"),
+    [
+        ("none", r"Foreign.*launch\(\) returned None, and not a list of handles.*ClientHandle"),
+        ("numbers", r"Client 1 cannot be watched: ForeignLauncher.launch\(\) returned 4, and not"),
+        ("words", r"Client 1 was not started: ForeignLauncher.launch\(\) raised KeyError: 'words'"),
+    ],
+)
+def test_what_a_launcher_returns_instead_of_handles_is_named(clients, returns, said):
+    settings = {"launcher": ForeignLauncher, "launcher_kwargs": {"returns": returns}}
+    with pytest.raises(ClientError, match=said), clients(**settings):
+        pass
+
+
+@pytest.mark.parametrize(
     ("settings", "error", "text"),
     [
         ({"launcher": NoLauncher}, ReferenceFormError, "not derived from Launcher"),
-        ({"launcher_kwargs": {"speed": 3}}, ConfigError, "unexpected keyword argument 'speed'"),
+        ({"launcher_kwargs": {"speed": 3}}, UnknownOptionError, 'has no option "speed"'),
         ({"launcher": "physx/manuel"}, ComponentNotFoundError, 'Did you mean "manual"'),
     ],
 )

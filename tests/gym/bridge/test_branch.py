@@ -2,21 +2,24 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
+import gymnasium
 import numpy as np
 import pytest
 import sizes
 
 from physx_core import DataGeneration, Dataset, EnvironmentConfig
 from physx_core.errors import (
+    DatasetError,
     PhysxError,
     UnknownOptionError,
     UntrustedReferenceError,
-    UsageError,
 )
 from physx_core.pipelines import Branch
-from physx_gym import make_env
+from physx_core.plugins import resolve
+from physx_gym import make_env, read_log
 
 pytestmark = pytest.mark.slow
 
@@ -117,8 +120,6 @@ def test_a_log_is_simulated_again_and_branched():
     )
     with DataGeneration(environment, episodes=1, session_name="again", quiet=True) as run:
         run.execute()
-    with pytest.raises(UsageError, match="physx generate gym/ID .*policy=ant.h5 --episodes 1"):
-        Branch("ant.h5", 5, {"gravity": [0, 0, -1]}, quiet=True).execute()
     with Dataset.open("sessions/again") as dataset:
         assert dataset.num_samples("training") == 12
     branch = Branch("sessions/again", 5, {"push": {"torso": [200.0, 0.0, 0.0]}}, quiet=True)
@@ -127,6 +128,53 @@ def test_a_log_is_simulated_again_and_branched():
     assert branch.rows_equal == (6, 6)
     assert np.array_equal(was["action"], changed["action"])
     assert not np.array_equal(was["next_observation"], changed["next_observation"])
+
+
+@pytest.mark.usefixtures("log")
+def test_the_log_itself_is_branched_off():
+    push = {"push": {"torso": [200.0, 0.0, 0.0]}}
+    branch = Branch("ant.h5", 5, push, quiet=True)
+    branch.execute()
+    was, changed = branch.futures
+    assert branch.rows_equal == (6, 6)
+    assert np.array_equal(was["action"], changed["action"])
+    assert not np.array_equal(was["next_observation"], changed["next_observation"])
+    Branch("ant.h5", 5, {"policy": "random"}, quiet=True, step_nb=20).execute()
+    with pytest.raises(DatasetError, match="no row 12 in the mode training: it has 12 rows"):
+        Branch("ant.h5", 12, push, quiet=True).execute()
+    with pytest.raises(UnknownOptionError, match="wind"):
+        Branch("ant.h5", 5, {"wind": 1}, quiet=True).execute()
+
+
+@pytest.mark.parametrize(
+    ("constants", "message"),
+    [
+        ({"spec": None}, "does not say how its environment was made"),
+        ({"spec": {"id": "No/Ant-v0", "kwargs": {}}}, '"No/Ant-v0", which is not registered'),
+        ({"backend": "own.py:Engine"}, "arguments of physx/Ant-v0 that may name code"),
+        ({"backend": "pinocchio"}, "has another state after .* steps"),
+        ({"leg_nb": 5}, "unexpected keyword argument 'leg_nb'"),
+    ],
+)
+@pytest.mark.usefixtures("log")
+def test_a_log_that_cannot_be_branched_says_why(constants, message):
+    known = read_log("ant.h5")
+    if "spec" not in constants:
+        constants = {"spec": {"id": "physx/Ant-v0", "kwargs": constants}}
+    replace(known, constants={**known.constants, **constants}).write("other.h5")
+    with pytest.raises(PhysxError, match=message):
+        Branch("other.h5", 5, {"gravity": [0, 0, -1]}, quiet=True).execute()
+    assert not Path("sessions").exists()
+
+
+def test_only_plain_arguments_are_in_a_log():
+    backend = type(resolve("backend", "dart"))
+    env = gymnasium.make("physx/Cartpole-v0", render_mode="rgb_array", backend=backend)
+    env.unwrapped.eval()
+    env.reset(options={"log_path": "pole.h5"})
+    env.step(env.action_space.sample())
+    env.close()
+    assert read_log("pole.h5").constants["spec"] is None
 
 
 @pytest.mark.usefixtures("log")

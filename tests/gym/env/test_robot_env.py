@@ -11,7 +11,16 @@ from gymnasium import spaces
 
 from physx_core.errors import ConfigError, EpisodeError, UnknownOptionError, UsageError
 from physx_gym import RobotEnv, Simulator
-from physx_sim import Encoder, Ground, Motor
+from physx_sim import (
+    Encoder,
+    Ground,
+    JointCoupling,
+    JointSettings,
+    Mimic,
+    Motor,
+    Robot,
+    World,
+)
 
 pytestmark = pytest.mark.processes
 
@@ -112,6 +121,21 @@ def test_sensors_are_what_is_measured():
 
 
 # Begin and end of an episode ----------------------------------------------------------------------
+
+
+def test_neutral_positions_are_those_that_couplings_and_leaders_allow(backend):
+    hips = [f"{end}_{side}_hip" for end in ("back", "front") for side in ("left", "right")]
+    couplings = [JointCoupling({hips[0]: 1.0, hips[1]: 1.0}, 0.4), JointCoupling({hips[2]: 2}, 0.5)]
+    followers = {hips[3]: JointSettings(mimic=Mimic(hips[2], -1.0, 0.1))}
+    for given, wanted in ((couplings, (0.2, 0.2, 0.25, -0.15)), ((), (0.0, 0.0, 0.0, 0.1))):
+        robot = Robot("ant", couplings=given, joints=followers)
+        env = RobotEnv(World([robot], gravity=(0, 0, 0), contacts="none"), 0.02, backend=backend)
+        found = dict(zip(env.simulator.layout.joints, env._neutral().tolist(), strict=True))
+        assert [found[name] for name in hips] == pytest.approx(wanted)
+        assert found["front_left_knee"] == pytest.approx(1.0)
+        env.reset(seed=0)
+        env.step(np.zeros(env.action_space.shape))
+        assert np.abs(env.simulator.velocities).max() < 1e-6  # nothing had to return
 
 
 def test_neutral_is_0_or_the_middle_of_the_limits(backend):

@@ -12,7 +12,18 @@ from sizes import size
 from physx_core import plugins
 from physx_core.errors import ConfigError
 from physx_core.rotations import from_axis_angle, to_matrix
-from physx_sim import Attachment, Box, Connect, Ground, Robot, Sphere, Weld, World, Wrench
+from physx_sim import (
+    Attachment,
+    BodySettings,
+    Box,
+    Connect,
+    Ground,
+    Robot,
+    Sphere,
+    Weld,
+    World,
+    Wrench,
+)
 from physx_sim.errors import FeatureNotSupportedError, SimulationError
 
 pytestmark = pytest.mark.processes
@@ -126,6 +137,55 @@ def test_static_bodies_hold_what_is_welded_to_them(engine):
             simulation.detach(number)
 
 
+@pytest.mark.parametrize(
+    "motion",
+    [{"velocity": (0.5, 0, 0)}, {"angular_velocity": (0, 0, 1)}, {"position": (1, 0, 1.2)}],
+    ids=str,
+)
+def test_static_bodies_that_hold_something_cannot_move(engine, motion):
+    objects = [crate(position=(0, 0, 1)), hand(static=True, position=(0, 0, 1.2))]
+    with engine.build(World(objects=objects)) as simulation:
+        number = simulation.attach(Weld("crate", "hand"))
+        with pytest.raises(SimulationError, match='"hand" is attached; detach it before moving'):
+            simulation.set_body("hand", BodySettings(**motion))
+        simulation.set_body("hand", BodySettings(friction=0.5, surface_velocity=(1, 0, 0)))
+        simulation.detach(number)
+        simulation.set_body("hand", BodySettings(**motion))
+        if "position" in motion:
+            simulation.attach(Weld("hand", "crate"))
+        else:
+            with pytest.raises(SimulationError, match='"hand" moves; stop it before attaching'):
+                simulation.attach(Weld("hand", "crate"))
+
+
+def test_a_snapshot_holds_bodies_where_its_static_bodies_are(engine):
+    """Attachments that say where they hold are alike, wherever the static body is."""
+    objects = [crate(position=(0, 0, 1)), hand(static=True, position=(0, 0, 1.2))]
+    world, weld = World(objects=objects, gravity=(0, 0, 0)), Weld("hand", "crate", (0, 0, -0.3))
+    with engine.build(world) as simulation, engine.build(world) as other:
+        other.set_body("hand", BodySettings(position=(1, 0, 1.2)))
+        for each in (simulation, other):
+            each.attach(weld)
+        other.restore(simulation.snapshot())
+        for each in (simulation, other):
+            each.step(20)
+        np.testing.assert_array_equal(simulation.positions(), other.positions())
+
+
+@pytest.mark.parametrize("change", [{"mass": 2.0}, {"friction": 0.3}, {"hidden": True}], ids=str)
+def test_changes_leave_attachments_where_they_are(engine, change):
+    objects = [crate(name=n, position=(x, 0, 1)) for x, n in enumerate("abc")]
+    world = World(objects=objects, gravity=(0, 0, 0))
+    with engine.build(world) as simulation:
+        q = simulation.positions()
+        q[8] = 0.5
+        simulation.set_state(q, np.zeros(18))
+        simulation.attach(Connect("a", "b", (0.5, 0, 0)))
+        simulation.set_body("c", BodySettings(**change))
+        simulation.step(100)
+        np.testing.assert_allclose(simulation.positions(), q, atol=1e-9)
+
+
 def test_attached_bodies_touch_the_ground(engine):
     objects = [crate(position=(0, 0, 0.05)), hand(position=(0, 0, 0.11), orientation=(0, 0, 0, 1))]
     world = World(objects=objects, ground=Ground(), attachments=[Weld("hand", "crate")])
@@ -207,6 +267,24 @@ class Attaching(RuleBasedStateMachine):
     def teardown(self):
         self.simulation.close()
         self.other.close()
+
+
+def test_the_history_of_attachments_changes_no_digit(engine):
+    objects = [crate(name=f"crate {n}", position=(0.3 * n, 0.05 * n, 1)) for n in range(4)]
+    world = World(objects=objects)
+    with engine.build(world) as simulation, engine.build(world) as other:
+        first = simulation.attach(Weld("crate 0", "crate 1"))
+        simulation.attach(Connect("crate 1", "crate 2"))
+        simulation.step(20)
+        simulation.detach(first)
+        simulation.attach(Weld("crate 0", "crate 3"))
+        simulation.apply_wrench(Wrench("crate 0", (3, 1, 2), (0.1, 0.2, 0)))
+        simulation.step(20)
+        other.restore(simulation.snapshot())
+        for each in (simulation, other):
+            each.step(50)
+        np.testing.assert_array_equal(simulation.positions(), other.positions())
+        np.testing.assert_array_equal(simulation.velocities(), other.velocities())
 
 
 @pytest.mark.parametrize("name", ["dart", "pinocchio", "mujoco"])

@@ -178,6 +178,35 @@ def test_friction_changes(engine, changed):
         assert simulation.velocities()[0] == pytest.approx(0.2 * G * 0.2, rel=0.05)
 
 
+@pytest.mark.parametrize("heights", [False, True], ids=["friction", "heights"])
+def test_contacts_stay_until_the_next_step(engine, heights):
+    """Whatever replaces the shapes that touched: DART keeps no contacts of those."""
+    objects = [crate(name=f"crate {n}", position=(0.4 * n, 0, 0.1)) for n in range(4)]
+    with engine.build(World(objects=objects, ground=slope(0))) as simulation:
+        simulation.step(5)
+        for number in range(5):
+            before = simulation.contacts()
+            assert len(before) >= 12
+            if heights:
+                simulation.set_ground(slope(0.001 * number))
+            else:
+                simulation.set_body("ground", BodySettings(friction=0.1 * number))
+            np.testing.assert_array_equal(simulation.contacts(), before)
+            np.testing.assert_array_equal(simulation.snapshot().contacts, before)
+            simulation.step(2)
+
+
+def test_a_link_without_mass_is_no_news(engine, tmp_path, capfd):
+    path = tmp_path / "arm.xml"
+    path.write_text(
+        '<mujoco><worldbody><body name="arm"><joint axis="0 1 0"/><geom size=".1"/></body>'
+        "</worldbody></mujoco>"
+    )
+    with engine.build(World([Robot(path)], contacts="none")) as simulation:
+        simulation.set_body("arm", BodySettings(mass=2.0))
+    assert capfd.readouterr() == ("", "")
+
+
 def test_friction_of_static_objects_and_links_changes(engine, write_urdf):
     puck = (
         '<robot name="puck"><link name="puck"><inertial><mass value="1"/><inertia ixx="0.01" '

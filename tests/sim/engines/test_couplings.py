@@ -46,6 +46,17 @@ def gears(write_urdf):
     return make
 
 
+@pytest.fixture
+def bar_with_limits(write_urdf):
+    """Return robots of the joints a, up to 0.1 rad, b and c."""
+    limits = ' type="revolute"><limit lower="-1" upper="{1}" effort="50" velocity="0"/>'
+    joint = WHEEL.partition("<limit")[0].replace(' type="continuous">', limits) + "</joint>"
+    uppers = {"a": 0.1, "b": 1.0, "c": 1.0}
+    joints = "".join(joint.replace("{0}", n).replace("{1}", str(x)) for n, x in uppers.items())
+    path = write_urdf(f'<robot name="bars"><link name="base"/>{joints}</robot>')
+    return lambda *couplings: Robot(path, couplings=couplings)
+
+
 def in_order(simulation, values):
     return np.array([values.get(name, 0.0) for name in simulation.layout.joints])
 
@@ -112,6 +123,16 @@ def test_a_coupling_of_one_joint_locks_it(engine, bar):
         assert simulation.positions()[0] == pytest.approx(-0.3)  # where it starts
         simulation.step(500)
         assert simulation.positions()[0] == pytest.approx(-0.3, abs=1e-4)
+
+
+def test_a_robot_starts_within_the_limits_of_all(bar_with_limits):
+    robot = bar_with_limits(JointCoupling({"a": 1, "b": 1, "c": -0.5}, 1.0))
+    model = read_robot(robot)
+    names = [joint.name for joint in model.joints]
+    start = dict(zip(names, model.start.tolist(), strict=True))
+    assert start["a"] + start["b"] - 0.5 * start["c"] == pytest.approx(1.0, abs=1e-9)
+    # The nearest to 0: a stays at its limit, and the others share the rest as their coefficients.
+    assert start == pytest.approx({"a": 0.1, "b": 0.72, "c": -0.36}, abs=1e-6)
 
 
 def test_states_that_violate_a_coupling_return_to_it(engine, gears):
@@ -185,6 +206,12 @@ def test_couplings_that_cannot_hold_are_errors(gears, couplings, mode, said):
     joints = {name: JointSettings(mode) for name in INERTIAS}
     with pytest.raises(ModelError, match=said):
         read_robot(gears(couplings=couplings, joints=joints))
+
+
+def test_couplings_that_limits_do_not_allow_are_errors(bar_with_limits):
+    sums = [JointCoupling({"a": 1, "b": 1}, 1.0), JointCoupling({"b": 1}, 0.5)]
+    with pytest.raises(ModelError, match='no positions within the limits of "a"'):
+        read_robot(bar_with_limits(*sums))
 
 
 @pytest.mark.parametrize(

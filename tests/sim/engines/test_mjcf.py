@@ -13,7 +13,7 @@ import pytest
 from compiled import Compiled, states, without_friction
 
 from physx_core import plugins
-from physx_sim import Ground, JointSettings, Robot, World, mjcf_robots
+from physx_sim import Ground, JointCoupling, JointSettings, Mimic, Robot, World, mjcf_robots
 from physx_sim.engines import read_robot
 from physx_sim.errors import ModelError
 
@@ -222,7 +222,8 @@ def test_what_is_left_out_is_named_once(tmp_path):
     path.write_text(
         '<mujoco><option density="1000" gravity="0 0 -1.6"/><worldbody><geom type="plane" size="1 '
         '1 1"/><body name="a"><freejoint/><geom type="ellipsoid" size=".1 .2 .3" condim="6" '
-        'friction="0.3"/><body name="b"><joint name="j"/><joint name="k" axis="1 0 0"/><geom '
+        'friction="0.3"/><body name="b"><joint name="j"/><joint name="k" axis="1 0 0" '
+        'actuatorfrcrange="-1 5"/><geom '
         'size=".1"/></body></body></worldbody><tendon><fixed name="t" stiffness="1"><joint '
         'joint="j" coef="1"/></fixed><fixed name="u"><joint joint="j" coef="1"/></fixed></tendon>'
         '<equality><joint joint1="j" joint2="k" polycoef="0 1 1 0 0"/></equality>'
@@ -237,6 +238,7 @@ def test_what_is_left_out_is_named_once(tmp_path):
     for part in (
         *('Robot "rich"', "actuators (1: command", "tendons (1", "equality constraints (1"),
         *("the fluid", "gravity=(0.0, 0.0, -1.6)", "ellipsoids"),
+        "a smaller limit in one direction",
         *("fixed to the world (World(ground=", "fixed_base=False lets"),
     ):
         assert part in text
@@ -318,6 +320,19 @@ EQUALITIES = """
   <connect body1="c" body2="a" anchor="0 0 0" active="false"/>
 </equality></mujoco>
 """
+
+
+def test_a_joint_may_follow_several_others(tmp_path):
+    path = tmp_path / "leaders.xml"
+    body = '<body><joint name="{}"/><geom size=".1"/></body>'
+    path.write_text(
+        f"<mujoco><worldbody>{''.join(map(body.format, 'abc'))}</worldbody><equality>"
+        '<joint joint1="a" joint2="b" polycoef="0.1 2 0 0 0"/>'
+        '<joint joint1="a" joint2="c" polycoef="0.2 -1 0 0 0"/></equality></mujoco>'
+    )
+    model = read_robot(Robot(path))
+    assert [mimic for *_, mimic in model.followers] == [Mimic("b", 2.0, 0.1)]
+    assert model.couplings == (JointCoupling({"a": 1.0, "c": 1.0}, 0.2),)
 
 
 @pytest.mark.filterwarnings("ignore:.*leaves out")

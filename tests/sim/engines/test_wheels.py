@@ -117,6 +117,20 @@ def test_wheels_roll_forward_and_slide_aside_only_as_omni_wheels(cart, lateral):
         assert abs(aside) < 1e-9 if lateral else aside > 0.1
 
 
+def test_omni_wheels_have_no_friction_whatever_changes(cart):
+    found = []
+    for friction in (None, 0.8):
+        with build(cart(lateral=False)) as simulation:
+            if friction is not None:
+                for side in ("left", "right"):
+                    simulation.set_body(f"{side} wheel", BodySettings(friction=friction))
+            simulation.step(10)
+            simulation.apply_wrench(Wrench("base", (0, 5, 0)))
+            simulation.step(200)
+            found.append(simulation.positions())
+    np.testing.assert_array_equal(*found)
+
+
 def test_a_lifted_cart_is_free_and_one_on_a_belt_is_carried(cart):
     with build(cart(position=(0.0, 0.0, 1.0))) as simulation:
         v = np.zeros(8)

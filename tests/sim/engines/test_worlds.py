@@ -13,15 +13,19 @@ import pytest
 from physx_core.errors import ConfigError
 from physx_sim import (
     Box,
+    Camera,
     Capsule,
     Cylinder,
     Ground,
     HeightField,
+    JointCoupling,
     JointSettings,
     Mesh,
     Robot,
     Sphere,
     Stairs,
+    Weld,
+    Wheel,
     World,
     Wrench,
 )
@@ -185,6 +189,17 @@ def test_duplicate_names_of_bodies_are_rejected(backend, bar):
         backend.build(World([bar()], objects=[Sphere(name="tip", radius=0.1)]))
 
 
+def test_things_that_can_be_gone_through_once_stay():
+    couplings = [JointCoupling({"a": 1.0})]
+    robots = [Robot("r.urdf", couplings=iter(couplings), wheels=iter([Wheel("a", 1)]))]
+    objects = [Sphere(name=name, radius=1) for name in "ab"]
+    world = World(iter(robots), objects=iter(objects), attachments=iter([Weld("a", "b")]))
+    assert list(world.robots) == robots and list(world.objects) == objects
+    assert list(robots[0].couplings) == couplings
+    assert (len(robots[0].wheels), len(world.attachments)) == (1, 1)
+    assert Camera(name="c", body="a", ignored=iter("bc")).ignored == ("b", "c")
+
+
 @pytest.mark.parametrize(
     ("make", "words"),
     [
@@ -208,6 +223,15 @@ def test_duplicate_names_of_bodies_are_rejected(backend, bar):
         (lambda: Robot("r.urdf", feet={"a": 0}), "feet"),
         (lambda: Robot(3), "must be a path"),
         (lambda: Robot("r.urdf", joints={"a": 3}), "JointSettings"),
+        (lambda: Robot("r.urdf", joints=[JointSettings()]), "joints is .* must be a mapping"),
+        (lambda: Robot("r.urdf", wheels=Wheel("a", 1)), "wheels must be a list of Wheels, as in"),
+        (lambda: Robot("r.urdf", wheels=None), "must be a list of Wheels"),
+        (lambda: Robot("r.urdf", couplings=3), "couplings must be a list of JointCouplings"),
+        (lambda: World(Robot("r.urdf")), r"World.robots must be a list of Robots"),
+        (lambda: World([Robot("r.urdf")], attachments=Weld("a")), "must be a list of Attachment"),
+        (lambda: Camera(name="c", body="a", ignored=3), "ignored is 3, not a list of names"),
+        (lambda: Camera(name="c", body="a", images=3), "images is 3, not a list of names"),
+        (lambda: Camera(name="c", body="a", noise={1: 0.1}), 'no option "1"'),
         (lambda: JointSettings(mode="torque"), "force, position, servo, velocity"),
         (lambda: JointSettings(stiffness=-1), "stiffness"),
         (lambda: Ground(normal=(0, 0, 0)), "must not be 0"),

@@ -52,6 +52,16 @@ class OtherName(Right):
         return {"z": super().predict(data)["y"]}
 
 
+class ReturnsNothing(Right):
+    def predict(self, data):
+        super().predict(data)
+
+
+class TakesNothing(Right):
+    def predict(self):
+        return {}
+
+
 class FlatPrediction(Right):
     def predict(self, data):
         return {"y": super().predict(data)["y"].sum(axis=-1)}

@@ -12,7 +12,8 @@ from physx_core.errors import (
     MissingFieldError,
     UnknownOptionError,
 )
-from physx_torch import FC, TorchNetwork
+from physx_core.toy import Linear
+from physx_torch import FC, EncoderDecoder, TorchNetwork, UNet
 
 
 class Force(TorchNetwork):
@@ -362,3 +363,21 @@ def test_prediction_with_gradients_becomes_an_array():
     array = network.tensor_to_numpy(prediction)["prediction"]
     assert isinstance(array, np.ndarray)
     assert array.shape == (3, 1)
+
+
+@pytest.mark.parametrize(
+    "network",
+    [
+        lambda names: Linear(**names),
+        lambda names: FC([2, 1], **names),
+        lambda names: EncoderDecoder([3, 2], **names),
+        lambda names: UNet(2, nb_input_channels=1, nb_output_channels=1, **names),
+    ],
+    ids=["linear", "fc", "encoder_decoder", "unet"],
+)
+@pytest.mark.parametrize("free", ["u", "v"])
+def test_networks_of_samples_of_one_size_refuse_meshes(network, free):
+    fields = {name: Field(name, ("node", 2) if name == free else (8, 8)) for name in "uv"}
+    with pytest.raises(FieldsMismatchError, match=r'torch/graph".*"torch/padded') as caught:
+        network({"net_fields": "u", "opt_fields": "v"}).bind(fields)
+    assert caught.value.differences == {free: 'its axis "node" has another size in each sample'}

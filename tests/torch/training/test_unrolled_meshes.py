@@ -1,4 +1,4 @@
-"""Graph networks that learn from several steps of their own predictions."""
+"""Networks on meshes that learn from, and are judged on, several steps of their own predictions."""
 
 from __future__ import annotations
 
@@ -9,9 +9,10 @@ import numpy as np
 import pytest
 import torch
 
-from physx_core import Dataset, DatasetConfig, Field, NetworkConfig, Training, View
+from physx_core import Dataset, DatasetConfig, Field, NetworkConfig, Training, View, evaluate
 from physx_core.dataset import EpisodeRecord
 from physx_core.errors import ConfigError
+from physx_core.pipelines import load_learner
 from physx_torch import TorchOptimization
 
 SIZES, LENGTH, STEPS, BATCH = (4, 2, 3, 5, 2), 7, 3, 6
@@ -55,8 +56,8 @@ def episode(number, size):
     }
 
 
-def store(change=lambda number, rows: rows):
-    with Dataset.create("data") as dataset:
+def store(change=lambda number, rows: rows, name="data"):
+    with Dataset.create(name) as dataset:
         nodes = Field("u", ("node", 2)), Field("edge", ("edge", 2), "int64", indexes="node")
         others = Field("load", ()), Field("tips", (2,), "int64", indexes="node")
         dataset.define_fields("training", [*nodes, *others])
@@ -183,3 +184,62 @@ def test_windows_of_several_rows_of_a_mesh_are_refused():
     store()
     with pytest.raises(ConfigError, match="windows of one row"):
         training(windows={**WINDOWS, "past": ("u", [-1, 0])}).execute()
+
+
+def fed_back(learner, number):
+    """Return the mean squared errors of an episode whose predictions are fed back, and of rest."""
+    rows = episode(number, SIZES[number])
+    state, found = rows["u"][0], []
+    for step in range(LENGTH - 1):
+        given = {"past": state, "sides": rows["edge"][step], "ends": rows["tips"][step]}
+        answer = learner.predict(
+            {name: np.fromiter([value], object, 1) for name, value in given.items()}
+            | {"push": rows["load"][step : step + 1], "ends": given["ends"][None]}
+        )
+        state, truth = answer["next"][0], rows["u"][step + 1]
+        found.append([np.square(each - truth).mean() for each in (state, rows["u"][0])])
+    return found
+
+
+@pytest.mark.parametrize("kind", ["graph", "padded"])
+def test_predictions_on_meshes_are_fed_back_in_each_episode(kind):
+    store()
+    store(name="other")
+    run = training(**(padded() if kind == "padded" else {}))
+    run.execute()
+    session = run.session.path
+    rollout = evaluate(session, "other", trust=True).rollouts["next"]
+    learner = load_learner(session, trust=True)
+    squares = np.array([fed_back(learner, number) for number in range(len(SIZES))])
+    errors = np.sqrt(squares.mean(axis=0)).T
+    np.testing.assert_allclose([rollout.errors, rollout.unchanged], errors, rtol=1e-5)
+    assert rollout.rows == tuple(range(1, LENGTH))
+
+
+def test_predictions_on_a_mesh_that_changes_are_not_fed_back():
+    nodes = Field("u", ("node", 2)), Field("edge", ("edge", 2), "int64", indexes="node")
+    for name in ("data", "other"):
+        with Dataset.create(name) as dataset:
+            fields = [*nodes, Field("after", ("node", 2), like="u")]
+            dataset.define_fields("training", fields)
+            parts = [episode(1, 3), episode(1, 4)]  # a node more in the second row
+            rows = {each: [part[each][0] for part in parts] for each in ("u", "edge")}
+            rows["after"] = rows["u"]
+            dataset.append_episodes("training", rows, [EpisodeRecord(episode=0, rows=2)])
+    given = {**GRAPH, "nodes": 2, "net_fields": ["u", "edge"], "opt_fields": "after"}
+    run = training(kwargs=given, windows={}, batch_size=1, unroll=[])
+    run.execute()
+    result = evaluate(run.session.path, "other")
+    assert not result.rollouts and result["other/after/rmse"] > 0
+    assert 'the size of the axis "node" changes' in str(result)
+
+
+def test_windows_of_several_rows_of_a_mesh_are_not_fed_back():
+    store()
+    store(name="other")
+    each = {"in_features": 2, "out_features": 2, "net_fields": "past", "opt_fields": "next"}
+    two = {"past": ("u", [-1, 0]), "next": ("u", [1, 2])}
+    run = training(torch.nn.Linear, each, two, unroll=[])
+    run.execute()
+    result = evaluate(run.session.path, "other", trust=True)
+    assert not result.rollouts and "several rows" in str(result)

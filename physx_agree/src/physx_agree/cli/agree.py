@@ -1,4 +1,4 @@
-"""``physx agree``: how far engines agree on a task, and why they part."""
+"""``physx agree``: compare engines on a task: how far they agree, and why they differ."""
 
 from __future__ import annotations
 
@@ -10,13 +10,13 @@ from typing import Annotated, Any
 import tyro
 
 from physx_agree import agree, store_agreement
-from physx_core.cli import argument_registry, show
+from physx_core.cli import options_from, show
 from physx_core.errors import ConfigError
 
 
 @dataclass
 class Agree:
-    """Run a task with the same seeds and policies on several engines, and say why they part."""
+    """Run a task with the same seeds and policies on several engines, and say why they differ."""
 
     task: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="TASK")]
     """Id of the environment, "module:id", "module:Class", or "script.py:function"."""
@@ -45,8 +45,7 @@ class Agree:
 
 def run(words: Sequence[str]) -> None:
     """Print the agreement, and store it if requested."""
-    with argument_registry():
-        options = tyro.cli(Agree, args=words, prog="physx agree")
+    options = options_from(Agree, words, "agree")
     if options.episodes < 1:
         raise ConfigError(f"--episodes is {options.episodes} but must be at least 1.")
     begin = time.monotonic()
@@ -60,10 +59,7 @@ def run(words: Sequence[str]) -> None:
         env_kwargs=options.env_kwargs,
         trust=options.trust,
     )
-    if options.json:
-        print(found.to_json())
-    else:
-        show(found)
+    show(found, as_json=options.json)
     if options.output is not None:
         store_agreement(options.output, found, time.monotonic() - begin)
         if not options.json:

@@ -11,8 +11,9 @@ from typing import Annotated, Any
 
 import tyro
 
-from physx_core.cli import show
+from physx_core.cli import options_from, show
 from physx_core.errors import UsageError, printable
+from physx_core.terminal import wrapped
 
 
 @dataclass
@@ -52,7 +53,7 @@ def run(words: Sequence[str]) -> None:
     from physx_cluster.sweep.runner import run_study
     from physx_cluster.sweep.study import STUDY, Study, is_study
 
-    options = tyro.cli(Sweep, args=words, prog="physx sweep")
+    options = options_from(Sweep, words, "sweep")
     folder = options.study or Path("studies") / options.place.stem
     file = options.place
     if file.is_dir() or is_study(file):
@@ -96,7 +97,8 @@ def _report(study: Any, folder: Path) -> None:
         _say(line)
     _say(f"table: {folder / TABLE}")
     place = shlex.quote(str(folder))
-    _say(f"next: physx sweep {place} --status, physx report {place}")
+    _say(f"next: physx sweep {place} --status")
+    _say(f"next: physx report {place}")
     if study.best() is None:
         raise StudyError(
             f"No trial of {folder} is complete with all seeds. The end of each trial's output.txt "
@@ -105,4 +107,4 @@ def _report(study: Any, folder: Path) -> None:
 
 
 def _say(line: str) -> None:
-    print(printable(line), file=sys.stderr, flush=True)
+    print(wrapped(printable(line)), file=sys.stderr, flush=True)

@@ -36,10 +36,11 @@ def show_status(study: Study) -> None:
     short = [name.rpartition(".")[2] for name in names]
     columns = [s if short.count(s) == 1 else n for s, n in zip(short, names, strict=True)]
     head = ("trial", "pipeline", *columns, "seed", "state", "epochs", study.definition.study.result)
+    wraps = {name for name, *texts in zip(head, *rows, strict=True) if " " in "".join(texts)}
     bars = _room([head, *rows])
     curves = [spark_line(list(numbers_of(study, trial).values()), bars) for trial in trials]
     lines = [(*row, curve) for row, curve in zip(rows, curves, strict=True)]
-    show_table((*head, ""), lines, numbers=("trial", *columns, "seed", *head[-2:]), curve="")
+    show_table((*head, ""), lines, numbers=set(head) - wraps - {"pipeline", "state"}, curve="")
     show()
     for line in summary(study):
         show(line)
@@ -67,7 +68,8 @@ def _describe(study: Study, best: Best) -> str:
 
 def _room(rows: Sequence[Sequence[str]]) -> int:
     """Return how many bars fit next to the columns of a table."""
-    taken = sum(max(map(len, column)) + _GAP for column in zip(*rows, strict=True))
+    words = ((len(w) for t in column for w in t.split()) for column in zip(*rows, strict=True))
+    taken = sum(max(column) + _GAP for column in words)
     return min(max(width() - taken, 1), _BARS)
 
 

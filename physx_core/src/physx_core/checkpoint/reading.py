@@ -38,7 +38,7 @@ from physx_core.checkpoint.description import (
     former_path,
     measure,
 )
-from physx_core.errors import CheckpointError, PhysxError, listed
+from physx_core.errors import CheckpointError, PhysxError, found_at, listed
 from physx_core.fields import Field
 from physx_core.normalization import Normalization
 from physx_core.origin import install_hint
@@ -124,7 +124,8 @@ def find(place: Path, name: str | None, which: int | str) -> Checkpoint:
     wanted = f"{name}_<number>" if which == -1 else path.name
     if not list_all(folder):
         raise CheckpointError(
-            f"There is no network in {folder}: name a training's session (physx train)."
+            f"There is no network in {folder}: name a training's session (physx train). "
+            f"{found_at(place)}"
         )
     raise CheckpointError(f'There is no checkpoint "{wanted}" in {folder}. Available: {others}.')
 

@@ -32,6 +32,7 @@ _ORDER = (
     "completion",
 )
 """Order of the core's commands in the overview; others follow alphabetically."""
+_HELP = {"-h", "--help"}
 _USAGE = 2  # the status of a parser that does not understand its words
 
 
@@ -100,7 +101,7 @@ def _interrupted(error: BaseException, how: str, number: signal.Signals) -> int:
 
 
 def _dispatch(words: list[str]) -> int:
-    if not words or words[0] in ("-h", "--help"):
+    if not words or words[0] in _HELP:
         print(_overview())
         return 0
     if words[0] == "--version":
@@ -115,7 +116,8 @@ def _dispatch(words: list[str]) -> int:
 def _run(name: str, words: list[str]) -> None:
     module = find_command(name)
     try:
-        module.run(words)
+        with contextlib.nullcontext() if _HELP.isdisjoint(words) else _wrapped_help():
+            module.run(words)
     except SystemExit as end:
         if end.code == _USAGE:
             for line in _suggestions(name, words):
@@ -124,6 +126,12 @@ def _run(name: str, words: list[str]) -> None:
         if end.code or not ours.startswith("physx_") or ends_in(end, "argparse", "tyro", ours):
             raise
         raise UsageError(f"{describe_ending(end)}, but the command is not finished.") from end
+
+
+def _wrapped_help() -> contextlib.AbstractContextManager[None]:
+    from physx_core.cli.help_texts import wrapped_help
+
+    return wrapped_help()
 
 
 def _suggestions(name: str, words: list[str]) -> Iterator[str]:

@@ -1,4 +1,4 @@
-"""Reads the options of commands from what they print for ``--help``."""
+"""What commands print for ``--help``: wraps it, and reads their options from it."""
 
 from __future__ import annotations
 
@@ -6,11 +6,45 @@ import contextlib
 import io
 import os
 import re
+import sys
+import textwrap
 from collections.abc import Callable, Collection, Iterator, Sequence
+from typing import TextIO
+
+from physx_core.terminal import width, wrapped
 
 _OPTION = re.compile(
     r"^[│ ]*(?:-\w, )?(--[a-z][\w.-]*)(?:, (--[a-z][\w.-]*))?(?: (\S.*?))?(?:  |│|$)"
 )
+_STYLE = re.compile(r"\x1b\[[0-9;]*m")
+
+
+class _Captured(io.StringIO):
+    """What is printed for the stream that it replaces, in color if that is a terminal."""
+
+    def __init__(self, stream: TextIO) -> None:
+        super().__init__()
+        self._stream = stream
+
+    def isatty(self) -> bool:
+        return self._stream.isatty()
+
+
+@contextlib.contextmanager
+def wrapped_help() -> Iterator[None]:
+    """Wrap what is printed meanwhile: parsers wrap options, but neither usages nor descriptions."""
+    printed = _Captured(sys.stdout)
+    try:
+        with contextlib.redirect_stdout(printed):
+            yield
+    finally:
+        for line in printed.getvalue().splitlines():
+            plain = _STYLE.sub("", line)
+            if len(plain) <= width():
+                print(line)
+            else:
+                hangs = plain.startswith((" ", "usage:"))
+                print(wrapped(plain) if hangs else textwrap.fill(plain, width()))
 
 
 def help_of(run: Callable[[Sequence[str]], object]) -> str:

@@ -14,11 +14,12 @@ import sys
 import tempfile
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib.metadata import Distribution, distributions
 from pathlib import Path
 
 from physx_core import plugins
+from physx_core.plugins.entries import unmet_requirements
 
 _SHOWN = (
     *("PYTHONPATH", "PYTHONHOME", "VIRTUAL_ENV", "CONDA_PREFIX", "ROS_DISTRO", "LD_LIBRARY_PATH"),
@@ -169,7 +170,13 @@ def find_packages() -> list[Package]:
     physx = sorted({*(name for name in found if name.startswith("physx-")), *map(_normal, owners)})
     libraries = {name for owner in physx for name in _required(found.get(owner, []))}
     names = [*physx, *sorted(libraries - set(physx))]
-    return [_describe(name, found[name]) for name in names if name in found]
+    described = [_describe(name, found[name]) for name in names if name in found]
+    return [
+        replace(each, problems=(*each.problems, *unmet_requirements(found[each.name][0])))
+        if each.name in physx
+        else each
+        for each in described
+    ]
 
 
 def _normal(name: str) -> str:

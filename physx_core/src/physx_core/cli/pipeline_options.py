@@ -2,23 +2,19 @@
 
 from __future__ import annotations
 
-import ast
 import copy
 import dataclasses
 import functools
-import inspect
-import itertools
-import sys
 import textwrap
 import typing
 from collections.abc import Mapping, Sequence
 from pathlib import Path
-from types import MappingProxyType
 from typing import Annotated, Any, TypeVar
 
 import tyro
 
 from physx_core.cli.arguments import argument_registry, take_changes
+from physx_core.cli.options import docstrings, set_help
 from physx_core.config import configuration_in, from_plain, read_toml, set_option
 from physx_core.errors import (
     ConfigFileError,
@@ -72,7 +68,7 @@ def pipeline_from(
     if unknown:
         raise UnknownOptionError(f"The table [{make.kind}]", unknown, known)
     form = dataclasses.make_dataclass(verb, options, kw_only=True)
-    about = textwrap.dedent(make.__doc__ or "").split("\n\n")[0]
+    about = textwrap.dedent(make.__doc__ or "").split("\n\n")[0].replace("``", "")
     lines = "\n".join(f"  physx {verb} {example}" for example in examples)
     kwargs = "network.network-kwargs" if "network" in known else "environment.env-kwargs"
     about += f"\n\nexamples:\n{lines}\n\n{_ONE_ARGUMENT.format(option=kwargs)}"
@@ -219,7 +215,7 @@ def _options_of(
     make: type[Pipeline], defaults: Mapping[str, Any], words: Sequence[str]
 ) -> list[tuple[str, Any, Any]]:
     """Return name, type, and default of each option for `dataclasses.make_dataclass`."""
-    hints, docs = typing.get_type_hints(make), _docstrings(make)
+    hints, docs = typing.get_type_hints(make), docstrings(make)
     options: list[tuple[str, Any, Any]] = []
     for option in _dataclass_fields(make):
         name = _option_name(option.name)
@@ -230,7 +226,7 @@ def _options_of(
         hint = hints[option.name]
         if name != option.name:
             hint = _configuration(make, option.name)
-            _set_help(hint)
+            set_help(hint)
             if default is None:
                 asked = any(word.startswith(f"--{name}.") for word in words)
                 if name == "environment" and not asked:
@@ -261,28 +257,3 @@ def _python_name(make: type[Pipeline], name: str) -> str:
 def _configuration(make: type[Pipeline], python_name: str) -> Any:
     hint = typing.get_type_hints(make)[python_name]
     return configuration_in(hint) or hint
-
-
-def _set_help(cls: type[Any]) -> None:
-    """Pass a configuration's docstrings to tyro: its own parser would break their lines."""
-    docs = _docstrings(cls)
-    hints = typing.get_type_hints(cls)
-    for option in _dataclass_fields(cls):
-        if (nested := configuration_in(hints[option.name])) is not None:
-            _set_help(nested)
-        option.metadata = MappingProxyType({**option.metadata, "help": docs.get(option.name, "")})
-
-
-def _docstrings(cls: type[Any]) -> dict[str, str]:
-    """Return the attribute docstrings of a class and its bases, each as one line."""
-    docs: dict[str, str] = {}
-    for base in filter(dataclasses.is_dataclass, reversed(cls.__mro__)):
-        tree = ast.parse(inspect.getsource(sys.modules[base.__module__]))
-        found = (node for node in tree.body if isinstance(node, ast.ClassDef))
-        body = next(node.body for node in found if node.name == base.__name__)
-        for statement, following in itertools.pairwise(body):
-            if isinstance(statement, ast.AnnAssign) and isinstance(following, ast.Expr):
-                name, text = ast.unparse(statement.target), following.value
-                words = str(text.value).split() if isinstance(text, ast.Constant) else []
-                docs[name] = " ".join(words)
-    return docs

@@ -191,8 +191,9 @@ class Environment(Closeable):
     # What a subclass implements -------------------------------------------------------------
 
     def create(self) -> None:
-        """Create the simulation."""
-        raise self._lacks("create")
+        """Create the simulation; not needed if `reset_parameters` sets the whole state."""
+        if type(self).reset_parameters is Environment.reset_parameters:
+            raise self._lacks("create")
 
     def init(self) -> None:
         """Initialize the simulation once it is created."""
@@ -202,7 +203,10 @@ class Environment(Closeable):
         raise self._lacks("init_database")
 
     def init_visualization(self) -> None:
-        """Add objects to `factory`."""
+        """Add objects to `factory`.
+
+        Called before the first `reset_parameters`: what that sets is drawn by the first step.
+        """
 
     def reset_parameters(self, **values: Any) -> None:
         """Prepare the next episode with these values of the defined parameters.
@@ -849,8 +853,13 @@ def _constants_of(kind: type[Environment]) -> list[str]:
     return [name for names in given for name in names]
 
 
-def explain_missing_attribute(error: AttributeError) -> str:
-    """Return a hint for an attribute that an environment or its factory does not have."""
+def explain_missing_attribute(error: AttributeError, method: str) -> str:
+    """Return a hint for an attribute that an environment or its factory does not have.
+
+    Args:
+        error: The error.
+        method: The environment's method that raised it.
+    """
     owner, name = error.obj, str(error.name)
     if not isinstance(owner, (Environment, Factory)):
         return ""
@@ -858,6 +867,12 @@ def explain_missing_attribute(error: AttributeError) -> str:
         return f" {type(owner).__name__}.__init__() must first call super().__init__(**kwargs)."
     if name in _OTHER_NAMES:
         return f" Use {_OTHER_NAMES[name]} instead."
+    resets = type(owner).reset_parameters if isinstance(owner, Environment) else None
+    if method == "init_visualization" and resets not in (None, Environment.reset_parameters):
+        return (
+            " reset_parameters() is called later: add objects here with any values, and change "
+            "them in step()."
+        )
     own = dir(type(owner)) if isinstance(owner, Factory) else [*dir(type(owner)), *vars(owner)]
     return nearest(name, (known for known in own if not known.startswith("_")))
 

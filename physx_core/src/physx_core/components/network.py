@@ -127,6 +127,27 @@ class Network(ABC):
                 missing,
             )
 
+    def reject_free_axes(self, fields: Mapping[str, Field]) -> None:
+        """Check that the fields of a network whose samples must have one size have no free axis.
+
+        Args:
+            fields: Fields by name, of which `net_fields` and `opt_fields` are checked.
+
+        Raises:
+            FieldsMismatchError: If one has a free axis.
+        """
+        free = {
+            name: f'its axis "{fields[name].free_axis}" has another size in each sample'
+            for name in (*self.net_fields, *self.opt_fields)
+            if fields[name].free_axis
+        }
+        if free:
+            raise FieldsMismatchError(
+                f"{type(self).__name__} needs samples of one size; those of meshes are taken by "
+                '"torch/graph", and by "torch/padded" for a network of yours',
+                free,
+            )
+
     @abstractmethod
     def predict(self, data: Tensors) -> Tensors:
         """Return ``{field: tensor}`` for `pred_fields` from the `net_fields` in `data`.

@@ -8,7 +8,7 @@ from typing import Any
 from physx_core.components.visualizer import Observer
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import ConfigError, UnknownOptionError
-from physx_core.plugins import resolve
+from physx_core.plugins import create
 
 
 def statistics_observers(
@@ -26,7 +26,7 @@ def statistics_observers(
     Raises:
         UnknownOptionError: If there are arguments for a reference that was not given.
         ConfigError: If the arguments of a reference are not a table.
-        PhysxError: If a reference cannot be resolved.
+        PhysxError: If a reference cannot be resolved, or does not accept its arguments.
     """
     references = [given] if isinstance(given, str) else list(given)
     unknown = kwargs.keys() - set(map(str, references))
@@ -40,7 +40,7 @@ def statistics_observers(
             )
     drawn = environment.visualizer if environment is not None else None
     return [
-        resolve("visualizer", reference)(**kwargs.get(str(reference), {}))
+        create("visualizer", reference, kwargs.get(str(reference), {}))
         for reference in references
         if reference != drawn
     ]

@@ -13,6 +13,9 @@ from physx_core.fields import Field
 from physx_core.processes import is_ending
 from physx_core.typing import Array
 
+_LISTS = ("announcements", "touch", "outputs")
+"""The methods that return a list."""
+
 
 class Observers(Observer):
     """Passes everything to each observer; one that raises is reported once, then disabled."""
@@ -115,7 +118,10 @@ class Observers(Observer):
         returned = []
         for observer, call in self._calls[method]:
             try:
-                returned.append(call(*arguments))
+                found = call(*arguments)
+                if method in _LISTS and (isinstance(found, str) or not isinstance(found, Sequence)):
+                    raise TypeError(f"{method}() returned {found!r:.100}, not a list")
+                returned.append(found)
             except BaseException as error:
                 if not isinstance(error, Exception) and not is_ending(error):
                     raise

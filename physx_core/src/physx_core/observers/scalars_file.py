@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from physx_core.components.visualizer import Observer
-from physx_core.errors import SessionError
+from physx_core.errors import SessionError, found_at
 
 HEADER = ("timeline", "step", "name", "value")
 FIELDS = "fields"
@@ -83,18 +83,23 @@ def _cut_unfinished_line(path: Path) -> None:
                 stream.truncate(content.rfind(b"\n") + 1)
 
 
-def read_scalars(session_dir: Path) -> dict[tuple[str, str], dict[int, float]]:
+def read_scalars(session: str | Path) -> dict[tuple[str, str], dict[int, float]]:
     """Return a session's statistics: (timeline, name) to step to value, in the order of writing.
 
     If a resumed run recorded a step again, the later value counts. An incomplete last line is
     ignored.
 
+    Args:
+        session: The session's folder.
+
     Raises:
         SessionError: If the session has no statistics file, or it was not written by physx.
     """
-    path = session_dir / "stats" / "scalars.csv"
+    path = Path(session) / "stats" / "scalars.csv"
     if not path.is_file():
-        raise SessionError(f"There is no {path}: only training runs write statistics.")
+        raise SessionError(
+            f"There is no {path}: only training runs write statistics. {found_at(Path(session))}"
+        )
     found: dict[tuple[str, str], dict[int, float]] = {}
     try:
         with path.open(encoding="utf-8", newline="") as stream:

@@ -5,7 +5,6 @@ from .data_generation import DataGeneration as DataGeneration
 from .evaluating import evaluate as evaluate
 from .evaluating import trace_episode as trace_episode
 from .learning.batches.drawn_rows import read_drawn_rows as read_drawn_rows
-from .learning.components import create_network as create_network
 from .learning.learner import Learner as Learner
 from .learning.loading import load_learner as load_learner
 from .learning.unseen import Unseen as Unseen

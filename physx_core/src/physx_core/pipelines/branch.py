@@ -11,16 +11,19 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from physx_core import plugins
 from physx_core.components.scene.event import Event
 from physx_core.config import EnvironmentConfig, at_least, from_plain, options, to_plain
 from physx_core.dataset import Dataset
 from physx_core.errors import UsageError
+from physx_core.pipelines.data_generation import DataGeneration
 from physx_core.pipelines.learning.learner import Learner
 from physx_core.pipelines.learning.loading import load_learner
 from physx_core.pipelines.pipeline import NewSessionPipeline
 from physx_core.pipelines.redrawing import Redrawing
 from physx_core.pipelines.replay import recorded_environment
-from physx_core.processes import Interrupt, deferred_interrupt
+from physx_core.plugins.hookspecs import LOG
+from physx_core.processes import Interrupt, TemporaryFolder, deferred_interrupt
 from physx_core.results import Result
 from physx_core.results.wording import number, plain
 from physx_core.typing import Array, Batch, Sample
@@ -48,7 +51,7 @@ class Branch(NewSessionPipeline):
     """
 
     data: str | Path
-    """Folder of the session or dataset."""
+    """Folder of the session or dataset; or the log of an episode, which is simulated again."""
     row: int = at_least(0)
     """Number of the row in its mode."""
     change: dict[str, Any] = field(default_factory=dict)
@@ -180,13 +183,9 @@ class Branch(NewSessionPipeline):
     def _open(self, resources: contextlib.ExitStack) -> None:
         if not self.change and self.policy is None:
             raise UsageError("Nothing changes: give change (--set NAME=VALUE ...) or a policy.")
-        if Path(self.data).is_file():
-            raise UsageError(
-                f"{self.data} is a file: give the folder of a session or dataset. The log of a "
-                "robot is simulated again, as a policy, by physx generate gym/ID "
-                f"--environment.env-kwargs policy={self.data} --episodes 1."
-            )
-        dataset = self._dataset = resources.enter_context(Dataset.open(self.data))
+        is_log = Path(self.data).is_file()
+        data = self._simulate_log(resources) if is_log else self.data
+        dataset = self._dataset = resources.enter_context(Dataset.open(data))
         if self.policy is not None:
             self._learner = load_learner(self.policy, trust=self.trust)
         with self._redrawing(AS_IT_WAS) as drawing:
@@ -202,6 +201,23 @@ class Branch(NewSessionPipeline):
             visualizer_kwargs=self.visualizer_kwargs,
         )
         self._observe(resources, drawn)
+
+    def _simulate_log(self, resources: contextlib.ExitStack) -> Path:
+        """Simulate the episode in a log again; return the folder of its rows, a temporary one."""
+        if LOG not in plugins.references_of("environment"):
+            raise UsageError(
+                f"{self.data} is a file, and no installed plugin simulates episodes in logs again: "
+                "give the folder of a session or dataset."
+            )
+        environment = EnvironmentConfig(
+            plugins.complete_reference("environment", LOG),
+            {"path": str(self.data)},
+            as_tcp_ip_client=False,
+            seed=0,
+        )
+        folder = str(resources.enter_context(TemporaryFolder("physx_branch_")).path)
+        again = DataGeneration(environment, episodes=1, session_dir=folder, quiet=True)
+        return Path(again.execute().places["session"])
 
     def _results(self, error: BaseException | None) -> Iterable[str]:
         if error is not None:

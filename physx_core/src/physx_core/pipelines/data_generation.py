@@ -23,6 +23,7 @@ from physx_core.pipelines.run_description import (
     describe_environment_config,
     describe_samples,
 )
+from physx_core.pipelines.saved_parameters import forget_parameters, remove_unused_parameters
 from physx_core.pipelines.storage import (
     GENERATION,
     STREAMS,
@@ -131,14 +132,16 @@ class DataGeneration(NewSessionPipeline):
             before = self.dataset.num_samples(self._mode)
             self.observers.begin("generation", *self._amount())
             self.data_generation_begin()
-            if self.episodes is None:
-                self._generate_batches()
-            else:
-                self._simulate_episodes()
-            if self._writer is not None and self.prove_independence:
-                self._writer.prove_independence()
-            self.data_generation_end()
-            self._rows = self.dataset.num_samples(self._mode) - before
+            try:
+                if self.episodes is None:
+                    self._generate_batches()
+                else:
+                    self._simulate_episodes()
+                if self._writer is not None and self.prove_independence:
+                    self._writer.prove_independence()
+                self.data_generation_end()
+            finally:
+                self._rows = self.dataset.num_samples(self._mode) - before
         return self.result
 
     def _amount(self) -> tuple[int, str]:
@@ -339,6 +342,8 @@ class DataGeneration(NewSessionPipeline):
             skip = self._streams.skip
             if former is not None and skip.rows >= (total or 0):
                 return
+        elif campaign is None:
+            remove_unused_parameters(self.dataset)
         known = self._streams
         self.source = self._open_source(
             *(resources, config, seed),
@@ -372,6 +377,7 @@ class DataGeneration(NewSessionPipeline):
         """Simulate episodes by number, instead of streams."""
         self.source.check_independent()
         parameters, self._streams = self.source.sets.parameters, None
+        forget_parameters(self.dataset.directory)
         self.dataset.update_info(**{STREAMS: None})
         campaign = Campaign.begin(self.dataset, self._mode, config, self._seed, seed, parameters)
         self._writer = self._make_writer(campaign)
@@ -443,7 +449,7 @@ class DataGeneration(NewSessionPipeline):
             yield describe_samples(self.dataset.directory)
             return
         count = self.batch_id
-        rate = count * (self.batch_size or 0) / duration
+        rate = max(self._rows, 0) / duration
         yield f"{count} of {self.batch_nb} batches in {duration:.2f} s, {rate:.0f} samples/s"
         yield describe_samples(self.dataset.directory)
         if self._writer is not None and self._writer.failed:

@@ -13,6 +13,12 @@ from physx_core.config import MODES, SETS, WRONG, EnvironmentConfig
 from physx_core.dataset import Dataset
 from physx_core.dataset.store.manifest import to_plain_info
 from physx_core.errors import ConfigError
+from physx_core.pipelines.saved_parameters import (
+    accept_parameters,
+    keep_parameters,
+    remove_unused_parameters,
+    restore_parameters,
+)
 from physx_core.pipelines.storage import EPISODE_OPTIONS, GENERATIONS, end_generation
 from physx_core.workers.pasts import NOTHING, Skip
 
@@ -84,10 +90,34 @@ class Generation:
         except (KeyError, TypeError):
             return None
 
+    @property
+    def name(self) -> str:
+        """What tells these streams from others in the dataset."""
+        return f"{self.mode} {self.first} {self.seed}"
+
+    def keep_parameters(self, dataset: Dataset) -> None:
+        """Back up what instances have saved, with which these streams begin.
+
+        What earlier streams saved that have no rows does not count.
+        """
+        remove_unused_parameters(dataset)
+        for entry in GENERATIONS:
+            last = self.find(dataset.info, entry)
+            if last is None or last.ended is not None:
+                continue
+            if dataset.num_samples(last.mode) == last.first:
+                last.restore_parameters(dataset)
+        keep_parameters(dataset.directory, f"{self.entry} {self.name}")
+
     def start(self, dataset: Dataset) -> None:
         """Store it in the dataset, in place of the descriptions of other runs."""
         end_generation(dataset, *(entry for entry in GENERATIONS if entry != self.entry))
         self.store(dataset)
+        accept_parameters(dataset.directory, self.entry)
+
+    def restore_parameters(self, dataset: Dataset) -> None:
+        """Restore what instances had saved when these streams began."""
+        restore_parameters(dataset.directory, self.entry, f"{self.entry} {self.name}")
 
     def store(self, dataset: Dataset) -> None:
         """Store it in the dataset."""

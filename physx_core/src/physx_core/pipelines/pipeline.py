@@ -23,7 +23,7 @@ from physx_core.errors import UsageError
 from physx_core.observers import Observers, ProgressBar, ScalarsFile
 from physx_core.pipelines.services import Predict, RunServices, Show, Touch
 from physx_core.pipelines.storage import remove_unused
-from physx_core.plugins import resolve
+from physx_core.plugins import create
 from physx_core.processes import (
     Terminated,
     describe_ending,
@@ -295,8 +295,9 @@ class Pipeline(ABC):
         if environment is not None:
             instance_nb = environment.num_clients
             if environment.visualizer is not None:
-                make = resolve("visualizer", environment.visualizer)
-                observers.append(make(**environment.visualizer_kwargs))
+                observers.append(
+                    create("visualizer", environment.visualizer, environment.visualizer_kwargs)
+                )
         self.observers = Observers(observers)
         self.observers.open(self.session.name, self.session.path, instance_nb)
         resources.callback(self.observers.close)
@@ -377,8 +378,10 @@ class Pipeline(ABC):
         """Say that a run repeats rows of an earlier one, if it does not go on from states."""
         repeated = skip.repeated(config.num_clients)
         if repeated and not skip.pasts:
-            hint = "" if config.state_every else "; with state_every it would go on from states"
-            self._say(f"{repeated:,} samples are stored, and simulated again first{hint}")
+            said = f"{repeated:,} samples are stored, and simulated again first"
+            if not config.state_every:
+                said += "; with state_every (--environment.state-every) it would go on from states"
+            self._say(said)
 
     def _record_config(self, seed: int, **others: object) -> None:
         """Write the options, some of them changed, and the actual seed to the session."""

@@ -146,8 +146,7 @@ class Redrawing(Closeable):
         stored = self._dataset.num_samples(self._mode)
         if not 0 <= row < stored:
             raise DatasetError(
-                f"{self._dataset.directory} has no row {row} in the mode {self._mode}: "
-                f"it has {stored:,} rows, from 0."
+                f"There is no row {row} in the mode {self._mode}: it has {stored:,} rows, from 0."
             )
         if self._is_numbered([row]):
             known, entry = self._episodes, self._entry(row)

@@ -12,7 +12,7 @@ from physx_core import files
 from physx_core.components.scene.event import Event
 from physx_core.errors import ConnectionRefusedByPeerError, DatasetError, UsageError
 from physx_core.net.values import decode, encode
-from physx_core.pipelines.storage import LARGEST_PARAMETERS, PARAMETERS
+from physx_core.pipelines.saved_parameters import LARGEST_PARAMETERS, PARAMETERS
 from physx_core.typing import Batch, Sample
 
 Predict: TypeAlias = Callable[[Batch], Batch]

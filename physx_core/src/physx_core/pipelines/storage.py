@@ -22,19 +22,13 @@ from physx_core.errors import (
     listed,
 )
 from physx_core.observers import read_scalars
+from physx_core.pipelines.saved_parameters import BEGUN, copy_parameters
 from physx_core.plugins import reference_of
 from physx_core.session import NOTES, Session, installed_versions, related_sessions
 from physx_core.sources.source import Source
 from physx_core.views.dataset_config import DatasetConfig
 
-PARAMETERS = "parameters_{}.bin"
-"""Name of the file in a dataset's folder that contains an instance's saved parameters."""
-_FORMER = ".former"
-_BEGINS = "parameters.begins"
-"""Name of the file that exists while a generation has begun, but has no rows yet."""
 _IF_SET = ("independent_episodes", "episode_steps", "sampler", "sampler_kwargs", "state_every")
-LARGEST_PARAMETERS = 2**32
-"""Maximum size of such a file in bytes."""
 GENERATION = "generation"
 """Entry in a dataset's info that describes the last training whose environments generated rows."""
 STREAMS = "streams"
@@ -125,9 +119,8 @@ def _is_unused(session: Session, path: Path, opened: bool) -> bool:
             return NOTES in path.read_text(encoding="utf-8")
         case ("dataset", name):
             is_data = name == FILE or path.suffix == ".h5"
-            return (
-                not opened or name in (LOCK, PROOF, _BEGINS) or (is_data and not _has_samples(path.parent))
-            )
+            is_empty = is_data and not _has_samples(path.parent)
+            return not opened or name in (LOCK, PROOF, BEGUN) or is_empty
         case ("stats", *_):
             numbers = session.stats_dir / "scalars.csv"
             return not numbers.exists() or not read_scalars(session.path)
@@ -241,45 +234,7 @@ def copy_existing(dataset: Dataset, config: DatasetConfig) -> None:
     with Dataset.open(config.existing_dir) as existing:
         copied = {"copied_from": str(existing.directory)}
         dataset.update_info(**existing.info | dict.fromkeys(GENERATIONS) | copied)
-        for path in existing.directory.glob(PARAMETERS.format("*")):
-            with files.storing(f"{path}, copied into the session,"):
-                content = files.read_content(path, LARGEST_PARAMETERS)
-                files.replace(dataset.directory / path.name, content)
-
-
-def keep_parameters(directory: Path) -> None:
-    """Back up the instances' parameters in a dataset's folder when a generation begins.
-
-    If a run was killed before it had rows, nothing goes on with what it saved: the parameters that
-    it began with are restored first.
-    """
-    if (directory / _BEGINS).exists():
-        restore_parameters(directory)
-    with files.storing(f"{directory}"):
-        for path in directory.glob(PARAMETERS.format("*") + _FORMER):
-            files.remove(path)
-        for path in directory.glob(PARAMETERS.format("*")):
-            content = files.read_content(path, LARGEST_PARAMETERS)
-            files.replace(path.with_name(path.name + _FORMER), content)
-        files.replace(directory / _BEGINS, b"")
-
-
-def accept_parameters(directory: Path) -> None:
-    """Let the parameters that are saved stay: a later run can go on with the generation."""
-    with files.storing(f"{directory}"):
-        files.remove(directory / _BEGINS)
-
-
-def restore_parameters(directory: Path) -> None:
-    """Restore the instances' parameters that `keep_parameters` backed up."""
-    with files.storing(f"{directory}"):
-        for path in directory.glob(PARAMETERS.format("*")):
-            former = path.with_name(path.name + _FORMER)
-            if former.exists():
-                files.replace(path, files.read_content(former, LARGEST_PARAMETERS))
-            else:
-                files.remove(path)
-        files.remove(directory / _BEGINS)
+        copy_parameters(existing.directory, dataset.directory)
 
 
 def is_copy(directory: Path) -> bool:

@@ -13,14 +13,7 @@ from physx_core.config import EnvironmentConfig
 from physx_core.dataset import Dataset
 from physx_core.pipelines.generation import Generation
 from physx_core.pipelines.services import Touch
-from physx_core.pipelines.storage import (
-    STREAMS,
-    accept_parameters,
-    describe_environment,
-    keep_parameters,
-    last_steps,
-    restore_parameters,
-)
+from physx_core.pipelines.storage import STREAMS, describe_environment, last_steps
 from physx_core.session import Session
 from physx_core.sources.source import Source
 from physx_core.workers.pasts import NOTHING, PastFiles
@@ -30,7 +23,7 @@ _ADVICE = "Start another run for more of them."
 
 def states_of(streams: Generation, session: Path) -> PastFiles:
     """Return the last states of streams, which are in the folder of their session."""
-    return PastFiles(session / "states", f"{streams.mode} {streams.first} {streams.seed}")
+    return PastFiles(session / "states", streams.name)
 
 
 class StoredStreams(Closeable):
@@ -76,11 +69,12 @@ class StoredStreams(Closeable):
         self._first, self._count = known.first, config.num_clients
         self._new = now if former is None else None
         if former is None:
-            keep_parameters(dataset.directory)
+            now.keep_parameters(dataset)
             return
         count = self._count
         self.skip = skip = former.resume(dataset, config, now, needed, _ADVICE)
-        restore_parameters(dataset.directory)
+        if skip.rows < needed:
+            former.restore_parameters(dataset)
         stop = former.first + skip.rows
         self.earlier = last_steps(dataset, mode, former.first, stop, count)
         if config.state_every:
@@ -107,7 +101,6 @@ class StoredStreams(Closeable):
         if new is not None:
             self._files.clear()
             new.start(self._dataset)
-            accept_parameters(self._dataset.directory)
 
     def touched(self, touch: Touch) -> Touch:
         """Return what a person did before rows that are repeated, and does before others.

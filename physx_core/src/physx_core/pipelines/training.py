@@ -21,7 +21,6 @@ from physx_core.dataset import Dataset
 from physx_core.errors import ConfigError, DivergedError, PhysxError
 from physx_core.observers import REPORT_SECONDS, statistics_observers
 from physx_core.pipelines.learning.bound_options import bound_options, check_bound
-from physx_core.pipelines.learning.components import create
 from physx_core.pipelines.learning.data_record import (
     describe_batch,
     record_data,
@@ -50,9 +49,11 @@ from physx_core.pipelines.storage import (
     reject_client_writers,
     reject_environments,
 )
+from physx_core.plugins import create
 from physx_core.processes import Interrupt, deferred_interrupt, is_from_signal
 from physx_core.results import Result
 from physx_core.results.errors import as_loss
+from physx_core.results.judge import UNCHANGED
 from physx_core.session import Session
 from physx_core.typing import Batch
 from physx_core.views.dataset_config import DatasetConfig
@@ -463,11 +464,17 @@ class Training(NewSessionPipeline):
         return " and ".join(decided)
 
     @property
+    def _decisive(self) -> str:
+        """What decides which network is the best."""
+        known = "training" if math.isnan(self.validation_loss) else "validation"
+        return self.monitor or f"{known} loss"
+
+    @property
     def stopped(self) -> str:
         """Why the training ends before its last epoch; empty if it does not."""
         if self.patience is None or self.epoch_id >= self.epoch_nb:
             return ""
-        return self.best.reason_to_stop(self.patience, self.monitor)
+        return self.best.reason_to_stop(self.patience, self._decisive)
 
     def validate(self) -> dict[str, float]:
         """Return the mean loss and other statistics over the validation samples."""
@@ -710,7 +717,7 @@ class Training(NewSessionPipeline):
 
     def _create_buffer(self) -> Buffer:
         environment = self.environment_config
-        buffer: Buffer = create("buffer", self.online, self.online_kwargs, Buffer)
+        buffer: Buffer = create("buffer", self.online, self.online_kwargs)
         produces = environment is not None and not environment.load_samples
         if not produces and buffer.capacity and not self.resume:
             raise ConfigError(
@@ -792,7 +799,7 @@ class Training(NewSessionPipeline):
         elif self.epoch_id >= self.epoch_nb:
             yield "nothing left to train: epoch_nb (--epoch-nb) is the total number of epochs"
         if not math.isinf(self.best.loss):
-            yield self.best.describe(self.monitor)
+            yield self.best.describe(self._decisive)
         if self.environment_config is not None:
             yield describe_samples(self.data.dataset.directory)
         if self.data.online is not None:
@@ -829,10 +836,24 @@ class Training(NewSessionPipeline):
             words = [f"--network.{k} {shlex.quote(v)}" for k, v in named.items() if ":" in v]
             yield " ".join(["physx predict", path, "ENVIRONMENT --step-nb N", *words])
             yield f"physx stats {path}"
+            if changes := self._changes_to_learn():
+                options = (f"--dataset.normalize.{shlex.quote(each)} increment" for each in changes)
+                yield " ".join([f"physx train --config {path}", *options])
         elif self._is_resumable:
             yield f"physx train {path} --resume"
         else:
             yield f"physx train --config {path} --network.network-dir {path}"
+
+    def _changes_to_learn(self) -> list[str]:
+        """Return targets that "nothing changes" predicts better, and that are not increments."""
+        known = self.learner.transformation.normalization
+        learned = {name for name, each in known.items() if each.since}
+        fields = {n: of for part in self._judgment.parts.values() for n, of in part.fields.items()}
+        return [
+            name
+            for name, of in fields.items() if name not in learned
+            if UNCHANGED in of.rivals and of.rivals[UNCHANGED].verdict == "loses"
+        ]  # fmt: skip
 
     def _components(self) -> Mapping[str, str]:
         return describe_training(self.learner, self.environment_config, self.data.dataset)

@@ -1,5 +1,7 @@
 """Plugins: components of pip-installed packages, selected by the name of their entry point."""
 
+from .creation import create as create
+from .creation import create_network as create_network
 from .entries import CHECKS as CHECKS
 from .entries import find_entries as find_entries
 from .entries import official_package as official_package
@@ -18,6 +20,7 @@ from .references import import_module as import_module
 from .references import reference_of as reference_of
 from .references import references_of as references_of
 from .references import resolve as resolve
+from .references import resolve_all as resolve_all
 from .registry import Plugin as Plugin
 from .registry import PluginInfo as PluginInfo
 from .registry import available as available

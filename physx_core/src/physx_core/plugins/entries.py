@@ -164,7 +164,36 @@ def _name_of(package: Distribution) -> str:
         return str(package.locate_file(""))
 
 
+def unmet_requirements(package: Distribution) -> list[str]:
+    """Return a sentence for each package that a package requires, but finds not, or too old or new.
+
+    Args:
+        package: The package; those that only its extras require are left out.
+    """
+    from importlib.metadata import PackageNotFoundError, version
+
+    try:
+        from packaging.requirements import InvalidRequirement, Requirement
+    except ImportError:  # a client's interpreter may lack it
+        return []
+    found = []
+    for line in package.requires or []:
+        with contextlib.suppress(InvalidRequirement):
+            needed = Requirement(line)
+            if needed.marker and not needed.marker.evaluate({"extra": ""}):
+                continue
+            text = f"{_name_of(package)} requires {needed.name}{needed.specifier}"
+            try:
+                present = version(needed.name)
+            except PackageNotFoundError:
+                found.append(f"{text}, which is not installed.")
+                continue
+            if not needed.specifier.contains(present, prereleases=True):
+                found.append(f"{text}, but {present} is installed.")
+    return found
+
+
 def describe_conflict(kind: str, entries: list[EntryPoint]) -> str:
     """Return the error message for several packages that claim one name."""
     owners = " and ".join(sorted(map(owner_of, entries)))
-    return f'The {kind} name "{entries[0].name}" is claimed by {owners}; uninstall one.'
+    return f'The {kind} name "{entries[0].name}" is claimed by {owners}; uninstall or rename one.'

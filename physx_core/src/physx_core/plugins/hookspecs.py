@@ -8,7 +8,8 @@ The names of plugins and components consist of letters, digits, "_", "-", and ".
 with "-" or ".". A component's name may consist of several such parts separated by "/", like
 Gymnasium ids. The component ``module`` adapts what the user has from another library: of the
 reference ``"plugin/package.module:Name"`` it gets ``"package.module:Name"`` as its argument
-``module``.
+``module``. The environment ``log`` simulates the episode in a log again, whose path it gets as its
+argument ``path``, and fails if it cannot.
 """
 
 from __future__ import annotations
@@ -37,6 +38,8 @@ MARK = "physx_kind"
 """Attribute of a hook's function that says what `kind_hook` was told."""
 ADAPTER = "module"
 """Name of the component that adapts what other libraries define, and of its argument."""
+LOG = "log"
+"""Name of the environment that simulates the episode in a log again."""
 
 
 def kind_hook(base: str, *, is_instance: bool = False) -> Callable[[Hook], Hook]:

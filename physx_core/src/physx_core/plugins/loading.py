@@ -7,12 +7,17 @@ import os
 import signal
 import sys
 import threading
+import traceback
 from collections.abc import Iterator
+from pathlib import Path
 from types import FrameType
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-from physx_core.errors import PluginError, printable
-from physx_core.plugins.entries import unreadable_hint
+from physx_core.errors import PhysxError, PluginError, printable
+from physx_core.plugins.entries import unmet_requirements, unreadable_hint
+
+if TYPE_CHECKING:
+    from importlib.metadata import Distribution
 
 TIMEOUT_VARIABLE = "PHYSX_IMPORT_TIMEOUT"
 """Environment variable with the time in s that a plugin may take to import."""
@@ -26,7 +31,9 @@ class _TimeIsUp(BaseException):
 
 
 @contextlib.contextmanager
-def loading(plugin: str, who: str, doing: str) -> Iterator[None]:
+def loading(
+    plugin: str, who: str, doing: str, package: Distribution | None = None
+) -> Iterator[None]:
     """Convert any failure in a plugin's own code to an error that names the plugin.
 
     This includes ``sys.exit`` and KeyboardInterrupt, unless a signal raised them. A plugin that
@@ -36,6 +43,7 @@ def loading(plugin: str, who: str, doing: str) -> Iterator[None]:
         plugin: Name of the plugin.
         who: The plugin and its package, for messages.
         doing: Description of a failure, for example "fails to import its module".
+        package: Its package, whose requirements a failure is compared with.
 
     Raises:
         PluginError: If the plugin raises anything, or takes too long.
@@ -60,7 +68,9 @@ def loading(plugin: str, who: str, doing: str) -> Iterator[None]:
             if signals:
                 raise
             text = f"{who} {doing}: {_description(error)}"
-            hint = unreadable_hint()  # libraries such as torch read all metadata when imported
+            # Libraries such as torch read all metadata when they are imported.
+            hints = [*(unmet_requirements(package) if package else []), unreadable_hint()]
+            hint = " ".join(filter(None, hints))
             raise PluginError(plugin, f"{text.rstrip('.')}. {hint}" if hint else text) from error
 
 
@@ -77,7 +87,18 @@ def _note(text: str) -> None:
 def _description(error: BaseException) -> str:
     if isinstance(error, SystemExit):
         return f"it calls sys.exit({error.code!r})"
-    return str(error) or type(error).__name__
+    frames = traceback.extract_tb(error.__traceback__)
+    files = [Path(each.filename) for each in frames]
+    own = [
+        f"({file.name}, line {frame.lineno})"
+        for file, frame in zip(files, frames, strict=True)
+        if file.is_file() and file.parent != Path(__file__).parent and "importlib" not in file.parts
+    ]
+    says_all = isinstance(error, (ImportError, SyntaxError, PhysxError))
+    if str(error) and (says_all or not own):
+        return str(error)
+    text = f": {error}" if str(error) else ""
+    return " ".join([f"{type(error).__name__}{text}", *own[-1:]])
 
 
 def _is_main() -> bool:

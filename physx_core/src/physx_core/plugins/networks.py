@@ -14,7 +14,7 @@ from physx_core.components.network import Network
 from physx_core.errors import ConfigError
 from physx_core.plugins.entries import official_package
 from physx_core.plugins.hookspecs import ADAPTER
-from physx_core.plugins.references import check_kind, find, resolve
+from physx_core.plugins.references import check_component, find, resolve
 from physx_core.plugins.registry import available, load
 
 
@@ -28,7 +28,7 @@ def resolve_network(reference: Any, arguments: Mapping[str, Any]) -> tuple[Any, 
     found = find("network", reference)
     library = _library_of(found)
     if library is None:
-        check_kind("network", reference, found)
+        check_component("network", reference, found)
         return found, dict(arguments)
     if ADAPTER in arguments:
         raise ConfigError(

@@ -13,6 +13,7 @@ import hashlib
 import importlib
 import importlib.util
 import sys
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from types import ModuleType
@@ -22,6 +23,7 @@ from physx_core.config import SCRIPT_PREFIX
 from physx_core.config import reference_of as reference_of
 from physx_core.errors import (
     ComponentNotFoundError,
+    MissingLibraryError,
     PhysxError,
     PluginError,
     PluginNotFoundError,
@@ -32,6 +34,7 @@ from physx_core.errors import (
 from physx_core.plugins.hookspecs import ADAPTER
 from physx_core.plugins.kinds import find_kind, kind_names
 from physx_core.plugins.loading import loading
+from physx_core.plugins.methods import check_methods
 from physx_core.plugins.registry import available, load, plugin_hint
 
 if TYPE_CHECKING:
@@ -88,9 +91,10 @@ def resolve(kind: str, reference: Any) -> Any:
         ComponentNotFoundError: If the plugin, module or script has no component of that name.
         ReferenceFormError: If the reference has none of the forms above, or names a class of
             another kind.
+        ConfigError: If it is a class that lacks a method, or whose methods take other arguments.
     """
     component = find(kind, reference)
-    check_kind(kind, reference, component)
+    check_component(kind, reference, component)
     return component() if find_kind(kind).is_instance and isinstance(component, type) else component
 
 
@@ -104,6 +108,23 @@ def references_of(kind: str) -> dict[str, list[str]]:
         with contextlib.suppress(PluginError):
             for name in load(plugin).components.get(kind, ()):
                 found.setdefault(name, []).append(f"{plugin}/{name}")
+    return found
+
+
+def resolve_all(kind: str) -> dict[str, Any]:
+    """Return all components of a kind by reference; a broken one is left out, with a warning.
+
+    Args:
+        kind: See `resolve`.
+    """
+    found = {}
+    for reference in sorted(each for places in references_of(kind).values() for each in places):
+        try:
+            found[reference] = resolve(kind, reference)
+        except MissingLibraryError:  # it would say so if it were asked for
+            continue
+        except PhysxError as error:
+            warnings.warn(f"The {kind} {reference} is left out. {error}", stacklevel=2)
     return found
 
 
@@ -197,7 +218,7 @@ def check_kind(kind: str, reference: Any, found: Any) -> None:
     Raises:
         ReferenceFormError: If it names anything else.
     """
-    base = _base_of(kind)
+    base = base_of(kind)
     if isinstance(found, type) and not issubclass(found, base):
         place = _place_of(reference)
         raise ReferenceFormError(
@@ -210,7 +231,24 @@ def check_kind(kind: str, reference: Any, found: Any) -> None:
         )
 
 
-def _base_of(kind: str) -> type[Any]:
+def check_component(kind: str, reference: Any, found: Any) -> None:
+    """Check that a reference names a class of the right kind that is complete, or a function.
+
+    Args:
+        kind: See `resolve`.
+        reference: The reference, for messages.
+        found: The object that it names.
+
+    Raises:
+        ReferenceFormError: If it names anything else.
+        ConfigError: If it is a class that lacks a method, or whose methods take other arguments.
+    """
+    check_kind(kind, reference, found)
+    check_methods(kind, reference, found, base_of(kind))
+
+
+def base_of(kind: str) -> type[Any]:
+    """Return the base class of a kind of component."""
     place, _, name = find_kind(kind).base.rpartition(":")
     base: type[Any] = getattr(importlib.import_module(place), name)
     return base
@@ -412,13 +450,8 @@ def _no_plugin(kind: str, plugin_name: str) -> PluginNotFoundError:
             components = load(name).components.get(kind, {})
             having += [name] if components else []
             meant += [f'"{name}/{plugin_name}"'] if plugin_name in components else []
-    hint = (
-        f"Did you mean {' or '.join(meant)}?"
-        if meant
-        else f"Plugins with a component of kind {kind}: {listed(having)}. "
-        f"{plugin_hint(plugin_name)}"
-    )
-    return PluginNotFoundError(plugin_name, list(available()), hint)
+    hint = f"Plugins with a component of kind {kind}: {listed(having)}. {plugin_hint(plugin_name)}"
+    return PluginNotFoundError(plugin_name, list(available()), "" if meant else hint, meant)
 
 
 def import_module(kind: str, place: str) -> ModuleType:
@@ -504,7 +537,7 @@ def _classes(kind: str, module: ModuleType) -> list[str]:
     classes = {name: found for name, found in vars(module).items() if isinstance(found, type)}
     if kind not in kind_names():
         return list(classes)
-    base = _base_of(kind)
+    base = base_of(kind)
     fitting = [name for name, found in classes.items() if issubclass(found, base) and found != base]
     if kind != "network":
         return fitting

@@ -3,15 +3,17 @@
 from __future__ import annotations
 
 import functools
+import inspect
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import pluggy
 
-from physx_core.errors import PluginError, PluginNotFoundError
+from physx_core.errors import PluginError, PluginNotFoundError, listed, nearest
 from physx_core.origin import install_hint
 from physx_core.plugins import hookspecs
 from physx_core.plugins.entries import (
+    HOOKSPECS,
     PLUGINS,
     describe_conflict,
     find_entries,
@@ -99,36 +101,60 @@ def _load(entry: EntryPoint) -> Plugin:
     who = f'Plugin "{entry.name}" ({info.distributions[0]})'
     if not is_plugin_name(entry.name):
         raise PluginError(entry.name, f"{who} cannot have this name: {_NAMES}.")
-    with loading(entry.name, who, f"fails to import {entry.value}"):
+    with loading(entry.name, who, f"fails to import {entry.value}", entry.dist):
         module = entry.load()
+    if problem := _problem_of(module, entry.value):
+        raise PluginError(entry.name, f"{who} {problem}")
     manager = pluggy.PluginManager(PLUGINS)
     manager.add_hookspecs(hookspecs)
     added = [hook for hook in further_hooks() if hasattr(module, hook)]
     for hook in added:
         manager.add_hookspecs(hookspecs_of(hook))
     hooks = {kind: hook_of(kind) for kind in CORE_KINDS} | {kind_of(hook): hook for hook in added}
-    try:
-        manager.register(module, entry.name)
-        manager.check_pending()
-    except pluggy.PluginValidationError as error:
-        known = ", ".join(map(hook_of, kind_names()))
-        text = f"{who} has an unknown hook (known: {known}): {error}"
-        raise PluginError(entry.name, text) from error
-    with loading(entry.name, who, "fails in a hook"):
-        components = {kind: _call(manager, hook) for kind, hook in hooks.items()}
+    manager.register(module, entry.name)
+    components: dict[str, Components] = {}
+    for kind, hook in hooks.items():
+        with loading(entry.name, who, f"fails in {hook}()"):
+            returned = getattr(manager.hook, hook)()
+        for given in returned:
+            if problem := _problem_of_components(given):
+                raise PluginError(entry.name, f"{who}: {hook}() {problem}")
+            components.setdefault(kind, {}).update(given)
     return Plugin(info, {kind: given for kind, given in components.items() if given})
 
 
-def _call(manager: pluggy.PluginManager, hook: str) -> Components:
-    merged: Components = {}
-    for given in getattr(manager.hook, hook)():
-        if not isinstance(given, dict):
-            raise TypeError(f"{hook}() returned {type(given).__name__}, not a dictionary")
-        for name in given:
-            if not is_component_name(name):
-                raise ValueError(f"{hook}() names a component {name!r}: {_NAMES}")
-        merged.update(given)
-    return merged
+def _problem_of(module: Any, place: str) -> str:
+    """Return what is wrong with the hooks of a plugin's module; empty if nothing is."""
+    members, known = getattr(module, "__dict__", {}), list(map(hook_of, kind_names()))
+    hooks = {
+        name: member
+        for name, member in members.items()
+        if inspect.isroutine(member) and hasattr(member, f"{PLUGINS}_impl")
+    }
+    if not hooks:
+        forgotten = [f"{name}()" for name in known if name in members]
+        what = f"{listed(forgotten)} in {place} is not" if forgotten else f"nothing in {place} is"
+        return (
+            f"has no hooks: {what} marked with hookimpl. A plugin is a module with functions such "
+            "as physx_environments(), which return components by name."
+        )
+    for name, hook in hooks.items():
+        if name not in known and not vars(hook)[f"{PLUGINS}_impl"]["optionalhook"]:
+            package = official_package(name, HOOKSPECS)
+            hint = f" It is one of {package}. {install_hint(package)}" if package else ""
+            hint = hint or nearest(name, known) or f" Hooks: {', '.join(known)}."
+            return f"has an unknown hook {name}.{hint}"
+        if arguments := inspect.signature(hook).parameters:
+            return f"has {name}({', '.join(arguments)}): hooks take no arguments."
+    return ""
+
+
+def _problem_of_components(given: Any) -> str:
+    """Return what is wrong with what a hook returned; empty if nothing is."""
+    if not isinstance(given, dict):
+        return f"returned {type(given).__name__}, not a dictionary"
+    wrong = [name for name in given if not is_component_name(name)]
+    return f"names a component {wrong[0]!r}: {_NAMES}" if wrong else ""
 
 
 def plugin_hint(name: str) -> str:

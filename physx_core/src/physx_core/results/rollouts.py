@@ -9,6 +9,7 @@ from typing import Any, Self
 import numpy as np
 
 from physx_core.errors import ConfigError
+from physx_core.fields import PTR
 from physx_core.results.errors import Target
 from physx_core.results.judge import Predictor
 from physx_core.results.result import Drift, EpisodeError, RolloutResult
@@ -170,7 +171,15 @@ class _Runs:
             raise NotRunError("the samples are of several sources; evaluate on one of them")
         loop = find_loop(network, batches)
         reading = batches.reading(network.names)
-        known = {name: targets[name].at(reading.fields[name]) for name in loop.feeds}
+        meshes = [each for each in network.names if reading.fields[each].free_axis]
+        if not all(reading.window(each).is_single for each in meshes):
+            raise NotRunError("windows of several rows have meshes of several rows")
+        if meshes and invariants:
+            raise NotRunError("invariants need rows of one size")
+        known = {
+            name: targets[name] if name in meshes else targets[name].at(reading.fields[name])
+            for name in loop.feeds
+        }
         for name, target in known.items():
             if target.classes is not None:
                 raise NotRunError(f"{name} has classes, not real numbers")
@@ -206,7 +215,7 @@ class _Runs:
         self.run("", steps)
         start = self._starts[place] - int(bool(self._loop.follows))
         truth, prediction = (
-            {name: np.concatenate([row[k][name] for row in self._kept.values()])
+            {name: np.concatenate([self._rows(name, row[k][name]) for row in self._kept.values()])
              for name in self._loop.feeds}
             for k in (0, 1)
         )  # fmt: skip
@@ -247,7 +256,7 @@ class _Runs:
         records = {name: _Record(len(self._episodes), list(self._invariants)) for name in names}
         row = 0
         while len(alive) and row < steps:
-            answer = self._network.predict({n: batch[n] for n in self._network.given})
+            answer = self._network.predict(batch)
             later = self._record(records, batch, answer, start, alive, row, steps)
             known = {
                 name: {o - loop.stride: v for o, v in {**known[name], **later[name]}.items()}
@@ -256,12 +265,12 @@ class _Runs:
             row += loop.stride
             kept, follow = self._read(row, alive)
             self._check_follows(batch, follow, alive, kept)
-            some = np.isin(alive, kept)
+            some = {name: self._entries(name, np.isin(alive, kept), batch) for name in names}
             known = {
-                name: {offset: values[some] for offset, values in each.items() if offset <= 0}
+                name: {offset: values[some[name]] for offset, values in each.items() if offset <= 0}
                 for name, each in known.items()
             }
-            start = {name: values[some] for name, values in start.items()}
+            start = {name: values[some[name]] for name, values in start.items()}
             alive, batch = kept, follow
             if len(alive):
                 batch = dict(batch) | self._inputs(known)
@@ -269,6 +278,15 @@ class _Runs:
             name: record.result(self._targets[name].field.unit, part, self._about)
             for name, record in records.items()
         }
+
+    def _entries(self, name: str, of_rows: Array, batch: Batch) -> Array:
+        """Return what the rows of a batch have; of a free axis, for each entry."""
+        axis = self._batches.fields[name].free_axis
+        return np.repeat(of_rows, np.diff(batch[axis + PTR])) if axis else of_rows
+
+    def _rows(self, name: str, values: Array) -> Array:
+        """Return values of a single episode at a single row, with an axis for the row."""
+        return values[np.newaxis] if self._batches.fields[name].free_axis else values
 
     def _known(self, batch: Batch) -> dict[str, dict[int, Array]]:
         """Return the values of each quantity at offsets from the reference row."""
@@ -320,7 +338,11 @@ class _Runs:
                 scale = scale[0] if scale.ndim == batch[name].ndim - 1 else scale
             for offset, values in later[name].items():
                 if row + offset <= steps:
-                    errors = [_mean_square(v, true[offset], scale) for v in (values, start[name])]
+                    places = self._entries(name, np.arange(len(alive)), batch)
+                    errors = (
+                        _mean_square(each, true[offset], scale, places)
+                        for each in (values, start[name])
+                    )
                     records[name].add(row + offset, alive, *errors)
         common = set.intersection(*(set(each) for each in later.values()))
         rows = [offset for offset in sorted(common) if row + offset <= steps]
@@ -362,11 +384,17 @@ class _Runs:
         return found
 
     def _check_follows(self, before: Batch, after: Batch, alive: Index, kept: Index) -> None:
-        """Check that a row begins with what the one before it ended with."""
+        """Check that a row goes on with the mesh and values that the one before it ended with."""
         some = np.isin(alive, kept)
+        for name in self._loop.feeds if len(kept) else ():
+            axis = self._batches.fields[name].free_axis
+            own, new = (np.diff(each[axis + PTR]) if axis else some for each in (before, after))
+            if axis and not np.array_equal(own[some], new):
+                raise NotRunError(f'the size of the axis "{axis}" changes within an episode')
         for name in self._loop.follows:
             for each in self._loop.feeds[name] if len(kept) else ():
-                if not np.allclose(before[name][some], after[each], rtol=1e-4, atol=1e-6):
+                ended = before[name][self._entries(name, some, before)]
+                if not np.allclose(ended, after[each], rtol=1e-4, atol=1e-6):
                     raise NotRunError(
                         f"the rows of an episode do not go on where the one before ended: {each} "
                         f"is not the last {name}"
@@ -432,6 +460,8 @@ def _first(rows: Sequence[int], wanted: Array) -> int | None:
     return rows[int(np.argmax(wanted))] if wanted.any() else None
 
 
-def _mean_square(guess: Array, truth: Array, scale: Array) -> Array:
+def _mean_square(guess: Array, truth: Array, scale: Array, places: Index) -> Array:
+    """Return the mean squared error of each row, of which there are entries at these places."""
     error = np.abs(np.subtract(guess, truth, dtype=np.result_type(truth, np.float64))) / scale
-    return np.asarray(np.square(error).reshape(len(truth), -1).mean(axis=1))
+    means = np.square(error).reshape(len(truth), -1).mean(axis=1)
+    return np.bincount(places, means) / np.bincount(places)

@@ -28,6 +28,8 @@ def between(interval: Interval | None) -> str:
 
 def plain(value: Any) -> str:
     """Return a parameter's value."""
+    if isinstance(value, (list, tuple)):
+        return f"[{', '.join(map(plain, value))}]"
     return f"{value:.4g}" if isinstance(value, float) else str(value)
 
 

@@ -11,6 +11,7 @@ from physx_core.errors import PhysxError
 from physx_core.net.handshake import TOKEN_VARIABLE
 from physx_core.processes import kill_descendants, prepare_worker
 from physx_core.workers.client.worker import run_client
+from physx_core.workers.warned import mark_warnings
 
 
 def main() -> int:
@@ -20,6 +21,7 @@ def main() -> int:
     parser.add_argument("--instance", type=int, help="number of the instance; any by default")
     options = parser.parse_args()
     prepare_worker()
+    mark_warnings()
     cells.take()
     token = os.environ.pop(TOKEN_VARIABLE, "")
     try:

@@ -651,7 +651,8 @@ class Instance(Closeable):
         if exits:
             summary = describe_ending(error)
         if isinstance(error, AttributeError):
-            summary += explain_missing_attribute(error)
+            hint = explain_missing_attribute(error, method)
+            summary += f".{hint}" if hint else ""
         if place:
             summary += f" ({place})"
         text = "".join(traceback.format_exception(error))

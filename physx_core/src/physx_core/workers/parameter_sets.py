@@ -3,25 +3,22 @@
 from __future__ import annotations
 
 import contextlib
-import inspect
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
 
-from physx_core.components.environment import options_of
 from physx_core.components.parameter import SET_FIELDS, Parameter
-from physx_core.components.sampler import LearningSampler, Sampler, checked, checked_many
+from physx_core.components.sampler import LearningSampler, checked, checked_many
 from physx_core.config import MODES, EnvironmentConfig
 from physx_core.errors import (
     ConfigError,
     FieldsMismatchError,
     PhysxError,
-    UnknownOptionError,
     UsageError,
 )
 from physx_core.fields import Field
-from physx_core.plugins import resolve
+from physx_core.plugins import create
 from physx_core.typing import Batch
 from physx_core.workers.learned_sets import LearnedSets
 from physx_core.workers.pasts import NOTHING, Skip
@@ -59,7 +56,11 @@ class ParameterSets:
         self._config, self._seed = config, list(seed)
         self.instance_nb = config.num_clients
         self._recorded = skip.sets
-        self._sampler = None if config.sampler is None else _make_sampler(config, config.sampler)
+        self._sampler = (
+            None
+            if config.sampler is None
+            else create("sampler", config.sampler, config.sampler_kwargs)
+        )
         self._waiting: list[dict[int, Mapping[str, Any]]] = [{} for _ in range(self.instance_nb)]
         self._newest: dict[int, Mapping[str, Any]] = {}  # of each instance
         self._begun: list[dict[str, Any]] = []
@@ -93,7 +94,9 @@ class ParameterSets:
                 "leave sampler out."
             )
         if first:
-            self._sampler = self._sampler or _make_sampler(self._config, _DEFAULT)
+            self._sampler = self._sampler or create(
+                "sampler", _DEFAULT, self._config.sampler_kwargs
+            )
             self._sampler.begin(first, self._seed)
 
     def check_same(self, number: int, other: Sequence[Parameter]) -> None:
@@ -250,21 +253,3 @@ class ParameterSets:
     def _record(self, number: int, values: Mapping[str, Any]) -> dict[str, Any]:
         episode, instance = divmod(number, self.instance_nb)
         return {"set": number, "env_id": instance + 1, "episode": episode, **values}
-
-
-def _make_sampler(config: EnvironmentConfig, reference: str | type[Any]) -> Sampler:
-    make = resolve("sampler", reference)
-    name = reference if isinstance(reference, str) else getattr(make, "__name__", repr(make))
-    if inspect.isabstract(make):
-        raise ConfigError(f"The sampler {name} is not complete: it does not implement ask().")
-    try:
-        sampler = make(**config.sampler_kwargs)
-    except TypeError as error:
-        known = options_of(make) if isinstance(make, type) else list(config.sampler_kwargs)
-        unknown = config.sampler_kwargs.keys() - set(known)
-        if unknown:
-            raise UnknownOptionError(f'The sampler "{name}"', unknown, known) from error
-        raise ConfigError(f'The sampler "{name}" rejects its arguments: {error}.') from error
-    if not isinstance(sampler, Sampler):
-        raise ConfigError(f"EnvironmentConfig.sampler: {name} is not a Sampler.")
-    return sampler

@@ -1,4 +1,4 @@
-"""``physx robots``: list the robots that a world may name, and their collision shapes."""
+"""``physx robots``: list the robots that are available by name."""
 
 from __future__ import annotations
 
@@ -12,9 +12,10 @@ from physx_sim import RobotInfo
 
 _HELP = """usage: physx robots
 
-Lists the robots that can be given by name, as in Robot("cartpole"), with the degrees of freedom of
-their joints (a floating base has 6 more), their mass, and the kind of their collision shapes. With
-meshes, Robot(collisions="boxes") or "capsules" is many times faster."""
+Lists the robots that can be given by name, as in Robot("cartpole"), with the
+degrees of freedom of their joints (a floating base has 6 more), their mass,
+and the kind of their collision shapes. With meshes, Robot(collisions="boxes")
+or "capsules" is many times faster."""
 
 
 def run(words: Sequence[str]) -> None:

@@ -68,10 +68,9 @@ def load_skeleton(movable: MovableBody, *, free: bool = False) -> dynamics.Skele
     model = movable.model
     skeleton = dynamics.Skeleton(movable.name)
     nodes: list[Any] = []
-    with _silence():  # DART warns of links without mass
-        for link in model.bodies:
-            nodes.append(_add_link(skeleton, link, nodes, movable))
-        write_masses(skeleton, movable)
+    for link in model.bodies:
+        nodes.append(_add_link(skeleton, link, nodes, movable))
+    write_masses(skeleton, movable)
     moving = [
         node.getParentJoint()
         for link, node in zip(model.bodies, nodes, strict=True)
@@ -144,8 +143,9 @@ def attach_shapes(skeleton: dynamics.Skeleton, movable: MovableBody) -> None:
 
 def write_masses(skeleton: dynamics.Skeleton, movable: MovableBody) -> None:
     """Write the masses and moments of inertia of a robot's or object's links."""
-    for link, body in zip(movable.model.bodies, skeleton.getBodyNodes(), strict=True):
-        body.setInertia(dynamics.Inertia(link.mass, link.center, link.inertia))
+    with _silence():  # DART warns of links without mass
+        for link, body in zip(movable.model.bodies, skeleton.getBodyNodes(), strict=True):
+            body.setInertia(dynamics.Inertia(link.mass, link.center, link.inertia))
 
 
 def static_skeleton(static: Static) -> dynamics.Skeleton:

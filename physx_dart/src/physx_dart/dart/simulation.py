@@ -195,6 +195,7 @@ class DartSimulation(RobotSimulation[DartRobot]):
 
     def change_parts(self, before: Parts) -> None:
         """Take over masses, friction, and ground."""
+        self._keep_contacts()
         for robot, old, new in zip(self._robots, before.movables, self.parts.movables, strict=True):
             if new is not old:
                 robot.change(new)
@@ -241,13 +242,17 @@ class DartSimulation(RobotSimulation[DartRobot]):
             self.bind(number, bond)
         if self._stateless:
             return
-        if self._stepped:
-            self._kept = self.read_contacts()
-        self._reader.clear_warm_start()
+        self._keep_contacts()
         contacts = self._world.getConstraintSolver()
         contacts.removeAllSkeletons()
         for skeleton in [*(robot.skeleton for robot in self._robots), *self._statics]:
             contacts.addSkeleton(skeleton)
+
+    def _keep_contacts(self) -> None:
+        """Keep the contacts of the last step, as what touched in DART is about to be replaced."""
+        if self._stepped:
+            self._kept = self.read_contacts()
+        self._reader.clear_warm_start()
 
     def read_contacts(self) -> Records:
         """Return the contacts of the last physics step."""

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from physx_core.rotations import (
+    cross_rows,
     from_rotation_vector,
     multiply,
     rotate_back,
@@ -183,7 +184,7 @@ class DartRobot(RobotEngine):
         twist = self._with_base(q, v)
         a = self.forward(q, twist, torques, pushed=True)
         if self.base:
-            a[:3] += np.cross(twist[3:6], twist[:3])
+            a[:3] += cross_rows(twist[3:6], twist[:3])
         return self._with_world(q, a)
 
     def _with_world(self, q: Vector, twist: Vector) -> Vector:
@@ -238,7 +239,7 @@ class DartRobot(RobotEngine):
         self._shadow.computeForwardDynamics()
         a = self._shadow.getAccelerations()
         if rotation is not None:
-            linear = a[3:6] @ rotation - np.cross(velocities[3:6], velocities[:3])
+            linear = a[3:6] @ rotation - cross_rows(velocities[3:6], velocities[:3])
             a = np.concatenate([linear, a[:3] @ rotation, a[6:]])
         return a
 
@@ -247,7 +248,7 @@ class DartRobot(RobotEngine):
         rotation = self._place(self._shadow, positions, velocities)
         a = accelerations
         if rotation is not None:
-            linear = rotation @ (a[:3] + np.cross(velocities[3:6], velocities[:3]))
+            linear = rotation @ (a[:3] + cross_rows(velocities[3:6], velocities[:3]))
             a = np.concatenate([rotation @ a[3:6], linear, a[6:]])
         self._shadow.setAccelerations(a)
         self._shadow.computeInverseDynamics(False, False, False)

@@ -26,6 +26,10 @@ class Warmth:
     Args:
         points: Upper bound on `ContactPoints.numbers`.
         rows: Number of constraint rows of its joints.
+
+    Attributes:
+        points: Impulses of points by their numbers, shape (points, 3).
+        rows: Impulses of the rows, shape (rows,).
     """
 
     def __init__(self, points: int, rows: int) -> None:
@@ -41,9 +45,10 @@ class Warmth:
 class Solved:
     """What a step solved: impulses along rows of contact points, joints, ties, and turning points.
 
+    Velocities are those of the robots that were solved together, one after the other.
+
     Attributes:
-        parts: Constraints of the robots; their velocities, one after the other, are the columns.
-        inverse: Inverse of their mass matrix, shape (nv, nv).
+        inverse: Inverse of the mass matrix, shape (nv, nv).
         along: Jacobian of the rows, shape (n, nv).
         spread: Velocities for unit impulses, shape (nv, n).
         response: Velocities along the rows for unit impulses, shape (n, n).
@@ -57,7 +62,6 @@ class Solved:
         turning: Points that resist turning, as in `ContactProblem`.
     """
 
-    parts: Sequence[Constraints]
     inverse: Vector
     along: Vector
     spread: Vector
@@ -77,6 +81,7 @@ class Constraints:
 
     Attributes:
         joints: Constraints of its joints.
+        warmth: Impulses to start with.
         inverse: Returns the inverse of its mass matrix, shape (nv, nv).
         touching: Points that touch planes, or None.
         acts: The rows of the joints that act.
@@ -112,7 +117,7 @@ class Constraints:
             touched: Whether it touches anything.
         """
         self.joints, self.inverse, self.touching = joints, inverse, touching
-        self._warmth, self._bounds = warmth, joints.bounds(positions)
+        self.warmth, self._bounds = warmth, joints.bounds(positions)
         self.acts = joints.acting(self._bounds, velocities, _REACH if touched else 0.0)
         self.nv = joints.base + len(velocities)
         self.impulses = _NOTHING
@@ -122,17 +127,6 @@ class Constraints:
         """Return the target velocities of all rows, shape (rows,)."""
         return self.joints.aims(self._bounds)
 
-    def rows(self) -> tuple[Vector, Vector, Vector, Vector]:
-        """Return smallest and largest impulses, targets, and last impulses of all rows."""
-        return self.joints.least, self.joints.most, self.aims(), self._warmth.rows
-
-    def last(self) -> Vector:
-        """Return the last impulses of the touching points, shape (3 k,)."""
-        points = self._warmth.points
-        if self.touching is None:
-            return points[:0].ravel()
-        return points.take(self.touching.numbers, 0).ravel()
-
     def add_missed(self, velocities: Vector) -> bool:
         """Activate the rows that velocities (nv,) require; return whether any were inactive."""
         ahead = self.joints.acting(self._bounds, velocities[self.joints.base :], -_MISSED)
@@ -141,22 +135,18 @@ class Constraints:
             self.acts = sorted(self.acts + missed)
         return bool(missed)
 
-    def clear_warm_start(self) -> None:
-        """Start the next step with no impulses."""
-        self._warmth.clear_warm_start()
-
     def keep(self, points: Vector, rows: Vector) -> None:
         """Store the impulses of the touching points and of all rows."""
         self.impulses = points.reshape(-1, 3)
-        self._warmth.points.fill(0.0)
+        self.warmth.points.fill(0.0)
         if self.touching is not None:
-            self._warmth.points[self.touching.numbers] = self.impulses
-        self._warmth.rows[:] = rows
+            self.warmth.points[self.touching.numbers] = self.impulses
+        self.warmth.rows = rows
 
 
 def limited(part: Constraints, v: Vector) -> Vector:
     """Return the velocities after the impulses of the joint rows only."""
-    part.clear_warm_start()
+    part.warmth.clear_warm_start()
     if not part.acts:
         return v
     joints, rows = part.joints, np.array(part.acts)
@@ -166,7 +156,7 @@ def limited(part: Constraints, v: Vector) -> Vector:
     least, most, none = joints.least.take(rows), joints.most.take(rows), v[:0]
     impulses = solve(response, change, least, most)
     part.solved = Solved(
-        [part], inverse, along, spread, response, -change, none, least, most, impulses, rows, none
+        inverse, along, spread, response, -change, none, least, most, impulses, rows, none
     )
     return v + spread.dot(impulses)
 
@@ -216,62 +206,67 @@ class _Group:
         ties: tuple[Vector, Vector] | None,
     ) -> None:
         """Collect the constraints; the arguments are those of `constrained`."""
+        nothing, width = v[:0], len(v)
         self._parts, self._spans = parts, _spans([part.nv for part in parts])
-        nothing = v[:0]
+        self._of_rows = _spans([len(part.joints.columns) for part in parts])
+        wide = list(zip(parts, self._spans, strict=True))
         self._touching = touching = [] if pairs is None else [pairs]
-        self._guess = [nothing if warm is None else warm.ravel()]
-        for part, span in zip(parts, self._spans, strict=True):
+        guess = [] if warm is None else [warm.ravel()]
+        for part, span in wide:
             if part.touching is not None:
-                touching.append(part.touching.widened(span, len(v)))
-            self._guess.append(part.last())
+                touching.append(part.touching.widened(span, width))
+                guess.append(part.warmth.points.take(part.touching.numbers, 0).ravel())
+        self._of_pairs = 0 if pairs is None else 3 * len(pairs.gaps)
         self._inverse = _diagonal([part.inverse() for part in parts], self._spans)
-        self._points, self._bias, self._friction = np.zeros((0, len(v))), nothing, nothing
+        self._points = np.zeros((0, width))
+        self._bias = self._friction = self._guess = self._pace = nothing
         if touching:
             self._points = joined([each.jacobian for each in touching])
             self._bias = joined([each.bias(before, period) for each in touching])
             self._friction = joined([each.friction for each in touching])
-        self._of_rows = _spans([len(part.joints.columns) for part in parts])
-        of_parts = zip(*(part.rows() for part in parts), strict=True)
-        self._least, self._most, self._aims, self._last = map(joined, of_parts)
-        wide = zip(parts, self._spans, strict=True)
-        self._joints = joined([widened(part.joints.jacobian, span, len(v)) for part, span in wide])
-        self._pace, self._turning = nothing, None
-        self._more: list[tuple[Vector, Vector]] = []  # Jacobians and targets of further rows
+            self._guess = joined(guess)
+        self._least = joined([part.joints.least for part in parts])
+        self._most = joined([part.joints.most for part in parts])
+        self._aims = joined([part.aims() for part in parts])
+        self._last = joined([part.warmth.rows for part in parts])
+        self._joints = joined([widened(part.joints.jacobian, span, width) for part, span in wide])
+        self._turning = None
+        self._more: list[Vector] = []  # Jacobians of further rows
+        self._targets: list[Vector] = []
         if ties is not None:
             self._pace = ties[1]
-            self._more.append((ties[0], -self._pace))
+            self._more, self._targets = [ties[0]], [-self._pace]
         if (spins := together(touching)) is not None:
             self._turning = spins.points, spins.bounds
-            self._more.append((spins.jacobian, -spins.drift))
+            self._more.append(spins.jacobian)
+            self._targets.append(-spins.drift)
 
     def solve(self, v: Vector, solver: ImpulseSolver) -> Solved:
         """Return the impulses of all constraints, with the rows of joints that act."""
         pairs = zip(self._parts, self._of_rows, strict=True)
-        rows = joined([np.array(part.acts, np.intp) + span.start for part, span in pairs])
+        rows = np.array([span.start + row for part, span in pairs for row in part.acts], np.intp)
         least, most = self._least.take(rows), self._most.take(rows)
         if len(self._parts) > 1:  # the solver expects rows with one bound first
             order = np.argsort(np.isinf(least) == np.isinf(most), kind="stable")
             rows, least, most = rows[order], least[order], most[order]
-        jacobian = [self._points, self._joints.take(rows, 0)]
-        targets, guess = [self._bias, -self._aims.take(rows)], [*self._guess, self._last.take(rows)]
-        for more, aims in self._more:
-            jacobian.append(more)
-            targets.append(aims)
-            guess.append(np.zeros(len(aims)))
+        along = np.concatenate([self._points, self._joints.take(rows, 0), *self._more])
+        targets = np.concatenate([self._bias, -self._aims.take(rows), *self._targets])
         if len(self._pace):
             endless = np.full(len(self._pace), np.inf)
             least, most = np.concatenate([least, -endless]), np.concatenate([most, endless])
-        along, turning = np.concatenate(jacobian), self._turning
         spread = self._inverse.dot(along.T)
-        response, free = along.dot(spread), along.dot(v) + np.concatenate(targets)
+        response, free = along.dot(spread), along.dot(v) + targets
         if len(self._bias):
-            first, friction = np.concatenate(guess), self._friction
-            impulses = solver.solve(response, free, friction, least, most, first, turning)
+            none = (np.zeros(len(each)) for each in self._targets)
+            guess = np.concatenate([self._guess, self._last.take(rows), *none])
+            impulses = solver.solve(
+                response, free, self._friction, least, most, guess, self._turning
+            )
         else:
             impulses = solve(response, -free, least, most)
         return Solved(
-            *(self._parts, self._inverse, along, spread, response, free, self._friction),
-            *(least, most, impulses, rows, self._pace, turning),
+            *(self._inverse, along, spread, response, free, self._friction),
+            *(least, most, impulses, rows, self._pace, self._turning),
         )
 
     def add_missed(self, velocities: Vector) -> bool:
@@ -287,13 +282,14 @@ class _Group:
         of_rows[rows] = impulses[len(self._bias) : len(self._bias) + len(rows)]
         if self._turning is not None:
             _keep_turning(self._touching, impulses)
-        first = end = len(self._guess[0])
-        of_parts = zip(self._parts, self._guess[1:], self._of_rows, strict=True)
-        for part, warmed, span in of_parts:
-            begin, end = end, end + len(warmed)
+        end = self._of_pairs
+        for part, span in zip(self._parts, self._of_rows, strict=True):
+            begin = end
+            if part.touching is not None:
+                end += 3 * len(part.touching.gaps)
             part.keep(impulses[begin:end], of_rows[span])
             part.solved = solved
-        return impulses[:first].reshape(-1, 3)
+        return impulses[: self._of_pairs].reshape(-1, 3)
 
 
 def _keep_turning(touching: Sequence[ContactPoints], impulses: Vector) -> None:

@@ -10,6 +10,7 @@ import eigenpy
 import numpy as np
 
 from physx_core.typing import Index, Vector
+from physx_sim.errors import SimulationError
 
 _REGULARIZATION = 1e-9
 """Relative regularization of the diagonal, as in DART's solver."""
@@ -18,8 +19,7 @@ _STUCK = 1e-14
 _ACCURACY = 1e-9
 """Accuracy of velocities, in m/s, for free velocities of 1 m/s or less."""
 _Turned = tuple[slice, slice | list[int], Sequence[Sequence[float]]]
-"""Rows that a projection changes, the rows on which the result depends, and how; (): on none."""
-_NOWHERE = slice(0)
+"""Rows that a projection changes, the rows on which the result depends, and how."""
 
 
 class ContactProblem:
@@ -66,13 +66,20 @@ class ContactProblem:
             most: Likewise.
             turning: Points that resist turning, as indices, and their largest angular impulses per
                 normal impulse across and about the normal, in m, shape (s, 2).
+
+        Raises:
+            SimulationError: If a value is not finite.
         """
         self.matrix = regularized(response)
         # Lists, because operations on short arrays take longer.
-        rates = self.matrix.diagonal().tolist()
-        largest = max(rates, default=0.0) or 1.0
-        if min(rates, default=1.0) <= (least_rate := _STUCK * largest):
+        rates, speeds = self.matrix.diagonal().tolist(), free.tolist()
+        # A non-finite entry of the response makes the diagonal non-finite, too.
+        if not math.isfinite(sum(speeds) + sum(rates)):
+            raise SimulationError("The state is no longer finite. Use a smaller period.")
+        largest = max(rates) or 1.0
+        if min(rates) <= (least_rate := _STUCK * largest):
             free = np.where(np.array(rates) <= least_rate, 0.0, free)
+            speeds = free.tolist()
             rates = [largest if rate <= least_rate else rate for rate in rates]
             self.matrix.flat[:: len(free) + 1] = rates
         self.free = free
@@ -89,10 +96,9 @@ class ContactProblem:
         self._rates = np.array(rates)
         # A step against the velocities, scaled per row.
         self._unit, self._scaled = unit(len(free)), self.matrix / self._rates[:, None]
-        self._back = self._unit - self._scaled
-        self._start = -free / self._rates
+        self._back, self._start = self._unit - self._scaled, free / self._rates
         self._bounds = list(zip(least.tolist(), most.tolist(), strict=True))
-        self.accuracy = _ACCURACY * max(1.0, *map(abs, free.tolist()))
+        self.accuracy = _ACCURACY * max(1.0, max(speeds), -min(speeds))
 
     @property
     def turning_rows(self) -> int:
@@ -107,7 +113,7 @@ class ContactProblem:
         """Return the best impulses within `most` steps from given ones, and their error."""
         best, least_error = impulses, math.inf
         for _ in range(most):
-            projected, turned = self._project(impulses)
+            projected, held, turned = self._project(impulses)
             change = projected - impulses
             error = self._error(change)
             if error < least_error:
@@ -116,7 +122,7 @@ class ContactProblem:
                     break
             elif not error < math.inf:
                 break
-            slope = self._slope(turned, self._scaled, self._back)
+            slope = self._slope(held, turned, self._scaled, self._back)
             impulses = impulses + eigenpy.PartialPivLU(slope).solve(change)
         return best, least_error
 
@@ -128,10 +134,10 @@ class ContactProblem:
         Args:
             impulses: The solution.
         """
-        _, turned = self._project(impulses)
-        slope = self._slope(turned, self._scaled, self._back)
+        _, held, turned = self._project(impulses)
+        slope = self._slope(held, turned, self._scaled, self._back)
         # The projection alone, as if impulses had no response.
-        rest = self._slope(turned, np.zeros(slope.shape), self._unit)
+        rest = self._slope(held, turned, np.zeros(slope.shape), self._unit)
         found: Vector = eigenpy.PartialPivLU(slope).solve((rest - self._unit) / self._rates)
         return found
 
@@ -139,19 +145,20 @@ class ContactProblem:
         velocities = change * self._rates
         return math.sqrt(velocities.dot(velocities))
 
-    def _project(self, impulses: Vector) -> tuple[Vector, list[_Turned]]:
+    def _project(self, impulses: Vector) -> tuple[Vector, list[int], list[_Turned]]:
         """Return impulses (n,) after a step and a projection onto the cones and bounds.
 
-        Also return where the projection changed them.
+        Also return the rows that the projection made constant, and where it turned others.
         """
-        values = (self._back.dot(impulses) + self._start).tolist()
-        turned: list[_Turned] = []
+        values = (self._back.dot(impulses) - self._start).tolist()
         place = 0
+        held: list[int] = []
+        turned: list[_Turned] = []
         for friction in self._coefficients:
             x, y, normal = values[place : place + 3]
             if normal <= 0:
                 values[place : place + 3] = 0.0, 0.0, 0.0
-                turned.append((slice(place, place + 3), _NOWHERE, ()))
+                held += (place, place + 1, place + 2)
             elif (across := math.hypot(x, y)) > (bound := friction * normal):
                 share, x, y = bound / across, x / across, y / across
                 values[place], values[place + 1] = bound * x, bound * y
@@ -164,40 +171,45 @@ class ContactProblem:
         for least, most in self._bounds:
             if not least < values[place] < most:
                 values[place] = least if values[place] <= least else most
-                turned.append((slice(place, place + 1), _NOWHERE, ()))
+                held.append(place)
             place += 1
         for normal, across, about in self._turning:
-            turned += _limit_turning(values, place, normal, (across, about))
+            turned += _limit_turning(values, held, place, normal, (across, about))
             place += 3
-        return np.array(values), turned
+        return np.array(values), held, turned
 
-    def _slope(self, turned: Sequence[_Turned], scaled: Vector, back: Vector) -> Vector:
+    def _slope(
+        self, held: Sequence[int], turned: Sequence[_Turned], scaled: Vector, back: Vector
+    ) -> Vector:
         """Return the derivative of impulses minus their projection, shape (n, n).
 
         Args:
-            turned: Where the projection changed them.
+            held: Rows that the projection made constant.
+            turned: Where it turned others.
             scaled: The derivative of the impulses minus those after the step, shape (n, n).
             back: The derivative of the impulses after the step, in the same form.
         """
         slope, unit = scaled.copy(), self._unit
+        for row in held:
+            slope[row] = unit[row]
         for rows, sources, turn in turned:
-            slope[rows] = unit[rows] - np.array(turn).dot(back[sources]) if turn else unit[rows]
+            slope[rows] = unit[rows] - np.array(turn).dot(back[sources])
         return slope
 
 
 def _limit_turning(
-    values: list[float], place: int, normal: int, bounds: Sequence[float]
+    values: list[float], held: list[int], place: int, normal: int, bounds: Sequence[float]
 ) -> list[_Turned]:
     """Project the angular impulses of a point, from a row on, given its normal's row.
 
-    Return where that changed them.
+    Return where that turned them; add those that it made constant to `held`.
     """
     across, about = (bound * values[normal] for bound in bounds)
     turned: list[_Turned] = []
     x, y, z = values[place : place + 3]
     if not across:
         values[place : place + 2] = 0.0, 0.0
-        turned.append((slice(place, place + 2), _NOWHERE, ()))
+        held += (place, place + 1)
     elif (size := math.hypot(x, y)) > across:
         share, x, y = across / size, x / size, y / size
         values[place], values[place + 1] = across * x, across * y
@@ -208,8 +220,11 @@ def _limit_turning(
         turned.append((slice(place, place + 2), [place, place + 1, normal], turn))
     if abs(z) >= about:
         values[place + 2] = math.copysign(about, z)
-        slope = ((math.copysign(bounds[1], z),),) if about else ()
-        turned.append((slice(place + 2, place + 3), [normal], slope))
+        if about:
+            slope = ((math.copysign(bounds[1], z),),)
+            turned.append((slice(place + 2, place + 3), [normal], slope))
+        else:
+            held.append(place + 2)
     return turned
 
 

@@ -14,6 +14,7 @@ import numpy as np
 import pinocchio
 from numpy.typing import NDArray
 
+from physx_core.rotations import cross_rows
 from physx_core.typing import Records, Vector
 from physx_dart.pinocchio.models import twists_of
 from physx_dart.pinocchio.surfaces import Heights, Plane, Surface, surface_of
@@ -29,11 +30,16 @@ _FASTEST_RETURN = 0.1
 """Maximum speed of this correction, in m/s: a body that is pushed out faster jumps visibly."""
 _BOUNCE = 0.1
 """Approach speed, in m/s, above which contacts bounce."""
+_FLAT = 1e-9
+"""Sine of the angle between a rim's axis and the normal up to which it lies flat."""
 _FARTHEST_RUN = 0.3
 """Angle, in rad, that the deepest point of a rim may run along it in a step to count as rolling."""
 _CORNERS = np.array([[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)])
 _THIRDS = np.array([[1.0, 0.0], [-0.5, 0.75**0.5], [-0.5, -(0.75**0.5)]])
 """Cosines and sines of three directions around a rim."""
+
+# Arrays, because NumPy takes twice as long with numbers.
+_ZERO, _HALF, _NEAR = np.array(0.0), np.array(0.5), np.array(MARGIN)
 
 Indices = NDArray[np.intp]
 
@@ -246,14 +252,17 @@ class ContactFinder:
         for weights, (joint, center, *_) in zip(self._weights, anchors, strict=True):
             weights[4 * joint : 4 * joint + 4] = *center, 1.0
         self._rim_radii = np.array([row[2] for row in rims])
-        self._rim_moved = moved[joints[len(points) :]]
+        self._rim_joints = joints[len(points) :]
+        self._rim_moved = moved[self._rim_joints]
         self._rim_axes = np.array([row[5] for row in rims]).reshape(-1, 3, 3)
         spread = np.repeat(np.arange(len(anchors)), [1] * len(points) + [around] * len(rims))
         self._links = np.array([row[3] for row in anchors], np.intp)[spread]
         self._radii = np.array([row[2] for row in points] + [0.0] * (around * len(rims)))
         self._joint_of = joints[spread]
         self._moved = moved[joints[spread]]
-        self._frames = np.zeros((len(spread), 6))
+        self._moved_along_axes = np.tile(self._moved, 3)
+        self._rim_of = np.full(len(spread), -1)  # of the deepest points
+        self._rim_of[len(points) :: around] = np.arange(len(rims))
 
     def __bool__(self) -> bool:
         """Return whether anything can ever touch."""
@@ -272,10 +281,9 @@ class ContactFinder:
             period: Length of the step, in s.
         """
         motions = twists_of(pinocchio.computeJointJacobians(self._model, self._data, q))
-        points, rolling = self._weights.dot(self._poses.reshape(-1, 3)), None
+        points = self._weights.dot(self._poses.reshape(-1, 3))
         if self._first_rim < len(points):
-            rims, rolling = self._rims(points, motions[3:].dot((self._rim_moved * v).T).T, period)
-            points = np.concatenate([points[: self._first_rim], rims])
+            points = np.concatenate([points[: self._first_rim], self._on_rims(points)])
         found = []
         for place, surface in self._surfaces:
             gaps, axes = surface.distances(points)
@@ -283,16 +291,14 @@ class ContactFinder:
             rows = self._near(surface, points, axes, gaps, motions, v, period)
             if not len(rows):
                 continue
-            gaps = gaps.take(rows)
-            normals = axes.take(rows, 0) if len(axes) > 1 else axes.repeat(len(rows), 0)
-            depths = self._radii.take(rows) + 0.5 * np.minimum(gaps, 0.0)
+            gaps, normals = gaps.take(rows), axes.take(rows, 0)
+            depths = self._radii.take(rows) + _HALF * np.minimum(gaps, _ZERO)
             touched = points.take(rows, 0) - depths[:, None] * normals[:, 2]
-            frames = np.concatenate([normals, surface.moments(touched, normals)], 2)
-            moved = self._moved.take(rows, 0)
-            jacobian = frames.reshape(-1, 6).dot(motions).reshape(len(rows), 3, -1)
-            jacobian *= moved[:, None]
+            jacobian = surface.twist_rows(touched, normals).reshape(-1, 6).dot(motions)
+            jacobian *= self._moved_along_axes.take(rows, 0).reshape(jacobian.shape)
             numbers, spins = place * len(points) + rows, None
             if self._spins is not None:
+                moved = self._moved.take(rows, 0)
                 spins = Spins.of(self._spins[numbers], normals, motions, moved)
             found.append(
                 ContactPoints(
@@ -302,8 +308,8 @@ class ContactFinder:
                     gaps,
                     self._friction.take(numbers),
                     self._restitution.take(numbers),
-                    jacobian.reshape(3 * len(rows), -1),
-                    self._drift(place, normals, rows, rolling),
+                    jacobian,
+                    self._drift(place, normals, rows, motions, v, period),
                     spins,
                 )
             )
@@ -320,18 +326,22 @@ class ContactFinder:
         period: float,
     ) -> Indices:
         """Return the points (n, 3) that touch a surface or may touch it within the next step."""
-        frames = self._frames
-        frames[:, :3], frames[:, 3:] = axes[:, 2], surface.levers(points, axes)
-        speeds = frames.dot(motions)
+        speeds = surface.normal_rows(points, axes).dot(motions)
         speeds *= self._moved
         ahead = speeds.dot(v)
         ahead *= period
         ahead += gaps
-        near: Indices = (np.minimum(gaps, ahead, out=ahead) < MARGIN).nonzero()[0]
+        near: Indices = (np.minimum(gaps, ahead, out=ahead) < _NEAR).nonzero()[0]
         return near
 
     def _drift(
-        self, static: int, axes: Vector, points: Indices, rolling: Vector | None
+        self,
+        static: int,
+        axes: Vector,
+        points: Indices,
+        motions: Vector,
+        v: Vector,
+        period: float,
     ) -> Vector | None:
         """Return the velocities along the axes (k, 3, 3) that points stick to, shape (3 k,).
 
@@ -339,13 +349,18 @@ class ContactFinder:
             static: The surface, whose velocity it is.
             axes: Two tangents and the normal of each point.
             points: The points.
-            rolling: What `_rims` adds for points on rims.
+            motions: Twists for unit velocities, shape (6, nv).
+            v: Velocities without contacts, shape (nv,).
+            period: Length of the step, in s.
         """
-        if rolling is None and not self._drifts:
+        if not len(self._rim_radii) and not self._drifts:
             return None
         found: Vector = axes @ self._drifts.get(static, np.zeros(3))
-        if rolling is not None:
-            found += np.einsum("kij,kj->ki", axes, rolling[points])
+        rims = self._rim_of.take(points)
+        rolling = (rims >= 0).nonzero()[0]
+        if len(rolling):
+            speeds = self._rolling(rims.take(rolling), motions[3:] * v, period)
+            found[rolling] += np.einsum("kij,kj->ki", axes.take(rolling, 0), speeds)
         found[:, 2] = 0.0
         return found.ravel()
 
@@ -381,8 +396,37 @@ class ContactFinder:
         statics, points = np.divmod(numbers, len(self._links))
         return self._links[points], statics
 
-    def _rims(self, points: Vector, turns: Vector, period: float) -> tuple[Vector, Vector]:
-        """Return three points on each rim, including the deepest, and how these roll.
+    def _rim_frames(self, rims: Indices | slice) -> tuple[Vector, Vector, Vector]:
+        """Return how rims lie.
+
+        Returns:
+            Their axes, and the directions from their centers to their deepest points, shape (k, 3);
+            the sines of the angles between axes and the ground's normal, 0 for flat ones, (k, 1).
+        """
+        up = self._up
+        poses = self._poses[self._rim_joints[rims], :3].transpose(0, 2, 1)
+        axes = poses @ self._rim_axes[rims]
+        along = axes[:, :, 2]
+        downward = (along @ up)[:, None] * along - up
+        sines = np.sqrt(np.einsum("ij,ij->i", downward, downward))[:, None]
+        sines[sines <= _FLAT] = 0.0
+        beside = np.where(sines, downward / np.where(sines, sines, 1.0), axes[:, :, 0])
+        return along, beside, sines
+
+    def _on_rims(self, points: Vector) -> Vector:
+        """Return three points on each rim, the deepest first, shape (3 rims, 3).
+
+        Args:
+            points: Centers of spheres and rims.
+        """
+        along, beside, _ = self._rim_frames(slice(None))
+        around = _THIRDS @ np.stack([beside, cross_rows(along, beside)], axis=1)
+        centers, radii = points[self._first_rim :, None], self._rim_radii[:, None, None]
+        found: Vector = (centers + radii * around).reshape(-1, 3)
+        return found
+
+    def _rolling(self, rims: Indices, turns: Vector, period: float) -> Vector:
+        """Return the velocities with which the deepest points of rims end a step if they stick.
 
         Where a rim rolls, the point that touches runs along it, so the velocity that friction has
         just stopped is not that of the next point, and friction would do work on it: Euler's disk
@@ -390,33 +434,23 @@ class ContactFinder:
         direction, no work is done.
 
         Args:
-            points: Centers of spheres and rims.
-            turns: Angular velocities of the rims, in rad/s, shape (rims, 3).
+            rims: The rims.
+            turns: What each velocity adds to angular velocities, in rad/s, shape (3, nv).
             period: Length of the step, in s.
 
         Returns:
-            The points, shape (3 rims, 3), and for all points the velocity with which they end a
-            step if they stick, in m/s, shape (points, 3).
+            The velocities, in m/s, shape (k, 3).
         """
-        first, up = self._first_rim, self._up
-        poses = self._poses[self._joints[first:], :3].transpose(0, 2, 1)
-        axes = poses @ self._rim_axes
-        along = axes[:, :, 2]
-        downward = (along @ up)[:, None] * along - up
-        lengths = np.sqrt(np.einsum("ij,ij->i", downward, downward))[:, None]
-        upright = lengths <= 1e-9
-        divisors = np.where(upright, 1.0, lengths)
-        beside = np.where(upright, axes[:, :, 0], downward / divisors)
-        around = _THIRDS @ np.stack([beside, np.cross(along, beside)], axis=1)
-        found = (points[first:, None] + self._rim_radii[:, None, None] * around).reshape(-1, 3)
-        tilting = np.cross(turns, along)
+        up, (along, beside, sines) = self._up, self._rim_frames(rims)
+        turns = self._rim_moved[rims].dot(turns.T)
+        tilting = cross_rows(turns, along)
         pace = (tilting @ up)[:, None] * along + (along @ up)[:, None] * tilting
         pace -= np.einsum("ij,ij->i", beside, pace)[:, None] * beside
-        run = period * (pace / divisors - np.cross(turns, beside))
-        run[upright[:, 0] | (np.einsum("ij,ij->i", run, run) > _FARTHEST_RUN**2)] = 0.0
-        rolling = np.zeros((first + len(found), 3))
-        rolling[first :: len(_THIRDS)] = -0.5 * self._rim_radii[:, None] * np.cross(turns, run)
-        return found, rolling
+        run = period * (pace / np.where(sines, sines, 1.0) - cross_rows(turns, beside))
+        far = np.einsum("ij,ij->i", run, run) > _FARTHEST_RUN**2
+        run[far | (sines[:, 0] == 0)] = 0.0
+        found: Vector = -0.5 * self._rim_radii[rims, None] * cross_rows(turns, run)
+        return found
 
 
 def supports_of(model: Any) -> Vector:
@@ -453,14 +487,14 @@ def spins_of(first: Vector, second: Vector) -> Vector | None:
 
 def together(points: Sequence[ContactPoints]) -> Spins | None:
     """Return the friction against turning of points that are combined in this order."""
-    if all(each.spins is None for each in points):
-        return None
     first, numbers, found = 0, [], []
     for each in points:
         if each.spins is not None:
             numbers.append(first + each.spins.points)
             found.append(each.spins)
         first += len(each.gaps)
+    if not found:
+        return None
     names = ("bounds", "jacobian", "drift", "impulses")
     rest = (np.concatenate([getattr(spins, name) for spins in found]) for name in names)
     return Spins(np.concatenate(numbers), *rest)

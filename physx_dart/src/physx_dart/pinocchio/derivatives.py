@@ -38,14 +38,11 @@ class GroupDerivatives:
     Velocities are those of the stepping models, one robot after the other.
     """
 
-    def __init__(
-        self, robots: Sequence[PinocchioRobot], solved: Solved | None, period: float
-    ) -> None:
+    def __init__(self, robots: Sequence[PinocchioRobot], period: float) -> None:
         """Differentiate the velocities after the step.
 
         Args:
             robots: The robots.
-            solved: What the step solved; None: nothing constrained it.
             period: Length of the step, in s.
 
         Raises:
@@ -61,6 +58,9 @@ class GroupDerivatives:
         for robot, span in self._robots:
             for number, block in enumerate(robot.free_derivatives()):
                 self._change[span, number, span] = block
+        found = [robot.last_step()[2] for robot in robots]
+        self._parts = [part for part in found if part is not None]
+        solved = self._parts[0].solved if self._parts else None
         if solved is not None and len(solved.impulses):
             self._constrain(self._with_resting(solved))
         for robot, span in self._robots:
@@ -73,13 +73,13 @@ class GroupDerivatives:
     def _with_resting(self, solved: Solved) -> Solved:
         """Return the problem with the friction of joints at rest, which did not need to act."""
         first, more = 0, []
-        for part, (_, span) in zip(solved.parts, self._robots, strict=True):
+        for part, (_, span) in zip(self._parts, self._robots, strict=True):
             more.append(first + part.joints.resting(self._after[span][part.joints.base :]))
             first += len(part.joints.columns)
         rows = np.setdiff1d(joined(more), solved.rows)
         if not len(rows):
             return solved
-        columns = self._columns(solved)[rows]
+        columns = self._columns()[rows]
         last = len(solved.impulses) - _turning_rows(solved)
         nothing = np.zeros(len(rows))
         along, free, impulses = (
@@ -92,7 +92,7 @@ class GroupDerivatives:
         )
         spread = solved.inverse.dot(along.T)
         least, most = (
-            joined([getattr(part.joints, name) for part in solved.parts])[rows]
+            joined([getattr(part.joints, name) for part in self._parts])[rows]
             for name in ("least", "most")
         )
         return replace(
@@ -106,9 +106,9 @@ class GroupDerivatives:
             impulses=impulses,
         )
 
-    def _columns(self, solved: Solved) -> Vector:
+    def _columns(self) -> Vector:
         """Return the velocity of each row of all joints."""
-        parts = zip(solved.parts, self._robots, strict=True)
+        parts = zip(self._parts, self._robots, strict=True)
         return joined([part.joints.columns + span.start for part, (_, span) in parts])
 
     def _constrain(self, solved: Solved) -> None:
@@ -124,7 +124,7 @@ class GroupDerivatives:
         nv, slopes = self._nv, np.zeros((len(solved.impulses), self._nv))
         caused, pushed, first = solved.spread.dot(solved.impulses), np.zeros((nv, nv)), 0
         spin = len(solved.impulses) - _turning_rows(solved)
-        for part, (robot, span) in zip(solved.parts, self._robots, strict=True):
+        for part, (robot, span) in zip(self._parts, self._robots, strict=True):
             pushed[span, span] = -_momentum_slopes(robot, caused[span])
             if (points := part.touching) is not None:
                 end = first + 3 * len(points.gaps)
@@ -140,12 +140,12 @@ class GroupDerivatives:
         missing = solved.along.dot(change)
         missing[:, :nv] += slopes
         of_joints = slice(first, first + len(solved.rows))
-        places, columns = np.arange(of_joints.start, of_joints.stop), self._columns(solved)
+        places, columns = np.arange(of_joints.start, of_joints.stop), self._columns()
         at = columns[solved.rows]
-        motors = joined([part.joints.motors() for part in solved.parts])[solved.rows]
+        motors = joined([part.joints.motors() for part in self._parts])[solved.rows]
         limits = [
             part.joints.slopes(robot.last_step()[0][robot.nq - robot.nv + robot.base :])
-            for part, (robot, _) in zip(solved.parts, self._robots, strict=True)
+            for part, (robot, _) in zip(self._parts, self._robots, strict=True)
         ]
         missing[places, at] -= joined(limits)[solved.rows]
         missing[places, 3 * nv + at] -= motors

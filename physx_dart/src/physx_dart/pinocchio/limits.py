@@ -114,7 +114,8 @@ class JointConstraints:
         """
         pace, upward, downward = self._pace, [], []
         for place, (lower, upper, slowest) in zip(positions.tolist(), self._limits, strict=True):
-            up, down = lower - pace * place, pace * place - upper
+            at = pace * place
+            up, down = lower - at, at - upper
             if up > 0 or down > 0:  # outside: it returns regardless of its velocity limit
                 up, down = min(up, _FASTEST_RETURN), min(down, _FASTEST_RETURN)
             else:
@@ -194,16 +195,16 @@ def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vect
     # Lists, because operations on short arrays take longer.
     bounds = list(zip(least.tolist(), most.tolist(), strict=True))
     # -1: at the lower bound, 1: at the upper, 0: between; initially as if rows were independent.
-    sides = [_side(*each) for each in zip(alone.tolist(), bounds, strict=True)]
+    sides = _sides(alone, bounds)
     best, blocks = n + 1, 3
     for _ in range(50 * (n + 1)):
         impulses = _pivoted(matrix, change, sides, bounds)
-        right = [_side(*each) for each in zip(impulses.tolist(), bounds, strict=True)]
+        right = _sides(impulses, bounds)
         if any(sides):
             excess = (matrix.dot(impulses) - change).tolist()
-            for place, (side, over) in enumerate(zip(sides, excess, strict=True)):
+            for place, side in enumerate(sides):
                 if side:
-                    right[place] = 0 if side * over > 0 else side
+                    right[place] = 0 if side * excess[place] > 0 else side
         if right == sides:
             return impulses
         wrong = [place for place, side in enumerate(right) if side != sides[place]]
@@ -218,9 +219,10 @@ def solve(response: Vector, change: Vector, least: Vector, most: Vector) -> Vect
     return np.minimum(np.maximum(impulses, least), most)
 
 
-def _side(impulse: float, bounds: tuple[float, float]) -> int:
-    """Return -1 for an impulse below its bounds, 1 for one above, otherwise 0."""
-    return (impulse > bounds[1]) - (impulse < bounds[0])
+def _sides(impulses: Vector, bounds: list[tuple[float, float]]) -> list[int]:
+    """Return -1 for each impulse below its bounds, 1 for each above, otherwise 0."""
+    pairs = zip(impulses.tolist(), bounds, strict=True)
+    return [(impulse > most) - (impulse < least) for impulse, (least, most) in pairs]
 
 
 def _pivoted(

@@ -28,7 +28,7 @@ from physx_dart.pinocchio.contacts import (
     turning_of,
 )
 from physx_dart.pinocchio.robot import PinocchioRobot
-from physx_dart.pinocchio.surfaces import axes_of, moments_of
+from physx_dart.pinocchio.surfaces import axes_of, twist_rows
 from physx_sim import Stairs
 from physx_sim.engines import CollisionShape, Parts, steps_of
 from physx_sim.errors import FeatureNotSupportedError
@@ -188,7 +188,7 @@ class PairFinder:
                 center, velocity, surface = self._moved[body]
                 along = axes[place] @ surface
                 along[2] = 0.0
-                arm = np.cross(velocity[3:], point - center)
+                arm = cross_rows(velocity[3:], point - center)
                 found[place] = along + axes[place] @ (velocity[:3] + arm)
         return found.ravel()
 
@@ -288,7 +288,7 @@ class PairFinder:
         points = np.array([each[1] for each in found])
         axes = axes_of(np.array([each[2] for each in found]))
         gaps = np.array([each[3] for each in found])
-        frames = np.concatenate([axes, moments_of(points, axes)], axis=2)
+        frames = twist_rows(points, axes)
         jacobian = np.zeros((3 * len(pairs), self.columns[-1].stop))
         shares = []
         sides = (self._first[pairs], 1.0), (self._second[pairs], -1.0)

@@ -17,7 +17,7 @@ import numpy as np
 import pinocchio
 from numpy import add, multiply
 
-from physx_core.rotations import rotate_back, to_matrix
+from physx_core.rotations import cross_rows, rotate_back, to_matrix
 from physx_core.typing import Records, Vector
 from physx_dart.pinocchio.constraints import Constraints, Warmth, constrained, limited
 from physx_dart.pinocchio.contacts import ContactFinder, Indices, supports_of
@@ -182,7 +182,8 @@ class PinocchioRobot(RobotEngine):
         q, v = self._positions, self._velocities
         torques = self._net_torques(q, v) if self._smooth else self._torques
         a = pinocchio.aba(self.model_in_motion, self.data, q, v, torques, *self._more)
-        self._free = v + self._period * a
+        multiply(a, self._periods, a)
+        self._free = add(a, v, a)
         return self._free
 
     def free_derivatives(self) -> tuple[Vector, Vector, Vector]:
@@ -230,7 +231,7 @@ class PinocchioRobot(RobotEngine):
             if self.gyrates:
                 velocities = velocities + change
         self._earlier, self._before = self._positions, self._velocities
-        motion = self._period * velocities
+        motion = multiply(velocities, self._periods, self._motion)
         self._positions = pinocchio.integrate(self.model_in_motion, self._positions, motion)
         self._velocities = velocities
 
@@ -353,7 +354,7 @@ class PinocchioRobot(RobotEngine):
             pinocchio.forwardKinematics(self._model, self._data, self._positions)
             turn = (self._data.oMi[joint].rotation @ place.rotation).T
             force, torque = turn @ force, turn @ torque
-        wrench = pinocchio.Force(force, torque + np.cross(point, force))
+        wrench = pinocchio.Force(force, torque + cross_rows(point, force))
         self._pushes[joint] = self._pushes[joint] + place.act(wrench)
         self._more = (self._pushes,)
 

@@ -104,9 +104,7 @@ class PinocchioSimulation(RobotSimulation[PinocchioRobot]):
         state, commands = np.zeros((2 * nv, 2 * nv)), np.zeros((2 * nv, joints))
         parts = dict(zip(self._robots, self.layout.parts.values(), strict=True))
         for group in groups:
-            constraints = group[0].last_step()[2]
-            solved = None if constraints is None else constraints.solved
-            found = GroupDerivatives(group, solved, self.period).in_layout()
+            found = GroupDerivatives(group, self.period).in_layout()
             if len(group) == len(self._robots):
                 return found
             own = np.concatenate([np.arange(nv)[parts[robot].velocities] for robot in group])

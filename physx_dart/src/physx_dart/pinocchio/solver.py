@@ -13,7 +13,6 @@ import pinocchio
 from physx_core.errors import UnknownOptionError
 from physx_core.typing import Index, Vector
 from physx_dart.pinocchio.contact_problem import ContactProblem
-from physx_sim.errors import SimulationError
 
 SOLVERS = ("pgs", "admm")
 _NEWTON_STEPS = 12
@@ -86,10 +85,10 @@ class ImpulseSolver:
             guess: Impulses to start with, shape (n,).
             turning: These s points, as indices, and their largest angular impulses per normal
                 impulse across and about the normal, in m, shape (s, 2).
+
+        Raises:
+            SimulationError: If a value is not finite.
         """
-        # A non-finite entry of the response makes the diagonal non-finite, too.
-        if not math.isfinite(sum(free.tolist()) + sum(response.diagonal().tolist())):
-            raise SimulationError("The state is no longer finite. Use a smaller period.")
         problem = ContactProblem(response, free, friction, least, most, turning)
         best, least_error, good = guess, math.inf, problem.accuracy
         for begin in self._beginnings(problem, guess):
@@ -121,14 +120,16 @@ class ImpulseSolver:
             limits: Maximum number of iterations, and the accuracy at which it stops.
             guess: Impulses to start with.
         """
-        known, result = len(guess) - problem.turning_rows, _KINDS[name][2]()
-        delassus = pinocchio.DelassusOperatorDense(problem.matrix[:known, :known])
-        result.setConstraintImpulseGuess(guess[:known])
+        matrix, free, turning = problem.matrix, problem.free, problem.turning_rows
+        if turning:
+            matrix, free, guess = matrix[:-turning, :-turning], free[:-turning], guess[:-turning]
+        result = _KINDS[name][2]()
+        result.setConstraintImpulseGuess(guess)
         models, settings = self._models(problem), _settings(name, *limits)
-        self._solvers[name].solve(delassus, problem.free[:known], *models, settings, result)
-        found = np.zeros(len(guess))
-        found[:known] = result.retrieveConstraintImpulses()
-        return found
+        delassus = pinocchio.DelassusOperatorDense(matrix)
+        self._solvers[name].solve(delassus, free, *models, settings, result)
+        found: Vector = result.retrieveConstraintImpulses()
+        return np.concatenate([found, np.zeros(turning)]) if turning else found
 
     def _models(self, problem: ContactProblem) -> tuple[Any, Any]:
         """Return Pinocchio's description of a problem."""

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -31,50 +30,62 @@ class Surface(ABC):
 
         Returns:
             Distances in m, shape (n,); two tangents and the outward normal as rows,
-            shape (n, 3, 3), or (1, 3, 3) if they are the same everywhere.
+            shape (n, 3, 3).
         """
 
     def at_edges(self, points: Vector) -> NDArray[np.bool_]:
         """Return whether points (n, 3) are where the surface bends."""
         return np.zeros(len(points), np.bool_)
 
-    def moments(self, points: Vector, axes: Vector) -> Vector:
-        """Return the cross products of points (n, 3) with the axes there, shape (n, 3, 3)."""
-        return moments_of(points, axes)
+    def twist_rows(self, points: Vector, axes: Vector) -> Vector:
+        """Return what maps a twist to the velocities of points (n, 3) along the axes there.
 
-    def levers(self, points: Vector, axes: Vector) -> Vector:
-        """Return the cross products of points (n, 3) with the normals there, shape (n, 3)."""
-        return cross_rows(points, axes[:, 2])
+        Returns:
+            The axes and the points' cross products with them, shape (n, 3, 6).
+        """
+        return twist_rows(points, axes)
+
+    def normal_rows(self, points: Vector, axes: Vector) -> Vector:
+        """Return the last of `twist_rows` for each point, shape (n, 6)."""
+        return np.concatenate([axes[:, 2], cross_rows(points, axes[:, 2])], axis=1)
 
 
-@dataclass(frozen=True, eq=False)
 class Plane(Surface):
     """An infinite plane: unit normal, and height along it in m."""
 
-    normal: Vector
-    height: float
+    def __init__(self, normal: Vector, height: float) -> None:
+        self.normal, self.height = normal, height
+        axes = axes_of(normal[None])
+        # Rows are a linear function of a point plus constants, which are kept once per point, as
+        # adding arrays of different shapes takes four times as long.
+        ends = twist_rows(np.concatenate([np.zeros((1, 3)), np.eye(3)]), axes).reshape(4, 18)
+        self._slopes = ends[1:] - ends[0]
+        self._normal_slopes = self._slopes[:, 12:].copy()
+        self._keep_constants(axes, 1)
 
-    @cached_property
-    def axes(self) -> Vector:
-        """Two tangents and the normal, as rows, shape (1, 3, 3)."""
-        return axes_of(self.normal[None])
-
-    @cached_property
-    def _moments(self) -> Vector:
-        """Maps a point to its cross products with the axes, flattened by rows, shape (3, 9)."""
-        return moments_of(np.eye(3), self.axes).reshape(3, 9)
+    def _keep_constants(self, axes: Vector, n: int) -> None:
+        """Keep the axes and the rows of n points at the origin."""
+        self._axes = axes[:1].repeat(n, 0)
+        origins = twist_rows(np.zeros((n, 3)), self._axes)
+        self._rows, self._normal_rows = origins.reshape(n, 18), origins[:, 2].copy()
 
     def distances(self, points: Vector) -> tuple[Vector, Vector]:
         """Return distances and axes."""
-        return points.dot(self.normal) - self.height, self.axes
+        if len(self._axes) < len(points):
+            self._keep_constants(self._axes, len(points))
+        return points.dot(self.normal) - self.height, self._axes[: len(points)]
 
-    def moments(self, points: Vector, axes: Vector) -> Vector:
-        """Return the cross products with the plane's axes."""
-        return points.dot(self._moments).reshape(-1, 3, 3)
+    def twist_rows(self, points: Vector, axes: Vector) -> Vector:
+        """Return the rows of points of which distances are known."""
+        rows: Vector = points.dot(self._slopes)
+        rows += self._rows[: len(points)]
+        return rows.reshape(-1, 3, 6)
 
-    def levers(self, points: Vector, axes: Vector) -> Vector:
-        """Return the cross products with the plane's normal."""
-        return points.dot(self._moments[:, 6:])
+    def normal_rows(self, points: Vector, axes: Vector) -> Vector:
+        """Return the last of them for each point."""
+        rows: Vector = points.dot(self._normal_slopes)
+        rows += self._normal_rows[: len(points)]
+        return rows
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,9 +142,14 @@ def axes_of(normals: Vector) -> Vector:
     steep, nothing = np.abs(z) > 0.5, np.zeros(len(x))
     first = np.where(steep, [z, nothing, -x], [y, -x, nothing]).T
     first /= np.sqrt(np.einsum("ij,ij->i", first, first))[:, None]
-    return np.stack([first, np.cross(normals, first), normals], axis=1)
+    return np.stack([first, cross_rows(normals, first), normals], axis=1)
 
 
-def moments_of(points: Vector, axes: Vector) -> Vector:
-    """Return the cross products of points (n, 3) with the rows of axes (n or 1, 3, 3)."""
-    return axes @ (points @ _CROSS).reshape(-1, 3, 3)
+def twist_rows(points: Vector, axes: Vector) -> Vector:
+    """Return what maps a twist to the velocities of points (n, 3) along axes (n or 1, 3, 3).
+
+    Returns:
+        The axes and the points' cross products with them, shape (n, 3, 6).
+    """
+    moments = axes @ (points @ _CROSS).reshape(-1, 3, 3)
+    return np.concatenate([np.broadcast_to(axes, moments.shape), moments], axis=2)

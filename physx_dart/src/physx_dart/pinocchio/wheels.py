@@ -58,8 +58,8 @@ class Wheels:
             point = pose.translation - wheel.radius / length * upright
             if point.dot(normal) - self._height > _NEAR * wheel.radius:
                 continue
-            forward = np.cross(axle, normal) / length
-            directions = np.array([forward, np.cross(normal, forward)])[: 1 + wheel.lateral]
+            forward = cross_rows(axle, normal) / length
+            directions = np.array([forward, cross_rows(normal, forward)])[: 1 + wheel.lateral]
             moved = motions * supports[link.parentJoint]
             moved[:3] += cross_rows(moved[3:].T, point[None]).T
             rows.append(directions @ moved[:3])

@@ -1,4 +1,4 @@
-"""``physx edit``: write a dataset with other rows or fields than another one."""
+"""``physx edit``: write a copy of a dataset with other rows or fields."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import Annotated, Any, Literal
 
 import tyro
 
-from physx_core.cli import count, show
+from physx_core.cli import count, options_from, show
 from physx_core.errors import UsageError
 from physx_core.observers import ProgressBar
 from physx_core.views import View
@@ -70,7 +70,7 @@ class Edit:
 
 def run(words: Sequence[str]) -> None:
     """Write the dataset, and print the number of its samples."""
-    options = tyro.cli(Edit, args=words, prog="physx edit")
+    options = options_from(Edit, words, "edit")
     bar = ProgressBar()
     bar.begin("edit", None, "B")
     try:

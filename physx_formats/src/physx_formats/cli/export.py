@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from physx_core.cli import count, show
+from physx_core.cli import count, options_from, show
 from physx_core.dataset import EPISODES, Dataset
 from physx_core.observers import ProgressBar
 from physx_formats import ExportOptions, export
@@ -67,7 +67,7 @@ class Export:
 
 def run(words: Sequence[str]) -> None:
     """Export a dataset and print the number of exported samples."""
-    options = tyro.cli(Export, args=words, prog="physx export")
+    options = options_from(Export, words, "export")
     form = ExportOptions(
         options.compression,
         options.observations,

@@ -8,7 +8,7 @@ from typing import Annotated
 
 import tyro
 
-from physx_core.cli import count, show
+from physx_core.cli import count, options_from, show
 from physx_core.observers import ProgressBar
 from physx_formats import import_file
 
@@ -26,6 +26,8 @@ class Import:
     the folder of a LeRobot dataset, or of a DeepPhysX dataset or session."""
     directory: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="DIR")]
     """The dataset's folder; rows are appended to an existing dataset that has the same fields."""
+    form: Annotated[str | None, tyro.conf.arg(name="from")] = None
+    """Name of the file's format; by default the one that recognizes it."""
     mode: str | None = None
     """Mode of the rows, regardless of the file's; for a file with several modes, the one to import.
     By default the file's modes, or training if it has none."""
@@ -38,13 +40,14 @@ class Import:
 
 def run(words: Sequence[str]) -> None:
     """Import a file and print the number of stored samples."""
-    options = tyro.cli(Import, args=words, prog="physx import")
+    options = options_from(Import, words, "import")
     bar = ProgressBar()
     bar.begin("import", None, "B")
     try:
         stored = import_file(
             options.file,
             options.directory,
+            form=options.form,
             mode=options.mode,
             fields=options.fields,
             max_bytes=options.max_bytes,

@@ -1,9 +1,9 @@
 """CSV: the rows of one mode as text, one column per number.
 
 A column is named after its field, the place of the number in arrays, and the unit:
-``position[0][2] [m]``. Text holds no types: columns of integers become int64, of ``true`` and
-``false`` bool, others of numbers float64, and the rest text, as wide as the longest. The decimal
-numbers are exact.
+``position[0][2] [m]``. Text holds no types: columns of integers become int64, or uint64 if they
+do not fit, of ``true`` and ``false`` bool, others of numbers float64, and the rest text, as wide as
+the longest. The decimal numbers are exact.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from __future__ import annotations
 import contextlib
 import itertools
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,10 @@ from physx_formats.format import Columns, Format
 from physx_formats.table import BLOCK, ExportOptions, Notes, Table, check_size, import_library
 
 _MOST_COLUMNS = 10_000
+_KINDS = ("bool", "int64", "double", "string", "null")
+"""Types of columns that are fields; others, such as dates, are text."""
+_LARGE = 2.0**63
+"""Number from which integers are no int64, and would lose digits as float64."""
 _NAME = re.compile(r"(?P<name>.*?)(?P<place>(\[\d+\])*)(\s+\[(?P<unit>[^\[\]]*)\])?")
 
 
@@ -98,14 +102,14 @@ class _Column:
         missing = next((each for each in arrays if each.null_count), None)
         if len(parts) != np.prod(size, dtype=int):
             self.problem = f'The columns of "{name}" in {path} leave out places of {size}.'
+        elif missing is not None:
+            row = next(k for k, each in enumerate(missing) if not each.is_valid)
+            self.problem = f'"{name}" of {path} has no number in row {row}.'
         elif not self._is_text and any(kind.kind not in "biuf" for kind in kinds):
             self.problem = (
                 f'Only some columns of "{name}" of {path} hold numbers. Choose what to '
                 "import with fields (--fields on the command line)."
             )
-        elif missing is not None:
-            row = next(k for k, each in enumerate(missing) if not each.is_valid)
-            self.problem = f'"{name}" of {path} has no number in row {row}.'
         self._arrays = arrays
 
     def read(self, start: int, count: int) -> Array:
@@ -118,19 +122,38 @@ class _Column:
         return np.stack(parts, axis=-1).astype(self.dtype).reshape(-1, *self.shape[1:])
 
 
+def _read(csv: Any, path: Path) -> Any:
+    """Return the columns of a file, of the types that text says."""
+
+    def read(types: Mapping[str, str]) -> Any:
+        options = csv.ConvertOptions(
+            column_types=types,
+            null_values=["", "NA", "null"],
+            strings_can_be_null=True,
+            quoted_strings_can_be_null=False,
+        )
+        return csv.read_csv(path, convert_options=options)
+
+    table, types = read({}), dict[str, str]()
+    for name, column in zip(table.column_names, table.columns, strict=True):
+        if str(column.type) not in _KINDS:
+            types[name] = "string"
+        elif str(column.type) == "double" and (np.abs(column.to_numpy()) >= _LARGE).any():
+            with contextlib.suppress(ValueError):  # it holds no integers
+                read({**types, name: "uint64"})
+                types[name] = "uint64"
+    return read(types) if types else table
+
+
 @contextlib.contextmanager
 def open_columns(path: Path, limit: int) -> Iterator[tuple[Columns, Notes]]:
     """Open a file; yield its columns by field."""
     import_library("pyarrow", "Importing CSV", "csv")
     csv = import_library("pyarrow.csv", "Importing CSV", "csv")
     check_size(path, path.stat().st_size, limit)
-    convert = csv.ConvertOptions(
-        null_values=["", "NA", "null"],
-        strings_can_be_null=True,
-        quoted_strings_can_be_null=False,
-    )
+
     try:
-        table = csv.read_csv(path, convert_options=convert)
+        table = _read(csv, path)
     except (ValueError, OSError) as error:
         raise ExchangeError(f"{path} is not a valid CSV file: {error}.") from error
     fields: dict[str, dict[tuple[int, ...], tuple[int, str]]] = {}

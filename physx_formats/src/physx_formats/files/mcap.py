@@ -20,7 +20,7 @@ from physx_core.parsing import parse_json
 from physx_core.typing import Array, Vector
 from physx_formats.errors import ExchangeError
 from physx_formats.format import Columns, Format
-from physx_formats.table import Notes, check_size, import_library
+from physx_formats.table import ArrayColumn, Notes, check_size, import_library
 
 MAGIC = b"\x89MCAP0\r\n"
 _STATES = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
@@ -38,20 +38,6 @@ class _Series:
 
     times: list[tuple[int, int]] = field(default_factory=list)
     values: list[tuple[Vector, ...]] = field(default_factory=list)
-
-
-class _Column:
-    """Numbers of one joint, or times; see `Column`."""
-
-    problem = ""
-
-    def __init__(self, values: Vector, unit: str = "") -> None:
-        self._values, self.unit = values, unit
-        self.shape, self.dtype = values.shape, values.dtype
-
-    def read(self, start: int, count: int) -> Array:
-        """Return the next rows."""
-        return self._values[start : start + count]
 
 
 @contextlib.contextmanager
@@ -183,14 +169,14 @@ def _part(value: Any, *names: str) -> Any:
 
 def _columns(
     place: str, joints: Sequence[str], series: _Series, starts: Array
-) -> Iterator[tuple[str, _Column]]:
+) -> Iterator[tuple[str, ArrayColumn]]:
     """Yield the columns of a table; times are from the first message of the recording, in s."""
     times = np.array(series.times)
     stamped = bool(times[:, 0].any())
     order = np.argsort(times[:, 0 if stamped else 1], kind="stable")
     since = (times[order] - starts) * 1e-9
-    yield "time", _Column(since[:, 0 if stamped else 1], "s")
-    yield "log_time", _Column(since[:, 1], "s")
+    yield "time", ArrayColumn(since[:, 0 if stamped else 1], "s")
+    yield "log_time", ArrayColumn(since[:, 1], "s")
     for kind, values in zip(_KINDS, zip(*series.values, strict=True), strict=True):
         empty = sum(not len(each) for each in values)
         if empty == len(values):
@@ -201,7 +187,7 @@ def _columns(
             )
         table = np.array(values)[order]
         for number, joint in enumerate(joints):
-            yield f"{kind}.{joint.replace('/', '.')}", _Column(table[:, number])
+            yield f"{kind}.{joint.replace('/', '.')}", ArrayColumn(table[:, number])
 
 
 def _recognizes(path: Path, begin: bytes) -> bool:

@@ -16,7 +16,7 @@ from physx_core.errors import listed
 from physx_core.fields import Field
 from physx_core.typing import Batch
 from physx_formats.errors import ExchangeError
-from physx_formats.format import Columns, all_formats
+from physx_formats.format import Columns, all_formats, find_format
 from physx_formats.table import KINDS, Advance, Column, Notes, check_size
 from physx_formats.transfer.episodes import EpisodeCopier, copy_stream, split_records
 
@@ -31,6 +31,7 @@ def import_file(
     path: str | Path,
     directory: str | Path,
     *,
+    form: str | None = None,
     mode: str | None = None,
     fields: Sequence[str] = (),
     max_bytes: int | None = None,
@@ -49,6 +50,7 @@ def import_file(
             dataset or session, or of a recording of ROS 2; or what the formats of other plugins
             recognize.
         directory: The dataset's folder. Rows are appended if the dataset exists.
+        form: Name of its format; None: the one that recognizes it.
         mode: Mode for the rows, regardless of the mode in the file; for a file with several modes,
             the one to import. None: the modes that the file names, or else ``training``.
         fields: Names of the arrays to import, as in the file; empty: all of them.
@@ -60,14 +62,17 @@ def import_file(
         Number of rows added to each mode.
 
     Raises:
-        ExchangeError: If the file is missing or damaged, its arrays differ in length, or it holds
+        ComponentNotFoundError: If there is no format of that name.
+        ReferenceFormError: If several plugins have one, and `form` does not say which.
+        ExchangeError: If the file is missing or damaged, no format recognizes it or several do, its
+            arrays differ in length, or it holds
             more than `max_bytes`.
         SampleError: If a value is NaN or infinite.
         DatasetError: If the dataset has other fields or cannot be written.
     """
     path, directory = Path(path), Path(directory)
     limit = max(_ALWAYS, _RATIO * _size_of(path)) if max_bytes is None else max_bytes
-    with _open(path, limit) as (columns, notes):
+    with _open(path, limit, form) as (columns, notes):
         chosen = _choose(path, columns, fields)
         check_size(path, sum(map(_size_of_column, chosen.values())), limit)
         modes = _arrange(path, chosen, notes, mode)
@@ -114,8 +119,10 @@ def _size_of_column(column: Column) -> int:
     return rows * max(_LEAST_ROW, math.prod(shape) * column.dtype.itemsize)
 
 
-def _open(path: Path, limit: int) -> AbstractContextManager[tuple[Columns, Notes]]:
-    """Open a file with the format that recognizes it."""
+def _open(
+    path: Path, limit: int, form: str | None
+) -> AbstractContextManager[tuple[Columns, Notes]]:
+    """Open a file with the given format, or the one that recognizes it."""
     begin = b""
     if not path.is_dir():
         if not path.is_file():
@@ -125,10 +132,18 @@ def _open(path: Path, limit: int) -> AbstractContextManager[tuple[Columns, Notes
                 begin = file.read(8)
         except OSError as error:
             raise ExchangeError(f"{path} cannot be read: {error.strerror}.") from error
-    readers = {name: each for name, each in all_formats().items() if each.open is not None}
-    for each in readers.values():
-        if each.open is not None and each.recognizes(path, begin):
-            return each.open(path, limit)
+    formats = all_formats() if form is None else {form: find_format(form)}
+    readers = {name: each.open for name, each in formats.items() if each.open is not None}
+    found = [name for name in readers if form or formats[name].recognizes(path, begin)]
+    if len(found) == 1:
+        return readers[found[0]](path, limit)
+    if found:
+        raise ExchangeError(
+            f"{path} may be of several formats: {listed(found)}. Choose one of them with form "
+            "(--from on the command line)."
+        )
+    if form:
+        raise ExchangeError(f"Nothing can be imported from {form}.")
     what = "folder" if path.is_dir() else "file"
     raise ExchangeError(
         f"The {what} {path} is of no known format: {listed(readers)}. To add rows of another physx "

@@ -17,7 +17,7 @@ import tyro
 from gymnasium import spaces
 
 from physx_core import checkpoint
-from physx_core.cli import argument_registry, show, show_table
+from physx_core.cli import options_from, show, show_table
 from physx_core.components import Evaluation
 from physx_core.errors import ConfigError, SessionError
 from physx_core.results import PolicyResult, Result, read_results, store_result
@@ -68,8 +68,7 @@ class Evaluate:
 
 def run(words: Sequence[str]) -> None:
     """Print the figures, and write the requested files."""
-    with argument_registry():
-        options = tyro.cli(Evaluate, args=words, prog="physx evaluate")
+    options = options_from(Evaluate, words, "evaluate")
     if options.episodes < 1:
         raise ConfigError(f"--episodes is {options.episodes} but must be at least 1.")
     backend = {} if options.backend is None else {"backend": options.backend}

@@ -1,4 +1,4 @@
-"""``physx log``: show recorded episodes as a table, a plot, or a replay."""
+"""``physx log``: show logs of robots' episodes as a table, a plot, or a replay."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from physx_core.cli import show, show_table
+from physx_core.cli import options_from, show, show_table
 from physx_gym.telemetry.episode_log import TIME, Log
 from physx_gym.telemetry.log_file import read_log
 
@@ -39,7 +39,7 @@ class ShowLog:
 
 def run(words: Sequence[str]) -> None:
     """Print each log as a table, or write a plot or a recording."""
-    options = tyro.cli(ShowLog, args=words, prog="physx log")
+    options = options_from(ShowLog, words, "log")
     logs = [read_log(file) for file in options.files]
     if options.plot is not None:
         from physx_gym.visualization.plotting import plot

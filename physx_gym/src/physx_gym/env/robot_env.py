@@ -29,7 +29,7 @@ from physx_gym.env.timing import StepTiming
 from physx_gym.simulator.simulator import make_simulator, simulator_options
 from physx_gym.spaces import copy_tree, fill, neutral
 from physx_gym.telemetry.episode_recorder import EpisodeRecorder
-from physx_gym.telemetry.logged_actions import LoggedActions
+from physx_gym.telemetry.logged_actions import LoggedActions, describe_spec
 from physx_sim import BodySettings, Wrench
 from physx_sim.errors import SimulationError
 
@@ -253,8 +253,9 @@ class RobotEnv(PipelineEnv):
     def _neutral(self) -> Vector:
         """Return the neutral positions of the robot, shape (nq,).
 
-        By default, each joint is at 0, or in the middle of its limits if 0 is outside them, and a
-        floating base is where the world puts it. Called by `_sample_state`.
+        By default, each joint is at 0, or in the middle of its limits if 0 is outside them, or the
+        nearest position that leaders and couplings allow, and a floating base is where the world
+        puts it. Called by `_sample_state`.
         """
         return self.simulator.neutral()
 
@@ -498,6 +499,7 @@ class RobotEnv(PipelineEnv):
             constants |= layer._constants()
         name, path = type(self).__name__, self.reset_options.get("log_path")
         if everything:
+            constants["spec"] = describe_spec(self.spec)
             info["log_path"] = self.recorder.begin(
                 name, outermost.action, path, constants, self._draw
             )

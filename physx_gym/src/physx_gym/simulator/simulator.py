@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import inspect
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Self
@@ -34,6 +34,7 @@ from physx_sim import (
     Wrench,
     with_rotors,
 )
+from physx_sim.engines import RobotModel, read_robot
 from physx_sim.errors import SimulationError
 
 _CHANGES = {"changes", "gravity"}
@@ -51,6 +52,7 @@ class Engine:
         part: The controlled robot's part of the state.
         first: The state right after building, with the masses, friction and gravity of now.
         masses: Masses of the robots' links as built, by the names of bodies, once needed.
+        models: The controlled robot's model, once needed.
     """
 
     simulation: Simulation
@@ -58,6 +60,7 @@ class Engine:
     part: Part
     first: State
     masses: dict[str, float] = field(default_factory=dict)
+    models: list[RobotModel] = field(default_factory=list)
 
 
 class Simulator(SharedArrays, Closeable):
@@ -120,8 +123,8 @@ class Simulator(SharedArrays, Closeable):
         self.world = self._built_world = world
         self.backend = backend
         self._robot_name = names[0] if robot is None else robot
-        self._given_motors = _check_list("motors", Motor, motors)
-        self._given_sensors = _check_list("sensors", Sensor, sensors)
+        self._given_motors = None if motors is None else checks.things("motors", motors, Motor)
+        self._given_sensors = None if sensors is None else checks.things("sensors", sensors, Sensor)
         self._motors: tuple[Motor, ...] = self._given_motors or ()
         self._sensors: tuple[Sensor, ...] = self._given_sensors or ()
         self.control_period = _positive_or_none("control_period", control_period)
@@ -309,8 +312,8 @@ class Simulator(SharedArrays, Closeable):
     def neutral(self) -> Vector:
         """Return the robot's neutral positions, shape (nq,).
 
-        Joints are at 0, or in the middle of their limits if 0 is outside them; a floating base is
-        where the world puts it.
+        Joints are at 0, or in the middle of their limits if 0 is outside them, or the nearest
+        position that leaders and couplings allow; a floating base is where the world puts it.
         """
         engine = self._built()
         found: Vector = engine.first.positions[engine.part.positions].copy()
@@ -320,6 +323,10 @@ class Simulator(SharedArrays, Closeable):
         joint_positions.fill(0.0)
         outside = (lower > 0.0) | (upper < 0.0)
         joint_positions[outside] = 0.5 * (lower + upper)[outside] if outside.any() else 0.0
+        if not engine.models:
+            (robot,) = (each for each in self.world.robots if each.name == self._robot_name)
+            engine.models.append(read_robot(robot))
+        joint_positions[:] = engine.models[0].allowed(joint_positions)
         return found
 
     def place_on_ground(self, positions: Vector) -> Vector:
@@ -622,21 +629,6 @@ def simulator_options(thing: Any) -> set[str]:
     takers: list[Any] = [Simulator, *(() if isinstance(thing, World) else (Simulator.build,))]
     known = {name for taker in takers for name in inspect.signature(taker).parameters}
     return known - {"world", "urdf", "options"}
-
-
-def _check_list(option: str, kind: type[Any], given: Any) -> tuple[Any, ...] | None:
-    """Return a list of motors or sensors as a tuple; None stays None."""
-    if given is None:
-        return None
-    name = kind.__name__
-    wanted = f"{option} must be a list of {name}s, as in [{name}(...)]"
-    if isinstance(given, (str, Mapping)) or not isinstance(given, Iterable):
-        raise ConfigError(f"{wanted}, not {given!r}.")
-    found = tuple(given)
-    for each in found:
-        if not isinstance(each, kind):
-            raise ConfigError(f"{wanted}; {each!r} is not a {name}.")
-    return found
 
 
 def _positive_or_none(option: str, value: float | None) -> float | None:

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any
 
 import gymnasium
 import numpy as np
+from gymnasium.envs.registration import EnvSpec
 
 from physx_core.typing import Array
 from physx_gym.errors import LogError
@@ -16,6 +18,8 @@ from physx_gym.telemetry.log_file import read_log
 
 _ACTION = "action"
 _EXTENSION = ".h5"
+_SPEC = "spec"
+_WITHOUT = "render_mode"  # which no state depends on
 
 
 class LoggedActions:
@@ -38,14 +42,7 @@ class LoggedActions:
             LogError: If it is no log, or lacks the seed, actions or states.
         """
         self._path, self._simulator = path, simulator
-        if Path(path).suffix != _EXTENSION:
-            raise self._error(
-                f"is no log of physx ({_EXTENSION}): it lacks the seed, the actions and the states "
-                "of a simulation, without which none can be simulated again. Environments record "
-                'them in evaluation mode: env.reset(options={"log_path": FILE}). For logs of real '
-                "robots, there is physx identify"
-            )
-        log = read_log(path)
+        log = _read(path)
         seed, step = log.constants.get("seed"), log.constants.get("step_dt")
         if not isinstance(seed, int) or not isinstance(step, float) or not step > 0:
             raise self._error("lacks the seed or the duration of a step")
@@ -102,3 +99,52 @@ class LoggedActions:
 
     def _error(self, what: str) -> LogError:
         return LogError(f"{self._path} {what}.")
+
+
+def describe_spec(spec: EnvSpec | None) -> dict[str, Any] | None:
+    """Return what ``gymnasium.make`` was given, for a log; None if that is not plain data."""
+    if spec is None:
+        return None
+    given = {name: value for name, value in spec.kwargs.items() if name != _WITHOUT}
+    try:
+        json.dumps(given)
+    except (TypeError, ValueError):
+        return None
+    return {"id": spec.id, "kwargs": given}
+
+
+def logged_environment(path: str | Path) -> dict[str, Any]:
+    """Return the ``id`` and the arguments of a log's environment.
+
+    Raises:
+        LogError: If it is no log, or names no registered environment, or code.
+    """
+    advice = (
+        "Name the environment yourself, and branch off its session: physx generate gym/ID "
+        f"--environment.env-kwargs policy={path} --episodes 1"
+    )
+    spec = _read(path).constants.get(_SPEC)
+    if not isinstance(spec, dict) or not isinstance(spec.get("kwargs"), dict):
+        raise LogError(
+            f"{path} does not say how its environment was made: only gymnasium.make leaves that in "
+            f"a log, if all arguments are plain data. {advice}"
+        )
+    id, given = str(spec.get("id")), spec["kwargs"]
+    if id not in gymnasium.registry:
+        raise LogError(f'{path} is of the environment "{id}", which is not registered. {advice}')
+    if ":" in json.dumps(given, separators=(",", "=")):  # a text in it, as in "module:Class"
+        raise LogError(
+            f"{path} has arguments of {id} that may name code, which is not imported. {advice}"
+        )
+    return {**given, "id": id}
+
+
+def _read(path: str | Path) -> Log:
+    if Path(path).suffix != _EXTENSION:
+        raise LogError(
+            f"{path} is no log of physx ({_EXTENSION}): it lacks the seed, the actions and the "
+            "states of a simulation, without which none can be simulated again. Environments "
+            'record them in evaluation mode: env.reset(options={"log_path": FILE}). For logs of '
+            "real robots, there is physx identify."
+        )
+    return read_log(path)

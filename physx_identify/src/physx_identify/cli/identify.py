@@ -1,4 +1,4 @@
-"""``physx identify``: parameters of a robot from a log, with intervals."""
+"""``physx identify``: identify a robot's parameters from a log, with confidence intervals."""
 
 from __future__ import annotations
 
@@ -9,7 +9,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from physx_core.cli import show
+from physx_core.cli import options_from, show
 from physx_identify import (
     Model,
     identify,
@@ -26,7 +26,7 @@ from physx_sim import Robot
 
 @dataclass
 class Identify:
-    """Find parameters of a robot in a log, with intervals that hold."""
+    """Identify a robot's parameters from a log, with confidence intervals."""
 
     log: Annotated[str, tyro.conf.Positional, tyro.conf.arg(metavar="LOG")]
     """File or folder with positions and torques of the joints: CSV, Parquet, npz, HDF5, MCAP (of
@@ -45,7 +45,7 @@ class Identify:
     session: str | None = None
     """Folder that keeps the result, for physx report."""
     propose: str | None = None
-    """CSV file for a motion of the same length that would tell more."""
+    """CSV file for an excitation trajectory of the same length that would narrow the intervals."""
     period: float | None = None
     """Time between samples, in s; by default from the log's column of times."""
     columns: dict[str, str] = field(default_factory=dict)
@@ -61,7 +61,7 @@ class Identify:
     held: tuple[str, ...] = ()
     """Joints that did not move and are not in the log, such as a gripper's: they are at 0."""
     floating: bool = False
-    """The base of the robot moves, and the log has its pose: base_x, base_y, base_z, and base_qx,
+    """The robot has a floating base, and the log has its pose: base_x, base_y, base_z, and base_qx,
     base_qy, base_qz, base_qw; or gyroscope_x ... and accelerometer_x ... of a sensor on it."""
     imu: str = ""
     """Frame on the base, such as imu_link, whose inertial sensor takes the place of the pose; by
@@ -69,8 +69,8 @@ class Identify:
     axes: Literal["link", "world"] = "link"
     """Along which axes forces on links are: force.foot_x ... and moment.foot_x ..."""
     flight: bool = False
-    """Nothing but gravity and the log's forces acts on a robot whose base moves, so that the
-    equations of the base count, too. Slow."""
+    """Nothing but gravity and the log's forces acts on the floating robot, so that the equations of
+    its base count, too. Slow."""
     instant: bool = False
     """Torques are those at the instants of the samples, instead of held from each to the next."""
     engines: tuple[str, ...] = ()
@@ -86,7 +86,7 @@ class Identify:
 
 def run(words: Sequence[str]) -> None:
     """Print what the log says, and store it if requested."""
-    options = tyro.cli(Identify, args=words, prog="physx identify")
+    options = options_from(Identify, words, "identify")
     robot = Robot(options.robot, fixed_base=not options.floating)
     begin = time.monotonic()
     model = Model(robot, options.gravity, options.held)
@@ -113,10 +113,7 @@ def run(words: Sequence[str]) -> None:
         flight=options.flight,
         imu=options.imu,
     )
-    if options.json:
-        print(found.to_json())
-    else:
-        show(found)
+    show(found, as_json=options.json)
     notes = []
     if log.left_out:
         notes.append(f"columns not used: {', '.join(log.left_out)}")

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
 
 import numpy as np
 
@@ -68,8 +67,6 @@ class Imu:
     """
 
     arm: Vector
-    orders: ClassVar[tuple[int, ...]] = (2, 2, 2, 1, 1, 1)
-    """Derivatives that its readings are."""
 
     def motion(
         self, readings: Vector, period: float, instant: bool

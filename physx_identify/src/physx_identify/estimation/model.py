@@ -288,15 +288,14 @@ class Model:
         """
         count = len(self.coordinates)
         q, v, a = path.configurations, path.velocities, path.accelerations
-        found = np.empty((len(q), count, directions.shape[1]))
+        found = np.zeros((len(q), count, directions.shape[1]))
         bodies = np.ascontiguousarray(directions[10 * self._empty : 10 * count])
         if bodies.any():
             regress, model, data = pinocchio.computeJointTorqueRegressor, self._of(path), self._data
+            own = np.empty((len(q), count, len(bodies)))
             for place, (q_k, v_k, a_k) in enumerate(zip(q, v, a, strict=True)):
-                own = regress(model, data, q_k, v_k, a_k).reshape(count, -1)  # flat of one joint
-                np.dot(own, bodies, out=found[place])
-        else:
-            found[:] = 0.0
+                own[place] = regress(model, data, q_k, v_k, a_k)
+            np.dot(own.reshape(-1, len(bodies)), bodies, out=found.reshape(-1, found.shape[2]))
         rest = directions[10 * count :].reshape(4, count, -1)
         sign = np.sign(signs)
         stribeck = sign * np.exp(-np.abs(signs) / STRIBECK)

@@ -13,8 +13,9 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.linalg import cholesky_banded, lapack
+from scipy.linalg import cholesky_banded, lapack, toeplitz
 from scipy.optimize import minimize
+from scipy.signal import lfilter
 
 from physx_core.typing import Array, Vector
 
@@ -133,6 +134,9 @@ class Whitener:
                 if place >= 0:
                     columns[place, : count - ahead, i] = block[:, i, j]
         columns[0] += noise.torque**2
+        begun = _beginning(noise) if order else np.zeros((joints, 0, 0))
+        for row, ahead in itertools.combinations_with_replacement(range(order), 2):
+            columns[(ahead - row) * joints, row] += begun[:, row, ahead]
         factor: Vector = cholesky_banded(band, lower=True, check_finite=False)
         return factor
 
@@ -186,9 +190,8 @@ class Whitener:
         random, (count, joints) = np.random.default_rng(0), self._used.shape
         errors = noise.encoder * random.standard_normal((count + 2, self._blocks.shape[-1]))
         residual = noise.torque * random.standard_normal((count, joints))
-        for row in range(noise.order, count):
-            for lag, weights in enumerate(noise.regression.T, 1):
-                residual[row] += weights * residual[row - lag]
+        for joint, weights in enumerate(noise.regression):
+            residual[:, joint] = lfilter([1.0], [1.0, *-weights], residual[:, joint])
         for place, blocks in enumerate(self._blocks):
             residual -= np.einsum("kij,kj->ki", blocks, errors[place : place + count])
         return errors, residual
@@ -415,6 +418,28 @@ def _regression(partial: Vector) -> Vector:
     found = np.zeros((len(partial), 0))
     for each in partial.T:
         found = np.concatenate([found - each[:, None] * found[:, ::-1], each[:, None]], axis=1)
+    return found
+
+
+def _beginning(noise: Noise) -> Vector:
+    """Return by what the covariance of the first filtered torques is more than later.
+
+    Noise did not begin with the log: nothing is taken away from its first samples for those before.
+
+    Returns:
+        Shape (joints, order, order), zeros but for the samples that lack one before.
+    """
+    partial, order = _partial(noise.regression), noise.order
+    known = [noise.torque**2 / np.prod(1 - partial**2, axis=1)]
+    for lag in range(1, order):
+        known.append(np.sum(_regression(partial[:, :lag]).T * np.array(known[::-1]), axis=0))
+    found = np.zeros((len(partial), order, order))
+    for joint, weights in enumerate(noise.regression):
+        filters = np.eye(order)
+        for lag, weight in enumerate(weights[: order - 1], 1):
+            filters -= weight * np.eye(order, k=-lag)
+        found[joint] = filters @ toeplitz([each[joint] for each in known]) @ filters.T
+        found[joint] -= noise.torque[joint] ** 2 * np.eye(order)
     return found
 
 

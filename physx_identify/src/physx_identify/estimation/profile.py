@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import brentq
 
-from physx_identify.estimation.fit import Data, Fit, Problem
-from physx_identify.estimation.model import Model
-from physx_identify.unknowns import Parameter
+from physx_identify.estimation.fit import Fit, Problem
 
 CURVED = ("delay", "encoder")
 """Kinds that torques are not linear in; of the others, the likelihood is quadratic."""
@@ -22,9 +20,7 @@ to which it is cut where a log tells no end."""
 
 
 def profile_interval(
-    model: Model,
-    parameters: Sequence[Parameter],
-    data: Data,
+    problem: Problem,
     found: Fit,
     place: int,
     width: float,
@@ -37,19 +33,16 @@ def profile_interval(
     28, 1987).
 
     Args:
-        model: The robot.
-        parameters: What is unknown.
-        data: The log.
-        found: What a fit of these found.
+        problem: Parameters in a log.
+        found: What a fit of them found.
         place: Place of the parameter, an independent one.
         width: Half of the usual interval, in standard errors.
 
     Returns:
         Its ends; None: the likelihood is quadratic, and the usual interval is right.
     """
-    if parameters[place].kind not in CURVED:
+    if problem.parameters[place].kind not in CURVED:
         return None
-    problem = Problem(model, parameters, data)
     row, best = int(np.flatnonzero(found.independent == place)[0]), float(found.values[place])
     z, a = (each[:, found.independent] for each in (found.instruments, found.columns))
     inner = np.linalg.inv(z.T @ a)

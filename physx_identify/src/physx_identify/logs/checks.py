@@ -232,7 +232,7 @@ def _compared(log: Log, model: Model) -> tuple[Vector, Vector, dict[str, Vector]
         As logged; those of the model's motion; and those of each link's wrench.
     """
     data = data_of(log)
-    path = data.path(data.smoother()(data.positions))
+    path = data.path(Smoother(data.positions)(data.positions))
     smooth = Smoother(log.torques)
     moves = model.columns(path, model.numbers[:, None], path.ends)[..., 0]
     given = {link: data.of_steps(each) for link, each in data.wrenches.items()}

@@ -13,7 +13,7 @@ from physx_core.errors import UnknownOptionError, listed, nearest
 from physx_core.typing import Array, Vector
 from physx_identify.errors import IdentificationError
 from physx_identify.estimation.base import Base, Imu
-from physx_identify.estimation.fit import SLOWEST, Data
+from physx_identify.estimation.equations import SLOWEST, Data
 from physx_identify.logs.tables import read_table
 
 _BASE = {"base_positions": ("x", "y", "z"), "base_orientations": ("qx", "qy", "qz", "qw")}

@@ -14,11 +14,18 @@ from physx_identify.estimation.structure import ResidualTest
 from physx_identify.result import wording
 from physx_identify.result.estimates import Combination, EngineFit, Estimate, LogNoise
 from physx_sim import JointSettings, Robot
+from physx_sim.engines import read_robot
 
 SETTINGS = ("damping", "friction", "armature")
 """Kinds that are settings of a robot's joints."""
 UNSETTABLE = ("inertia", "payload", "stribeck")
 """Kinds that are of a robot, but that no option of one holds."""
+
+
+def masses_of(robot: Robot) -> dict[str, float]:
+    """Return the masses of a robot's links in its file, in kg, whatever the robot's factors are."""
+    model = read_robot(dataclasses.replace(robot, mass_factors={}))
+    return {body.name: body.mass for body in model.bodies}
 
 
 @dataclass(frozen=True)
@@ -108,6 +115,7 @@ class Identification:
         Raises:
             IdentificationError: If something else was unknown of the robot itself, which no option
                 of a robot holds: inertia, payload, Stribeck friction.
+            ModelError: If the robot's file cannot be read.
         """
         given = [each.value for each in self.estimates] if values is None else list(values)
         odd = [e.name for e in self.estimates if e.kind in UNSETTABLE]
@@ -115,10 +123,10 @@ class Identification:
             raise IdentificationError(
                 f'No option of a robot holds "{odd[0]}": edit its file, or identify its mass.'
             )
-        masses, joints = dict(robot.mass_factors), dict(robot.joints)
+        masses, joints, bare = dict(robot.mass_factors), dict(robot.joints), masses_of(robot)
         for each, value in zip(self.estimates, given, strict=True):
             if each.kind == "mass":
-                masses[each.of] = masses.get(each.of, 1.0) * value / each.nominal
+                masses[each.of] = value / bare.get(each.of, each.nominal)
             elif each.kind in SETTINGS:
                 settings = joints.get(each.of, JointSettings())
                 changed: Any = {each.kind: value}

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from physx_core.cli import argument_registry
+from physx_core.cli import options_from
 from physx_core.errors import ConfigError, UsageError
 from physx_core.net import TOKEN_VARIABLE
 from physx_core.processes import TemporaryFolder
@@ -57,8 +57,7 @@ class Serve:
 
 def run(words: Sequence[str]) -> None:
     """Run the command."""
-    with argument_registry():
-        chosen = tyro.cli(Serve, args=words, prog="physx serve")
+    chosen = options_from(Serve, words, "serve")
     if chosen.write_launcher is not None:
         _write_launcher(chosen)
         return

@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from physx_core.cli import options_from
 from physx_report import show
 
 
@@ -29,5 +30,5 @@ class Report:
 
 def run(words: Sequence[str]) -> None:
     """Write the page and print its name, or show it in a notebook."""
-    options = tyro.cli(Report, args=words, prog="physx report")
+    options = options_from(Report, words, "report")
     show(options.session, options.output, trust=options.trust)

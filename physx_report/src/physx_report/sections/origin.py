@@ -24,8 +24,9 @@ def _blocks(run: Run) -> Iterator[Block]:
         yield Table(["option", "value"], rows, f"Options ({kind})")
         if kind in _COMMANDS:
             file = shlex.quote(str(Path(run.path) / "config.toml"))
-            again = f"physx {_COMMANDS[kind]} --config {file} --session-name again"
-            yield Text([again], "code")
+            again = f"physx {_COMMANDS[kind]} --config {file}"
+            goes_on = kind == "prediction"  # with the session's network
+            yield Text([again if goes_on else f"{again} --session-name again"], "code")
     if "sweep" in run.results:
         study = run.path / "study.toml"
         if study.is_file():

@@ -9,7 +9,7 @@ from typing import Annotated
 
 import tyro
 
-from physx_core.cli import show
+from physx_core.cli import options_from, show
 from physx_core.errors import UsageError
 from physx_rerun.recordings import recording_of
 from physx_rerun.viewer.headless import render_picture
@@ -44,7 +44,7 @@ class Snapshot:
 
 def run(words: Sequence[str]) -> None:
     """Render the picture and print its path."""
-    options = tyro.cli(Snapshot, args=words, prog="physx snapshot")
+    options = options_from(Snapshot, words, "snapshot")
     timeline, at = options.timeline, _position(options.at)
     if timeline is None and options.at is not None and options.at.endswith("s"):
         timeline = "sim_time"

@@ -11,6 +11,7 @@ from typing import Annotated
 import tyro
 
 from physx_core import cli
+from physx_core.cli import options_from
 from physx_core.errors import VisualizerError
 from physx_rerun.notebook import show as show
 from physx_rerun.recordings import recording_of
@@ -50,7 +51,7 @@ def run(words: Sequence[str]) -> None:
     Raises:
         VisualizerError: If there is no recording, or if the viewer does not start or fails.
     """
-    options = tyro.cli(View, args=words, prog="physx view")
+    options = options_from(View, words, "view")
     with recording_of(options.place) as path:
         viewer = _open(path.resolve(), options)
         try:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
@@ -129,7 +129,7 @@ class Robot:
             (condim 6).
         joints: Settings of joints, by their name in the file.
         couplings: Which joints move together, besides those that follow others; None: those of an
-            MJCF file, otherwise none. It starts at positions that couplings allow.
+            MJCF file, otherwise none. It starts at positions that couplings and limits allow.
         wheels: Links that roll on the ground without slip.
         mass_factors: Scale factors for the mass and moments of inertia of links, by their name in
             the file; 1 for all others.
@@ -176,15 +176,15 @@ class Robot:
         for option in MATERIAL:
             if (value := getattr(self, option)) is not None:
                 checks.not_negative(f"{where}{option}", value)
-        kinds: tuple[tuple[type, Iterable[object]], ...]
-        kinds = (
-            (JointSettings, self.joints.values()),
-            (JointCoupling, self.couplings or ()),
-            (Wheel, self.wheels),
-        )
-        for kind, things in kinds:
-            wrong = [thing for thing in things if not isinstance(thing, kind)]
-            if wrong:
-                raise ConfigError(f"{where}{wrong[0]!r} is not a {kind.__name__}.")
+        if self.couplings is not None:
+            couplings = checks.things(f"{where}couplings", self.couplings, JointCoupling)
+            object.__setattr__(self, "couplings", couplings)
+        object.__setattr__(self, "wheels", checks.things(f"{where}wheels", self.wheels, Wheel))
+        joints = self.joints if isinstance(self.joints, Mapping) else None
+        if joints is None or not all(isinstance(each, JointSettings) for each in joints.values()):
+            raise ConfigError(
+                f"{where}joints is {self.joints!r} but must be a mapping from names to "
+                "JointSettings."
+            )
         for link, factor in self.mass_factors.items():
             checks.positive(f'{where}mass_factors["{link}"]', factor)

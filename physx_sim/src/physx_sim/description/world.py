@@ -57,16 +57,11 @@ class World:
     iterations: int | None = None
 
     def __post_init__(self) -> None:
-        kinds: tuple[tuple[type, Sequence[object]], ...]
-        kinds = (
-            (Robot, self.robots),
-            (WorldObject, self.objects),
-            (Attachment, self.attachments),
-        )
-        for kind, things in kinds:
-            wrong = [thing for thing in things if not isinstance(thing, kind)]
-            if wrong:
-                raise ConfigError(f"World: {wrong[0]!r} is not a {kind.__name__}.")
+        kinds: tuple[tuple[str, type], ...]
+        kinds = (("robots", Robot), ("objects", WorldObject), ("attachments", Attachment))
+        for option, kind in kinds:
+            found = checks.things(f"World.{option}", getattr(self, option), kind)
+            object.__setattr__(self, option, found)
         names = [robot.name for robot in self.robots] + [thing.name for thing in self.objects]
         if len(set(names)) != len(names) or "ground" in names:
             raise ConfigError(

@@ -107,9 +107,7 @@ class Attachments:
         """Replace all active attachments."""
         wanted = {each.number: each.attachment for each in applied}
         self._next = max([self._next, *(number + 1 for number in wanted)])
-        if list(wanted.items()) == list(self._active.items()):
-            return
-        for number in list(self._active):  # all of them: engines solve them in their order
+        for number in list(self._active):  # all of them, as static bodies may be elsewhere now
             self.remove(number)
         for number, attachment in wanted.items():
             self._bind(number, attachment)

@@ -203,9 +203,11 @@ class Changes:
             else replace(body, mass=mass, inertia=body.inertia * (mass / body.mass))
             for body in model.bodies
         )
+        rolling = {wheel.link for wheel in model.wheels}  # without friction, whatever it is
         shapes = tuple(
             replace(shape, **frictions)
-            if (frictions := _frictions(changed.get(shape.body, changed[model.links[0]])))
+            if shape.body not in rolling
+            and (frictions := _frictions(changed.get(shape.body, changed[model.links[0]])))
             else shape
             for shape in model.shapes
         )

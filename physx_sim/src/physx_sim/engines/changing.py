@@ -60,12 +60,15 @@ class ChangeableSimulation(ReadableSimulation[Engine]):
         """Change a body from now on.
 
         Raises:
-            SimulationError: If there is no body with that name, or it does not have what changes.
+            SimulationError: If there is no body with that name, it does not have what changes, or
+                it is attached and would be hidden or moved.
             FeatureNotSupportedError: If the engine lacks `changes` or `moving_statics`.
         """
         body = self._checked_body(name, settings)
-        if settings.hidden and self._attachments.hold(name):
-            raise SimulationError(f'"{name}" is attached; detach it before hiding it.')
+        moves = any(value is not None for value in motion_of(settings)[:-1])
+        if (settings.hidden or moves) and self._attachments.hold(name):
+            how = "hiding" if settings.hidden else "moving"
+            raise SimulationError(f'"{name}" is attached; detach it before {how} it.')
         self._changes.merge(name, settings)
         self._move_static(body, settings)
         self._apply_changes()
@@ -154,13 +157,18 @@ class ChangeableSimulation(ReadableSimulation[Engine]):
         """Hold two bodies together from now on; return the attachment's number for `detach`.
 
         Raises:
-            SimulationError: If one of them is hidden, or neither can move.
+            SimulationError: If one of them is hidden or is a static body that moves, or neither can
+                move.
         """
         self._check_has("attachments")
         self._check_attachment(attachment)
+        velocities = zip(self.layout.statics, self._scenery.velocities, strict=True)
+        moving = [name for name, velocity in velocities if velocity.any()]
         for name in (attachment.body_a, attachment.body_b):
             if self._changes.of(name).hidden:
                 raise SimulationError(f'"{name}" is hidden, so nothing can be attached to it.')
+            if name in moving:
+                raise SimulationError(f'"{name}" moves; stop it before attaching anything to it.')
         poses = [self._pose_of(name) for name in (attachment.body_a, attachment.body_b)]
         return self._attachments.add(filled(attachment, poses))
 

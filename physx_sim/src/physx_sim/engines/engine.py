@@ -36,17 +36,10 @@ class RobotEngine(ABC):
         self.resistance = Resistance.of(movable)
 
     def neutral(self) -> Vector:
-        """Return the rest positions: 0 or the nearest limit, with the base at its initial pose."""
+        """Return the rest positions: those of the model, with the base at its initial pose."""
         movable = self.movable
         base = [] if self.fixed_base else [*movable.position, *movable.orientation]
-        found = np.array([*base, *(max(j.lower, min(0.0, j.upper)) for j in self.model.joints)])
-        joints = found[len(base) :]
-        for follower, leader, mimic in self.model.followers:
-            joints[follower] = mimic.multiplier * joints[leader] + mimic.offset
-        if self.model.couplings:
-            rows, sums = self.model.coupling_rows
-            joints -= np.linalg.pinv(rows) @ (rows @ joints - sums)
-        return found
+        return np.concatenate([base, self.model.start])
 
     @abstractmethod
     def hold(self, commands: Vector) -> None:

@@ -101,19 +101,19 @@ def read_actuators(path: str | Path) -> dict[str, ActuatorNetwork]:
     try:
         arrays = load(read_content(Path(path), _LARGEST))
         found = {}
-        for joint in sorted({name.split(":")[0] for name in arrays}):
-            count = sum(name.startswith(f"{joint}:") for name in arrays) // 2 - 1
-            layers = [
-                (
-                    np.asarray(arrays[f"{joint}:{place}:weights"], np.float64),
-                    np.asarray(arrays[f"{joint}:{place}:biases"], np.float64),
-                )
-                for place in range(count)
-            ]
+        ends = ":period"
+        for joint in sorted(name.removesuffix(ends) for name in arrays if name.endswith(ends)):
+            layers: list[tuple[Vector, Vector]] = []
+            while (layer := f"{joint}:{len(layers)}:") + "weights" in arrays:
+                given = (arrays[layer + part] for part in ("weights", "biases"))
+                weights, biases = (np.asarray(each, np.float64) for each in given)
+                layers.append((weights, biases))
             if not all(np.isfinite(each).all() for layer in layers for each in layer):
                 raise ConfigError("a weight is not finite")
             period, limit = (float(arrays[f"{joint}:{each}"][0]) for each in ("period", "limit"))
             found[joint] = ActuatorNetwork(period, layers, limit)
+        if len(arrays) != sum(2 + 2 * len(network.layers) for network in found.values()):
+            raise ConfigError("it holds other arrays")
     except (OSError, ValueError, LookupError, TypeError, SafetensorError, ConfigError) as error:
         raise ConfigError(
             f"{path} is not a file of actuator networks: {error}. "

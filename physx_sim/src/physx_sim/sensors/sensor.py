@@ -251,9 +251,7 @@ class RaySensor(Sensor):
         super().__post_init__()
         where = f'{type(self).__name__} "{self.name}": '
         checks.positive(f"{where}reach", self.reach)
-        names = self.ignored
-        if isinstance(names, str) or not all(isinstance(name, str) for name in names):
-            raise ConfigError(f"{where}ignored is {names!r}, not a list of names.")
+        object.__setattr__(self, "ignored", checks.names(f"{where}ignored", self.ignored))
 
     def _store_rows(self, option: str, width: int) -> None:
         where, rows = f'{type(self).__name__} "{self.name}": {option}', getattr(self, option)
@@ -376,7 +374,8 @@ class Camera(RaySensor):
 
     def __post_init__(self) -> None:
         where = f'Camera "{self.name}": '
-        images = (self.images,) if isinstance(self.images, str) else tuple(self.images)
+        images = self.images
+        images = (images,) if isinstance(images, str) else checks.names(f"{where}images", images)
         if unknown := [str(image) for image in images if image not in _IMAGES]:
             raise UnknownOptionError(f"{where}images", unknown, tuple(_IMAGES))
         object.__setattr__(self, "images", tuple(dict.fromkeys(images)))

@@ -9,7 +9,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from physx_core.cli import argument_registry, show
+from physx_core.cli import options_from, show
 from physx_core.config import NetworkConfig
 from physx_core.errors import ConfigError, ContractError, UsageError
 from physx_core.fields import Field
@@ -57,8 +57,7 @@ class Check:
 
 def run(words: Sequence[str]) -> None:
     """Print a table of counts, then the findings."""
-    with argument_registry():
-        options = tyro.cli(Check, args=words, prog="physx check")
+    options = options_from(Check, words, "check")
     found = check_plugin(
         options.name,
         kind=options.kind,

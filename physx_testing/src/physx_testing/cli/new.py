@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 
 import tyro
 
-from physx_core import plugins
-from physx_core.cli import show
+from physx_core import __version__, plugins
+from physx_core.cli import options_from, show
 from physx_core.errors import ConfigError
 from physx_core.files import create_folder, make_folder, remove_folder, rename
 
@@ -28,7 +28,7 @@ class _Part:
     Attributes:
         summary: Short description.
         tried: Commands to try it with.
-        arguments: Arguments of its contract kit.
+        check: How the contract kit is called in the test.
         options: The same as options of ``physx check``.
         requires: Distributions that it needs.
         kit: Module of the function that checks it.
@@ -36,7 +36,7 @@ class _Part:
 
     summary: str
     tried: str
-    arguments: str = "$class_name"
+    check: str = "check_$kind($class_name)"
     options: str = ""
     requires: tuple[str, ...] = ("physx-core",)
     kit: str = "physx_testing"
@@ -53,12 +53,23 @@ _PARTS = {
     "network": _Part(
         "a two-layer network",
         f"{_SPRING}\n{_TRAIN}",
-        "$class_name, fields=FIELDS",
+        "check_network($class_name, fields=FIELDS)",
         " --fields state=2 force=1 next_state=2",
         ("physx-core", "physx-torch"),
     ),
     "visualizer": _Part(
         "a visualizer that writes a text file", f"{_SPRING} --environment.visualizer $name"
+    ),
+    "launcher": _Part(
+        "a launcher of clients with a low priority",
+        f"{_SPRING} \\\n    --environment.launcher $name --environment.num-clients 2",
+    ),
+    "format": _Part(
+        "a file format for datasets",
+        f"{_SPRING}\nphysx export sessions/data_generation spring.txt --to $name\n"
+        "physx import spring.txt spring",
+        "next(check_plugin('$name', kind='format'))".replace("'", '"'),
+        requires=("physx-core", "physx-formats"),
     ),
     "backend": _Part(
         "a physics engine for articulated rigid bodies, without contacts",
@@ -87,7 +98,9 @@ class New:
     components to any of them.
     """
 
-    kind: tyro.conf.Positional[Literal["environment", "network", "visualizer", "backend", "plugin"]]
+    kind: tyro.conf.Positional[
+        Literal["environment", "network", "visualizer", "launcher", "format", "backend", "plugin"]
+    ]
     """What the plugin contains."""
     name: Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="NAME")]
     """Name by which users select the plugin, such as wave-tank."""
@@ -97,7 +110,7 @@ class New:
 
 def run(words: Sequence[str]) -> None:
     """Write the files and print what to do next."""
-    options = tyro.cli(New, args=words, prog="physx new")
+    options = options_from(New, words, "new")
     name = options.name
     _check_name(name)
     target = options.folder / f"physx-{name}"
@@ -151,24 +164,27 @@ def _render(name: str, kinds: Sequence[str]) -> dict[str, str]:
     requires = list(dict.fromkeys(one for part in parts for one in part.requires))
     summary = "A physx plugin: " + " and ".join(part.summary for part in parts) + "."
     listed = "\n".join(
-        f"| `src/{package}/{kind}.py` | the class `{values['class_name']}`: {part.summary} |"
+        f"| `src/{package}/{kind}.py` | `{values['class_name']}`: {part.summary} |"
         for kind, part, values in zip(kinds, parts, each, strict=True)
     )
     whole = common | {
         "summary": summary,
-        "dependencies": ", ".join(f'"{one}"' for one in requires),
+        "dependencies": ", ".join(f'"{one}>={_since()},<1"' for one in requires),
         "usage": Template(_usage(kinds)).substitute(common),
         "contents": listed,
         "options": "".join(part.options for part in parts),
     }
     tests = [
-        fill("test.py", values | {"arguments": Template(part.arguments).substitute(values)})
+        fill("test.py", values | {"check": Template(part.check).substitute(values)})
         for part, values in zip(parts, each, strict=True)
     ]
-    imports = [f"from {package}.{v['kind']} import {v['class_name']}" for v in each]
+    imports: list[str] = []
     kits: dict[str, list[str]] = {}
-    for kind, part in zip(kinds, parts, strict=True):
-        kits.setdefault(part.kit, []).append(f"check_{kind}")
+    for values, part in zip(each, parts, strict=True):
+        kit = "check_plugin" if "check_plugin" in part.check else f"check_{values['kind']}"
+        kits.setdefault(part.kit, []).append(kit)
+        if "$class_name" in part.check:
+            imports += [f"from {package}.{values['kind']} import {values['class_name']}"]
     head = ['"""The components fulfill the contracts that physx and its users rely on."""\n']
     head += ["from physx_core import Field"] if "network" in kinds else []
     head += [f"from {module} import {', '.join(names)}" for module, names in kits.items()]
@@ -184,6 +200,11 @@ def _render(name: str, kinds: Sequence[str]) -> dict[str, str]:
         + "".join(fill("hook.py", values) for values in each),
         "tests/test_contract.py": "\n".join(head) + "\n" + "".join(tests),
     } | {f"{source}/{values['kind']}.py": fill(f"{values['kind']}.py", values) for values in each}
+
+
+def _since() -> str:
+    """Return the first version that the plugin works with: this one, without its last number."""
+    return __version__.rpartition(".")[0]
 
 
 def _usage(kinds: Sequence[str]) -> str:

@@ -77,10 +77,11 @@ class FC(TorchNetwork):
         """Set the shapes of the fields before the first batch.
 
         Raises:
-            FieldsMismatchError: If a field is missing, its shape is unknown, or the number of
-                values in the fields differs from the size of the first or last layer.
+            FieldsMismatchError: If a field is missing or has a free axis, its shape is unknown, or
+                the number of values in the fields differs from the size of the first or last layer.
         """
         super().bind(fields)
+        self.reject_free_axes(fields)
         reject_complex(self, fields)
         self._check("first", self.sizes[0], {name: fields[name] for name in self.net_fields})
         targets = {name: fields[name] for name in self.opt_fields}

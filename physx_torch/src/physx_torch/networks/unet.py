@@ -175,10 +175,11 @@ class UNet(TorchNetwork):
         """Set the grid from the fields before the first batch.
 
         Raises:
-            FieldsMismatchError: If a field is missing or has another grid, or the number of
-                channels of the fields differs from the network's.
+            FieldsMismatchError: If a field is missing, has a free axis or another grid, or the
+                number of channels of the fields differs from the network's.
         """
         super().bind(fields)
+        self.reject_free_axes(fields)
         reject_complex(self, fields)
         mine = {name: fields[name] for name in (*self.net_fields, *self.opt_fields)}
         self.size = self._given_size or self._size_of(mine[self.net_fields[0]])

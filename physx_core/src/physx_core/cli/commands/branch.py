@@ -1,4 +1,4 @@
-"""``physx branch``: go back to a stored row, and on from there with a change."""
+"""``physx branch``: simulate on from a stored row, as it was and with a change."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ _SET = "--set"
 
 
 def run(words: Sequence[str]) -> None:
-    """Branch off a row; the first words are a session's or dataset's folder, and the row.
+    """Branch off a row; the first words are a session, dataset or log, and the row.
 
     Both futures are drawn by the given visualizer, by default that of the only installed visualizer
     plugin. The row ``cursor`` is where the cursor of an open viewer stands, which then shows the
@@ -39,11 +39,12 @@ def run(words: Sequence[str]) -> None:
         ("data", "row"),
         words,
         given,
-        arguments="DATASET ROW|cursor",
+        arguments="DATASET|LOG ROW|cursor",
         examples=(
             "sessions/data_generation 120 --set stiffness=5",
             "sessions/data_generation cursor --set stiffness=5 --step-nb 300",
             "sessions/data_generation 120 --policy sessions/training",
+            "ant.h5 20 --set push.torso=[200,0,0]",
         ),
     )
     pipeline.execute()

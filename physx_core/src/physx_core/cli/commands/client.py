@@ -11,6 +11,7 @@ from typing import Annotated
 
 import tyro
 
+from physx_core.cli.options import options_from
 from physx_core.errors import ConfigError
 from physx_core.net.handshake import TOKEN_VARIABLE
 from physx_core.net.tokens import find_token
@@ -41,7 +42,7 @@ class Client:
 
 def run(words: Sequence[str]) -> None:
     """Run the client and print what it does."""
-    options = tyro.cli(Client, args=words, prog="physx client")
+    options = options_from(Client, words, "client")
     token = find_token(options.token_file)
     if token is None:
         raise ConfigError(

@@ -1,4 +1,4 @@
-"""``physx compact``: free the disk space of rows that no episode of a campaign has."""
+"""``physx compact``: free the disk space of failed, lost and unfinished episodes."""
 
 from __future__ import annotations
 
@@ -8,6 +8,7 @@ from typing import Annotated
 
 import tyro
 
+from physx_core.cli.options import options_from
 from physx_core.cli.output import show
 from physx_core.dataset import Dataset
 
@@ -27,7 +28,7 @@ class Compact:
 
 def run(words: Sequence[str]) -> None:
     """Compact a dataset, and print how much disk space that freed."""
-    options = tyro.cli(Compact, args=words, prog="physx compact")
+    options = options_from(Compact, words, "compact")
     with Dataset.open(options.directory, writable=True) as dataset:
         freed = dataset.compact(options.mode)
     more = "in order now; the files take more space:"

@@ -15,10 +15,13 @@ from physx_core.plugins.kinds import kind_names
 
 _HELP = """usage: physx completion {bash,zsh}
 
-Prints a script that completes commands, options, their values, component names, and files:
+Prints a script that completes commands, options, their values, component
+names, and files:
   bash: physx completion bash > ~/.local/share/bash-completion/completions/physx
-  zsh:  physx completion zsh > ~/.physx-completion; echo 'source ~/.physx-completion' >> ~/.zshrc
-It calls  physx completion after WORD ...  to learn what may follow, and so knows all plugins."""
+  zsh:  physx completion zsh > ~/.physx-completion
+        echo 'source ~/.physx-completion' >> ~/.zshrc
+It calls  physx completion after WORD ...  to learn what may follow, and so
+knows all plugins."""
 
 _ASK = r"""# Completes the command physx.
 typeset -gA _physx_known

@@ -13,9 +13,9 @@ from physx_core.errors import UsageError
 
 _HELP = """usage: physx doctor
 
-Shows what a bug report needs, without secrets: the interpreter, the machine, drivers, graphics
-cards, how fast this folder's disk is, limits, where each package comes from, broken plugins, and
-packages that hide others."""
+Shows what a bug report needs, without secrets: the interpreter, the machine,
+drivers, graphics cards, how fast this folder's disk is, limits, where each
+package comes from, broken plugins, and packages that hide others."""
 
 
 def run(words: Sequence[str]) -> None:

@@ -1,4 +1,4 @@
-"""``physx evaluate``: how good a session's network is; plugins evaluate other kinds of networks."""
+"""``physx evaluate``: evaluate a session's network against baselines, or a policy on episodes."""
 
 from __future__ import annotations
 
@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from physx_core import checkpoint, plugins
+from physx_core.cli.options import options_from
 from physx_core.cli.output import show
 from physx_core.components import Evaluation
 from physx_core.pipelines import evaluate
@@ -49,7 +50,7 @@ def run(words: Sequence[str]) -> None:
     if other is not None:
         other.run(words)
         return
-    options = tyro.cli(Evaluate, args=words, prog="physx evaluate")
+    options = options_from(Evaluate, words, "evaluate")
     result = evaluate(
         options.session,
         options.data,
@@ -58,10 +59,7 @@ def run(words: Sequence[str]) -> None:
         invariants=options.invariants,
         trust=options.trust,
     )
-    if options.json:
-        print(result.to_json())
-    else:
-        show(result)
+    show(result, as_json=options.json)
 
 
 def _other(session: Path) -> Evaluation | None:
@@ -71,6 +69,5 @@ def _other(session: Path) -> Evaluation | None:
         CheckpointError: If there is no network, or it is damaged.
     """
     fields = list(checkpoint.find(session, None, _LAST).fields)
-    known = plugins.references_of("evaluation")
-    found = (plugins.resolve("evaluation", each) for places in known.values() for each in places)
+    found = plugins.resolve_all("evaluation").values()
     return next((each for each in found if each.applies(fields)), None)

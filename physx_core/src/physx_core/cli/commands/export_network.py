@@ -10,6 +10,7 @@ from typing import Annotated
 import tyro
 
 from physx_core import checkpoint
+from physx_core.cli.options import options_from
 from physx_core.cli.output import show
 from physx_core.config import NetworkConfig
 from physx_core.pipelines.learning.loading import load_learner
@@ -40,7 +41,7 @@ class ExportNetwork:
 
 def run(words: Sequence[str]) -> None:
     """Export a network and print its fields and the file."""
-    options = tyro.cli(ExportNetwork, args=words, prog="physx export-network")
+    options = options_from(ExportNetwork, words, "export-network")
     place = Path(options.directory)
     path = checkpoint.find(place, options.network_name, options.which_network).path
     config = NetworkConfig(options.network, device="cpu")

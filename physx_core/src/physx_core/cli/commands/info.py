@@ -11,6 +11,7 @@ import tyro
 
 from physx_core import checkpoint
 from physx_core.cli.dataset_tables import print_dataset
+from physx_core.cli.options import options_from
 from physx_core.cli.output import show
 from physx_core.errors import CheckpointError, DatasetNotFoundError, PhysxError, UsageError
 from physx_core.pipelines.learning.data_record import (
@@ -37,7 +38,7 @@ def run(words: Sequence[str]) -> None:
     Raises:
         UsageError: If no folder is named.
     """
-    options = tyro.cli(Info, args=words, prog="physx info")
+    options = options_from(Info, words, "info")
     if options.directory is None:
         raise UsageError(
             "physx info needs a folder: physx info SESSION. What is installed: physx doctor."

@@ -14,6 +14,7 @@ from typing import Annotated
 
 import tyro
 
+from physx_core.cli.options import options_from
 from physx_core.cli.output import show, show_table, width
 from physx_core.dataset import Dataset
 from physx_core.errors import DatasetError, MissingLibraryError, SessionError
@@ -41,7 +42,7 @@ class Stats:
 
 def run(words: Sequence[str]) -> None:
     """Print a line for each statistic, or start TensorBoard."""
-    options = tyro.cli(Stats, args=words, prog="physx stats")
+    options = options_from(Stats, words, "stats")
     if options.tensorboard:
         _start_tensorboard(Path(options.session), options.port)
         return

@@ -11,6 +11,7 @@ import tyro
 
 from physx_core import checkpoint
 from physx_core.cli.dataset_tables import count
+from physx_core.cli.options import options_from
 from physx_core.cli.output import show
 from physx_core.dataset import EPISODES, Dataset
 from physx_core.errors import DatasetError, DatasetNotFoundError, UsageError
@@ -42,7 +43,7 @@ class Verify:
 
 def run(words: Sequence[str]) -> None:
     """Print the repairs and all remaining problems."""
-    options = tyro.cli(Verify, args=words, prog="physx verify")
+    options = options_from(Verify, words, "verify")
     if checkpoint.is_one(Path(options.directory)):
         _verify_checkpoint(Path(options.directory), options)
         return

@@ -44,8 +44,7 @@ from physx_core.errors import (
     DatasetError,
     DatasetNotFoundError,
     FieldsMismatchError,
-    listed,
-    nearest,
+    found_at,
 )
 from physx_core.fields import ENDS, Field, ends_fields
 
@@ -61,21 +60,7 @@ def locate(directory: str | Path) -> Path:
     for folder in (given, given / "dataset"):
         if holds_dataset(folder):
             return folder
-    if given.is_file():
-        what = "It is a file: give the folder of a session or dataset."
-    elif not given.is_dir():
-        missing = given.absolute()
-        while not missing.parent.is_dir():
-            missing = missing.parent
-        around = [path.name for path in missing.parent.iterdir()]
-        meant = nearest(missing.name, around)
-        what = (
-            f"The folder {missing} does not exist.{meant} "
-            f"{missing.parent} contains: {listed(around)}."
-        )
-    else:
-        what = f"The folder contains: {listed(p.name for p in given.iterdir())}."
-    raise DatasetNotFoundError(f"There is no dataset in {given}. {what}")
+    raise DatasetNotFoundError(f"There is no dataset in {given}. {found_at(given)}")
 
 
 def holds_dataset(folder: Path) -> bool:

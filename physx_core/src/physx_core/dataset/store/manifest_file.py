@@ -77,9 +77,11 @@ def append(directory: Path, manifest: Manifest, end: End, partitions: list[Parti
         partitions: The partitions, at least one.
     """
     before, after = end.statistics, _store_statistics(directory, manifest)
+    if after is None:  # a change cannot say so: the file stays, and no counted row is in it
+        after = before
     plain = [{"mode": each.mode, "partition": each.to_dict()} for each in partitions]
     change: dict[str, Any] = {**plain[0], "also": plain[1:]} if plain[1:] else plain[0]
-    if after != before and after is not None:
+    if after is not None and after != before:
         change["statistics"] = statistics_file.reference(after)
     end = changes_file.append(directory, end, change)  # they count in the statistics, or none does
     manifest.end, manifest.statistics_checksum = end._replace(statistics=after), after

@@ -32,8 +32,7 @@ from physx_core.errors import (
 from physx_core.fields import NUMBERS, PTR, Field, free_axes, is_finite
 from physx_core.normalization import Normalization
 from physx_core.packing import join, pack, packed_fields, split
-from physx_core.pipelines.learning.components import create, create_network
-from physx_core.plugins import import_component
+from physx_core.plugins import create, create_network, import_component
 from physx_core.rows import concatenate
 from physx_core.typing import Array, Batch, Index, Tensors
 
@@ -78,7 +77,7 @@ class Learner:
         self.network: Network = network or create_network(config)
         reference = config.transformation or self.network.default_transformation
         self.transformation: Transformation = create(
-            "transformation", reference, config.transformation_kwargs, Transformation
+            "transformation", reference, config.transformation_kwargs
         )
         self.config = dataclasses.replace(config, transformation=reference)
         self.network.set_data_type(config.data_type)
@@ -89,6 +88,7 @@ class Learner:
         self.group = Group()
         self.row_losses: Array = np.zeros(0)
         self._is_between_steps = False
+        self._is_checked = False
         self._predict_training = self._predict_batch
         self._read = self.network.numpy_to_tensor
         if trains:
@@ -104,9 +104,7 @@ class Learner:
                 f"{type(self.network).__name__} names no default_optimization: choose what trains "
                 "it in NetworkConfig.optimization."
             )
-        optimization: Optimization = create(
-            "optimization", reference, config.optimization_kwargs, Optimization
-        )
+        optimization: Optimization = create("optimization", reference, config.optimization_kwargs)
         arguments = dict(config.optimizer_kwargs)
         if config.lr is not None:
             arguments["lr"] = config.lr
@@ -250,7 +248,8 @@ class Learner:
         Raises:
             DivergedError: If the loss or a gradient is not finite, unless
                 `Optimization.stops_at_nan` is off.
-            UsageError: If there is no optimization.
+            UsageError: If there is no optimization, or the prediction lacks a field.
+            FieldsMismatchError: If a prediction has not the shape of its target.
         """
         if self._is_between_steps:
             self._is_between_steps = False
@@ -260,6 +259,8 @@ class Learner:
         if weight is None:
             share, weight = (batch, 1.0) if group.size == 1 else group.share_of(batch)
         step = self._predict_training(share)
+        if not self._is_checked:
+            self._check(step)
         loss, stops = optimization.compute_loss(step), optimization.stops_at_nan
         if stops and isinstance(loss, (float, np.floating)) and not math.isfinite(loss):
             raise DivergedError(self._explain(f"the loss is {loss}", step))
@@ -276,6 +277,30 @@ class Learner:
         if stops and not math.isfinite(losses["loss"]):
             raise DivergedError(self._explain(f"the loss is {losses['loss']}", step))
         return losses
+
+    def _check(self, step: PredictedBatch) -> None:
+        """Check the first prediction: a wrong shape might be broadcast, and trained on."""
+        self._is_checked = True
+        network, found = self.network, step.prediction
+        names = list(network.pred_fields)
+        if not isinstance(found, Mapping) or not found.keys() >= set(names):
+            given = listed(map(str, found)) if isinstance(found, Mapping) else type(found).__name__
+            raise UsageError(
+                f"{type(network).__name__}.predict() must return a dictionary with "
+                f"{listed(names)}, not {given}."
+            )
+        differences = {}
+        for name, target in zip(names, network.opt_fields, strict=False):
+            if self.fields[target].numpy_dtype.kind in "iub":  # labels, of which a loss knows more
+                continue
+            wanted, values = tuple(step.targets[target].shape), found[name]
+            if not hasattr(values, "shape"):
+                kind = type(values).__name__
+                differences[name] = f'a {kind}, but "{target}" has the shape {wanted}'
+            elif tuple(values.shape) != wanted:
+                differences[name] = f'shape {tuple(values.shape)}, but "{target}" has {wanted}'
+        if differences:
+            raise FieldsMismatchError("Prediction and target differ", differences)
 
     def _compute_row_losses(self, optimization: Optimization, step: PredictedBatch) -> Array:
         found = optimization.compute_row_losses(step)
@@ -421,7 +446,8 @@ class Learner:
         except KeyError as error:
             raise MissingFieldError(
                 f'The network reads the field "{error.args[0]}", which is missing. '
-                f"Given: {', '.join(batch) or 'none'}.",
+                f"Given: {', '.join(batch) or 'none'}. An environment gives more than it trains "
+                "with, such as windows, by define_additional_fields() and set_additional_data().",
                 field=str(error.args[0]),
             ) from None
         try:

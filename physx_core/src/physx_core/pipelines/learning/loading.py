@@ -11,8 +11,8 @@ from physx_core import checkpoint
 from physx_core.components.network import Network
 from physx_core.config import NetworkConfig, merge_arguments
 from physx_core.errors import CheckpointError, ConfigError, PhysxError
-from physx_core.pipelines.learning.components import create_network
 from physx_core.pipelines.learning.learner import Learner
+from physx_core.plugins import create_network
 from physx_core.plugins.networks import resolve_network
 from physx_core.plugins.references import check_recorded, is_of_plugin, is_recorded_as
 

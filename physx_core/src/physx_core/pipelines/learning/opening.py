@@ -33,14 +33,11 @@ from physx_core.pipelines.pipeline import derive_seed
 from physx_core.pipelines.services import Predict, Show
 from physx_core.pipelines.storage import (
     GENERATION,
-    accept_parameters,
     copy_existing,
     describe_environment,
-    keep_parameters,
     open_existing,
     open_own,
     reject_episode_fields,
-    restore_parameters,
 )
 from physx_core.pipelines.stored_episodes import find_begun
 from physx_core.plugins.networks import resolve_network
@@ -313,13 +310,12 @@ class DataOpening:
         former = self.start.generation
         self._generation = former or now
         if former is None:
-            keep_parameters(dataset.directory)
+            now.keep_parameters(dataset)
             now.start(dataset)
-            accept_parameters(dataset.directory)
             return now, NOTHING
         advice = advise(self.session.path)
         skip = former.resume(dataset, environment, now, self.buffer.total, advice)
-        restore_parameters(dataset.directory)
+        former.restore_parameters(dataset)
         return former, self._find_place(former, skip, environment.num_clients)
 
     def _find_place(self, former: Generation, skip: Skip, count: int) -> Skip:

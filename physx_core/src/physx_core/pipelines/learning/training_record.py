@@ -148,21 +148,21 @@ class BestEpoch:
         self.loss, self.epoch = loss, epoch
         return True
 
-    def describe(self, name: str | None) -> str:
+    def describe(self, name: str) -> str:
         """Return the best value in words.
 
         Args:
-            name: What decides; None: the loss.
+            name: What decides.
         """
-        value = as_loss(name or "", self.loss)
-        least = "largest" if (name or "").endswith("accuracy") else "smallest"
-        return f"{least} {name or 'loss'} {value:.6g}, after epoch {self.epoch}"
+        value = as_loss(name, self.loss)
+        least = "largest" if name.endswith("accuracy") else "smallest"
+        return f"{least} {name} {value:.6g}, after epoch {self.epoch}"
 
-    def reason_to_stop(self, patience: int, name: str | None) -> str:
+    def reason_to_stop(self, patience: int, name: str) -> str:
         """Return why to stop after `patience` epochs without improvement; empty: continue."""
         if self.waited < patience:
             return ""
         return (
-            f"The training stopped early: the {name or 'loss'} did not improve {self.waited} times "
+            f"The training stopped early: the {name} did not improve {self.waited} times "
             f"in a row (patience={patience}); {self.describe(name)}."
         )

@@ -9,12 +9,11 @@ from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from physx_core.components.launcher import ClientHandle, Launcher
+from physx_core.components.launcher import ClientHandle
 from physx_core.components.services import Services
 from physx_core.config import EnvironmentConfig
 from physx_core.errors import (
     ClientError,
-    ConfigError,
     PhysxError,
 )
 from physx_core.net.addresses import format_address, is_loopback, parse_address
@@ -22,7 +21,7 @@ from physx_core.net.handshake import TOKEN_VARIABLE
 from physx_core.net.link import SOCKETS, Transport
 from physx_core.net.tokens import choose_token, find_token
 from physx_core.net.values import encode
-from physx_core.plugins import reference_of, resolve
+from physx_core.plugins import create
 from physx_core.plugins.references import locate
 from physx_core.workers.instance import instance_arguments
 from physx_core.workers.journal import Journal
@@ -37,6 +36,7 @@ from physx_core.workers.server.peer import Peer
 from physx_core.workers.server.server import Server
 from physx_core.workers.server.stream_pool import StreamPool
 from physx_core.workers.server.written_rows import WrittenRows
+from physx_core.workers.warned import repeat_warnings
 
 _ALL = ("", "0.0.0.0", "::")  # all addresses of this machine
 _TICK = 0.1
@@ -87,7 +87,7 @@ class ClientGroup:
         self.config = config
         self._seed = list(seed)
         self._accepts_all = accept_all
-        self._launcher = launcher = _make_launcher(config)
+        self._launcher = launcher = create("launcher", config.launcher, config.launcher_kwargs)
         launcher.elastic = config.is_elastic
         token = choose_token(config, launcher.by_hand, launcher.elsewhere)
         self._laggards, self._named = Laggards(self._clock), set[str]()
@@ -221,6 +221,7 @@ class ClientGroup:
         finally:
             try:
                 stop(self._handles.values(), patience)
+                repeat_warnings(self._handles.values())
             finally:
                 self._handles = {}
                 self.server.close()
@@ -254,8 +255,7 @@ class ClientGroup:
 
     def _launch(self, numbers: Sequence[int]) -> None:
         now = self._clock.monotonic()
-        started = self._launcher.launch(numbers, self._address(), self.server.token)
-        handles = {handle.instance_id: handle for handle in started}
+        handles = self._handles_of(numbers)
         self._handles.update(handles)
         self._launched.update(dict.fromkeys(numbers, now))
         without = [number for number in numbers if number not in handles]
@@ -265,6 +265,26 @@ class ClientGroup:
                 f"was not started: {type(self._launcher).__name__}.launch() returned no handle "
                 "for it. A launcher that starts nothing must set by_hand = True.",
             )
+
+    def _handles_of(self, numbers: Sequence[int]) -> dict[int, ClientHandle]:
+        """Have the launcher start clients; return their handles by instance."""
+        call = f"{type(self._launcher).__name__}.launch()"
+        try:
+            started = self._launcher.launch(numbers, self._address(), self.server.token)
+        except PhysxError:
+            raise
+        except Exception as error:
+            text = f"was not started: {call} raised {type(error).__name__}: {error}"
+            raise ClientError(numbers[0], text) from error
+        handles = list(started) if isinstance(started, Iterable) else [started]
+        for each in handles:
+            if not isinstance(each, ClientHandle):
+                raise ClientError(
+                    numbers[0],
+                    f"cannot be watched: {call} returned {each!r:.100}, and not a list of handles, "
+                    "each of a class derived from ClientHandle.",
+                )
+        return {handle.instance_id: handle for handle in handles}
 
     def _address(self) -> str:
         """Return the ``HOST:PORT`` at which clients that the launcher starts reach the server."""
@@ -457,16 +477,3 @@ class ClientGroup:
             },
             "EnvironmentConfig",
         )
-
-
-def _make_launcher(config: EnvironmentConfig) -> Launcher:
-    make = resolve("launcher", config.launcher)
-    name = reference_of(config.launcher)
-    try:
-        launcher = make(**config.launcher_kwargs)
-    except TypeError as error:
-        text = str(error).split("() ")[-1]
-        raise ConfigError(f"EnvironmentConfig.launcher_kwargs: {name} {text}.") from error
-    if not isinstance(launcher, Launcher):
-        raise ConfigError(f"EnvironmentConfig.launcher: {name} is not a Launcher.")
-    return launcher

@@ -117,6 +117,8 @@ def find_features(table: Table, roles: Roles, named: Mapping[str, Sequence[str]]
             raise ConfigError(
                 f'LeRobot has no feature "{name}". It has: {listed(_NAMED)}, {OBSERVATION}NAME.'
             )
+        if "/" in name:
+            raise ConfigError(f'The feature "{name}" needs a name without "/".')
         if not of or any(each.name == name for each in features):
             raise ConfigError(f'The feature "{name}" has {"two lots of" if of else "no"} fields.')
         features.append(Feature(name, tuple(fields[each] for each in of)))

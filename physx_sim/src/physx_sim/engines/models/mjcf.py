@@ -275,6 +275,7 @@ def _left_out(file: MjcfFile, links: _Links) -> Iterator[str]:
             yield f"{what} ({count}: {effect})"
     joints = links.joints
     places = model.jnt_dofadr[joints]
+    uneven = model.jnt_actfrclimited[joints] & (model.jnt_actfrcrange[joints].sum(axis=1) != 0)
     solid = [geom for body in links.places for geom in file.solid(body)]
     for found, what in (
         (option.density or option.viscosity, "the fluid (there is no drag)"),
@@ -283,6 +284,7 @@ def _left_out(file: MjcfFile, links: _Links) -> Iterator[str]:
         (model.jnt_stiffnesspoly[joints].any(), "the nonlinear part of springs"),
         (model.dof_dampingpoly[places].any(), "the nonlinear part of dampers"),
         (model.jnt_springyield[joints].any(), "springs that yield"),
+        (uneven.any(), "that torques have a smaller limit in one direction"),
         ((model.geom_condim[solid] < 3).any(), "that some contacts have no friction (condim 1)"),
         (model.geom_margin[solid].any(), "margins of contacts"),
     ):

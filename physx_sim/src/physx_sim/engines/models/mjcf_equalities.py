@@ -16,7 +16,8 @@ class Equalities:
 
     Attributes:
         mimics: How joints follow others.
-        couplings: Joints that are locked, and fixed tendons of a constant length or ratio.
+        couplings: Joints that are locked or follow a second one, and fixed tendons of a constant
+            length or ratio.
         attachments: What holds links together.
         left_out: What no engine is told.
 
@@ -57,6 +58,8 @@ class Equalities:
             return False
         offset = first + float(data[0]) - float(data[1]) * self._length({pair[1]: 1.0})
         follower, leader = map(self._file.joint_name, pair)
+        if follower in self.mimics:
+            return self._couple({pair[0]: 1.0, pair[1]: -float(data[1])}, offset)
         self.mimics[follower] = Mimic(leader, float(data[1]), offset)
         return True
 

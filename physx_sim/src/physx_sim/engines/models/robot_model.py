@@ -16,6 +16,12 @@ from physx_sim.engines.models.rigid_bodies import Inertial, Joint, RigidBody
 from physx_sim.engines.models.shapes import CollisionShape
 from physx_sim.errors import ModelError
 
+_MOST = 1000
+"""Maximum number of projections onto what couplings and limits allow."""
+_CLOSE, _ROUNDED = 1e-9, 1e-3
+"""Distance from limits, in rad or m, at which projections end, and above which couplings contradict
+them: the numbers in files are rounded."""
+
 
 @dataclass(frozen=True)
 class RobotModel:
@@ -78,6 +84,39 @@ class RobotModel:
             sums.append(scale * coupling.offset)
         return rows, np.array(sums)
 
+    @functools.cached_property
+    def start(self) -> Vector:
+        """Positions of the joints at the start, shape (joints,): 0 or the nearest limit.
+
+        Joints that follow others or are coupled are where these let them be.
+        """
+        return self.allowed(np.array([max(j.lower, min(0.0, j.upper)) for j in self.joints]))
+
+    def allowed(self, positions: Vector) -> Vector:
+        """Return positions of joints, shape (joints,), where couplings and leaders let them be.
+
+        Followers are moved to where their leaders are; if there are couplings, all joints to the
+        nearest positions within their limits.
+
+        Args:
+            positions: Within the joints' limits, shape (joints,), in rad or m.
+        """
+        found = np.array(positions, np.float64)
+        for follower, leader, mimic in self.followers:
+            found[follower] = mimic.multiplier * found[leader] + mimic.offset
+        if not self.couplings:
+            return found
+        lower, upper = np.array([(joint.lower, joint.upper) for joint in self.joints]).T
+        rows, sums = self.coupling_rows
+        inverse, beyond = np.linalg.pinv(rows), np.zeros(len(found))
+        for _ in range(_MOST):  # Dykstra's projections, one after the other
+            coupled = found - inverse @ (rows @ found - sums)
+            found = np.clip(coupled + beyond, lower, upper)
+            beyond += coupled - found
+            if np.abs(found - coupled).max() < _CLOSE:
+                break
+        return coupled
+
 
 def model_of_body(name: str, path: Path, inertial: Inertial, shape: CollisionShape) -> RobotModel:
     """Return the model of an object: a robot with one link.
@@ -108,7 +147,8 @@ def coupled(
 
     Raises:
         ModelError: If a joint does not exist, a leader follows its follower, a follower has
-            commands, or couplings repeat or contradict each other or leave no motion to a motor.
+            commands, or couplings repeat or contradict each other or the limits of their joints,
+            or leave no motion to a motor.
     """
     model = _with_leaders(robot, model, mimics)
     names = [joint.name for joint in model.joints]
@@ -154,9 +194,14 @@ def _check_independent(model: RobotModel) -> None:
         ("hold joints whose motors impose their velocities", rows[:, yields]),
     ):
         if np.linalg.matrix_rank(some) < len(rows):
-            raise ModelError(
-                f"its couplings {what}; Robot(couplings=...) replaces those of its file"
-            )
+            raise _contradicts(what)
+    for joint, position in zip(model.joints, model.start.tolist(), strict=True):
+        if not joint.lower - _ROUNDED <= position <= joint.upper + _ROUNDED:
+            raise _contradicts(f'allow no positions within the limits of "{joint.name}"')
+
+
+def _contradicts(what: str) -> ModelError:
+    return ModelError(f"its couplings {what}; Robot(couplings=...) replaces those of its file")
 
 
 def _with_leaders(robot: Robot, model: RobotModel, file: Mapping[str, Mimic]) -> RobotModel:

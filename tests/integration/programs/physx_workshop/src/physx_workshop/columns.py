@@ -4,7 +4,7 @@ import contextlib
 
 import numpy as np
 
-from physx_formats import Format, Notes
+from physx_formats import ArrayColumn, ExchangeError, Format, Notes
 
 _BEGIN = b"columns:"
 
@@ -19,23 +19,17 @@ def _write(tables, path, options):
     return 0
 
 
-class _Column:
-    unit = problem = ""
-
-    def __init__(self, values):
-        self._values, self.shape, self.dtype = values, values.shape, values.dtype
-
-    def read(self, start, count):
-        return self._values[start : start + count]
-
-
 @contextlib.contextmanager
 def _open(path, limit):
     with path.open() as file:
         names = file.readline().removeprefix(_BEGIN.decode()).split()
-        rows = np.loadtxt(file, ndmin=2)
+        try:
+            rows = np.loadtxt(file, ndmin=2)
+        except ValueError as error:
+            raise ExchangeError(f"{path} holds no table: {error}.") from error
     chosen = {name: [each == name for each in names] for name in names}
-    yield {name: _Column(rows[:, which]) for name, which in chosen.items()}, Notes()
+    yield {name: ArrayColumn(rows[:, which]) for name, which in chosen.items()}, Notes()
 
 
-COLUMNS = Format(_write, recognizes=lambda path, begin: begin == _BEGIN, open=_open)
+_LOSSES = ("units", "types", "notes", "records")
+COLUMNS = Format(_write, recognizes=lambda path, begin: begin == _BEGIN, open=_open, loses=_LOSSES)
