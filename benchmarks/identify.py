@@ -10,7 +10,8 @@ encoders, of both. A cell of half as many logs each: the arm with late torques a
 is off; a robot that floats, 3 s, its base measured to 1 mm and 1 mrad; the same, 1 s, of which only
 gravity acts on the base. The peer's own function, of MuJoCo's sysid, gets the least-squares
 residual and Jacobian along the true path, where only torques are noisy.
-Contact: logs of 2 s of a leg whose foot strikes the ground, of which the model knows nothing.
+Contact: logs of 2 s of a leg whose foot strikes the ground, with the noisy force of the ground,
+with flags where it touches, and without, so that the model knows nothing of it.
 Panda: seven joints, 20 s at 100 Hz, 5 % noise. Engines: logs of each engine, all fitted on
 Pinocchio. Structure: Stribeck friction that the model lacks, of several standard errors: how often
 the tests find it, beside the best test, which knows what to look for. Excitation: expected errors
@@ -41,6 +42,7 @@ from scipy.stats import norm
 sys.path.insert(0, str(Path(__file__).parents[1] / "tests" / "shared"))
 import logged_arm as arm
 import logged_flyer as flyer
+import logged_leg as leg
 import logged_oscillator as oscillator
 
 from physx_core.typing import Vector
@@ -50,7 +52,7 @@ from physx_identify.estimation.model import STRIBECK
 from physx_identify.estimation.model import Path as Motion
 from physx_identify.excitation import expected_errors
 from physx_identify.unknowns import as_unknowns
-from physx_sim import Ground, JointSettings, Robot, World
+from physx_sim import JointSettings, Robot
 
 UNKNOWN = ("mass", "damping", "friction")
 SAMPLES = 800
@@ -347,41 +349,58 @@ def structure(draws: int) -> bool:
     return claim("hidden friction of 7 standard errors", shares[7.0], at_least=0.95) and good
 
 
-LEG = Robot("acrobot", mass_factors={"upper": 0.3, "lower": 0.3})
+_STEPPING: list[tuple[Vector, Vector, Vector]] = []
 
 
-def stepping() -> tuple[Vector, Vector]:
-    """Return motion and torques of a leg whose foot strikes the ground, for 2 s."""
-    settings = {joint: JointSettings(damping=0.1, friction=0.2) for joint in arm.JOINTS}
-    leg = Robot("acrobot", joints=settings, mass_factors={"upper": 0.3, "lower": 0.36})
-    world = World([leg], ground=Ground(height=-1.85), period=arm.PERIOD, contacts="static")
-    simulation = PinocchioBackend().build(world)
-    moments = np.arange(500) * arm.PERIOD
-    elbow = 1.1 + 0.5 * np.sin(5.0 * moments) + 0.2 * np.sin(8.0 * moments)
-    targets = np.stack([0.25 * np.sin(3.8 * moments) - 0.5 * elbow, elbow], axis=1)
-    speeds = np.gradient(targets, arm.PERIOD, axis=0)
-    simulation.set_state(targets[0], speeds[0])
-    positions, torques = np.empty((2, *targets.shape))
-    for row, (target, speed) in enumerate(zip(targets, speeds, strict=True)):
-        positions[row] = simulation.positions()
-        errors = target - positions[row], speed - simulation.velocities()
-        torques[row] = np.array([90, 30]) * errors[0] + np.array([9, 2.4]) * errors[1]
-        simulation.set_commands(torques[row])
-        simulation.step(1)
-    return positions[100:], torques[100:]
+def stepping() -> tuple[Vector, Vector, Vector]:
+    """Return motion and torques of a leg whose foot strikes the ground, and its forces."""
+    if not _STEPPING:
+        _STEPPING.append(leg.stepping())
+    return _STEPPING[0]
 
 
 def told_of_leg(seed: int) -> bool:
-    """Return whether a leg's log with contacts is told by intervals that are called 95 %."""
-    return identify(arm.noisy(stepping(), correlation=0.9, seed=seed), LEG, UNKNOWN).holds
+    """Return whether a leg's log without contacts is told by intervals that are called 95 %."""
+    log = arm.noisy(stepping()[:2], correlation=0.9, seed=seed)
+    return identify(log, leg.KNOWN, UNKNOWN).holds
+
+
+def draw_of_leg(job: tuple[str, float, int]) -> tuple[list[bool], bool] | None:
+    """Return which intervals of a leg hold, and whether a test failed; None: no intervals."""
+    known, correlation, seed = job
+    make = leg.sensed if known == "forces" else leg.flagged
+    result = identify(make(stepping(), correlation=correlation, seed=seed), leg.KNOWN, UNKNOWN)
+    if not result.converged:
+        return None
+    held = [result[n].low <= true <= result[n].high for n, true in leg.HIDDEN.items()]
+    return held, bool(result.lacks)
 
 
 def contact(draws: int) -> bool:
-    """Print how often logs with contacts are refused their level."""
+    """Print how often intervals of a leg hold, and how often logs without contacts are refused."""
+    good = True
     with ProcessPoolExecutor() as pool:
         refused = 1 - float(np.mean(list(pool.map(told_of_leg, range(draws)))))
-    print(f"  logs of a leg with contacts, {draws} draws: level refused in {refused:.2f}")
-    return claim("contacts: level refused", refused, at_least=0.95)
+        print(
+            f"  logs of a leg without its contacts, {draws} draws: level refused in {refused:.2f}"
+        )
+        for row, known in enumerate(("forces", "flags")):
+            for column, correlation in enumerate(CORRELATIONS):
+                first = 1000 * (len(CORRELATIONS) * row + column)
+                jobs = [(known, correlation, first + seed) for seed in range(draws)]
+                results = [x for x in pool.map(draw_of_leg, jobs) if x is not None]
+                held = np.array([each for each, _ in results])
+                print(
+                    f"  contact {known:6} correlation {correlation:4}: {held.mean():.3f}, worst "
+                    f"parameter {held.mean(axis=0).min():.2f}, without an interval "
+                    f"{draws - len(held)}, called model error {sum(each for _, each in results)}",
+                    flush=True,
+                )
+                name = f"contact {known}, {correlation}"
+                good &= claim(f"{name}: pooled", held.mean(), at_least=0.90)
+                good &= claim(f"{name}: too wide", held.mean(), at_most=0.98)
+                good &= claim(f"{name}: worst parameter", held.mean(axis=0).min(), at_least=0.85)
+    return claim("contacts: level refused", refused, at_least=0.95) and good
 
 
 def excitation() -> bool:

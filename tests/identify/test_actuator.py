@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -131,3 +133,6 @@ def test_the_command_learns_networks_from_the_same_log(log, learned, tmp_path, c
     short = Log(JOINTS, PERIOD, log.positions[:200], log.torques[:200])
     with pytest.raises(IdentificationError, match="too few"):
         learn_actuators(learned[0], short, ROBOT)
+    touched = dataclasses.replace(short, contacts={"lower": np.zeros(len(short))})
+    with pytest.raises(IdentificationError, match="Actuator networks know nothing of contacts"):
+        learn_actuators(learned[0], touched, ROBOT)

@@ -6,7 +6,7 @@ import pytest
 from logged_arm import PERIOD, noisy
 
 from physx_identify import identify
-from physx_identify.estimation.smooth import Smoother
+from physx_identify.estimation.smooth import Smoother, white_noise
 
 
 def accelerations(positions):
@@ -46,3 +46,17 @@ def test_a_pendulum_near_its_own_frequency_is_told():
     for name, true in oscillator.HIDDEN.items():
         assert found[name].low <= true <= found[name].high
     assert found["mass bar"].error < 0.01
+
+
+def test_smoothing_does_not_reach_over_kinks():
+    time = np.arange(200) * PERIOD
+    positions = np.stack([np.abs(time - 0.5), np.sin(5 * time + 1.0)], axis=1)
+    noise = 1e-4 * np.random.default_rng(0).normal(size=positions.shape)
+    kinks = np.arange(200) == 100
+    through, around = (Smoother(positions + noise, each) for each in (None, kinks))
+    assert white_noise(positions + noise) == pytest.approx(1e-4, rel=0.2)
+    left = around(positions + noise) - positions
+    assert np.abs(left).max() < 4e-4
+    assert np.diff(left, 2, axis=0).std() < 0.1 * np.diff(noise, 2, axis=0).std()
+    kept, moved = (np.abs(each(positions) - positions)[:, 0].max() for each in (around, through))
+    assert kept < 1e-9 and moved > 1e-4

@@ -70,7 +70,7 @@ def learn_actuators(
 
     Raises:
         IdentificationError: If what was unknown of the robot is nothing that a robot can be given,
-            or the log is too short.
+            the base floats, something touches the robot, or the log is too short.
         MissingLibraryError: If `physx_torch` is not installed.
     """
     try:
@@ -82,6 +82,7 @@ def learn_actuators(
 
     model = Model(found.applied_to(robot), gravity, held)
     model.check_fixed("Actuator networks")
+    log.check_no_contacts("Actuator networks")
     path = Motion(Smoother(log.positions)(log.positions), log.period)
     needed = model.columns(path, model.numbers[:, None], path.ends)[:, :, 0]
     late = sum(each.value for each in found.estimates if each.kind == "delay")

@@ -13,14 +13,14 @@ from physx_core import checks
 from physx_core.errors import ConfigError
 from physx_core.typing import Array, Vector
 from physx_identify.engines import find_engines, refits, world_of
-from physx_identify.estimation.equations import SLOWEST, Data
+from physx_identify.estimation.equations import SLOWEST
 from physx_identify.estimation.fit import Fit, Problem
 from physx_identify.estimation.inertia import cholesky_of, from_cholesky, is_physical
 from physx_identify.estimation.model import GRAVITY, Model
 from physx_identify.estimation.profile import profile_interval
 from physx_identify.estimation.structure import structure_tests
 from physx_identify.logs.checks import check_log
-from physx_identify.logs.log import Log
+from physx_identify.logs.log import Log, data_of
 from physx_identify.result.estimates import Combination, Estimate, LogNoise
 from physx_identify.result.identification import Identification
 from physx_identify.unknowns import Parameter, Unknown, as_unknowns
@@ -50,13 +50,15 @@ def identify(
     engines: Sequence[str] = (),
     slowest: float = SLOWEST,
     flight: bool = False,
+    imu: str = "",
     seed: int = 0,
 ) -> Identification:
     """Find parameters of a robot in a log, with intervals.
 
     Args:
         log: Positions, and measured or commanded torques, of all joints.
-        robot: The robot as it is known so far; if its base floats, the log has the base's pose.
+        robot: The robot as it is known so far; if its base floats, the log has the base's pose, or
+            readings of an inertial sensor on it.
         unknowns: What to find, such as ``["mass:hand", "friction"]``; see `Unknown`.
         level: Nominal probability of the intervals.
         gravity: In m/s².
@@ -67,17 +69,20 @@ def identify(
             which of them depend on the engine.
         slowest: In rad/s or m/s. Samples at which a joint with dry friction is slower are left out,
             since their friction is unknown.
-        flight: Whether nothing but gravity acts on a floating base. Its six equations then count,
-            too, each with noise of its own, which takes many times as long.
+        flight: Whether nothing but gravity and the log's wrenches acts on a floating robot. The six
+            equations of its base then count, too, each with noise of its own, which takes many
+            times as long.
+        imu: Name of the frame on the base whose inertial sensor takes the place of the base's pose;
+            empty: there is none, or it is in the base's own frame and there is no pose.
         seed: Seed of the draws from the posterior.
 
     Raises:
         IdentificationError: If the log is bad, see `check_log`; if nothing unknown acts on the
-            robot's torques; or if there are engines, but the robot's base floats, or something is
-            unknown that no engine's robot can be given.
+            robot's torques; or if there are engines, but the robot's base floats, something touches
+            it, or something is unknown that no engine's robot can be given.
         ConfigError: If an unknown, the level, the slowest velocity or an engine is wrong; or if
             torques are those at instants, which no engine takes.
-        ComponentNotFoundError: If the robot has no link or joint of a name.
+        ComponentNotFoundError: If the robot has no link, joint or frame on its base of a name.
         PluginNotFoundError: If there is no engine of a name.
         PluginError: If the plugin of an engine is broken.
         ModelError: If the robot cannot be loaded.
@@ -88,15 +93,17 @@ def identify(
     checks.positive("slowest", slowest)
     model = Model(robot, gravity, held)
     parameters = model.parameters(as_unknowns(unknowns))
-    check_log(log, model, len(parameters))
+    if imu:
+        log = log.with_sensor_at(model.sensor_pose(imu))
+    check_log(log, model, len(parameters), flight)
     if engines:
         model.check_fixed("Refits on engines")
+        log.check_no_contacts("Refits on engines")
     if engines and instant:
         raise ConfigError("Engines hold torques from step to step: leave instant out, or engines.")
     world = world_of(robot, log.period, gravity, held)
     others = find_engines(engines, world, parameters)
-    torques = np.pad(log.torques, ((0, 0), (len(model.coordinates) - len(log.joints), 0)))
-    data = Data(log.coordinates, torques, log.period, instant, slowest, log.base, flight)
+    data = data_of(log, instant, slowest, flight)
     problem = Problem(model, parameters, data)
     found = problem.solve()
     again = problem.solve(np.array([each.nominal for each in parameters]), found.noise)

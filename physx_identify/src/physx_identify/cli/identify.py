@@ -5,7 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -49,7 +49,8 @@ class Identify:
     period: float | None = None
     """Time between samples, in s; by default from the log's column of times."""
     columns: dict[str, str] = field(default_factory=dict)
-    """Columns of positions, torques, velocities and time, where they have unusual names."""
+    """Columns of positions, torques, velocities, time or, say, force.foot, where they have unusual
+    names."""
     episode: int | None = None
     """Episode of a dataset with several."""
     topic: str | None = None
@@ -61,9 +62,15 @@ class Identify:
     """Joints that did not move and are not in the log, such as a gripper's: they are at 0."""
     floating: bool = False
     """The robot has a floating base, and the log has its pose: base_x, base_y, base_z, and base_qx,
-    base_qy, base_qz, base_qw."""
+    base_qy, base_qz, base_qw; or gyroscope_x ... and accelerometer_x ... of a sensor on it."""
+    imu: str = ""
+    """Frame on the base, such as imu_link, whose inertial sensor takes the place of the pose; by
+    default it is in the frame of the base, and used if there is no pose."""
+    axes: Literal["link", "world"] = "link"
+    """Along which axes forces on links are: force.foot_x ... and moment.foot_x ..."""
     flight: bool = False
-    """Nothing but gravity acts on the floating base, so that its equations count, too. Slow."""
+    """Nothing but gravity and the log's forces acts on the floating robot, so that the equations of
+    its base count, too. Slow."""
     instant: bool = False
     """Torques are those at the instants of the samples, instead of held from each to the next."""
     engines: tuple[str, ...] = ()
@@ -91,6 +98,7 @@ def run(words: Sequence[str]) -> None:
         episode=options.episode,
         topic=options.topic,
         floating=model.floating,
+        axes=options.axes,
     )
     found = identify(
         log,
@@ -103,6 +111,7 @@ def run(words: Sequence[str]) -> None:
         engines=options.engines,
         slowest=options.slowest,
         flight=options.flight,
+        imu=options.imu,
     )
     show(found, as_json=options.json)
     notes = []

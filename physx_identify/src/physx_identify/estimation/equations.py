@@ -3,21 +3,25 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 from functools import cached_property
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
-from physx_core.typing import Vector
-from physx_identify.estimation.base import COORDINATES, Base
+from physx_core.typing import Array, Vector
+from physx_identify.estimation.base import COORDINATES, Base, Imu
 from physx_identify.estimation.model import Model, Path
-from physx_identify.estimation.smooth import Smoother
+from physx_identify.estimation.smooth import Smoother, white_noise
 from physx_identify.unknowns import Parameter
 
 _LOWEST = 0.2
 """Share of a nominal value below which the path is not corrected with a value."""
+_BESIDE = 4
+"""Samples next to a contact at which the smoothed path is uncertain, as at the ends of a log."""
+_KINK = 3.0 * np.sqrt(20.0)
+"""Third difference of positions with contacts, in deviations of their noise, that is a kink."""
 _NEAR = 0.01
 """Share of the encoders' errors in differences that derivatives are made of."""
 _FAINT = 1e-9
@@ -31,13 +35,16 @@ class Data:
     """Measured motion and torques.
 
     Attributes:
-        positions: Shape (samples, joints), in rad or m.
-        torques: Shape (samples, joints), in N m or N.
+        positions: As in `Path`, shape (samples, coordinates).
+        torques: Shape (samples, coordinates), in N m or N.
         period: In s.
         instant: As in `Path`.
         slowest: Velocity below which dry friction is unknown, in rad/s or m/s.
-        base: Measured orientations of a floating base, whose coordinates come first.
-        flight: Whether nothing but gravity acts on a floating base, so that its forces are known.
+        base: What is known of a floating base, whose coordinates come first.
+        flight: Whether all that acts on a floating robot is known.
+        wrenches: What acts on links, shape (samples, 6), each of the period before a sample.
+        axes: Along which axes, as in `Model.wrenches`.
+        contacts: Whether anything else does, shape (samples,), in the period before a sample.
     """
 
     positions: Vector
@@ -45,8 +52,11 @@ class Data:
     period: float
     instant: bool = False
     slowest: float = SLOWEST
-    base: Base | None = None
+    base: Base | Imu | None = None
     flight: bool = False
+    wrenches: Mapping[str, Vector] = field(default_factory=dict)
+    axes: str = "link"
+    contacts: Mapping[str, Array] = field(default_factory=dict)
 
     @property
     def rows(self) -> slice:
@@ -56,6 +66,18 @@ class Data:
     def path(self, positions: Vector) -> Path:
         """Return a motion at its times."""
         return Path(positions, self.period, self.instant, self.base)
+
+    def of_steps(self, readings: Vector) -> Vector:
+        """Return those of readings that belong to the samples of a path."""
+        return readings[1:-1] if self.instant else readings[2:]
+
+    def with_readings(self, stencil: Vector, felt: Sequence[Vector]) -> Vector:
+        """Return a stencil with derivatives by wrenches, each (samples, joints, 6), at its end."""
+        if not felt:
+            return stencil
+        more = np.zeros((*stencil.shape[:3], 6 * len(felt)))
+        more[1 if self.instant else 2] = np.concatenate(felt, axis=2)
+        return np.concatenate([stencil, more], axis=3)
 
 
 @dataclass(frozen=True)
@@ -67,10 +89,11 @@ class Equation:
             parameters).
         columns: Columns of what was measured, of the same shape.
         target: Shape (samples, joints).
-        stencil: As in `Model.stencil`, along the same path as the instruments, by positions in
-            deviations of the encoders, shape (3, samples, joints, positions).
+        stencil: As in `Model.stencil`, along the same path as the instruments, by positions and
+            wrenches in deviations of the encoders, shape (3, samples, joints, readings).
         torques: Of the model along that path, of the same shape as the target.
-        doubt: By what dry friction differs if it is applied another way, shape (samples, joints).
+        doubt: By what dry friction and wrenches differ if they are applied another way, shape
+            (samples, joints).
         braking: What dry friction takes of a velocity in a step, shape (samples, coordinates).
     """
 
@@ -120,19 +143,42 @@ class Equations:
 
     @cached_property
     def smoother(self) -> Smoother:
-        """What smooths positions as much as those of the log ask for."""
-        return Smoother(self.data.positions)
+        """What smooths positions as much as those of the log ask for, but not over contacts."""
+        data = self.data
+        if not data.wrenches and not data.contacts:
+            return Smoother(data.positions)
+        touched = np.any(
+            np.stack([np.zeros(len(data.positions), bool), *data.contacts.values()]), 0
+        )
+        kinks = _around(touched, 2, 1)  # the step before a flag, and the samples around it
+        rough = np.abs(np.diff(data.positions, 3, axis=0)) > _KINK * white_noise(data.positions)
+        kinks[2:-1] |= rough.any(axis=1)
+        kinks[:-1] |= kinks[1:]
+        return Smoother(data.positions, kinks)
+
+    @cached_property
+    def struck(self) -> Array:
+        """Which torques unknown contacts enter, shape (samples - 2, coordinates)."""
+        found = np.zeros((len(self.data.positions), len(self.model.coordinates)), bool)
+        for link, on in self.data.contacts.items():
+            found |= on[:, None] & self.model.moved(link)
+        return _around(found, _BESIDE + 1, _BESIDE)[1:-1]
 
     @cached_property
     def scale(self) -> Vector:
-        """Noise of each position, shape (coordinates,), relative to the encoders'."""
-        scale = np.ones(self.data.positions.shape[1])
-        if self.data.base is not None:
-            noise = self.smoother.noise
-            encoder = max(_size(noise[6:]), _FAINT)
+        """Noise of each position, then of each wrench, relative to the encoders'."""
+        noise, base = self.smoother.noise, 0 if self.data.base is None else len(COORDINATES)
+        scale, encoder = np.ones(len(noise)), max(_size(noise[base:]), _FAINT)
+        if base:
             for part in (slice(0, 3), slice(3, 6)):
                 scale[part] = max(_size(noise[part]), _FAINT) / encoder
-        return scale
+        felt = [white_noise(each) / encoder for each in self.data.wrenches.values()]
+        return np.concatenate([scale, *felt])
+
+    def scaled(self, errors: Vector) -> Vector:
+        """Return errors of the positions, from those of all readings in deviations."""
+        found: Vector = (self.scale * errors)[:, : len(self.model.coordinates)]
+        return found
 
     def positions(self, values: Vector) -> Vector:
         """Return measured positions without the encoders' offsets."""
@@ -182,20 +228,32 @@ class Equations:
         """
         numbers = self._known + self._directions @ np.maximum(values, self._lowest)
         stencil = self.model.stencil(path, numbers)
-        dry, (doubt, braking) = None, np.zeros((2, *path.own.shape))
-        if self.dry.any() and not path.instant:  # halfway between the two ways of engines
+        dry, felt, (doubt, braking) = None, [], np.zeros((2, *path.own.shape))
+        acting = np.zeros((2, *path.own.shape))  # by wrenches: along the path, and as measured
+        if (self.dry.any() or self.data.wrenches) and not path.instant:
+            # halfway between the two ways of engines
             dry = 0.5 * (self.model.dry(path, stencil, numbers) + np.eye(path.own.shape[1]))
+        for link, wrenches in self.data.wrenches.items():
+            readings = self.data.of_steps(wrenches)
+            by_reading, slopes = self.model.wrenches(path, link, readings, self.data.axes)
+            acting += np.einsum("kij,kj->ki", by_reading, readings)
+            acting[1] += np.einsum("kij,kj->ki", slopes, raw.own - path.own)
+            stencil[1] -= slopes
+            felt.append(-by_reading)
+        if dry is not None:
             rubbing = self.model.friction(path, numbers)
-            doubt = np.einsum("kij,kj->ki", dry, rubbing) - rubbing
             yields = np.diagonal(np.linalg.inv(path.period * stencil[2]), axis1=1, axis2=2)
-            braking = np.abs(yields * rubbing)
+            impulses, braking = rubbing - acting[0], np.abs(yields * rubbing)
+            doubt = np.einsum("kij,kj->ki", dry, impulses) - impulses
+            acting = np.einsum("kij,akj->aki", dry, acting)
+            felt = [dry @ each for each in felt]
         torques = self._torques(values, whole)
         along, change = self._columns(path, raw, dry)
         instruments, known = self._split(along, stencil, torques)
-        own = known + instruments[..., self.plain] @ values[self.plain]
+        own = known - acting[0] + instruments[..., self.plain] @ values[self.plain]
         instruments = self._endogenous(instruments, own)
         columns, known = self._split(along + change, stencil, torques)
-        target = torques - known
+        target = torques - known + acting[1]
         for place, each in self._special:
             if each.kind == "gain":
                 target = target + columns[..., place]
@@ -208,7 +266,7 @@ class Equations:
             instruments[:, rows],
             columns[:, rows],
             target[:, rows],
-            self.scale * stencil[:, :, rows],
+            self.scale * self.data.with_readings(stencil, felt)[:, :, rows],
             own[:, rows],
             doubt[:, rows],
             braking,
@@ -270,3 +328,13 @@ class Equations:
 
 def _size(values: Vector) -> float:
     return float(np.sqrt(np.mean(values**2)))
+
+
+def _around(on: Array, before: int, after: int) -> Array:
+    """Return where something is on, with so many samples before and after."""
+    found = on.copy()
+    for _ in range(before):
+        found[:-1] |= found[1:]
+    for _ in range(after):
+        found[1:] |= found[:-1]
+    return found

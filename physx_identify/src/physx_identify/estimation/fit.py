@@ -132,6 +132,7 @@ class Problem:
             if moving:  # then it stays, or the sign of slow motions may never settle
                 path = dataclasses.replace(raw, positions=smoother(measured + corrections))
                 used = ~(equations.dry & _unsure(path.ends, slow))[:, equations.data.rows]
+                used &= ~equations.struck[:, equations.data.rows]
                 whole = round(equations.late(values))
                 used[: max(_EDGE, -whole)] = used[-max(_EDGE, whole) :] = False
             equation = equations.at(path, raw, values, whole)
@@ -156,10 +157,10 @@ class Problem:
             if not moving and (moved < _CLOSE).all():
                 found = dataclasses.replace(found, converged=True)
                 break
-            corrections = equations.scale * whitener.corrections(found.residual, noise)
+            corrections = equations.scaled(whitener.corrections(found.residual, noise))
             if equations.dry.any() and moving:
                 errors, left = whitener.draw(noise)
-                errors = equations.scale * (errors + whitener.corrections(left, noise))
+                errors = equations.scaled(errors + whitener.corrections(left, noise))
                 unsure = np.diff(smoother(errors), axis=0)
                 slow = np.maximum(
                     equations.data.slowest, _UNSURE * unsure.std(axis=0) / equations.data.period

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import Any
 
 import numpy as np
 import pinocchio
 
 from physx_core.errors import ComponentNotFoundError
-from physx_core.typing import Vector
+from physx_core.rotations import from_rotation_vector_rows, to_matrix_rows
+from physx_core.typing import Array, Vector
 from physx_dart.pinocchio.models import frames_of, load_model, load_stepping_model
 from physx_identify.errors import IdentificationError
-from physx_identify.estimation.base import COORDINATES, Base
+from physx_identify.estimation.base import COORDINATES, Base, Imu
 from physx_identify.estimation.inertia import TEN, UNITS, carried, ten_of
 from physx_identify.unknowns import LINKS, Parameter, Unknown
 from physx_sim import Robot, World
@@ -31,17 +34,18 @@ class Path:
     """A motion in discrete time, sampled at physics steps as the engines step them.
 
     Attributes:
-        positions: Before, at and after each sample, shape (samples + 2, coordinates), in rad or m.
+        positions: Before, at and after each sample, shape (samples + 2, coordinates), in rad or m;
+            of a floating base with an inertial sensor, that sensor's readings.
         period: In s.
         instant: Whether torques are those at the instants of the samples, instead of held from each
             sample to the next.
-        base: Measured orientations of a floating base, whose coordinates come before the joints'.
+        base: What is known of a floating base, whose coordinates come before the joints'.
     """
 
     positions: Vector
     period: float
     instant: bool = False
-    base: Base | None = None
+    base: Base | Imu | None = None
 
     @property
     def own(self) -> Vector:
@@ -53,27 +57,44 @@ class Path:
         """Positions as Pinocchio takes them, with quaternions, shape (samples, numbers)."""
         if self.base is None:
             return self.own
+        if isinstance(self.base, Imu):
+            upright = np.tile([0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0], (len(self.own), 1))
+            return np.concatenate([upright, self.own[:, 6:]], axis=1)
         turned = self.base.turned(self.positions[:, 3:6])[1:-1]
         return np.concatenate([self.own[:, :3], turned, self.own[:, 6:]], axis=1)
 
     @property
     def velocities(self) -> Vector:
         """Velocities that centrifugal torques depend on, shape (samples, joints)."""
-        if self.instant:
-            return (self.positions[2:] - self.positions[:-2]) / (2 * self.period)
-        return (self.positions[1:-1] - self.positions[:-2]) / self.period
+        return self._motion[0]
 
     @property
     def ends(self) -> Vector:
         """Velocities that resistance depends on: of an engine, those at the end of the step."""
-        return (
-            self.velocities if self.instant else np.diff(self.positions[1:], axis=0) / self.period
-        )
+        return self._motion[1]
 
     @property
     def accelerations(self) -> Vector:
         """Shape (samples, joints)."""
-        return np.diff(self.positions, 2, axis=0) / self.period**2
+        return self._motion[2]
+
+    @property
+    def readings(self) -> Vector:
+        """Those of an inertial sensor around each sample, shape (3, samples, 6)."""
+        base = self.positions[:, :6]
+        return np.stack([base[:-2], base[1:-1], base[2:]])
+
+    @cached_property
+    def _motion(self) -> tuple[Vector, Vector, Vector]:
+        q, h = self.positions, self.period
+        velocities = (q[2:] - q[:-2]) / (2 * h) if self.instant else (q[1:-1] - q[:-2]) / h
+        ends = velocities.copy() if self.instant else np.diff(q[1:], axis=0) / h
+        found = velocities, ends, np.diff(q, 2, axis=0) / h**2
+        if isinstance(self.base, Imu):
+            motion = self.base.motion(self.readings, h, self.instant)
+            for each, own in zip(found, motion, strict=True):
+                each[:, :6] = own
+        return found
 
 
 class Model:
@@ -89,6 +110,7 @@ class Model:
         joints: Names of its joints.
         coordinates: Names of what its torques belong to: those of a floating base, and the joints.
         numbers: All numbers as in its file and settings, shape (14 * coordinates,).
+        gravity: In m/s².
     """
 
     def __init__(
@@ -110,8 +132,8 @@ class Model:
             IdentificationError: If it has no joints, or joints follow others, are coupled, or have
                 springs.
         """
-        self.robot = robot
-        world = World(robots=[robot], gravity=tuple(gravity))
+        self.robot, self.gravity = robot, tuple(gravity)
+        world = World(robots=[robot], gravity=self.gravity)
         self.movable = _with_held(read_parts(world).movables[0], held)
         joints = self.movable.model.joints
         self._check(robot, self.movable)
@@ -122,6 +144,8 @@ class Model:
         count, base = len(self.coordinates), len(self.coordinates) - len(joints)
         load = load_stepping_model if self.floating else load_model
         self._pin = load(self.movable, world.gravity, armature=np.zeros(count))
+        self._weightless = self._pin.copy()
+        self._weightless.gravity.setZero()
         self._data = self._pin.createData()
         bodies = [
             ten_of(each.mass, each.lever, each.inertia) if each.mass else np.zeros(10)
@@ -267,7 +291,7 @@ class Model:
         found = np.zeros((len(q), count, directions.shape[1]))
         bodies = np.ascontiguousarray(directions[10 * self._empty : 10 * count])
         if bodies.any():
-            regress, model, data = pinocchio.computeJointTorqueRegressor, self._pin, self._data
+            regress, model, data = pinocchio.computeJointTorqueRegressor, self._of(path), self._data
             own = np.empty((len(q), count, len(bodies)))
             for place, (q_k, v_k, a_k) in enumerate(zip(q, v, a, strict=True)):
                 own[place] = regress(model, data, q_k, v_k, a_k)
@@ -305,6 +329,9 @@ class Model:
         count = len(self.coordinates)
         damping = path.period * np.diag(numbers[10 * count : 11 * count])
         damped = path.period**2 * stencil[2]
+        if isinstance(path.base, Imu):  # readings are no positions
+            _, of_a = path.base.slopes(path.readings, path.period, path.instant)
+            damped[..., :6] = stencil[2][..., :6] @ np.linalg.inv(of_a[2])
         return np.linalg.solve(damped - damping, damped).swapaxes(1, 2)
 
     def stencil(self, path: Path, numbers: Vector) -> Vector:
@@ -314,7 +341,7 @@ class Model:
             By the position before, its own and after, shape (3, samples, joints, joints).
         """
         count, h = len(self.coordinates), path.period
-        model = self._pin.copy()
+        model = self._of(path).copy()
         for joint, ten in enumerate(numbers[10 * self._empty : 10 * count].reshape(-1, 10), 1):
             inertia = pinocchio.Inertia
             empty = not ten[0]  # as the part of a floating base that only translates
@@ -330,10 +357,97 @@ class Model:
         second = (mass + armature) / h**2
         if path.instant:
             first = (by_v + damping) / (2 * h)
-            return np.stack([second - first, by_q - 2 * second, second + first])
-        return np.stack([
-            second - by_v / h, by_q + (by_v - damping) / h - 2 * second, second + damping / h
-        ])  # fmt: skip
+            found = np.stack([second - first, by_q - 2 * second, second + first])
+        else:
+            before, after = second - by_v / h, second + damping / h
+            found = np.stack([before, by_q + (by_v - damping) / h - 2 * second, after])
+        if isinstance(path.base, Imu):
+            of_v, of_a = path.base.slopes(path.readings, h, path.instant)
+            found[..., :6] = by_v[..., :6] @ of_v + mass[..., :6] @ of_a
+        return found
+
+    def _of(self, path: Path) -> Any:
+        """Return Pinocchio's model for a path: specific forces have gravity in them."""
+        return self._weightless if isinstance(path.base, Imu) else self._pin
+
+    def sensor_pose(self, frame: str) -> Vector:
+        """Return the pose of a frame in a floating base, a homogeneous matrix of shape (4, 4).
+
+        Raises:
+            ComponentNotFoundError: If no frame that is fixed to the base has this name.
+        """
+        frames = zip(self.movable.model.links, frames_of(self.movable), strict=True)
+        fixed = {name: self._pin.frames[place] for name, place in frames}
+        root = next(iter(fixed.values())).parentJoint
+        fixed = {name: each for name, each in fixed.items() if each.parentJoint == root}
+        if frame not in fixed:
+            where = f'The base of robot "{self.robot.name}"'
+            raise ComponentNotFoundError("frame", frame, where, list(fixed))
+        found: Vector = fixed[frame].placement.homogeneous
+        return found
+
+    # Contacts -------------------------------------------------------------------------------
+
+    def moved(self, link: str) -> Array:
+        """Return which coordinates move a link, shape (coordinates,).
+
+        Raises:
+            ComponentNotFoundError: If there is no link of a name.
+        """
+        links = self.movable.model.links
+        if link not in links:
+            raise ComponentNotFoundError("link", link, f'Robot "{self.robot.name}"', links)
+        joint = self._pin.frames[frames_of(self.movable)[links.index(link)]].parentJoint
+        found = np.zeros(len(self.coordinates), bool)
+        for each in list(self._pin.supports[joint])[1:]:
+            first = self._pin.idx_vs[each]
+            found[first : first + self._pin.nvs[each]] = True
+        return found
+
+    def wrenches(self, path: Path, link: str, readings: Vector, axes: str) -> tuple[Vector, Vector]:
+        """Return what wrenches on a link add to the torques along a path.
+
+        Args:
+            path: The motion.
+            link: The link, at whose origin they act.
+            readings: Forces in N and moments in N m of each step, shape (samples, 6).
+            axes: Whether they are along the axes of the ``"world"``, or of the ``"link"`` where a
+                step ends.
+
+        Returns:
+            Torques by the readings, shape (samples, coordinates, 6); and derivatives of the torques
+            by the positions, shape (samples, coordinates, coordinates).
+        """
+        place = frames_of(self.movable)[self.movable.model.links.index(link)]
+        count, data = len(self.coordinates), self._data
+        twists, turns = np.empty((len(path.own), 6, count)), np.empty((len(path.own), 3, 3))
+        local = pinocchio.ReferenceFrame.LOCAL
+        for row, q in enumerate(path.configurations):
+            pinocchio.computeJointJacobians(self._pin, data, q)
+            turns[row] = pinocchio.updateFramePlacement(self._pin, data, place).rotation.T
+            own = pinocchio.getFrameJacobian(self._pin, data, place, local)
+            twists[row] = own.reshape(6, count)
+        if axes == "link":
+            turning = np.einsum("kij,kj->ki", twists[:, 3:], path.period * path.ends)
+            turns = to_matrix_rows(from_rotation_vector_rows((not path.instant) * turning))
+        linear, angular = twists[:, :3].swapaxes(1, 2), twists[:, 3:].swapaxes(1, 2)
+        force, moment = (
+            np.einsum("kij,kj->ki", turns, each)[:, None] for each in np.split(readings, 2, axis=1)
+        )
+        # The twist by a nearer joint is turned by a farther one.
+        near = linear[:, :, None], angular[:, :, None]
+        far = linear[:, None], angular[:, None]
+        moved = np.cross(near[1], far[0]) + np.cross(near[0], far[1])
+        joint = np.repeat(np.arange(self._pin.njoints), self._pin.nvs)
+        slopes = np.einsum("kijd,kld->kij", moved, force)
+        slopes += np.einsum("kijd,kld->kij", np.cross(near[1], far[1]), moment)
+        slopes *= joint[:, None] < joint
+        if axes == "world":
+            slopes += linear @ np.cross(force, angular).swapaxes(1, 2)
+            slopes += angular @ np.cross(moment, angular).swapaxes(1, 2)
+        if isinstance(path.base, Imu):
+            slopes[..., :6] = 0.0  # by readings
+        return np.concatenate([linear @ turns, angular @ turns], axis=2), slopes
 
 
 def _with_held(movable: MovableBody, held: Sequence[str]) -> MovableBody:

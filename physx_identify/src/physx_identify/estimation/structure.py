@@ -130,11 +130,13 @@ def _probability(found: Values) -> float:
 
 def _whiteness(found: Fit) -> float:
     """Return the probability of the correlations of the whitened residual with itself."""
-    count, joints = found.used.shape
-    white = found.white[: count * joints].reshape(count, joints)
-    power = np.mean(white**2, axis=0)
+    used = found.used
+    white = np.where(used, found.white[: used.size].reshape(used.shape), 0.0)
+    count = used.sum(axis=0)
+    power = np.sum(white**2, axis=0) / count
     value = 0.0
     for lag in range(1, _LAGS + 1):
-        correlation = np.sum(white[lag:] * white[:-lag], axis=0) / power / count
-        value += float(count * (count + 2) / (count - lag) * np.sum(correlation**2))
-    return float(chi2.sf(value, _LAGS * joints - found.noise.regression.size))
+        pairs = np.maximum(np.sum(used[lag:] & used[:-lag], axis=0), 1)
+        correlation = np.sum(white[lag:] * white[:-lag], axis=0) / power
+        value += float(np.sum((count + 2) / count * correlation**2 / pairs))
+    return float(chi2.sf(value, _LAGS * used.shape[1] - found.noise.regression.size))

@@ -7,11 +7,13 @@ import itertools
 import numpy as np
 
 from physx_core.errors import listed
+from physx_core.rotations import from_rotation_vector_rows, multiply, rotate_rows
 from physx_core.typing import Vector
 from physx_identify.errors import IdentificationError
-from physx_identify.estimation.model import Model, Path
+from physx_identify.estimation.base import Base, Imu
+from physx_identify.estimation.model import Model
 from physx_identify.estimation.smooth import Smoother
-from physx_identify.logs.log import Log
+from physx_identify.logs.log import Log, data_of
 
 _LEAST = 50
 _LEAST_PER_PARAMETER = 10
@@ -30,27 +32,46 @@ _TURN, _LEAP = 0.2, 0.02
 _CLEAR, _UNLIKE = 0.2, 0.02
 """Share of what is unlike the model, and least of it, that shows that torques are exchanged."""
 _SHOWN_SIGN = -0.5
+_IN_G = 0.3
+"""Largest difference from 1 of a specific force in g, of a robot that does not fall."""
+_SPREAD = 0.01
+"""Least share of the specific force that changes in the world, to blame the gyroscope for it."""
+_TURNS = {
+    1.0: "",
+    -1.0: "angular velocities have the opposite sign.",
+    np.pi / 180: "angular velocities are in deg/s. Convert them to rad/s.",
+    180 / np.pi: "angular velocities in rad/s were taken for deg/s. Convert them to rad/s.",
+}
+"""Factors of wrong angular velocities, and what is wrong."""
+_TOO_LARGE_FORCE = 3.0
 _FAMILIAR = {180 / np.pi: "degrees", np.pi / 180: "radians taken for degrees", 1e3: "mm or ms"}
 
 
-def check_log(log: Log, model: Model, parameters: int = 1) -> None:
+def check_log(log: Log, model: Model, parameters: int = 1, flight: bool = False) -> None:
     """Check that a log can be of a robot.
 
     Args:
         log: The log.
         model: The robot.
         parameters: Number of unknowns.
+        flight: Whether a floating base may fall freely.
 
     Raises:
         IdentificationError: If joints are missing, unknown or in another order; it is too short; a
             joint does not move; positions are beyond the joint's limits, repeat or have jumps;
             velocities are not those of the positions; or torques are cut off, constant, in another
             unit, order or sign than the robot's; or there is no pose of a floating base, one of a
-            fixed base, or one that jumps.
+            fixed base, or one that jumps; or the readings of its inertial sensor are in another
+            unit or of another sign, or lack gravity; or wrenches have another unit or sign, act on
+            a link that does not move, or are along unknown axes; or contacts leave too few samples.
+        ComponentNotFoundError: If wrenches or contacts are of a link that the robot has not.
     """
     _check_base(log, model)
     _check_joints(log, model)
     _check_length(log, parameters)
+    if log.gyroscope is not None and log.base_positions is None:
+        _check_sensor(log, model, flight)
+    _check_links(log, model, parameters)
     _check_positions(log, model)
     if log.velocities is not None:
         _check_velocities(log, log.velocities)
@@ -78,13 +99,14 @@ def _check_base(log: Log, model: Model) -> None:
     if model.floating is not (log.base is not None):
         what = (
             f'robot "{model.robot.name}" floats, but there is no pose of its base (base_x ... '
-            "base_qw). If it hangs or stands, pass Robot(..., fixed_base=True)"
+            "base_qw) and no inertial sensor on it. If it hangs or stands, pass Robot(..., "
+            "fixed_base=True)"
             if model.floating
             else "there is a pose of the base, but the robot's is fixed. If it moves, pass "
             "Robot(..., fixed_base=False) (--floating)"
         )
         raise IdentificationError(f"{log.source}: {what}.")
-    if log.base is None:
+    if not isinstance(log.base, Base):
         return
     for what, values, most in (
         ("turns by", np.diff(log.base.angles, axis=0), _TURN),
@@ -189,11 +211,8 @@ def _check_torques(log: Log, model: Model) -> None:
                     f"{where} are {end:.4g} in {100 * share:.0f} % of the samples: cut off by a "
                     "limit, so the true ones are unknown. Cut the log there, or move less."
                 )
-    path = Smoother(log.coordinates)(log.coordinates)
-    motion = Path(path, log.period, base=log.base)
-    expected = model.columns(motion, model.numbers[:, None], motion.ends)[..., 0][5:-5]
-    expected = expected[:, -len(log.joints) :]
-    torques = Smoother(log.torques)(log.torques)[1:-1][5:-5]
+    torques, expected, acting = _compared(log, model)
+    expected = expected - sum(acting.values())
     alike = _correlations(torques, expected)
     _check_order(log, alike)
     ratios = np.std(torques, axis=0) / np.maximum(np.std(expected, axis=0), 1e-9)
@@ -204,6 +223,118 @@ def _check_torques(log: Log, model: Model) -> None:
             f"{log.source}: torques are {ratio:.3g} times those of the robot as it is known. Are "
             "they in another unit (N mm, A), or at the other side of the gear? Convert them to N m."
         )
+
+
+def _compared(log: Log, model: Model) -> tuple[Vector, Vector, dict[str, Vector]]:
+    """Return torques of the joints, smoothed, where nothing unknown touches the robot.
+
+    Returns:
+        As logged; those of the model's motion; and those of each link's wrench.
+    """
+    data = data_of(log)
+    path = data.path(Smoother(data.positions)(data.positions))
+    smooth = Smoother(log.torques)
+    moves = model.columns(path, model.numbers[:, None], path.ends)[..., 0]
+    given = {link: data.of_steps(each) for link, each in data.wrenches.items()}
+    acting = {
+        link: np.einsum("kij,kj->ki", model.wrenches(path, link, each, data.axes)[0], each)
+        for link, each in given.items()
+    }
+    kept = np.ones(len(path.own), bool)
+    for each in data.contacts.values():
+        kept &= data.of_steps(each) == 0
+    kept[:5] = kept[-5:] = False
+    joints = slice(-len(log.joints), None)
+    of_wrenches = {link: each[kept, joints] for link, each in acting.items()}
+    return smooth(log.torques)[1:-1][kept], moves[kept, joints], of_wrenches
+
+
+def _check_sensor(log: Log, model: Model, flight: bool) -> None:
+    """Check that the base turns as its specific force does."""
+    assert log.gyroscope is not None
+    assert log.accelerometer is not None
+    weight, source = float(np.linalg.norm(model.gravity)), log.source
+    felt = float(np.median(np.linalg.norm(log.accelerometer, axis=1)))
+    if weight and not flight and abs(felt - 1.0) < _IN_G and weight > 2.0:
+        raise IdentificationError(
+            f"{source}: the accelerometer reads {felt:.3g} m/s². Is it in g? Then say so: a unit "
+            "in the file, as in  accelerometer_x [g]."
+        )
+    if not flight and felt < 0.5 * weight:
+        raise IdentificationError(
+            f"{source}: the accelerometer reads {felt:.3g} m/s², so gravity is missing: at rest, "
+            f"it is {weight:.3g} upwards. If the robot falls freely, pass flight (--flight)."
+        )
+    spread = {factor: _spread(log, factor) for factor in _TURNS}
+    best = min(spread, key=lambda factor: spread[factor])
+    if spread[best] < _CLEAR * spread[1.0] and spread[1.0] > _SPREAD:
+        raise IdentificationError(
+            f"{source}: specific force and angular velocity of the base do not belong together: "
+            f"{_TURNS[best]}"
+        )
+
+
+def _spread(log: Log, factor: float) -> float:
+    """Return how much of the specific force is not constant in the world for a second.
+
+    Args:
+        log: The log.
+        factor: What angular velocities are multiplied by.
+    """
+    assert log.gyroscope is not None
+    assert log.accelerometer is not None
+    count = max(int(1.0 / log.period), 10)
+    left, whole = 0.0, 0.0
+    for first in range(0, len(log) - count + 1, count):
+        turns, part = [(0.0, 0.0, 0.0, 1.0)], slice(first, first + count)
+        for step in from_rotation_vector_rows(factor * log.period * log.gyroscope[part]).tolist():
+            turns.append(multiply(turns[-1], step))
+        force = rotate_rows(np.array(turns[1:]), log.accelerometer[part])
+        left += float(np.sum((force - force.mean(axis=0)) ** 2))
+        whole += float(np.sum(force**2))
+    return left / whole if whole else 0.0
+
+
+def _check_links(log: Log, model: Model, parameters: int) -> None:
+    struck = np.zeros((len(log), len(model.coordinates)), bool)
+    for link, on in log.contacts.items():
+        struck |= (on != 0)[:, None] & model.moved(link)
+    left = int(np.sum(~struck.all(axis=1)))
+    least = max(_LEAST, _LEAST_PER_PARAMETER * parameters)
+    if log.contacts and left < least:
+        raise IdentificationError(
+            f"{log.source}: contacts of {listed(log.contacts)} leave {left} samples; {parameters} "
+            f"unknowns need at least {least}."
+        )
+    for link in log.wrenches:
+        if not model.moved(link).any():
+            raise IdentificationError(
+                f"{log.source}: no joint moves {link}, so its wrench says nothing. Leave it out."
+            )
+    if log.wrenches and log.axes == "world" and isinstance(log.base, Imu):
+        raise IdentificationError(
+            f"{log.source}: an inertial sensor does not tell the axes of the world. Give wrenches "
+            "along those of their links (--axes link)."
+        )
+    if not log.wrenches:
+        return
+    torques, moves, acting = _compared(log, model)
+    missing = moves - torques  # what wrenches should be
+    for link, own in acting.items():
+        others = missing - sum(each for name, each in acting.items() if name != link)
+        size = float(np.sum(own**2))
+        share = float(np.sum(own * others)) / size if size else 1.0
+        clear = abs(share) * np.sqrt(size) > _WELL * np.linalg.norm(others)
+        if clear and share < 0:
+            raise IdentificationError(
+                f"{log.source}: the force on {link} has the opposite sign of what moves the robot "
+                "there. It must be the one on the robot, not of it."
+            )
+        if clear and not 1 / _TOO_LARGE_FORCE < share < _TOO_LARGE_FORCE:
+            raise IdentificationError(
+                f"{log.source}: the force on {link} is {1 / share:.3g} times what moves the robot "
+                "there. Is it in another unit (kN, kg)? Convert it to N, moments to N m."
+            )
 
 
 def _check_order(log: Log, alike: Vector) -> None:
