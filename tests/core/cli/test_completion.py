@@ -55,6 +55,7 @@ def complete(request, capsys):
     return propose
 
 
+KINDS = ["backend", "environment", "format", "launcher", "network", "plugin", "visualizer"]
 FORMATS = ["npz", "parquet", "csv", "safetensors", "vtkhdf", "minari", "lerobot", "zarr"]
 FORMATS += ["hdf5-single"]
 
@@ -92,7 +93,7 @@ def after(capsys):
     ("words", "found"),
     [
         ("completion", ["bash", "zsh"]),
-        ("new", ["backend", "environment", "format", "launcher", "network", "plugin", "visualizer"]),
+        ("new", KINDS),
         ("export --to", FORMATS),
         ("export --to =", FORMATS),
         ("train --on-nan", ["stop", "continue"]),
