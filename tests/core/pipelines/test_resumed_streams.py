@@ -60,8 +60,20 @@ def stored(name):
         }
 
 
-def interrupt(*_):
-    raise KeyboardInterrupt
+def ended_early(pipeline, monkeypatch, *, killed):
+    """End the run of "stopped" in its first step, as an interrupt or as a kill leaves it."""
+
+    def step(_):
+        if killed:
+            shutil.copytree("sessions/stopped", "killed")
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
+        patch.setattr(resolve("environment", RIVER), "step", step)
+        pipeline.execute()
+    if killed:
+        shutil.rmtree("sessions/stopped", ignore_errors=True)
+        shutil.move("killed", "sessions/stopped")
 
 
 def interrupted(pipeline, after):
@@ -93,15 +105,15 @@ def test_a_resumed_generation_has_the_same_rows(run, every, places, nothing_stay
 
 
 @pytest.mark.parametrize("what", ["generation", "training"])
-@pytest.mark.parametrize("resume", [True, False])
-def test_parameters_saved_by_a_run_without_rows_do_not_count(run, what, resume, monkeypatch):
+@pytest.mark.parametrize(("killed", "resume"), [(True, True), (True, False), (False, False)])
+def test_parameters_saved_by_a_run_without_rows_do_not_count(
+    run, what, killed, resume, monkeypatch
+):
     """The environment counts its runs with `save_parameters`, before its first row."""
     environment, make = run.streams(LOCAL), getattr(run, what)
     make("whole", environment).execute()
     for resumed in (False, resume, False):
-        with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-            patch.setattr(resolve("environment", RIVER), "step", interrupt)
-            make("stopped", environment, resume=resumed).execute()
+        ended_early(make("stopped", environment, resume=resumed), monkeypatch, killed=killed)
     make("stopped", environment, resume=resume).execute()
     assert stored("stopped") == stored("whole")
 
@@ -112,9 +124,7 @@ def test_a_run_without_rows_between_others_changes_nothing(run, every, between, 
     environment = run.streams(LOCAL, state_every=every)
     run.generation("whole", environment).execute()
     interrupted(run.generation("stopped", environment), 4)
-    with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(resolve("environment", RIVER), "step", interrupt)
-        getattr(run, between)("stopped", environment).execute()
+    ended_early(getattr(run, between)("stopped", environment), monkeypatch, killed=True)
     run.generation("stopped", environment, resume=True).execute()
     assert stored("stopped") == stored("whole")
 

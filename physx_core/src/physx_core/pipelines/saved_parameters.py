@@ -58,11 +58,21 @@ def keep_parameters(directory: Path, streams: str) -> None:
         directory: The dataset's folder.
         streams: Name of the streams: `Generation.name`.
     """
-    if (directory / BEGUN).exists():
-        _copy(directory, directory, _OF_STREAMS, _BEGUN)
+    drop_parameters(directory)
     _copy(directory, directory, _OF_STREAMS, become=_BEGUN)
     with files.storing(f"{directory}"):
         files.replace(directory / BEGUN, streams.encode())
+
+
+def drop_parameters(directory: Path) -> None:
+    """Restore the parameters with which streams began that were never described, if any.
+
+    Args:
+        directory: The dataset's folder.
+    """
+    if (directory / BEGUN).exists():
+        _copy(directory, directory, _OF_STREAMS, _BEGUN)
+        forget_parameters(directory)
 
 
 def accept_parameters(directory: Path, entry: str) -> None:
@@ -91,20 +101,6 @@ def restore_parameters(directory: Path, entry: str, streams: str) -> None:
         accept_parameters(directory, entry)
     _copy(directory, directory, _OF_STREAMS, f".{entry}")
     forget_parameters(directory)
-
-
-def end_without_rows(directory: Path) -> None:
-    """Remove the backup of streams that end without rows, unless they have saved something."""
-    with files.storing(f"{directory}"):
-        now, before = (
-            {
-                path.name.removesuffix(end): files.read_content(path, LARGEST_PARAMETERS)
-                for path in directory.glob(_OF_STREAMS + end)
-            }
-            for end in ("", _BEGUN)
-        )
-    if now == before:
-        forget_parameters(directory)
 
 
 def forget_parameters(directory: Path) -> None:

@@ -12,7 +12,7 @@ from physx_core.components.hand import HAND
 from physx_core.config import EnvironmentConfig
 from physx_core.dataset import Dataset
 from physx_core.pipelines.generation import Generation
-from physx_core.pipelines.saved_parameters import end_without_rows
+from physx_core.pipelines.saved_parameters import drop_parameters
 from physx_core.pipelines.services import Touch
 from physx_core.pipelines.storage import STREAMS, describe_environment, last_steps
 from physx_core.session import Session
@@ -138,7 +138,7 @@ class StoredStreams(Closeable):
         self._files.keep(source.take_pasts() or {})
 
     def close(self) -> None:
-        """Write the last states, once the dataset is closed."""
-        self._files.close()
+        """Write the last states, once the dataset is closed; without rows, leave nothing behind."""
         if self._new is not None:
-            end_without_rows(self._dataset.directory)
+            drop_parameters(self._dataset.directory)
+        self._files.close()
