@@ -66,7 +66,8 @@ def identify(
         engines: Names of engines on which the values are fitted anew, such as ``"mujoco"``, to show
             which of them depend on the engine.
         slowest: In rad/s or m/s. Samples at which a joint with dry friction is slower are left out,
-            since their friction is unknown.
+            since their friction is unknown, and so are, in any case, the last two steps before a
+            joint stops.
         flight: Whether nothing but gravity acts on a floating base. Its six equations then count,
             too, each with noise of its own, which takes many times as long.
         seed: Seed of the draws from the posterior.

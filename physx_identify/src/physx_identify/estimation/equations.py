@@ -71,7 +71,6 @@ class Equation:
             deviations of the encoders, shape (3, samples, joints, positions).
         torques: Of the model along that path, of the same shape as the target.
         doubt: By what dry friction differs if it is applied another way, shape (samples, joints).
-        braking: What dry friction takes of a velocity in a step, shape (samples, coordinates).
     """
 
     instruments: Vector
@@ -80,7 +79,6 @@ class Equation:
     stencil: Vector
     torques: Vector
     doubt: Vector
-    braking: Vector
 
 
 class Equations:
@@ -182,13 +180,11 @@ class Equations:
         """
         numbers = self._known + self._directions @ np.maximum(values, self._lowest)
         stencil = self.model.stencil(path, numbers)
-        dry, (doubt, braking) = None, np.zeros((2, *path.own.shape))
+        dry, doubt = None, np.zeros(path.own.shape)
         if self.dry.any() and not path.instant:  # halfway between the two ways of engines
             dry = 0.5 * (self.model.dry(path, stencil, numbers) + np.eye(path.own.shape[1]))
             rubbing = self.model.friction(path, numbers)
             doubt = np.einsum("kij,kj->ki", dry, rubbing) - rubbing
-            yields = np.diagonal(np.linalg.inv(path.period * stencil[2]), axis1=1, axis2=2)
-            braking = np.abs(yields * rubbing)
         torques = self._torques(values, whole)
         along, change = self._columns(path, raw, dry)
         instruments, known = self._split(along, stencil, torques)
@@ -211,7 +207,6 @@ class Equations:
             self.scale * stencil[:, :, rows],
             own[:, rows],
             doubt[:, rows],
-            braking,
         )
 
     def _columns(self, path: Path, raw: Path, dry: Vector | None) -> tuple[Vector, Vector]:
