@@ -1,7 +1,7 @@
 """Intervals of `physx identify`: do they hold, and does it say when they do not?
 
     python benchmarks/identify.py [--check] [--draws 200] [coverage] [contact] [panda] [engines]
-                                  [structure] [excitation]
+                                  [standstill] [structure] [excitation]
 
 Coverage: the share of nominal 95 % intervals that hold the true value, of logs of 4 s at 200 Hz: a
 pendulum that swings about its rest, three parameters; an arm of two links that tracks a motion,
@@ -13,9 +13,11 @@ residual and Jacobian along the true path, where only torques are noisy.
 Contact: logs of 2 s of a leg whose foot strikes the ground, with the noisy force of the ground,
 with flags where it touches, and without, so that the model knows nothing of it.
 Panda: seven joints, 20 s at 100 Hz, 5 % noise. Engines: logs of each engine, all fitted on
-Pinocchio. Structure: Stribeck friction that the model lacks, of several standard errors: how often
-the tests find it, beside the best test, which knows what to look for. Excitation: expected errors
-of the proposed motion relative to a sweep in frequency of equal length and reach.
+Pinocchio. Standstill: logs of MuJoCo, in which strong dry friction fades as a joint stops, with
+little noise: how often they get their level, and whether their intervals then hold. Structure:
+Stribeck friction that the model lacks, of several standard errors: how often the tests find it,
+beside the best test, which knows what to look for. Excitation: expected errors of the proposed
+motion relative to a sweep in frequency of equal length and reach.
 """
 
 from __future__ import annotations
@@ -52,6 +54,7 @@ from physx_identify.estimation.model import STRIBECK
 from physx_identify.estimation.model import Path as Motion
 from physx_identify.excitation import expected_errors
 from physx_identify.unknowns import as_unknowns
+from physx_mujoco import MujocoBackend
 from physx_sim import JointSettings, Robot
 
 UNKNOWN = ("mass", "damping", "friction")
@@ -306,6 +309,43 @@ def engines() -> bool:
     return claim("told or called model error", float(good), at_least=1)
 
 
+STRONG = {
+    "shoulder": JointSettings(damping=0.5, friction=0.8),
+    "elbow": JointSettings(damping=0.2, friction=0.3),
+}
+
+
+@cache
+def stopped() -> tuple[Vector, Vector]:
+    """Return motion and torques of an arm with strong dry friction, in MuJoCo."""
+    robot = Robot("double_pendulum", joints=STRONG, mass_factors={"lower": 1.2})
+    motion: tuple[Vector, Vector] = arm.simulated(robot, SAMPLES, MujocoBackend)
+    return motion
+
+
+def leveled(job: tuple[float, int]) -> list[bool] | None:
+    """Return which intervals of dry friction hold in a log; None: it does not get its level."""
+    result = identify(arm.noisy(stopped(), torque=job[0], seed=job[1]), arm.KNOWN, UNKNOWN)
+    if not result.holds:
+        return None
+    found = {name: result[f"friction {name}"] for name in STRONG}
+    return [found[name].low <= STRONG[name].friction <= found[name].high for name in STRONG]
+
+
+def standstill(draws: int) -> bool:
+    """Print how often logs of joints that MuJoCo's dry friction stops get their level."""
+    jobs = [(noise, 1000 + seed) for noise in (0.01, 0.005) for seed in range(draws // 2)]
+    with ProcessPoolExecutor() as pool:
+        results = [each for each in pool.map(leveled, jobs, chunksize=4) if each is not None]
+    held = float(np.mean(results))
+    print(
+        f"  logs of MuJoCo with strong dry friction: {len(results)} of {len(jobs)} get their "
+        f"level; {held:.3f} of the intervals of friction hold"
+    )
+    good = claim("strong dry friction: level", len(results) / len(jobs), at_least=0.9)
+    return claim("strong dry friction: intervals that hold", held, at_least=0.9) and good
+
+
 def rubbing(newton_meters: float, seed: int) -> Log:
     """Return a log with Stribeck friction of the shoulder, which the model lacks."""
     positions, torques = clean()
@@ -426,6 +466,7 @@ def main(words: list[str]) -> None:
         "contact": lambda: contact(min(draws, 40)),
         "panda": panda,
         "engines": engines,
+        "standstill": lambda: standstill(min(draws, 60)),
         "structure": lambda: structure(min(draws, 40)),
         "excitation": excitation,
     }

@@ -68,7 +68,8 @@ def identify(
         engines: Names of engines on which the values are fitted anew, such as ``"mujoco"``, to show
             which of them depend on the engine.
         slowest: In rad/s or m/s. Samples at which a joint with dry friction is slower are left out,
-            since their friction is unknown.
+            since their friction is unknown, and so are, in any case, the last two steps before a
+            joint stops.
         flight: Whether nothing but gravity and the log's wrenches acts on a floating robot. The six
             equations of its base then count, too, each with noise of its own, which takes many
             times as long.

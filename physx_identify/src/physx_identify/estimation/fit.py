@@ -39,9 +39,9 @@ _EDGE = 4
 """Samples left out at both ends, where the smoothed path is uncertain."""
 _SEPARABLE = 1e-6
 """Relative length of what is left of a column without the others, below which it is one of them."""
-_UNSURE, _BRAKED = 2.0, 2.0
-"""Velocity below which dry friction is unknown: in standard errors; in what dry friction takes of
-it in a step, as engines may stop a joint over several steps."""
+_UNSURE, _STOPPING = 2.0, 2.0
+"""Where dry friction is unknown: velocity in standard errors; steps before a joint stops, in which
+engines may let it fade."""
 
 
 @dataclass(frozen=True)
@@ -131,7 +131,7 @@ class Problem:
             moving = step <= _PATH_STEPS or (not settled and step <= _LONGEST)
             if moving:  # then it stays, or the sign of slow motions may never settle
                 path = dataclasses.replace(raw, positions=smoother(measured + corrections))
-                used = ~(equations.dry & _unsure(path.ends, slow))[:, equations.data.rows]
+                used = ~(equations.dry & _unsure(path, slow))[:, equations.data.rows]
                 used &= ~equations.struck[:, equations.data.rows]
                 whole = round(equations.late(values))
                 used[: max(_EDGE, -whole)] = used[-max(_EDGE, whole) :] = False
@@ -165,8 +165,6 @@ class Problem:
                 slow = np.maximum(
                     equations.data.slowest, _UNSURE * unsure.std(axis=0) / equations.data.period
                 )
-                change = equation.braking + equations.data.period * np.abs(path.accelerations)
-                slow = np.maximum(slow, _BRAKED * change)
         assert found is not None
         if likely is None:
             return found
@@ -287,13 +285,14 @@ def _whitened(
     return z, a, np.concatenate([whitener.whitened(equation.target, noise, factor), mean])
 
 
-def _unsure(velocities: Vector, slow: Vector) -> Array:
-    """Return where the sign of velocities, shape (samples, joints), is unsure.
+def _unsure(path: Path, slow: Vector) -> Array:
+    """Return where the sign of velocities is unsure, shape (samples, joints).
 
-    That is where they are slow, and next to a reversal, where dry friction may have stopped a joint
-    for a moment, and smoothing takes most from the path.
+    That is where they are slow or about to stop, and next to a reversal, where dry friction may
+    have stopped a joint for a moment, and smoothing takes most from the path.
     """
-    found: Array = np.abs(velocities) < slow
+    velocities, lost = path.ends, -_STOPPING * path.period * path.accelerations
+    found: Array = np.abs(velocities) < np.maximum(slow, lost * np.sign(velocities))
     turned = np.diff(np.sign(velocities), axis=0) != 0
     found[1:] |= turned
     found[:-1] |= turned
