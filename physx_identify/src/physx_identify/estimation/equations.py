@@ -145,9 +145,8 @@ class Equations:
         data = self.data
         if not data.wrenches and not data.contacts:
             return Smoother(data.positions)
-        touched = np.any(
-            np.stack([np.zeros(len(data.positions), bool), *data.contacts.values()]), 0
-        )
+        none = np.zeros(len(data.positions), bool)
+        touched: Array = np.logical_or.reduce([none, *data.contacts.values()])
         kinks = _around(touched, 2, 1)  # the step before a flag, and the samples around it
         rough = np.abs(np.diff(data.positions, 3, axis=0)) > _KINK * white_noise(data.positions)
         kinks[2:-1] |= rough.any(axis=1)
