@@ -161,6 +161,14 @@ class Equations:
             found |= on[:, None] & self.model.moved(link)
         return _around(found, _BESIDE + 1, _BESIDE)[1:-1]
 
+    def bridged(self, residual: Vector) -> Vector:
+        """Return torques, shape (samples - 2, joints), that are straight over unknown contacts."""
+        found, rows = residual.copy(), np.arange(len(residual))
+        for own, struck in zip(found.T, self.struck[:, self.data.rows].T, strict=True):
+            if struck.any() and not struck.all():
+                own[struck] = np.interp(rows[struck], rows[~struck], own[~struck])
+        return found
+
     @cached_property
     def scale(self) -> Vector:
         """Noise of each position, then of each wrench, relative to the encoders'."""

@@ -196,14 +196,6 @@ class Whitener:
             residual -= np.einsum("kij,kj->ki", blocks, errors[place : place + count])
         return errors, residual
 
-    def _bridged(self, residual: Vector) -> Vector:
-        """Return a residual that is straight where torques do not count, as next to contacts."""
-        found, rows = residual.copy(), np.arange(len(residual))
-        for own, used in zip(found.T, self._used.T, strict=True):
-            if used.any():
-                own[~used] = np.interp(rows[~used], rows[used], own[used])
-        return found
-
     def loss(
         self,
         residual: Vector,
@@ -260,7 +252,7 @@ class Whitener:
             return found if np.isfinite(found) else _NEVER
 
         x = min((_packed(each) for each in (start, _usual(start))), key=loss)
-        axes = _Spectrum(self._bridged(residual), self._products).axes(_unpacked(x, start))
+        axes = _Spectrum(residual, self._products).axes(_unpacked(x, start))
         lowest = loss(x)
         for _ in range(_ITERATIONS):
             ends = np.array([[loss(x + sign * _APART * axis) for sign in (1, -1)] for axis in axes])
@@ -286,7 +278,7 @@ class Whitener:
             residual: Shape (samples, joints), in N m or N.
             orders: Highest order.
         """
-        spectrum = _Spectrum(self._bridged(residual), self._products)
+        spectrum = _Spectrum(residual, self._products)
         best: tuple[float, Noise] | None = None
         for order in range(min(1, orders), orders + 1):
             found = min((spectrum.fit(each) for each in spectrum.starts(order)), key=lambda x: x[0])
