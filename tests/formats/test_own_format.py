@@ -111,6 +111,13 @@ def test_the_kit_finds_nothing_in_a_right_format(add):
 
 
 @pytest.mark.processes
+def test_a_format_in_a_script_is_checked_before_it_is_in_a_plugin(tmp_path):
+    (tmp_path / "own.py").write_text(FORMATS.replace("{formats}", "{}"))
+    (report,) = check_plugin(f"{tmp_path}/own.py:OWN")
+    assert (report.kind, report.counts()["passed"]) == ("format", 4), str(report)
+
+
+@pytest.mark.processes
 @pytest.mark.parametrize(
     ("name", "number", "said"),
     [

@@ -841,6 +841,14 @@ def evaluates_a_session_that_does_not_exist():
     evaluate("sessions/traind")
 
 
+@mistake(
+    e.CheckpointError, "There is no network in sessions:", "contains: kept, trained, trained_1"
+)
+def evaluates_the_folder_of_all_sessions():
+    Path("sessions/trained_1").mkdir()
+    evaluate("sessions")
+
+
 @mistake(e.SessionError, 'traind does not exist. Did you mean "trained"')
 def reads_losses_of_a_session_that_does_not_exist():
     read_scalars("sessions/traind")

@@ -79,7 +79,7 @@ def _reads_again(subject: Subject) -> None:
     form: Format = subject.make()
     if form.open is None:
         raise NotApplicableError("nothing is imported from it")
-    import_file(place, copy)
+    import_file(place, copy, form=subject.reference)
     with Dataset.open(copy) as found, Dataset.open(subject.folder / "session") as wanted:
         for name, field in wanted.fields("training").items():
             expect(name in found.fields("training"), f'it loses the field "{name}"')
@@ -118,7 +118,7 @@ def _refuses_damage(subject: Subject) -> None:
     content = place.read_bytes()
     place.write_bytes(content[: len(content) // 2])
     try:
-        import_file(place, subject.folder / "copy")
+        import_file(place, subject.folder / "copy", form=subject.reference)
     except PhysxError:
         return
     except Exception as error:

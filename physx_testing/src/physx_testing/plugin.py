@@ -105,10 +105,10 @@ def _components(name: str, kind: str | None) -> list[tuple[str, str]]:
 
 
 def _kind_of(reference: str, kinds: Sequence[str]) -> str:
-    """Return the kind of a class, derived from its base class."""
+    """Return the kind of a class, or of an instance such as a format, by its base class."""
     for kind in kinds:
         made = find(kind, reference)
-        if isinstance(made, type):
+        if isinstance(made, type) or not callable(made):
             try:
                 check_kind(kind, reference, made)
             except ReferenceFormError:

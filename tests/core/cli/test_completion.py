@@ -55,6 +55,7 @@ def complete(request, capsys):
     return propose
 
 
+KINDS = ["backend", "environment", "format", "launcher", "network", "plugin", "visualizer"]
 FORMATS = ["npz", "parquet", "csv", "safetensors", "vtkhdf", "minari", "lerobot", "zarr"]
 FORMATS += ["hdf5-single"]
 
@@ -92,7 +93,7 @@ def after(capsys):
     ("words", "found"),
     [
         ("completion", ["bash", "zsh"]),
-        ("new", ["backend", "environment", "network", "plugin", "visualizer"]),
+        ("new", KINDS),
         ("export --to", FORMATS),
         ("export --to =", FORMATS),
         ("train --on-nan", ["stop", "continue"]),
@@ -113,6 +114,7 @@ def test_arguments_follow_commands_and_options_that_are_complete(after):
     assert {"generate", "completion"} <= {*after("")}
     assert {"toy/spring", "external/program", "--batch-nb"} <= {*after("generate")}
     assert "toy/spring" not in after("generate toy/spring")
+    assert "formats/npz" in after("import file folder --from")
     assert {"toy/spring", "--resume"} - {*after("train --online physx/fifo")} == {"toy/spring"}
     assert "toy/spring" in after("predict sessions/training --no-record")
     assert "toy/linear" in after("train --resume --network.network")

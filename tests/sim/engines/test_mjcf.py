@@ -272,8 +272,14 @@ def test_without_mujoco_an_error_says_what_to_install(odd, monkeypatch):
             {},
             'joint "b" is a ball',
         ),
+        (
+            '<mujoco><worldbody><body><joint/><geom size="1"/><body><joint name="joint0"/>'
+            '<geom size="1"/></body></body></worldbody></mujoco>',
+            {},
+            "its joints need different names, but are called joint0, joint0",
+        ),
     ],
-    ids=["xml", "empty", "trees", "root", "floating", "feet", "bodies", "ball"],
+    ids=["xml", "empty", "trees", "root", "floating", "feet", "bodies", "ball", "joints"],
 )
 def test_what_is_wrong_with_a_file_is_said(tmp_path, text, options, said):
     path = tmp_path / "wrong.xml"

@@ -108,25 +108,26 @@ def find(place: Path, name: str | None, which: int | str) -> Checkpoint:
     if is_one(place):
         return read(place)
     folder = place / "network" if (place / "network").is_dir() else place
+    known = list_all(folder)
+    if not known or (folder == place and not any(map(is_one, known))):  # sessions with numbers
+        raise CheckpointError(
+            f"There is no network in {folder}: name a training's session (physx train). "
+            f"{found_at(place)}"
+        )
     if name is None:
-        names = {path.name.rpartition("_")[0] for path in list_all(folder)}
+        names = {path.name.rpartition("_")[0] for path in known}
         name = names.pop() if len(names) == 1 else NAME
     numbers = list_numbers(folder, name)
     if which == -1 and numbers:
         return _find_last(folder, name, numbers)
     path = folder / f"{name}_{which}"
-    others = listed(p.name for p in list_all(folder) if p != path)
+    others = listed(p.name for p in known if p != path)
     if which in numbers or (which == BEST and (path.is_dir() or former_path(path).is_dir())):
         try:
             return read(path)
         except CheckpointError as error:
             raise CheckpointError(f"{error} Other checkpoints: {others}.") from error
     wanted = f"{name}_<number>" if which == -1 else path.name
-    if not list_all(folder):
-        raise CheckpointError(
-            f"There is no network in {folder}: name a training's session (physx train). "
-            f"{found_at(place)}"
-        )
     raise CheckpointError(f'There is no checkpoint "{wanted}" in {folder}. Available: {others}.')
 
 

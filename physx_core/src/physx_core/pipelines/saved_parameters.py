@@ -93,6 +93,20 @@ def restore_parameters(directory: Path, entry: str, streams: str) -> None:
     forget_parameters(directory)
 
 
+def end_without_rows(directory: Path) -> None:
+    """Remove the backup of streams that end without rows, unless they have saved something."""
+    with files.storing(f"{directory}"):
+        now, before = (
+            {
+                path.name.removesuffix(end): files.read_content(path, LARGEST_PARAMETERS)
+                for path in directory.glob(_OF_STREAMS + end)
+            }
+            for end in ("", _BEGUN)
+        )
+    if now == before:
+        forget_parameters(directory)
+
+
 def forget_parameters(directory: Path) -> None:
     """Remove the backup of streams that the dataset does not describe."""
     with files.storing(f"{directory}"):

@@ -12,6 +12,7 @@ from physx_core.components.hand import HAND
 from physx_core.config import EnvironmentConfig
 from physx_core.dataset import Dataset
 from physx_core.pipelines.generation import Generation
+from physx_core.pipelines.saved_parameters import end_without_rows
 from physx_core.pipelines.services import Touch
 from physx_core.pipelines.storage import STREAMS, describe_environment, last_steps
 from physx_core.session import Session
@@ -139,3 +140,5 @@ class StoredStreams(Closeable):
     def close(self) -> None:
         """Write the last states, once the dataset is closed."""
         self._files.close()
+        if self._new is not None:
+            end_without_rows(self._dataset.directory)

@@ -118,7 +118,7 @@ def resolve_all(kind: str) -> dict[str, Any]:
         kind: See `resolve`.
     """
     found = {}
-    for reference in sorted(each for places in references_of(kind).values() for each in places):
+    for reference in (each for places in references_of(kind).values() for each in places):
         try:
             found[reference] = resolve(kind, reference)
         except MissingLibraryError:  # it would say so if it were asked for

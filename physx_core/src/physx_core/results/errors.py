@@ -291,8 +291,7 @@ def compare(network: Errors, rival: Errors, unit: str) -> dict[str, Any]:
 
 
 def _too_few(count: int, unit: str) -> str:
-    counted = unit.removesuffix("s") if count == 1 else unit
-    return f"too few to say: {count} {counted}, fewer than {FEWEST}"
+    return f"too few {unit} to say: {count}, fewer than {FEWEST}"
 
 
 def mean_interval(values: Sequence[float]) -> Interval | None:

@@ -94,6 +94,7 @@ class Equation:
         torques: Of the model along that path, of the same shape as the target.
         doubt: By what dry friction and wrenches differ if they are applied another way, shape
             (samples, joints).
+        braking: What dry friction takes of a velocity in a step, shape (samples, coordinates).
     """
 
     instruments: Vector
@@ -102,6 +103,7 @@ class Equation:
     stencil: Vector
     torques: Vector
     doubt: Vector
+    braking: Vector
 
 
 class Equations:
@@ -233,7 +235,7 @@ class Equations:
         """
         numbers = self._known + self._directions @ np.maximum(values, self._lowest)
         stencil = self.model.stencil(path, numbers)
-        dry, doubt, felt = None, np.zeros(path.own.shape), []
+        dry, felt, (doubt, braking) = None, [], np.zeros((2, *path.own.shape))
         acting = np.zeros((2, *path.own.shape))  # by wrenches: along the path, and as measured
         if (self.dry.any() or self.data.wrenches) and not path.instant:
             # halfway between the two ways of engines
@@ -246,7 +248,9 @@ class Equations:
             stencil[1] -= slopes
             felt.append(-by_reading)
         if dry is not None:
-            impulses = self.model.friction(path, numbers) - acting[0]
+            rubbing = self.model.friction(path, numbers)
+            yields = np.diagonal(np.linalg.inv(path.period * stencil[2]), axis1=1, axis2=2)
+            impulses, braking = rubbing - acting[0], np.abs(yields * rubbing)
             doubt = np.einsum("kij,kj->ki", dry, impulses) - impulses
             acting = np.einsum("kij,akj->aki", dry, acting)
             felt = [dry @ each for each in felt]
@@ -272,6 +276,7 @@ class Equations:
             self.scale * self.data.with_readings(stencil, felt)[:, :, rows],
             own[:, rows],
             doubt[:, rows],
+            braking,
         )
 
     def _columns(self, path: Path, raw: Path, dry: Vector | None) -> tuple[Vector, Vector]:

@@ -39,8 +39,9 @@ _EDGE = 4
 """Samples left out at both ends, where the smoothed path is uncertain."""
 _SEPARABLE = 1e-6
 """Relative length of what is left of a column without the others, below which it is one of them."""
-_UNSURE = 2.0
-"""Velocity below which dry friction is unknown, in standard errors."""
+_UNSURE, _BRAKED = 2.0, 2.0
+"""Velocity below which dry friction is unknown: in standard errors; in what dry friction takes of
+it in a step, as engines may stop a joint over several steps."""
 
 
 @dataclass(frozen=True)
@@ -164,6 +165,8 @@ class Problem:
                 slow = np.maximum(
                     equations.data.slowest, _UNSURE * unsure.std(axis=0) / equations.data.period
                 )
+                change = equation.braking + equations.data.period * np.abs(path.accelerations)
+                slow = np.maximum(slow, _BRAKED * change)
         assert found is not None
         if likely is None:
             return found

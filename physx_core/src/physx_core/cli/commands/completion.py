@@ -56,7 +56,7 @@ compdef _physx physx
 """,
 }
 
-_KIND_OF = {"online": "buffer", "statistics": "visualizer"}
+_KIND_OF = {"online": "buffer", "statistics": "visualizer", "from": "format"}
 """Name of an option to the kind of component that it takes, where the two differ."""
 _WORD = re.compile(r"[\w.][\w./@+-]*|--[\w.-]+")
 """Text that a shell takes as a literal word: names in metadata are not trusted."""

@@ -68,9 +68,10 @@ def read_mjcf(robot: Robot, path: Path, *, touching: bool) -> RobotModel:
     root = file.root(robot)
     links = _Links(file, robot, root)
     names = [body.name for body in links.found]
-    if len(set(names)) < len(names):
-        raise ModelError(f"its links need different names, but are called {listed(names)}")
     joints = [body.joint.name for body in links.found if body.joint is not None]
+    for kind, known in (("links", names), ("joints", joints)):
+        if len(set(known)) < len(known):
+            raise ModelError(f"its {kind} need different names, but are called {listed(known)}")
     check_names(robot, names, joints)
     shapes = _Shapes(file, robot, list(links.places))
     by_body = {body: names[place] for body, place in links.places.items()}
