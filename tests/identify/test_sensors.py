@@ -136,6 +136,13 @@ def test_true_values_of_a_leg_in_contact_lie_in_their_intervals(clean, made):
     assert found["mass lower"].error < 0.02
 
 
+def test_an_unknown_contact_is_no_noise(clean):
+    log = leg.flagged(clean, correlation=0.98, seed=5010)
+    true = 0.05 * clean[1].std(axis=0) * np.sqrt(1 - 0.98**2)
+    noise = identify(log, leg.KNOWN, UNKNOWN).noise
+    assert noise.innovations == pytest.approx(true, rel=0.5)
+
+
 def test_the_noise_of_forces_is_that_of_the_torques(clean):
     loud, quiet = (
         identify(leg.sensed(clean, force=force, correlation=0.0), leg.KNOWN, UNKNOWN)

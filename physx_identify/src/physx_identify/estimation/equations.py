@@ -145,9 +145,8 @@ class Equations:
         data = self.data
         if not data.wrenches and not data.contacts:
             return Smoother(data.positions)
-        touched = np.any(
-            np.stack([np.zeros(len(data.positions), bool), *data.contacts.values()]), 0
-        )
+        none = np.zeros(len(data.positions), bool)
+        touched: Array = np.logical_or.reduce([none, *data.contacts.values()])
         kinks = _around(touched, 2, 1)  # the step before a flag, and the samples around it
         rough = np.abs(np.diff(data.positions, 3, axis=0)) > _KINK * white_noise(data.positions)
         kinks[2:-1] |= rough.any(axis=1)
@@ -161,6 +160,14 @@ class Equations:
         for link, on in self.data.contacts.items():
             found |= on[:, None] & self.model.moved(link)
         return _around(found, _BESIDE + 1, _BESIDE)[1:-1]
+
+    def bridged(self, residual: Vector) -> Vector:
+        """Return torques, shape (samples - 2, joints), that are straight over unknown contacts."""
+        found, rows = residual.copy(), np.arange(len(residual))
+        for own, struck in zip(found.T, self.struck[:, self.data.rows].T, strict=True):
+            if struck.any() and not struck.all():
+                own[struck] = np.interp(rows[struck], rows[~struck], own[~struck])
+        return found
 
     @cached_property
     def scale(self) -> Vector:

@@ -139,7 +139,7 @@ class Problem:
             if start is None and step == 1:
                 values = self._first(path, smoother, used)
             whitener = Whitener(equation.stencil, used)
-            residual = equation.target - equation.columns @ values
+            residual = equations.bridged(equation.target - equation.columns @ values)
             if not fixed:
                 if step == _NOISE_STEPS or (moving and step >= _PATH_STEPS):
                     assert noise is not None
@@ -268,7 +268,8 @@ class Problem:
         return Fit(
             values, free[sort], held, mixing[sort], covariance[np.ix_(sort, sort)], noise, step,
             False, y - a @ values, z, a, equation.torques + own,
-            target - columns @ values, equation.instruments[..., free[sort]], used, path, whitener,
+            equations.bridged(target - columns @ values), equation.instruments[..., free[sort]],
+            used, path, whitener,
             np.full(rank, float(used.sum() - rank)), self._known_of(free[sort], values),
         )  # fmt: skip
 
