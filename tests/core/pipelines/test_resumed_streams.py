@@ -60,6 +60,10 @@ def stored(name):
         }
 
 
+def interrupt(*_):
+    raise KeyboardInterrupt
+
+
 def ended_early(pipeline, monkeypatch, *, killed):
     """End the run of "stopped" in its first step, as an interrupt or as a kill leaves it."""
 
