@@ -112,6 +112,7 @@ class Equations:
         parameters: What is unknown.
         data: The log.
         nominal: Values of the parameters in the robot's file and settings.
+        plain: Which parameters the model's own torques are linear in.
         dry: Which coordinates have dry friction.
     """
 
