@@ -7,8 +7,7 @@ from hypothesis import strategies as st
 
 from physx_core import Buffer
 from physx_core.errors import ConfigError, UnknownOptionError, UsageError
-from physx_core.pipelines.learning.components import create
-from physx_core.plugins import resolve
+from physx_core.plugins import create, resolve
 
 MIXING = ("fifo", "reservoir", "window")
 DROPPED_AFTER = {"fifo": lambda views: views, "reservoir": lambda views: 1, "window": lambda _: 0}
@@ -16,7 +15,7 @@ DROPPED_AFTER = {"fifo": lambda views: views, "reservoir": lambda views: 1, "win
 
 
 def make(name, batch_size, batch_nb, seed=0, **options):
-    buffer = create("buffer", f"physx/{name}", options, Buffer)
+    buffer = create("buffer", f"physx/{name}", options)
     buffer.begin(batch_size, batch_nb, seed)
     return buffer
 

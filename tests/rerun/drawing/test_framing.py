@@ -146,7 +146,9 @@ def test_every_example_is_in_its_picture(file, cls, tmp_path, monkeypatch):
     except ModuleNotFoundError as error:
         pytest.skip(f"the example needs {error.name}")
     DataGeneration(
-        EnvironmentConfig(getattr(module, cls), as_tcp_ip_client=False, visualizer=Recorder),
+        EnvironmentConfig(
+            getattr(module, cls), as_tcp_ip_client=False, visualizer=Recorder, seed=1
+        ),
         session_dir=str(tmp_path),
         batch_nb=1,
         batch_size=4,

@@ -201,6 +201,7 @@ class Training(NewSessionPipeline):
     losses: dict[str, float] = field(init=False, repr=False, default_factory=dict)
     training_loss: float = field(init=False, repr=False, default=float("nan"))
     validation_loss: float = field(init=False, repr=False, default=float("nan"))
+    _validates: bool = field(init=False, repr=False, default=False)
     best: BestEpoch = field(init=False, repr=False)
     checkpoint_path: Path | None = field(init=False, repr=False, default=None)
     _reported: float = field(init=False, repr=False, default=0.0)
@@ -397,16 +398,15 @@ class Training(NewSessionPipeline):
         if self.learner.learning_rate is not None:
             values["learning_rate"] = self.learner.learning_rate
         every, judged = self.validation_every, self.training_loss
-        validates = every > 0 and self.data.stored.has_validation
-        is_due = not validates or self.epoch_id % every == 0
-        if validates:
+        is_due = not self._validates or self.epoch_id % every == 0
+        if self._validates:
             judged = self._validate(values) if is_due else float("nan")
         self.observers.scalars(values, self.epoch_id, "epoch")
         if self.histograms_every and self.epoch_id % self.histograms_every == 0:
             self.observers.histograms(self.learner.distributions(), self.epoch_id, "epoch")
         if is_due and self.best.update(judged, self.epoch_id):
             wanted = self.network_config.save_best
-            if wanted or (wanted is None and (validates or self.patience is not None)):
+            if wanted or (wanted is None and (self._validates or self.patience is not None)):
                 self._write(best=True)
         try:
             self.learner.epoch_end(judged)
@@ -456,18 +456,18 @@ class Training(NewSessionPipeline):
     @property
     def _decided(self) -> str:
         """What the validation samples decided about the last network, in words."""
-        validates = self.validation_every > 0
         scheduler = self.network_config.scheduler
         name = scheduler if isinstance(scheduler, str) else getattr(scheduler, "__name__", "")
-        decided = ["when the training stopped"] if self.patience is not None and validates else []
-        decided += ["the learning rate"] if "Plateau" in name and validates else []
+        decided = (
+            ["when the training stopped"] if self.patience is not None and self._validates else []
+        )
+        decided += ["the learning rate"] if "Plateau" in name and self._validates else []
         return " and ".join(decided)
 
     @property
     def _decisive(self) -> str:
         """What decides which network is the best."""
-        known = "training" if math.isnan(self.validation_loss) else "validation"
-        return self.monitor or f"{known} loss"
+        return self.monitor or f"{'validation' if self._validates else 'training'} loss"
 
     @property
     def stopped(self) -> str:
@@ -676,9 +676,9 @@ class Training(NewSessionPipeline):
         self._prepare_learner(start)
         if self._unrolling is not None:
             self._unrolling.check(self.data.stored, self.learner.transformation)
-        validates = self.validation_every > 0 and self.data.stored.has_validation
+        self._validates = self.validation_every > 0 and self.data.stored.has_validation
         of = self.learner, self.data.stored
-        self._judging = Judging(*of, self.monitor, metrics, rivals, validates=validates)
+        self._judging = Judging(*of, self.monitor, metrics, rivals, validates=self._validates)
         if start.checkpoint is not None and start.environment is None and self._is_main:
             fixed, folder = self._resumed.snapshots, self.data.dataset.directory
             data = self._resumed.data, self.data.stored.datasets, start.config.mode, fixed
