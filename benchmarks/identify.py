@@ -1,7 +1,8 @@
 """Intervals of `physx identify`: do they hold, and does it say when they do not?
 
-    python benchmarks/identify.py [--check] [--draws 200] [coverage] [contact] [panda] [engines]
-                                  [standstill] [structure] [excitation]
+    python benchmarks/identify.py [--check] [--draws 200] [coverage] [contact] [panda]
+                                  [derivatives] [engines] [standstill] [structure] [pairs]
+                                  [excitation]
 
 Coverage: the share of nominal 95 % intervals that hold the true value, of logs of 4 s at 200 Hz: a
 pendulum that swings about its rest, three parameters; an arm of two links that tracks a motion,
@@ -12,12 +13,14 @@ gravity acts on the base. The peer's own function, of MuJoCo's sysid, gets the l
 residual and Jacobian along the true path, where only torques are noisy.
 Contact: logs of 2 s of a leg whose foot strikes the ground, with the noisy force of the ground,
 with flags where it touches, and without, so that the model knows nothing of it.
-Panda: seven joints, 20 s at 100 Hz, 5 % noise. Engines: logs of each engine, all fitted on
-Pinocchio. Standstill: logs of MuJoCo, in which strong dry friction fades as a joint stops, with
-little noise: how often they get their level, and whether their intervals then hold. Structure:
-Stribeck friction that the model lacks, of several standard errors: how often the tests find it,
-beside the best test, which knows what to look for. Excitation: expected errors of the proposed
-motion relative to a sweep in frequency of equal length and reach.
+Panda: seven joints, 20 s at 100 Hz, 5 % noise: errors, torques of another motion, a delay.
+Derivatives: those of a fit against finite differences of Pinocchio's torques. Engines: logs of
+each engine, all fitted on Pinocchio. Standstill: logs of MuJoCo, in which strong dry friction fades
+as a joint stops, with little noise: how often they get their level, and whether their intervals
+then hold. Structure: Stribeck friction that the model lacks, of several standard errors: how often
+the tests find it, beside the best test, which knows what to look for. Pairs: two parameters that
+act alike. Excitation: expected errors of the proposed motion relative to a sweep in frequency of
+equal length and reach.
 """
 
 from __future__ import annotations
@@ -38,6 +41,7 @@ from typing import Any
 from unittest.mock import MagicMock
 
 import numpy as np
+import pinocchio
 from measure import claim, finish
 from scipy.stats import norm
 
@@ -49,6 +53,7 @@ import logged_oscillator as oscillator
 
 from physx_core.typing import Vector
 from physx_dart import PinocchioBackend
+from physx_dart.pinocchio.models import load_model
 from physx_identify import Estimate, Identification, Log, Model, identify, propose
 from physx_identify.estimation.model import STRIBECK
 from physx_identify.estimation.model import Path as Motion
@@ -249,48 +254,136 @@ def coverage(draws: int) -> bool:
 
 
 PANDA, FINGERS = "panda/panda", ("panda_finger_joint1", "panda_finger_joint2")
+ARM_PERIOD, LATENESS = 0.01, 0.013
+"""Of the Panda's logs, in s: period, and delay of the torques where they have one."""
 
 
-def panda() -> bool:
-    """Print how well a Panda is found from 20 s, and how long it takes."""
-    known = Robot(PANDA, collisions="none")
-    names = Model(known, held=FINGERS).joints
+def panda_model() -> Model:
+    """Return a Panda with the hidden friction, damping and armature."""
+    names = Model(Robot(PANDA, collisions="none"), held=FINGERS).joints
     true = {name: JointSettings(damping=0.5, friction=0.8, armature=0.1) for name in names}
-    model = Model(Robot(PANDA, collisions="none", joints=true), held=FINGERS)
-    random, period = np.random.default_rng(0), 0.01
-    time_ = np.arange(2000) * period
+    return Model(Robot(PANDA, collisions="none", joints=true), held=FINGERS)
+
+
+def reaching(model: Model, seed: int, late: float = 0.0) -> Motion:
+    """Return a motion of 20 s, by some seconds late."""
+    random = np.random.default_rng(seed)
     joints = model.movable.model.joints
     middle = np.array([0.5 * (each.lower + each.upper) for each in joints])
     reach = np.array([0.3 * (each.upper - each.lower) for each in joints])
     rates = 2 * np.pi * np.linspace(0.05, 0.5, 8)
     phases = random.uniform(0, 6.28, (len(joints), len(rates)))
-    waves = np.stack([np.sin(np.outer(time_, rates) + own).sum(axis=1) / 4 for own in phases], 1)
-    positions = middle + reach * waves
-    motion = Motion(positions, period)
+    moments = np.arange(2000) * ARM_PERIOD - late
+    waves = np.stack([np.sin(np.outer(moments, rates) + own).sum(axis=1) / 4 for own in phases], 1)
+    return Motion(middle + reach * waves, ARM_PERIOD)
+
+
+def torques_of(model: Model, motion: Motion) -> Vector:
+    """Return the torques along a motion, shape (samples - 2, joints)."""
     dry = model.dry(motion, model.stencil(motion, model.numbers), model.numbers)
-    torques = model.columns(motion, model.numbers[:, None], motion.ends, dry)[..., 0]
-    torques += 0.05 * torques.std(axis=0) * random.standard_normal(torques.shape)
-    torques = np.pad(torques, ((1, 1), (0, 0)), mode="edge")
-    noisy = positions + 1e-5 * random.standard_normal(positions.shape)
-    log = Log(model.joints, period, noisy, torques)
-    unknown = [f"{kind}:{name}" for kind in ("damping", "friction", "armature") for name in names]
-    links = [b.name for b in model.movable.model.bodies if b.name in LINKS]
+    return model.columns(motion, model.numbers[:, None], motion.ends, dry)[..., 0]
+
+
+def panda_log(model: Model, late: float = 0.0) -> Log:
+    """Return a log with 5 % noise of torques, which may be late."""
+    motion, random = reaching(model, 0), np.random.default_rng(1)
+    torques = torques_of(model, reaching(model, 0, late))
+    torques = torques + 0.05 * torques.std(axis=0) * random.standard_normal(torques.shape)
+    noisy = motion.positions + 1e-5 * random.standard_normal(motion.positions.shape)
+    return Log(model.joints, ARM_PERIOD, noisy, np.pad(torques, ((1, 1), (0, 0)), mode="edge"))
+
+
+def bound(model: Model, found: Identification) -> Vector:
+    """Return the Cramér-Rao bounds of the estimates that are told, as deviations.
+
+    Engines apply dry friction in two ways; which one a log has is as unknown as a value of which a
+    half is known, give or take a half.
+    """
+    unknown = model.parameters(as_unknowns([f"{e.kind}:{e.of}" for e in found.estimates]))
+    motion, count = reaching(model, 0), len(model.joints)
+    directions = np.stack([model.direction(each) for each in unknown], axis=1)
+    rubbing = np.zeros((len(model.numbers), count))
+    rubbing[11 * count : 12 * count] = np.diag(model.numbers[11 * count : 12 * count])
+    dry = model.dry(motion, model.stencil(motion, model.numbers), model.numbers)
+    ways = [model.columns(motion, rubbing, motion.ends, each) for each in (dry, None)]
+    columns = [model.columns(motion, directions, motion.ends), ways[0] - ways[1]]
+    scale = 0.05 * torques_of(model, motion).std(axis=0)
+    white = (np.concatenate(columns, axis=2) / scale[:, None]).reshape(-1, len(unknown) + count)
+    told = white.T @ white + np.diag([0.0] * len(unknown) + [1 / 0.5**2] * count)
+    inverse = np.linalg.inv(told + 1e-9 * np.diag(np.diag(told)))  # some are inseparable
+    bounds: Vector = np.sqrt(np.diag(inverse))
+    return bounds[[place for place, each in enumerate(found.estimates) if each.error]]
+
+
+def panda() -> bool:
+    """Print how well a Panda is found from 20 s, and how long it takes."""
+    model, known = panda_model(), Robot(PANDA, collisions="none")
+    kinds = ("damping", "friction", "armature")
+    unknown = [f"{kind}:{name}" for kind in kinds for name in model.joints]
+    unknown += [f"mass:{b.name}" for b in model.movable.model.bodies if b.name in LINKS]
+    log = panda_log(model)
     begin = time.process_time()
-    result = identify(log, known, [*unknown, *(f"mass:{link}" for link in links)], held=FINGERS)
+    result = identify(log, known, unknown, held=FINGERS)
     seconds = time.process_time() - begin
-    inside = []
+    inside, errors = [], []
     for each in result.estimates:
-        if each.error is None:
+        if not each.error:
             print(f"  {each.name}: inseparable")
             continue
         value = {"damping": 0.5, "friction": 0.8, "armature": 0.1}.get(each.kind, each.nominal)
         inside.append(each.low is not None and each.low <= value <= (each.high or 0.0))
+        errors.append(each.value - value)
         if each.kind == "mass":
             print(f"  {each.name}: {100 * (each.error / each.nominal):.2f} % standard error")
     print(f"  converged: {result.converged}; lacks {result.lacks or 'nothing'}")
     print(f"  {np.sum(inside)} of {len(inside)} intervals hold; {seconds:.0f} s of processor time")
     good = claim("Panda: intervals that hold", float(np.mean(inside)), at_least=0.85)
-    return claim("Panda: seconds of processor time", seconds, at_most=60) and good
+    good &= claim("Panda: seconds of processor time", seconds, at_most=60)
+    least = bound(model, result)
+    ratio = float(np.sqrt(np.mean((np.array(errors) / least) ** 2)))
+    good &= claim("Panda: errors relative to their Cramér-Rao bounds, rms", ratio, at_most=1.5)
+    stated = np.array([each.error for each in result.estimates if each.error]) / least
+    good &= claim("Panda: largest standard error relative to it", float(stated.max()), at_most=1.5)
+    other = Model(result.applied_to(known), held=FINGERS)
+    motion = reaching(model, 2)
+    true = torques_of(model, motion)
+    missed = np.sqrt(np.mean((torques_of(other, motion) - true) ** 2) / np.mean(true**2))
+    good &= claim("Panda: torques of another motion, relative rms", float(missed), at_most=0.012)
+    late = identify(panda_log(model, LATENESS), known, [*unknown, "delay"], held=FINGERS)["delay"]
+    print(f"  delay of {1e3 * LATENESS:.0f} ms: {1e3 * late.value:.2f} ms")
+    return (
+        claim("Panda: seconds off in the delay", abs(late.value - LATENESS), at_most=1e-3) and good
+    )
+
+
+def derivatives() -> bool:
+    """Print the processor time of exact derivatives relative to finite differences."""
+    model, motion = panda_model(), reaching(panda_model(), 0)
+    kinds = ("damping", "friction", "armature")
+    unknown = model.parameters(as_unknowns([*kinds, *(f"mass:{link}" for link in LINKS)]))
+    directions = np.stack([model.direction(each) for each in unknown], axis=1)
+    plain = load_model(model.movable, model.gravity, armature=np.zeros(len(model.joints)))
+    data = plain.createData()
+    rows = list(zip(motion.own, motion.velocities, motion.accelerations, strict=True))
+
+    def rollout() -> None:
+        for q, v, a in rows:
+            pinocchio.rnea(plain, data, q, v, a)
+
+    def exact() -> None:
+        model.columns(motion, directions, motion.ends)
+        model.stencil(motion, model.numbers)
+
+    spent: dict[Callable[[], None], list[float]] = {rollout: [], exact: []}
+    for _ in range(5):
+        for work, times in spent.items():
+            begin = time.process_time()
+            work()
+            times.append(time.process_time() - begin)
+    differences = (len(unknown) + 1 + 3 * len(model.joints)) * float(np.median(spent[rollout]))
+    ratio = float(np.median(spent[exact])) / differences
+    print(f"  derivatives by {len(unknown)} parameters and by three neighboring positions")
+    return claim("processor time relative to finite differences", ratio, at_most=1 / 3)
 
 
 LINKS = tuple(f"panda_link{number}" for number in range(1, 8))
@@ -449,6 +542,26 @@ def contact(draws: int) -> bool:
     return claim("contacts: level refused", refused, at_least=0.95) and good
 
 
+PAIR = ("armature shoulder", "Iyy upper")
+"""The rotor of the shoulder and the link that it turns, about the same axis."""
+
+
+def alike(seed: int) -> bool:
+    """Return whether it is said of a log that no part of it tells a pair apart."""
+    log = arm.noisy(clean(), correlation=0.9, seed=seed)
+    result = identify(log, arm.KNOWN, [*UNKNOWN[1:], "armature:shoulder", "inertia:upper"])
+    return all(result[name].verdict == "inseparable" for name in PAIR)
+
+
+def pairs(draws: int) -> bool:
+    """Print how often it is said that two parameters cannot be told apart."""
+    with ProcessPoolExecutor() as pool:
+        share = float(np.mean(list(pool.map(alike, range(draws)))))
+    return claim(
+        f"logs of {draws} in which {' and '.join(PAIR)} are inseparable", share, at_least=1
+    )
+
+
 def excitation() -> bool:
     """Print how much the proposed motion tells relative to a sweep."""
     result = CASES["arm"].found("both", 0.9, 0)
@@ -471,9 +584,11 @@ def main(words: list[str]) -> None:
         "coverage": lambda: coverage(draws),
         "contact": lambda: contact(min(draws, 100)),
         "panda": panda,
+        "derivatives": derivatives,
         "engines": engines,
         "standstill": lambda: standstill(min(draws, 60)),
         "structure": lambda: structure(min(draws, 40)),
+        "pairs": lambda: pairs(20),
         "excitation": excitation,
     }
     chosen = [name for name in parts if name in words] or list(parts)
