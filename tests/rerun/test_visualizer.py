@@ -222,7 +222,7 @@ def test_the_run_is_told_of_a_recording_that_is_there(opened, tmp_path):
     ball(visualizer)
     visualizer.close()
     file = tmp_path / "run.rrd"
-    assert list(visualizer.outputs()) == [f"recording: {file}", f"next: physx view {file}"]
+    assert list(visualizer.outputs()) == [f"recording: {file}  (physx view {file})"]
 
 
 def test_the_file_where_it_is_wanted(opened, tmp_path):

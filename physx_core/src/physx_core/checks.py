@@ -21,7 +21,7 @@ from physx_core.errors import ConfigError
 if TYPE_CHECKING:
     from physx_core.typing import Vector
 
-T = TypeVar("T")
+_T = TypeVar("_T")
 Convert = Callable[[str, Any], Any]
 """Returns a value as the declared type, given the option's name and the value."""
 
@@ -281,7 +281,7 @@ def vector(option: str, values: Any, length: int) -> tuple[float, ...]:
     return tuple(finite(option, number) for number in numbers)
 
 
-def things(option: str, values: Any, kind: type[T]) -> tuple[T, ...]:
+def things(option: str, values: Any, kind: type[_T]) -> tuple[_T, ...]:
     """Return a sequence of objects of a class as a tuple.
 
     Raises:

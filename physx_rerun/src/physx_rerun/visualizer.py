@@ -314,12 +314,11 @@ class RerunVisualizer(Visualizer):
         self._recording = self._offscreen = None
         if self.file is None:
             return
-        self._outputs.append(f"recording: {self.file}")
+        self._outputs.append(f"recording: {self.file}  (physx view {shlex.quote(str(self.file))})")
         if self.mode == "headless":
             picture = Path(self.picture) if self.picture else self.file.with_suffix(".png")
             render_picture(self.file, picture, self.picture_size, timeline=self._layout.timeline)
             self._outputs.append(f"picture: {picture}")
-        self._outputs.append(f"next: physx view {shlex.quote(str(self.file))}")
 
     def outputs(self) -> Sequence[str]:
         """Name the recording and the picture, if any: see `Observer.outputs`."""

@@ -117,7 +117,8 @@ class Observer(Closeable):
     def outputs(self) -> Sequence[str]:
         """Return a line for each file or folder that it wrote, for example ``recording: PATH``.
 
-        A command that shows it follows the path in brackets. Called after `close`.
+        A command that shows it may follow after two blanks, in brackets; the run prints it as the
+        next command. Called after `close`.
         """
         return ()
 

@@ -193,13 +193,15 @@ class Pipeline(ABC):
         if error is not None and not outputs and remove_unused(self.session, opened=True):
             self._say(f"session: {self.session.path} was removed: the run stored nothing in it")
             return
-        commands = (f"next: {command}" for command in self._next(error))
+        written = [line.removesuffix(")").partition("  (") for line in outputs]
+        shows = (command for _, _, command in written if command)
+        commands = (f"next: {command}" for command in (*shows, *self._next(error)))
         if error is None and self._has_finished:
             self._conclude()
             lines: Iterable[str] = self.result.lines
         else:
             lines = self._results(error)
-        self._say(*lines, *outputs, *commands)
+        self._say(*lines, *(file for file, _, _ in written), *commands)
 
     def _conclude(self) -> None:
         """Make the result of the finished run, and store it in the session."""
