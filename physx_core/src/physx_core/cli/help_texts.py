@@ -1,4 +1,4 @@
-"""What commands print for ``--help``: wraps it, and reads their options from it."""
+"""Help texts of commands: wraps them, and reads the commands' options from them."""
 
 from __future__ import annotations
 

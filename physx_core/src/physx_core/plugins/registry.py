@@ -132,8 +132,8 @@ def _problem_of(module: Any, place: str) -> str:
         if inspect.isroutine(member) and hasattr(member, f"{PLUGINS}_impl")
     }
     if not hooks:
-        forgotten = [f"{name}()" for name in known if name in members]
-        what = f"{listed(forgotten)} in {place} is not" if forgotten else f"nothing in {place} is"
+        unmarked = [f"{name}()" for name in known if name in members]
+        what = f"{listed(unmarked)} in {place} is not" if unmarked else f"nothing in {place} is"
         return (
             f"has no hooks: {what} marked with hookimpl. A plugin is a module with functions such "
             "as physx_environments(), which return components by name."
